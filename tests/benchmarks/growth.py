@@ -76,8 +76,8 @@ def of_cameras(task: tuple[int, int, bool]) -> dict[str, float]:
     return {
         "all": taken,
         "memory": grown / 1024,
-        "moved": float(len(found.moved)),
-        "rows": float(len(found.sights)),
+        "moved": float(len(found.cell.moved)),
+        "rows": float(len(found.views)),
     }
 
 

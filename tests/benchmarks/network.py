@@ -18,7 +18,7 @@ from support.networkbound import network_bound
 from visioncal.calibration.pipeline import align
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
-from visioncal.results import Alignment
+from visioncal.results import Calibration
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
 from visioncal.simulation.network import Network, simulate_network
 from visioncal.simulation.records import network_session
@@ -41,21 +41,21 @@ def drawn(options: NetworkOptions, seed: int) -> NetworkOptions:
     return replace(options, boards=boards, seed=seed)
 
 
-def aligned(cell: Network) -> Alignment:
+def aligned(cell: Network) -> Calibration:
     session = network_session(cell, "network", seen="names")
     return align(
         session, corners={view_corners.view: view_corners for view_corners in cell.corners}
     )
 
 
-def away(cell: Network, found: Alignment, frames: Sequence[str]) -> FloatArray:
+def away(cell: Network, found: Calibration, frames: Sequence[str]) -> FloatArray:
     """(6 f,) by which frames are off, on their right."""
     parts = []
     for name in frames:
         truth = cell.transforms[name]
-        if found.frames[name] == "cell":
-            truth = invert(cell.transforms[found.reference]) @ truth
-        parts.append(log(invert(truth) @ found.edge_of(name).matrix))
+        if found.cell.tree[name] == "cell":
+            truth = invert(cell.transforms[found.cell.reference]) @ truth
+        parts.append(log(invert(truth) @ found.tree.edge_of(name).matrix))
     return np.concatenate(parts)
 
 
@@ -76,7 +76,7 @@ def clean(seed: int) -> Clean:
     found = aligned(cell)
     taken = time.process_time() - begin
     bound = network_bound(cell)
-    error, covariance = away(cell, found, ["base_b"]), found.edge_of("base_b").covariance
+    error, covariance = away(cell, found, ["base_b"]), found.tree.edge_of("base_b").covariance
     frames = [edge.partition("_from_")[2] for edge in found.edges]
     every = away(cell, found, frames)
     return Clean(
@@ -112,10 +112,10 @@ def faulty(seed: int) -> Faulty:
     good = simulate_network(options)
     found, before = aligned(cell), aligned(good)
     told = [_tells(found, move) for move in (half, bumped)]
-    reasons = {sight.view: sight.reason for sight in found.sights if not sight.used}
+    reasons = {sight.view: sight.reason for sight in found.views if not sight.used}
     wrong = [view for view in cell.wrong_views if view in reasons]
     exchanged = [index for index in wrong if "exchanged" in reasons[index]]
-    besides = len(found.moved) - sum(told) + len(reasons) - len(wrong)
+    besides = len(found.cell.moved) - sum(told) + len(reasons) - len(wrong)
     return Faulty(
         *told,
         len(exchanged) >= 2,
@@ -126,15 +126,15 @@ def faulty(seed: int) -> Faulty:
     )
 
 
-def _tells(found: Alignment, push: Moved) -> bool:
+def _tells(found: Calibration, push: Moved) -> bool:
     """Whether a push is named, and between which stops it happened."""
     return any(
         move.frame == push.frame and move.last_stop < (push.from_stop or 0) <= move.first_stop
-        for move in found.moved
+        for move in found.cell.moved
     )
 
 
-def _mm(cell: Network, found: Alignment) -> float:
+def _mm(cell: Network, found: Calibration) -> float:
     return 1e3 * float(np.linalg.norm(away(cell, found, ["base_b"])[3:]))
 
 

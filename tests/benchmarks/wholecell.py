@@ -20,7 +20,7 @@ from results import wished, write_section
 from visioncal.calibration.pipeline import align
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners, FloatArray
-from visioncal.results import Alignment
+from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.network import simulate_network
@@ -121,14 +121,17 @@ def outcome(seed: int) -> Outcome:
     covariance = found.joint_covariance[np.ix_(*[np.repeat(rows, 6)] * 2)]
     error = np.concatenate(
         [
-            log(invert(_true(made.cell, name, found.reference)) @ found.edge_of(name).matrix)
+            log(
+                invert(_true(made.cell, name, found.cell.reference))
+                @ found.tree.edge_of(name).matrix
+            )
             for name, is_there in zip(names, rows.tolist(), strict=True)
             if is_there
         ]
     )
     offsets = [_zeros(found, made.cell, robot) for robot in ("a", "b")]
-    (clock,) = found.details.clocks.values()
-    floor = found.boards["floor"]
+    (clock,) = found.cell.details.clocks.values()
+    floor = found.cell.boards["floor"]
     return Outcome(
         float(error @ np.linalg.solve(covariance, error)) / len(error),
         1e3 * float(np.sqrt(np.mean(error.reshape(-1, 6)[:, 3:] ** 2))),
@@ -136,14 +139,14 @@ def outcome(seed: int) -> Outcome:
         (clock.camera_minus_robot_s - AHEAD_S) / clock.sigma_s,
         (floor.shape["scale"] - (SCALE - 1.0)) / floor.sigma["scale"],
         not any("contradicted" in reason for reason in found.verdict.reasons),
-        len(found.moved),
+        len(found.cell.moved),
         found.verdict.status,
     )
 
 
-def _zeros(found: Alignment, cell: Network, robot: str) -> FloatArray:
+def _zeros(found: Calibration, cell: Network, robot: str) -> FloatArray:
     """(k,) errors over their sigmas of the joints' zeros."""
-    rows = found.arms[robot].arm.parameters
+    rows = found.cell.robots[robot].arm.parameters
     zeros = [row for row in rows if row.name == "theta_rad"]
     away = [zero.change for zero in zeros] - cell.true_arms[robot].offset
     return np.asarray(away / [zero.sigma for zero in zeros])

@@ -13,7 +13,7 @@ from support.drawn import column
 
 from visioncal.core.transforms import log
 from visioncal.present.recording import paths, read_evidence
-from visioncal.results import Alignment
+from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
@@ -60,18 +60,18 @@ def out(folder, tmp_path_factory) -> Path:
 
 
 def test_pictures_of_several_cameras_are_one_cell(out):
-    cell, found = simulate_network(OPTIONS), Alignment.load(out)
+    cell, found = simulate_network(OPTIONS), Calibration.load(out)
     for frame in ("base_b", "cam_left", "cam_right"):
         edge = found.between("base_a", frame)
         off = log((np.linalg.inv(edge.matrix) @ cell.between("base_a", frame))[None])[0]
         # Six squared sigmas are exceeded once in 4e5; pictures of small boards are not ideal.
         assert off @ np.linalg.solve(edge.covariance, off) < 60.0, frame
     # Both rows whose pictures were exchanged are left out.
-    left_out = {sight.view: sight.reason for sight in found.sights if not sight.used}
+    left_out = {view.view: view.reason for view in found.views if not view.used}
     for view in cell.wrong_views:
         assert "disagrees" in left_out[view]
-    assert found.cameras["cam_right"].estimated
-    assert not found.cameras["cam_left"].estimated
+    assert found.cell.lenses["cam_right"].estimated
+    assert not found.cell.lenses["cam_left"].estimated
 
 
 def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(folder, tmp_path):

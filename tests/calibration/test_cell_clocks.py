@@ -9,7 +9,6 @@ from support.swept_cells import AHEAD_S, cell_of, swept_session
 from visioncal.calibration.pipeline import align
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
-from visioncal.results import Calibration
 from visioncal.simulation.layout import NetworkOptions
 
 CLOCK = "cam_side and robot b"
@@ -29,7 +28,7 @@ def found(swept):
 
 
 def test_the_offset_of_one_camera_is_found_by_the_motion(found):
-    clock = found.details.clocks[CLOCK]
+    clock = found.cell.details.clocks[CLOCK]
     assert clock.method == "motion"
     assert clock.sigma_s < 1e-4
     # Three sigma: one run in 370. What the motion tells of the arm as stated is off by more.
@@ -40,9 +39,8 @@ def test_the_offset_of_one_camera_is_found_by_the_motion(found):
 
 
 def test_the_clock_of_one_camera_and_robot_goes_with_them(found):
-    whole = Calibration.whole(found)
-    assert whole.of("side", "b").clock == found.details.clocks[CLOCK]
-    assert whole.of("left", "b").clock is None
+    assert found.of("side", "b").clock == found.cell.details.clocks[CLOCK]
+    assert found.of("left", "b").clock is None
 
 
 def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, found):
@@ -53,7 +51,7 @@ def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, 
     assert away @ np.linalg.solve(edge.covariance, away) < 22.0
     # Its lens is estimated, with a field and a focus of its own.
     assert edge.sigma_mm < 0.3
-    used = [sight for sight in found.sights if sight.seer == "cam_side" and sight.used]
+    used = [view for view in found.views if view.seer == "cam_side" and view.used]
     assert len(used) > 30
     assert found.session_sha256 == session.digest()
 
@@ -65,7 +63,7 @@ def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
     found = align(replace(session, document=document), corners=corners)
     (doubt,) = [reason for reason in found.verdict.reasons if "is stated as +20.00 ms" in reason]
     assert doubt.startswith(CLOCK)
-    assert found.details.clocks[CLOCK].stated_s == 0.02
+    assert found.cell.details.clocks[CLOCK].stated_s == 0.02
     assert found.verdict.status == "check"
 
 
@@ -83,8 +81,8 @@ def test_rows_whose_motion_tells_no_offset_are_left_out_and_say_so(swept):
     timed = [view for view in session.views if view.stamp_s is not None]
     views = tuple(view for view in session.views if view.stamp_s is None or view in timed[:5])
     found = align(replace(session, views=views), corners=corners)
-    lost = [sight for sight in found.sights if sight.seer == "cam_side"]
+    lost = [view for view in found.views if view.seer == "cam_side"]
     assert len(lost) == 5
-    assert all(not sight.used and "clock" in sight.reason for sight in lost)
-    assert "cam_side" in {untied.frame for untied in found.untied}
+    assert all(not view.used and "clock" in view.reason for view in lost)
+    assert "cam_side" in {untied.frame for untied in found.cell.untied}
     assert any(reason.startswith(CLOCK) for reason in found.verdict.reasons)

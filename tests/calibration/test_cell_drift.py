@@ -68,7 +68,7 @@ def test_frames_are_those_of_the_cold_arm(cell, session, found):
 
 
 def test_coefficients_are_within_their_sigmas(found, tmp_path):
-    Calibration.whole(found).save(tmp_path / "calibration.json")
+    found.save(tmp_path / "calibration.json")
     drift, heat = (
         Calibration.load(tmp_path / "calibration.json").of("left", "a").drift,
         Heat.drawn(0),
@@ -77,17 +77,17 @@ def test_coefficients_are_within_their_sigmas(found, tmp_path):
         [drift.growth_per_k - heat.growth_per_k, drift.drift_rad_per_k - heat.drift_rad_per_k]
     )
     assert off @ np.linalg.solve(drift.covariance[:12, :12], off) < OF_TWELVE
-    thermal = found.arms["a"].thermal
+    thermal = found.cell.robots["a"].thermal
     assert thermal.residual_mm.with_drift < 0.7 * thermal.residual_mm.without
     assert len(thermal.views) > 30
 
 
 def test_a_robot_without_temperatures_stays_and_is_named(found):
-    assert found.arms["b"].thermal is None
+    assert found.cell.robots["b"].thermal is None
     reasons = found.verdict.reasons
     assert any(reason.startswith("Robot a: the arm drifts with its temp") for reason in reasons)
     assert any(reason.startswith("Robot b: no data show how it drifts") for reason in reasons)
-    budget = found.uncertainty.budget_mm["flange_a_from_target_plate_a"]
+    budget = found.cell.uncertainty.budget_mm["flange_a_from_target_plate_a"]
     assert 0.0 < budget["temperature of a"] < budget["total"]
 
 

@@ -86,12 +86,12 @@ def test_a_camera_that_sees_nothing_of_the_rest_is_tied_by_a_drawing():
     ]
     corners = {view_corners.view: view_corners for view_corners in cell.corners}
     loose = align(replace(session, views=tuple(kept)), corners=corners)
-    assert {untied.frame for untied in loose.untied} == {"cam_right", "target_floor"}
+    assert {untied.frame for untied in loose.cell.untied} == {"cam_right", "target_floor"}
     rig = cell.between("cam_left", "cam_right")
     prior = {"cam_left_from_cam_right": whole(rig, 1e-4, 1e-4)}
     document = {**session.document, "prior": prior}
     found = align(replace(session, views=tuple(kept), document=document), corners=corners)
-    assert not found.untied
+    assert not found.cell.untied
     edge = found.between("base_a", "target_floor")
     away = log(invert(cell.between("base_a", "target_floor")) @ edge.matrix)
     # Chi-square of 6 beyond 22 is 0.1 %.
@@ -125,4 +125,4 @@ def test_cameras_of_other_mounts_take_priors_too():
     truth = cell.transforms["cam_hand"]
     prior = {"flange_a_from_cam_hand": {"x_m": float(truth[0, 3]), "sigma_m": 1e-6}}
     found = aligned(cell, prior)
-    assert found.edge_of("cam_hand").matrix[0, 3] == pytest.approx(truth[0, 3], abs=4e-6)
+    assert found.tree.edge_of("cam_hand").matrix[0, 3] == pytest.approx(truth[0, 3], abs=4e-6)

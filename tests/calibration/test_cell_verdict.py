@@ -90,7 +90,7 @@ def test_a_sound_cell_is_good_and_says_how_good(session):
     assert found.verdict.status == "good"
     good_for, reason = found.verdict.reasons
     assert good_for.startswith("It is good for tasks of ")
-    used = sum(sight.used for sight in found.sights)
+    used = sum(view.used for view in found.views)
     assert reason.startswith(
         f"All {used} used views agree: left out of the fit, they are predicted"
     )
@@ -113,7 +113,7 @@ def test_one_wrong_pose_of_a_robot_is_named(session):
     assert found.verdict.status == "check"
     # What a fault explains is not said once more of each camera.
     assert not any("were left out; view" in reason for reason in found.verdict.reasons)
-    why = {sight.view: sight.reason for sight in found.sights if not sight.used}
+    why = {view.view: view.reason for view in found.views if not view.used}
     assert sorted(why) == mine
     assert all(f"the pose of robot b at stop {stop} is wrong" in name for name in why.values())
 
@@ -147,7 +147,7 @@ def test_poses_of_a_robot_that_are_exchanged_are_named(session):
     found = align(rewritten(session, exchange))
     words = f"The poses of robot b at stops {first} and {second} are exchanged: views"
     assert any(reason.startswith(words) for reason in found.verdict.reasons)
-    out = [sight.view for sight in found.sights if not sight.used]
+    out = [view.view for view in found.views if not view.used]
     assert out == [*of_plate(session, "plate_b", first), *of_plate(session, "plate_b", second)]
 
 
@@ -164,7 +164,7 @@ def test_two_images_that_are_exchanged_have_a_command_that_mends_them(session):
     mended = exchange_views(swapped, first, second)
     assert len(mended.declaration.corrected) == 2
     again = align(mended)
-    assert all(sight.used for sight in again.sights if sight.view in (first, second))
+    assert all(view.used for view in again.views if view.view in (first, second))
     other = next(view.number for view in session.views if view.text["target"] != "plate_b")
     with pytest.raises(DataError, match=r"of another .*target"):
         exchange_views(session, first, other)
@@ -236,7 +236,7 @@ def test_a_lens_of_half_the_resolution_is_named_where_corners_hardly_deviate_by_
     found = align(rewritten(session, lambda *_: None, document))
     assert found.verdict.causes[0].kind == "other_lens"
     assert found.verdict.causes[0].words.startswith("cam_right: the stated matrix is for images")
-    assert all(sight.used for sight in found.sights)
+    assert all(view.used for view in found.views)
 
 
 def test_few_stops_are_told_by_robot(session):
@@ -326,7 +326,7 @@ def test_a_board_of_another_size_is_named_with_all_views_used(which, scale, seed
     found = align(recorded(simulate_network(cell)))
     assert found.verdict.causes[0].kind == "board_size"
     assert words in found.verdict.causes[0].words
-    assert all(sight.used for sight in found.sights)
+    assert all(view.used for view in found.views)
 
 
 def test_a_robot_in_millimetres_is_named_with_its_reading(session):
@@ -396,11 +396,11 @@ def test_poses_that_were_measured_worse_than_others_are_no_outliers(seed):
     poses = network_session(simulate_network(replace(CELL, seed=seed)), "two arms", seen="poses")
     found = align(poses)
     assert found.verdict.status == "good"
-    assert all(sight.used for sight in found.sights)
+    assert all(view.used for view in found.views)
 
 
 def test_a_few_uneven_poses_are_no_move(tmp_path):
     simulated = ("simulate", tmp_path / "cell", "--cell", "camera-and-tracker", "--no-images")
     assert visioncal(*simulated, "--seed", "6").status == 0
     found = align(Session.load(tmp_path / "cell"))
-    assert (found.verdict.status, found.moved) == ("good", ())
+    assert (found.verdict.status, found.cell.moved) == ("good", ())

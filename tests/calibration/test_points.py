@@ -453,8 +453,8 @@ def test_a_cell_of_two_cameras_is_aligned(tmp_path):
         error = log(invert(edge.matrix) @ true.as_matrix())
         # Chi-square of six exceeds this in one case of 100,000.
         assert error @ np.linalg.solve(edge.covariance, error) < 33.0
-    assert found.noise["cam_left"]["pixel_px"] == 0.1
-    assert found.noise["cam_right"]["pixel_px"] == 0.4
+    assert found.cell.noise["cam_left"]["pixel_px"] == 0.1
+    assert found.cell.noise["cam_right"]["pixel_px"] == 0.4
 
 
 def test_report_and_recording_draw_what_no_image_shows(cube, tmp_path):

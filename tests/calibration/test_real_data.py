@@ -96,7 +96,7 @@ def test_two_cameras_of_one_arm_are_one_cell(real_data, tmp_path):
     )
     result = visioncal.align(tmp_path)
     assert "stops 25 and 26 are exchanged" in result.verdict.top[0]
-    assert any(move.frame == "cam_c4" for move in result.moved)
+    assert any(move.frame == "cam_c4" for move in result.cell.moved)
 
 
 def test_eight_views_of_a_poor_set_are_not_called_good(real_data):

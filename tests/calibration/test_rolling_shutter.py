@@ -168,7 +168,7 @@ def test_a_camera_of_a_whole_cell_has_its_own():
     cell = cell_of(NetworkOptions(stops=16, seed=1), replace(HOW, readout_s=READOUT_S))
     session, corners = swept_session(cell)
     found = align(session, corners=corners)
-    (told,) = found.details.clocks.values()
+    (told,) = found.cell.details.clocks.values()
     shutter = told.shutter
     assert shutter.kind == "rolling"
     assert abs(shutter.readout_s - READOUT_S) < 4.0 * shutter.readout_sigma_s

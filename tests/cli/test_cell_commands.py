@@ -96,7 +96,7 @@ def test_a_pixel_is_located_in_the_base_of_any_robot(place):
     board = ("--pixel", "1200,1000", "--plane", "floor")
     names = ("--camera", "left", "--robot", "b")
     (told,) = json.loads(done("locate", "-c", place / "out", *board, *names, "--json"))
-    floor = whole.cell.between("base_b", "target_floor").matrix
+    floor = whole.between("base_b", "target_floor").matrix
     height = (np.array(told["p_base_m"]) - floor[:3, 3]) @ floor[:3, 2]
     assert abs(height) < 1e-9
     ambiguous = visioncal("locate", "-c", place / "out", *words, "--camera", "left")
@@ -156,7 +156,7 @@ def test_a_row_without_the_robots_pose_is_left_out_where_a_tool_is_placed(place)
 
 
 def test_many_rows_that_are_left_out_for_one_reason_share_a_line(place):
-    sight = Calibration.load(place / "out").cell.sights[0]
+    sight = Calibration.load(place / "out").views[0]
     lost = [replace(sight, view=index, used=False, reason="not needed") for index in range(30)]
     of = f"({sight.seer} of {sight.seen})"
     named = ", ".join(map(str, range(12)))
@@ -202,7 +202,7 @@ def test_two_whole_cells_are_compared_by_all_frames_or_by_a_pair(place, tmp_path
     edges["cell_from_cam_left"] = replace(
         edges["cell_from_cam_left"], matrix=edges["cell_from_cam_left"].matrix @ twist
     )
-    moved = Calibration.whole(replace(whole.cell, edges=edges))
+    moved = replace(whole, edges=edges)
     moved.save(tmp_path / "calibration.json")
     told = json.loads(done("diff", place / "out", tmp_path, "--json"))
     assert [name for name, value in told["transforms"].items() if value["is_change"]] == [
@@ -222,7 +222,7 @@ def test_transforms_of_one_robot_are_exported(place):
     text = done("export", place / "out", "--to", "text", "--camera", "left", "--robot", "b")
     rows = [line for line in text.splitlines() if line and not line.startswith("#")]
     written = np.array([row.split() for row in rows], dtype=float)
-    np.testing.assert_allclose(written, whole.cell.between("base_b", "cam_left").matrix)
+    np.testing.assert_allclose(written, whole.between("base_b", "cam_left").matrix)
     named = ("--edge", "flange_from_target", "--robot", "b", "--camera", "left")
     done("export", place / "out", "--to", "text", *named, "--target", "plate_b")
     refused = visioncal("export", place / "out", "--to", "robot-dh")
@@ -233,10 +233,10 @@ def test_transforms_of_one_robot_are_exported(place):
 
 def test_targets_are_corrected_for_the_robot_that_is_named(place, tmp_path):
     whole = Calibration.load(place / "out")
-    arm = whole.cell.arms["b"]
+    arm = whole.cell.robots["b"]
     bent = arm.model.corrected(1e-3 * np.ones((7, 6)))
-    arms = {**whole.cell.arms, "b": RobotResult(arm.model, arm=arm_of(bent))}
-    Calibration.whole(replace(whole.cell, arms=arms)).save(tmp_path / "calibration.json")
+    robots = {**whole.cell.robots, "b": RobotResult(arm.model, arm=arm_of(bent))}
+    replace(whole, cell=replace(whole.cell, robots=robots)).save(tmp_path / "calibration.json")
     q = np.array([[0.2, -1.2, 1.4, -1.6, -1.5, 0.3], [0.5, -1.0, 1.2, -1.4, -1.3, 0.1]])
     wanted = bent.base_from_flange(q)
     found = correct(Calibration.load(tmp_path), wanted, q[0], robot="b")

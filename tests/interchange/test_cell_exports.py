@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import yaml
 from support import placed
-from support.aligned_cells import made_up_cell
+from support.aligned_cells import made_up_cell, with_cell
 
 from visioncal.core.errors import DataError
+from visioncal.core.files import write_json
 from visioncal.core.transforms import adjoint, invert
 from visioncal.interchange.exports import Selection, document, export
 from visioncal.interchange.result_files import load_calibration, load_exportable
 from visioncal.results import CameraResult, Verdict
+from visioncal.results.document import to_alignment
 from visioncal.session.choosing import Choice
 from visioncal.simulation import fisheye_camera, wide_camera
 
@@ -23,7 +25,7 @@ POSE = {"rotation": ("x", "y", "z", "w"), "translation": ("x", "y", "z")}
 
 
 def test_any_frame_is_written_in_any_other(tmp_path):
-    CELL.save(tmp_path / "alignment.json")
+    write_json(tmp_path / "alignment.json", to_alignment(CELL, CELL.cell))
     source = load_exportable(tmp_path)
     text = export(source, "text", Selection("base_b_from_cam_top"))
     expected = (
@@ -42,7 +44,7 @@ FIXTURE = "base_b_from_jig"
 @pytest.mark.parametrize(("name", "sign"), [("base_a_from_jig", 1), ("jig_from_base_a", -1)])
 def test_a_fixture_of_one_robot_is_written_in_the_base_of_another(name, sign):
     jig = placed.frame(placed.BASE_FROM_FIXTURE, verdict=Verdict.of("bad", "It slips."))
-    cell = replace(CELL, placed={FIXTURE: jig})
+    cell = replace(CELL, frames={FIXTURE: jig})
     far = CELL.between("base_a", "base_b").matrix @ jig.edge.matrix
     # The pieces are independent: each covariance goes through its own derivative.
     whole = np.zeros((6, 6))
@@ -59,7 +61,7 @@ def test_a_fixture_of_one_robot_is_written_in_the_base_of_another(name, sign):
 
 def test_a_fixture_without_rotation_says_whose_it_has_and_unknown_frames_list_it():
     jig = placed.frame(placed.BASE_FROM_FIXTURE, oriented=False)
-    cell = replace(CELL, placed={FIXTURE: jig})
+    cell = replace(CELL, frames={FIXTURE: jig})
     text = export(cell, "text", Selection("cam_top_from_jig"))
     assert "rotation taken from the base_b, not measured" in text
     with pytest.raises(DataError, match=r"no frame 'jog'.* jig") as caught:
@@ -70,7 +72,9 @@ def test_a_fixture_without_rotation_says_whose_it_has_and_unknown_frames_list_it
 def test_all_frames_are_one_tree():
     found = list(yaml.safe_load_all(export(CELL, "ros", Selection("all"))))
     hangs = {value["child_frame_id"]: value["header"]["frame_id"] for value in found}
-    assert hangs == {name: on for name, on in CELL.frames.items() if not name.startswith("flange")}
+    assert hangs == {
+        name: on for name, on in CELL.cell.tree.items() if not name.startswith("flange")
+    }
     robot = ElementTree.fromstring(export(CELL, "urdf", Selection("all")))
     links = [element.attrib["name"] for element in robot.findall("link")]
     assert sorted(links) == sorted(["cell", *hangs])
@@ -90,10 +94,10 @@ def test_all_frames_are_one_tree():
 
 def test_a_lens_is_that_of_the_camera_that_is_named():
     cameras = {
-        "cam_top": CameraResult(wide_camera(), False),
-        "cam_hand": CameraResult(fisheye_camera(), False),
+        "top": CameraResult(wide_camera(), False),
+        "hand": CameraResult(fisheye_camera(), False),
     }
-    cell = replace(CELL, cameras=cameras)
+    cell = with_cell(CELL, cameras=cameras)
     for name, width in (("top", 1280), ("cam_hand", 1280)):
         info = yaml.safe_load(export(cell, "camera-info", Selection(camera=name)))
         assert info["image_width"] == width
@@ -135,7 +139,7 @@ def test_a_bad_verdict_is_warned_of():
 
 
 def test_what_needs_one_camera_takes_the_only_one_that_fits(tmp_path):
-    CELL.save(tmp_path / "alignment.json")
+    write_json(tmp_path / "alignment.json", to_alignment(CELL, CELL.cell))
     for path in (tmp_path, tmp_path / "alignment.json"):
         found = load_calibration(path)
         expected = CELL.between("base_b", "cam_top")

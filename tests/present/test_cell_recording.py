@@ -1,10 +1,12 @@
 """Recordings of aligned cells: the session and the result lie in them without loss."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from support.aligned_cells import cell_result
 
 from visioncal.calibration.pipeline import Run
 from visioncal.core.errors import DataError
@@ -16,7 +18,7 @@ from visioncal.present.recording import paths, read_calibration, read_evidence, 
 from visioncal.present.recording.frames import scan
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.scene import Scene
-from visioncal.results import Alignment, Calibration, Edge, Sight, Verdict
+from visioncal.results import Calibration, Edge, ViewResult, to_document
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
     BoardAt,
@@ -44,8 +46,8 @@ def session(cell) -> Session:
     return network_session(cell, "cell", seen="poses")
 
 
-def true_alignment(cell, session) -> Alignment:
-    """What aligning a simulated cell would give, were it exact."""
+def true_result(cell, session) -> Calibration:
+    """What calibrating a simulated cell would give, were it exact."""
     origin = invert(cell.transforms["base_a"])
     edges = {
         f"{cell.parents[name]}_from_{name}": Edge(
@@ -54,38 +56,23 @@ def true_alignment(cell, session) -> Alignment:
         for name, transform in cell.transforms.items()
         if name != "base_a"
     }
-    return Alignment(
-        session_name=session.name,
-        session_sha256=session.digest(),
-        created="2026-11-20T12:00:00+00:00",
-        reference="base_a",
-        frames=session.frames,
-        robots={"flange_a": "a", "flange_b": "b"},
-        edges=edges,
-        joint_covariance=1e-8 * np.eye(6 * len(edges)),
-        cameras={},
-        noise={},
-        sights=tuple(
-            Sight(
-                observation.view.number,
-                observation.station,
-                observation.seer,
-                observation.seen,
-                observation.view.number % 5 > 0,
-                "",
-                0.1,
-            )
-            for observation in session.observations
-        ),
-        moved=(),
-        untied=(),
-        weakest="",
-        verdict=Verdict("good"),
+    views = tuple(
+        ViewResult(
+            observation.view.number,
+            observation.view.number % 5 > 0,
+            residual_mm=0.1,
+            seer=observation.seer,
+            seen=observation.seen,
+            stop=observation.station,
+        )
+        for observation in session.observations
     )
+    found = cell_result(edges, 1e-8 * np.eye(6 * len(edges)), views, tree=session.frames)
+    return replace(found, session_name=session.name, session_sha256=session.digest())
 
 
 def test_frames_are_drawn_where_they_were(cell, session):
-    scene = Scene.of(session, Calibration.whole(true_alignment(cell, session)), {})
+    scene = Scene.of(session, true_result(cell, session), {})
     for observation in session.observations:
         seer = scene.in_cell(observation.seer, observation.view.number)
         seen = scene.in_cell(observation.seen, observation.view.number)
@@ -96,8 +83,8 @@ def test_frames_are_drawn_where_they_were(cell, session):
 
 
 def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path):
-    found = true_alignment(cell, session)
-    files = write_outputs(tmp_path / "out", session, Run(Calibration.whole(found), ())).files
+    found = true_result(cell, session)
+    files = write_outputs(tmp_path / "out", session, Run(found, ())).files
     assert [file.name for file in files] == [
         "calibration.json",
         "alignment.json",
@@ -106,7 +93,7 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
     ]
     recording = tmp_path / "out" / "recording.rrd"
     assert read_session(recording).digest() == session.digest()
-    assert read_calibration(recording).cell.document() == found.document()
+    assert to_document(read_calibration(recording)) == to_document(found)
     selection = Selection("base_a_from_cam_top")
     assert export(load_exportable(recording), "text", selection) == export(
         load_exportable(tmp_path / "out"), "text", selection
@@ -120,7 +107,7 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
 def test_recordings_of_cells_by_earlier_versions_open():
     kept = KEPT / "recording_of_cell.rrd"
     calibration = read_calibration(kept)
-    assert calibration.cell.frames["target_plate"] == "flange_b"
+    assert calibration.cell.tree["target_plate"] == "flange_b"
     assert calibration.verdict.status == "good"
     assert calibration.session_sha256 == read_session(kept).digest()
     assert len(calibration.views) == len(read_session(kept).views)
@@ -128,7 +115,7 @@ def test_recordings_of_cells_by_earlier_versions_open():
 
 
 def test_a_changed_result_is_noticed(cell, session, tmp_path):
-    write_outputs(tmp_path, session, Run(Calibration.whole(true_alignment(cell, session)), ()))
+    write_outputs(tmp_path, session, Run(true_result(cell, session), ()))
     recording = tmp_path / "recording.rrd"
     ((frame, _, _),) = chunks(scan(recording), (paths.CALIBRATION,), [])
     data = bytearray(recording.read_bytes())
@@ -142,5 +129,5 @@ def test_a_changed_result_is_noticed(cell, session, tmp_path):
 def test_images_that_are_missing_leave_the_rest(cell, tmp_path):
     session = network_session(cell, "cell", seen="names")
     assert isinstance(session.images, MemoryImages)
-    write_outputs(tmp_path, session, Run(Calibration.whole(true_alignment(cell, session)), ()))
+    write_outputs(tmp_path, session, Run(true_result(cell, session), ()))
     assert read_session(tmp_path / "recording.rrd").digest() == session.digest()

@@ -4,21 +4,21 @@ import re
 from dataclasses import replace
 
 import numpy as np
-from support.aligned_cells import made_up_cell
+from support.aligned_cells import made_up_cell, with_cell
 
 from visioncal.core.number_format import significant
 from visioncal.present.cellmap import pairs, weakest_frame
 from visioncal.present.report import write_report
 from visioncal.present.report.network import known_in_each_other
 from visioncal.present.report.page import render
-from visioncal.results import Alignment, Calibration, Moved, RobotResult, Sight, Untied
+from visioncal.results import Calibration, Moved, RobotResult, Untied, ViewResult
 from visioncal.results.arm import ArmLevel, ArmResult
 
 CELL = made_up_cell(5)
 
 
-def render_cell(found: Alignment) -> str:
-    return render(Calibration.whole(found), None, ())
+def render_cell(found: Calibration) -> str:
+    return render(found, None, ())
 
 
 def text_of(html: str) -> str:
@@ -30,7 +30,7 @@ def test_the_graph_has_every_frame_with_its_sigma():
     figure = re.search(r"<svg[^>]*The network of frames.*?</svg>", html, re.DOTALL)[0]
     labels = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
     for frame in ("base_b", "cam_top", "cam_hand", "target_plate"):
-        edge = CELL.edge_of(frame)
+        edge = CELL.tree.edge_of(frame)
         assert frame in labels
         worth = f"{significant(edge.sigma_mm)} mm, {significant(edge.sigma_deg)}°"
         assert worth in [label.replace("&#176;", "°") for label in labels]
@@ -39,22 +39,23 @@ def test_the_graph_has_every_frame_with_its_sigma():
 
 
 def test_observations_are_counted_by_who_saw_whom():
-    sights = (
-        Sight(0, 0, "cam_top", "target_plate", True, "", 3.0, 0.1),
-        Sight(1, 1, "cam_top", "target_plate", True, "", 4.0, 0.3),
-        Sight(2, 2, "cam_top", "target_plate", False, "disagrees", 90.0, 9.0),
-        Sight(3, 2, "cam_hand", "target_plate", False, "blurred"),
+    of_top = {"seer": "cam_top", "seen": "target_plate"}
+    views = (
+        ViewResult(0, True, residual_mm=3.0, residual_deg=0.1, **of_top, stop=0),
+        ViewResult(1, True, residual_mm=4.0, residual_deg=0.3, **of_top, stop=1),
+        ViewResult(2, False, "disagrees", residual_mm=90.0, residual_deg=9.0, **of_top, stop=2),
+        ViewResult(3, False, "blurred", seer="cam_hand", seen="target_plate", stop=2),
     )
-    first, second = pairs(replace(CELL, sights=sights))
+    first, second = pairs(views)
     assert (first.used, first.left_out, first.rms.mm) == (2, 1, 12.5**0.5)
     assert (second.used, second.rms) == (0, None)
-    words = text_of(render_cell(replace(CELL, sights=sights)))
+    words = text_of(render_cell(replace(CELL, views=views)))
     assert "2 (\N{MINUS SIGN}1)" in words
     assert "view 2 not used cam_top of target_plate: disagrees" in words
 
 
 def test_the_table_has_any_frame_in_any_other():
-    table = next(known_in_each_other(CELL))
+    table = next(known_in_each_other(CELL.tree))
     assert table.titles == ("the cell", "base_a", "base_b", "cam_top")
     rows = {row.cells[0]: row.cells[1:] for row in table.rows}
     assert list(rows) == ["base_a", "base_b", "cam_top"]
@@ -69,24 +70,22 @@ def test_errors_of_robots_are_told_where_they_were_estimated():
         for name, mm in (("nominal", 0.31), ("offsets", 0.17))
     )
     arm = RobotResult(arm=ArmResult(level="offsets", levels=levels))
-    words = text_of(render_cell(replace(CELL, arms={"a": arm})))
+    words = text_of(render_cell(with_cell(CELL, robots={"a": arm})))
     assert "The arm of a Taken: offsets of the joints." in words
     assert "left out of the fit to 0.17 mm, the arm as stated to 0.31 mm." in words
     assert "The arm" not in text_of(render_cell(CELL))
 
 
 def test_what_moved_and_what_is_untied_is_told(tmp_path):
-    frames = {**CELL.frames, "cam_top_until_stop_4": "cell"}
-    edges = {**CELL.edges, "cell_from_cam_top_until_stop_4": CELL.edge_of("cam_top")}
-    found = replace(
-        CELL,
-        frames=frames,
-        edges=edges,
-        joint_covariance=np.pad(CELL.joint_covariance, (0, 6)),
+    tree = {**CELL.cell.tree, "cam_top_until_stop_4": "cell"}
+    edges = {**CELL.edges, "cell_from_cam_top_until_stop_4": CELL.tree.edge_of("cam_top")}
+    found = with_cell(
+        replace(CELL, edges=edges, joint_covariance=np.pad(CELL.joint_covariance, (0, 6))),
+        tree=tree,
         moved=(Moved("cam_top", "cam_top_until_stop_4", 4, 5, 0.58, 0.03, ("target_plate",)),),
         untied=(Untied("cam_<far>", "Let it see target_plate."),),
     )
-    write_report(tmp_path / "report.html", Calibration.whole(found), None, ())
+    write_report(tmp_path / "report.html", found, None, ())
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     words = text_of(html)
     assert "Between stops 4 and 5. cam_top is where it stood last" in words
@@ -97,4 +96,4 @@ def test_what_moved_and_what_is_untied_is_told(tmp_path):
     # The network shows the cell as it is now.
     graph = re.search(r"<svg[^>]*The network of frames.*?</svg>", html, re.DOTALL)[0]
     assert "until_stop" not in graph
-    assert weakest_frame(found) == weakest_frame(CELL)
+    assert weakest_frame(found.tree) == weakest_frame(CELL.tree)

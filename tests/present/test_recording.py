@@ -18,7 +18,6 @@ from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners
-from visioncal.present.parts import sights
 from visioncal.present.recording import codec, notes, paths, read_session, write_recording
 from visioncal.present.viewer import blueprint
 from visioncal.results.evidence import ViewEvidence, magnification
@@ -263,7 +262,7 @@ def test_session_without_images_can_be_recorded(tmp_path: Path) -> None:
 
 
 def test_notes_cannot_load_or_link_anything(sample: Sample) -> None:
-    view = sights(sample.calibration)[6]
+    view = sample.calibration.views[6]
     assert "](http" not in notes.view_markdown(view)
     assert r"\[it\]\(http://example\.org\)" in notes.view_markdown(view)
     assert "| park | " in notes.solvers_markdown(sample.calibration)

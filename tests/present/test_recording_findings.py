@@ -11,7 +11,6 @@ from support.findings import healthy, sick, with_findings
 from support.samples import TARGET, Sample, made_up
 
 from visioncal.core.errors import DataError
-from visioncal.present.parts import sights
 from visioncal.present.recording import notes, paths, write_recording
 from visioncal.present.recording.overlays import Overlay
 from visioncal.present.viewer import blueprint
@@ -106,7 +105,7 @@ def test_residuals_of_views_left_out_end_at_the_scale_of_the_others(
     assert max(used) < beyond[6][0] < 1.5 * max(used)
     marks = column(recorded, f"{paths.POSITION_MM}/{paths.REJECTED}", "Scalars:scalars")
     assert set(marks) == {3}
-    assert "14.2 mm" in notes.view_markdown(sights(sample.calibration)[6])
+    assert "14.2 mm" in notes.view_markdown(sample.calibration.views[6])
 
 
 def test_residuals_of_views_left_out_are_drawn_to_scale(sample: Sample, recorded: Path) -> None:

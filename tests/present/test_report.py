@@ -22,7 +22,6 @@ from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.advice import listed, suspects
-from visioncal.present.parts import sights
 from visioncal.present.placements import placement
 from visioncal.present.recording import write_recording
 from visioncal.present.recording.notes import view_markdown
@@ -39,7 +38,7 @@ from visioncal.results import (
     Verdict,
     VerdictStatus,
 )
-from visioncal.results.parts import worst_view
+from visioncal.results.views import worst_view
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
 from visioncal.simulation import CellOptions, simulate, write_session
@@ -333,10 +332,10 @@ def test_views_lead_to_the_recording_and_back(sample: Sample, outputs: Path) -> 
     page = (outputs / "report.html").read_text(encoding="utf-8")
     worst = worst_view(sample.calibration.views, sample.calibration.rms)
     assert f"visioncal review '{outputs}' --view {worst}" in unescape(page)
-    for sight in sights(sample.calibration):
-        anchor = f"view-{sight.view}"
+    for view in sample.calibration.views:
+        anchor = f"view-{view.view}"
         assert f'id="{anchor}"' in page
-        assert f"(report.html#{anchor})" in view_markdown(sight)
+        assert f"(report.html#{anchor})" in view_markdown(view)
     # Where there is no recording, nothing leads to it.
     assert "visioncal review" not in render(sample.calibration, None, ())
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from support.aligned_cells import made_up_cell
+from support.aligned_cells import made_up_cell, with_cell
 from support.pages import Page
 from support.samples import made_up
 
@@ -13,7 +13,7 @@ from visioncal.present.recording.markdown import table_lines
 from visioncal.present.recording.notes import figures_markdown, verdict_markdown
 from visioncal.present.report.page import render
 from visioncal.present.tables import Row, Table
-from visioncal.results import Calibration, Moved, Sight
+from visioncal.results import Moved, ViewResult
 
 CELL = made_up_cell(3)
 
@@ -47,7 +47,7 @@ def test_cells_of_a_table_are_text_in_markdown():
 
 def test_page_and_recording_have_the_same_figures():
     sample = made_up()
-    for calibration in (sample.calibration, Calibration.whole(CELL)):
+    for calibration in (sample.calibration, CELL):
         words = Page(render(calibration, None, ())).words
         text = figures_markdown(calibration).replace("\\", "")
         for fact in facts.noise_facts(calibration):
@@ -62,9 +62,7 @@ def test_one_camera_has_one_of_each_without_a_name():
     calibration = made_up().calibration
     assert parts.cameras(calibration) == {"": calibration.camera}
     assert parts.arms(calibration) == {"": calibration}
-    assert [sight.view for sight in parts.sights(calibration)] == [
-        view.view for view in calibration.views
-    ]
+    assert [view.view for view in calibration.views] == [view.view for view in calibration.views]
     frames = parts.frames(calibration)
     assert frames.parents == {
         "base": "cell", "flange": "base", "cam": "flange", "target": "base"
@@ -76,25 +74,23 @@ def test_one_camera_has_one_of_each_without_a_name():
 
 def test_frames_of_a_cell_hang_as_they_did_last():
     former = "cam_top_until_stop_4"
-    moved = replace(
-        CELL,
-        frames={**CELL.frames, former: "cell"},
-        edges={**CELL.edges, f"cell_from_{former}": CELL.edge_of("cam_top")},
-        joint_covariance=np.pad(CELL.joint_covariance, (0, 6)),
+    edges = {**CELL.edges, f"cell_from_{former}": CELL.tree.edge_of("cam_top")}
+    moved = with_cell(
+        replace(CELL, edges=edges, joint_covariance=np.pad(CELL.joint_covariance, (0, 6))),
+        tree={**CELL.cell.tree, former: "cell"},
         moved=(Moved("cam_top", former, 4, 5, 0.58, 0.03),),
     )
-    frames = parts.frames(Calibration.whole(moved))
-    assert frames.parents == CELL.frames
-    assert frames.matrices.keys() == CELL.frames.keys() - CELL.robots.keys()
+    frames = parts.frames(moved)
+    assert frames.parents == CELL.cell.tree
+    assert frames.matrices.keys() == CELL.cell.tree.keys() - CELL.cell.flanges.keys()
     # The frame of the cell is that of its reference.
-    np.testing.assert_array_equal(frames.matrices[CELL.reference], np.eye(4))
-    assert "Between stops 4 and 5." in verdict_markdown(Calibration.whole(moved)).replace("\\", "")
+    np.testing.assert_array_equal(frames.matrices[CELL.cell.reference], np.eye(4))
+    assert "Between stops 4 and 5." in verdict_markdown(moved).replace("\\", "")
 
 
 def test_views_left_out_of_a_cell_say_who_saw_whom():
-    sights = tuple(
-        Sight(name, name, "cam_top", "target_plate", False, "blurred") for name in (3, 4)
-    )
-    text = verdict_markdown(Calibration.whole(replace(CELL, sights=sights)))
+    of = {"seer": "cam_top", "seen": "target_plate"}
+    views = tuple(ViewResult(name, False, "blurred", **of, stop=name) for name in (3, 4))
+    text = verdict_markdown(replace(CELL, views=views))
     assert "- views 3 and 4 (cam_top of target_plate): blurred" in text.replace("\\", "")
     assert "0 of 2 views used" in text

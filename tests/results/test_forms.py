@@ -9,6 +9,7 @@ from support.samples import made_up, with_frames
 
 from visioncal.core.errors import DataError
 from visioncal.results import Alignment, Calibration
+from visioncal.results.document import to_alignment
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +67,14 @@ def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path: Path, p
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("observations", [{"view": 0}], r"observations\[0\].stop is missing"),
+        ("observations", [{"view": 0}], r"observations\[0\].used is missing"),
         ("noise", {"a": {"translation_mm": "0.1"}}, "noise.a.translation_mm is '0.1'"),
         ("cameras", [], r"cameras is \[\]; a table is needed"),
         ("weakest", None, "weakest is None; a text is needed"),
     ],
 )
 def test_what_an_alignment_does_not_hold_is_named(tmp_path: Path, key, value, words):
-    path = tmp_path / "alignment.json"
-    path.write_text(json.dumps(made_up_cell(1).document() | {key: value}))
+    path, cell = tmp_path / "alignment.json", made_up_cell(1)
+    path.write_text(json.dumps(to_alignment(cell, cell.cell) | {key: value}))
     with pytest.raises(DataError, match=words):
         Alignment.load(path)

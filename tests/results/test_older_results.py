@@ -28,8 +28,8 @@ def test_what_is_read_and_written_again_is_the_same(name):
     # What was written in the reasons alone.
     assert again["verdict"].pop("findings")
     assert again == document
-    # In the same order, too.
-    assert list(again) == list(document)
+    # In the same order, too; of a cell, what it has by name stands together.
+    assert name == "pick" or list(again) == list(document)
 
 
 def test_what_this_version_does_not_know_is_kept():
@@ -55,8 +55,7 @@ def test_sections_have_types_and_none_where_nothing_was_computed():
     assert warm.drift.growth_per_k == pytest.approx(
         [joint.growth_per_k for joint in warm.thermal.joints]
     )
-    cell = Calibration.from_json(stored("pick"), "pick").cell
-    part = Calibration.whole(cell).of("left", "a", "plate_a")
+    part = Calibration.from_json(stored("pick"), "pick").of("left", "a", "plate_a")
     assert part.uncertainty.noise_95.keys() == {"robot_translation_mm", "robot_rotation_deg"}
     assert part.budget is None
     assert np.isfinite(part.noise_dof)

@@ -16,7 +16,7 @@ from support.made_schema import calibration_schema
 from support.result_schema import SHIPPED, faults
 from support.samples import made_up, with_frames
 
-from visioncal.results import Calibration, to_document
+from visioncal.results import to_document
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -46,7 +46,7 @@ def test_earlier_files_keep_it(name):
     [
         with_frames(made_up(5)).calibration,
         with_findings(made_up(5), sick() | {"kinematics": with_holdout()}),
-        Calibration.whole(made_up_cell(1)),
+        made_up_cell(1),
     ],
     ids=["frames", "findings", "cell"],
 )

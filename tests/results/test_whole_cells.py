@@ -124,17 +124,15 @@ def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, fold
     stop = 7
     rest = replace(session, views=tuple(view for view in session.views if view.stop != stop))
     corners = session.corner_table.of_views([view.number for view in rest.views])
-    again = package.calibrate(replace(rest, corner_table=corners)).cell
-    mine = [
-        sight for sight in found.cell.sights if sight.stop == stop and sight.left_out_px is not None
-    ]
+    again = package.calibrate(replace(rest, corner_table=corners))
+    mine = [view for view in found.views if view.stop == stop and view.left_out_px is not None]
     away = []
     for value in mine:
         robots = {name: cell.base_from_flange[name][stop] for name in ("a", "b")}
         pose = again.between(value.seer, value.seen, robots).matrix
         seen = session.corners[value.view]
         positions = corner_positions(session.plates[value.seen.removeprefix("target_")])
-        camera = again.cameras[value.seer].camera
+        camera = again.cell.lenses[value.seer].camera
         off = project(camera, positions[seen.ids] @ pose[:3, :3].T + pose[:3, 3]) - seen.px
         rms = np.sqrt(np.mean(np.sum(off**2, axis=1)))
         away.append((value.left_out_px - rms, value.rms_px - rms))
@@ -195,14 +193,14 @@ def test_one_camera_robot_and_target_are_as_near_as_their_covariance_says(
         ends = f"{parent}_{robot}", f"{child}_{camera if child == 'cam' else target}"
         error.append(log(invert(truth(cell, *ends)) @ edge.matrix))
         np.testing.assert_allclose(
-            edge.covariance, found.cell.between(*ends).covariance, rtol=1e-9, atol=1e-18
+            edge.covariance, found.between(*ends).covariance, rtol=1e-9, atol=1e-18
         )
     error = np.concatenate(error)
     assert error @ np.linalg.solve(one.joint_covariance, error) < MOST_OF_TWELVE
-    assert one.camera.camera is found.cell.cameras[f"cam_{camera}"].camera
+    assert one.camera.camera is found.cell.cameras[camera].camera
     assert one.robot.name == "ur5e"
     ends = (f"cam_{camera}", f"target_{target}")
-    mine = [sight.view for sight in found.cell.sights if (sight.seer, sight.seen) == ends]
+    mine = [view.view for view in found.views if (view.seer, view.seen) == ends]
     assert [view.view for view in one.views] == mine
 
 
@@ -308,10 +306,11 @@ def test_a_pair_calibrated_by_itself_agrees_with_the_whole_cell(found, folder):
 
 
 def test_further_stages_of_a_robot_stand_in_its_section(found, tmp_path):
-    arm = found.cell.arms["b"]
+    arm = found.cell.robots["b"]
     bent = arm.model.corrected(1e-3 * np.ones((7, 6)))
-    arms = {**found.cell.arms, "b": RobotResult(arm.model, arm=arm_of(bent))}
-    Calibration.whole(replace(found.cell, arms=arms)).save(tmp_path / "calibration.json")
+    robots = {**found.cell.robots, "b": RobotResult(arm.model, arm=arm_of(bent))}
+    bending = replace(found, cell=replace(found.cell, robots=robots))
+    bending.save(tmp_path / "calibration.json")
     again = Calibration.load(tmp_path)
     assert not again.of("left", "a").arm_is_calibrated
     one, q = again.of("left", "b"), np.full((1, 6), 0.3)
@@ -323,8 +322,9 @@ def test_further_stages_of_a_robot_stand_in_its_section(found, tmp_path):
 
 
 def test_errors_of_the_arms_are_said_where_a_part_does_not_have_them(found):
-    fitted = replace(found.cell, details=replace(found.cell.details, further={"arms": {"a": {}}}))
-    verdict = Calibration.whole(fitted).of("left", "a").verdict
+    details = replace(found.cell.details, further={"arms": {"a": {}}})
+    fitted = replace(found, cell=replace(found.cell, details=details))
+    verdict = fitted.of("left", "a").verdict
     assert verdict.status == "check"
     assert "errors of its arms" in verdict.reasons[0]
 
@@ -346,7 +346,7 @@ def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
     cell = simulate_network(replace(OPTIONS, stray_images=2, swapped_rows=1, seed=3))
     session = recorded(cell)
     found = package.calibrate(session)
-    assert {sight.view for sight in found.cell.sights if not sight.used} == set(cell.wrong_views)
+    assert {view.view for view in found.views if not view.used} == set(cell.wrong_views)
     check = verify(session, found, camera="left", robot="b", target="plate_b")
     assert check.passed
     assert set(check.seen.known.reasons) < set(cell.wrong_views)

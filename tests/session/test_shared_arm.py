@@ -11,7 +11,6 @@ from visioncal.calibration.pipeline import align, calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.estimation.workspace import postures
-from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE
 from visioncal.session.shared_arm import join_sessions
@@ -63,7 +62,7 @@ def error_mm(cell, calibration) -> float:
 
 def test_an_arm_is_known_better_from_several_sessions_than_from_one(cells, sessions):
     alone = calibrate(sessions[0], level="offsets")
-    joined = Calibration.whole(align(join_sessions(sessions), level="offsets"))
+    joined = align(join_sessions(sessions), level="offsets")
     parts = [joined.of(camera=name, target=name) for name in ("s1", "s2")]
     sigma, before = (calibration.arm.workspace_sigma_mm.median for calibration in (parts[0], alone))
     # Three times the stops: 0.6 of the sigma, less what the session's own frames leave.

@@ -12,7 +12,7 @@ from support.moved_arms import true_base
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.dynamics.identified import Identified
-from visioncal.results import Alignment, Calibration
+from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import (
     cell_names,
@@ -113,7 +113,7 @@ def test_cells_that_come_with_visioncal_are_calibrated(name, place):
     done("simulate", folder, "--cell", name, "--no-images", "--views", 20)
     assert len({view.stop for view in Session.load(folder).views}) == 20
     done("calibrate", folder, "-o", out)
-    found, (content, edges) = Alignment.load(out), truth_of(folder)
+    found, (content, edges) = Calibration.load(out), truth_of(folder)
     bodies = [
         edge for edge in edges if edge.startswith(("cam_", "target_", "instrument_", "point_"))
     ]
@@ -123,7 +123,7 @@ def test_cells_that_come_with_visioncal_are_calibrated(name, place):
         truth = edges[child]
         if parent == "cell":
             assert content["parents"][child] == "cell"
-            truth = invert(edges[found.reference]) @ truth
+            truth = invert(edges[found.cell.reference]) @ truth
         among = slice(None) if item.oriented else slice(3, 6)
         assert misfit(item, truth, among) < MOST, edge
 
@@ -270,7 +270,7 @@ def test_a_tracker_beside_a_cell_ties_its_robots(read, place):
         "simulate", folder, "--cell", "two-arms", "--no-images", "--views", 8, "--instrument", read
     )
     done("calibrate", folder, "-o", out)
-    found, (_, edges) = Alignment.load(out), truth_of(folder)
+    found, (_, edges) = Calibration.load(out), truth_of(folder)
     truth = invert(edges["base_a"]) @ edges["instrument_tracker"]
     assert misfit(found.between("base_a", "instrument_tracker"), truth) < MOST
     for robot in ("a", "b"):
@@ -343,7 +343,7 @@ def test_a_sweep_of_a_cell_tells_the_clock_of_its_camera(place):
     timed = [view for view in session.views if view.stamp_s is not None]
     assert all(view.base_from_flange() is None for view in timed)
     done("calibrate", folder, "-o", place / "swept-cell-out")
-    clocks = Alignment.load(place / "swept-cell-out").details.clocks
+    clocks = Calibration.load(place / "swept-cell-out").cell.details.clocks
     clock = clocks["cam_top and robot a"]
     # Four sigma: one run in fifteen thousand.
     assert abs(clock.camera_minus_robot_s - 0.04) < 4.0 * clock.sigma_s < 4e-3

@@ -109,18 +109,21 @@ def _of_calibration(result) -> Answer:
     return Answer(words, edges, _flat(result.noise))
 
 
-def _of_alignment(result) -> Answer:
+def _of_cell(result) -> Answer:
     words = {
-        "unused": [sight.view for sight in result.sights if not sight.used],
-        "moved": [f"{value.frame} {value.last_stop} {value.first_stop}" for value in result.moved],
-        "untied": sorted(value.frame for value in result.untied),
+        "unused": [view.view for view in result.views if not view.used],
+        "moved": [
+            f"{value.frame} {value.last_stop} {value.first_stop}" for value in result.cell.moved
+        ],
+        "untied": sorted(value.frame for value in result.cell.untied),
         "status": result.verdict.status,
         "levels": {
-            name: "" if arm.arm is None else arm.arm.level for name, arm in result.arms.items()
+            name: "" if robot.arm is None else robot.arm.level
+            for name, robot in result.cell.robots.items()
         },
     }
     edges = {name: (edge.matrix, edge.covariance) for name, edge in result.edges.items()}
-    return Answer(words, edges, _flat(result.noise))
+    return Answer(words, edges, _flat(result.cell.noise))
 
 
 def answer_of(case: Callable[[], Answer]) -> Answer:
@@ -136,7 +139,7 @@ def answer_of_session(path: Path) -> Answer:
     """Calibrates or, where it is a whole cell, aligns a recorded session."""
     session = Session.load(path)
     if len(session.robots) > 1 or len(session.cameras) > 1:
-        return _of_alignment(align(session))
+        return _of_cell(align(session))
     return _of_calibration(calibrate(session))
 
 
@@ -161,7 +164,7 @@ def _network(level: str = "auto", **options) -> Callable[[], Answer]:
         cell = simulate_network(NetworkOptions(**options))
         session: Session = network_session(cell, "network", seen="names")
         corners = {view_corners.view: view_corners for view_corners in cell.corners}
-        return _of_alignment(align(session, level=level, corners=corners))
+        return _of_cell(align(session, level=level, corners=corners))
 
     return case
 

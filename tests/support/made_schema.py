@@ -10,9 +10,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import numpy as np
 
 from visioncal.core.codec import INLINE, REST, Array, Written, entries
-from visioncal.results.document import CalibrationForm
-from visioncal.results.sections import CalibrationSections, CellSections
-from visioncal.results.whole import CellForm
+from visioncal.results.document import CalibrationForm, CellForm
+from visioncal.results.sections import CalibrationSections
 
 _TYPES = {float: "number", int: "integer", str: "string", bool: "boolean"}
 
@@ -22,7 +21,7 @@ def calibration_schema() -> dict[str, Any]:
     found = _Schemas()
     forms = {
         "Calibration": found.table(CalibrationForm, CalibrationSections),
-        "Cell": found.table(CellForm, CellSections),
+        "Cell": found.table(CellForm),
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -5,7 +5,7 @@ from dataclasses import replace
 from visioncal.calibration.stages.judged import Arm, Findings, Pair, Place, Sensor
 from visioncal.core.types import Rejection
 from visioncal.estimation.observability import Direction
-from visioncal.results import Rms, ViewResult
+from visioncal.results import HELD_BACK, ViewResult
 
 
 def directions(*sigmas):
@@ -15,13 +15,16 @@ def directions(*sigmas):
     )
 
 
+LEFT_OUT = {"left_out_mm": 0.11, "left_out_deg": 0.011, "left_out_px": 0.12}
+
+
 def views(count=20, **odd):
     """Views with like residuals, but for view 7 where `odd` says so."""
-    plain = [ViewResult(at, True, "", 40, 0.1, 0.1, 0.01) for at in range(count)]
+    plain = [ViewResult(at, True, "", 40, 0.1, 0.1, 0.01, **LEFT_OUT) for at in range(count)]
     return tuple(replace(view, **odd) if view.view == 7 else view for view in plain)
 
 
-PAIR = Pair(views(), Rms(0.1, 0.01, 0.1), Rms(0.11, 0.011, 0.12))
+PAIR = Pair(views())
 SENSOR = Sensor(20, pixel_px=0.05)
 ARM = Arm(20, 0.1, 0.0057)
 SOUND = Findings(
@@ -35,7 +38,20 @@ PARTS = {"pairs": PAIR, "sensors": SENSOR, "arms": ARM}
 
 
 def changed(findings, **changes):
-    """Findings with other values of their only pair, sensor and arm, or of their own."""
+    """Findings with other values of their only pair, sensor and arm, or of their own.
+
+    Residuals `rms`, `held_out` and `holdout` are those of every view.
+    """
+    (pair,) = findings.pairs
+    shown = changes.get("views", pair.views)
+    if rms := changes.pop("rms", None):
+        shown = [replace(view, residual_mm=rms.mm, residual_deg=rms.deg) for view in shown]
+    if held := changes.pop("held_out", None):
+        shown = [replace(view, left_out_mm=held.mm, left_out_deg=held.deg) for view in shown]
+    if back := changes.pop("holdout", None):
+        figures = {"residual_mm": back.mm, "residual_deg": back.deg}
+        shown = [*shown, ViewResult(90, False, HELD_BACK, **figures)]
+    changes["views"] = shown
     for name, part in PARTS.items():
         mine = {change: changes.pop(change) for change in list(changes) if hasattr(part, change)}
         if mine:

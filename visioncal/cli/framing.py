@@ -130,8 +130,8 @@ class Place:
                 culprits=[f"--{part}" for part in PARTS if choice.of(part)],
                 next_step="Name its output folder with -c, or leave them out.",
             )
-        if result is not None and result.cell is not None:
-            name = placed_name(result.cell, choice, needs, name)
+        if result is not None:
+            name = placed_name(result, choice, needs, name)
         folder = None if known is None or out is not None else _folder(known)
         place = cls(name, calibration, result, folder, out)
         place._check_names()

@@ -131,8 +131,7 @@ def locate_command(
             flange = _flange_of(session, _chosen(session, view), known)
         elif source is not None:
             check_size(Eye.of(known), read_image(source), source.name)
-        cell = result.cell
-        boards = {} if cell is None else boards_before(cell, Choice(camera, robot), EYE)
+        boards = boards_before(result, Choice(camera, robot), EYE)
         found = _by_plane(known, boards, pixel, plane, plane_sigma or 0.0, flange, sigma_px)
     else:
         refuse_given({"--plane": plane, "--plane-sigma-mm": plane_sigma}, "it is for --pixel")

@@ -64,7 +64,7 @@ def _row(file: Path, view: int | None) -> int | None:
     """The place among its views at which a recording is opened; None for the first."""
     from visioncal.interchange.result_files import load_result
     from visioncal.present.recording import read_session
-    from visioncal.results.parts import worst_view
+    from visioncal.results.views import worst_view
 
     if view is None:
         # A plan, and a session that is not calibrated yet, have no worst view.

@@ -11,8 +11,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray
 from visioncal.present.advice import left_out
 from visioncal.present.facts import solver_table
-from visioncal.present.parts import sights
-from visioncal.results import Alignment, Calibration, Sight, Step, Verdict
+from visioncal.results import Calibration, CellResult, Step, Verdict, ViewResult
 from visioncal.results.compare import edge_errors
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
@@ -59,7 +58,7 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
         _print_noise(cell)
     else:
         _print_residuals(calibration)
-    for suspects in left_out(_unsaid(calibration.verdict, sights(calibration))):
+    for suspects in left_out(_unsaid(calibration.verdict, calibration.views)):
         console.print(escape(f"  {suspects.words}"))
     if cell is not None:
         console.print(escape(cell.weakest))
@@ -85,7 +84,7 @@ def _print_residuals(calibration: Calibration) -> None:
     )
 
 
-def _print_noise(cell: Alignment) -> None:
+def _print_noise(cell: CellResult) -> None:
     """Prints the noise of a whole cell."""
     console = answers()
     for name, levels in cell.noise.items():
@@ -100,7 +99,7 @@ def _print_noise(cell: Alignment) -> None:
         console.print(f"noise of {name}: {', '.join(words)}")
 
 
-def _unsaid(verdict: Verdict, views: Iterable[Sight]) -> Iterator[Sight]:
+def _unsaid(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:
     """The views about which the verdict does not say already why they were left out."""
     said = [finding for finding in verdict.findings if finding.without_it]
     for view in views:

@@ -112,9 +112,11 @@ def write_outputs(
             write_recording(path, session, run.calibration, run.evidence, layout, images)
 
         drawings[RECORDING] = record
-    results = {CALIBRATION: run.calibration.save}
-    if (cell := run.calibration.whole_cell) is not None:
-        results[ALIGNMENT] = cell.save
+    results: dict[str, _Writer] = {CALIBRATION: run.calibration.save}
+    if (cell := run.calibration.cell) is not None:
+        from visioncal.results.document import to_alignment
+
+        results[ALIGNMENT] = _text(json_text(to_alignment(run.calibration, cell)))
     return _write(folder, results, drawings, (ALIGNMENT,), without)
 
 

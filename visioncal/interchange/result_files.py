@@ -10,7 +10,7 @@ from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes
 from visioncal.interchange.outputs import CALIBRATION, RECORDING, review_command
-from visioncal.results import Alignment, Calibration, FrameFile, to_document
+from visioncal.results import Calibration, FrameFile, to_document
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.choosing import ANY, ARM, PARTS, Choice, Part
@@ -107,8 +107,8 @@ def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile
     return load_calibration(path, Choice(robot=robot), ARM)
 
 
-def load_exportable(path: Path) -> "Calibration | FrameFile | Alignment | Identified":
-    """Loads what `load_placed` does, the alignment of a whole cell, or an arm's dynamics.
+def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
+    """Loads what `load_placed` does, the result of a whole cell, or an arm's dynamics.
 
     Args:
         path: As there, or an alignment.json or a dynamics.json, recognised by its content, a folder
@@ -127,8 +127,7 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Alignment | Identi
     frames = path / FRAMES if alone else path
     if _holds_frames(frames):
         return FrameFile.load(frames)
-    found = load_result(path)
-    return found if found.cell is None else found.cell
+    return load_result(path)
 
 
 def _holds_frames(path: Path) -> bool:

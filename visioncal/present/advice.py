@@ -7,8 +7,7 @@ import numpy as np
 
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
-from visioncal.present.parts import sights
-from visioncal.results import Calibration, Sight
+from visioncal.results import Calibration, ViewResult
 
 # Views whose residual is this many times the median are named, as by the verdict.
 _STANDS_OUT = CalibrationLimits.outlier
@@ -53,9 +52,9 @@ def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
     In a good result none stands out: that one view sees the board less well than others is no
     doubt.
     """
-    found, by_pair = sights(calibration), dict[str, list[Sight]]()
-    for sight in found if calibration.verdict.status != "good" else ():
-        by_pair.setdefault(_of(sight), []).append(sight)
+    found, by_pair = calibration.views, dict[str, list[ViewResult]]()
+    for other in found if calibration.verdict.status != "good" else ():
+        by_pair.setdefault(_of(other), []).append(other)
     outlying = (
         Suspects((view,), used=True, why=why, of=of)
         for of, mine in by_pair.items()
@@ -64,18 +63,18 @@ def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
     return (*outlying, *left_out(found))
 
 
-def left_out(found: Iterable[Sight]) -> Iterator[Suspects]:
+def left_out(found: Iterable[ViewResult]) -> Iterator[Suspects]:
     """Those of some views that were not used, by their reasons."""
     by_reason: dict[tuple[str, str], list[int]] = {}
-    for sight in found:
-        if not sight.used:
-            by_reason.setdefault((_of(sight), sight.reason), []).append(sight.view)
+    for view in found:
+        if not view.used:
+            by_reason.setdefault((_of(view), view.reason), []).append(view.view)
     for (of, why), views in by_reason.items():
         yield Suspects(tuple(views), used=False, why=why, of=of)
 
 
-def _of(sight: Sight) -> str:
-    return f"{sight.seer} of {sight.seen}" if sight.seer else ""
+def _of(view: ViewResult) -> str:
+    return f"{view.seer} of {view.seen}" if view.seer else ""
 
 
 def outlying_views(found: Sequence[Suspects]) -> tuple[int, ...]:
@@ -83,27 +82,27 @@ def outlying_views(found: Sequence[Suspects]) -> tuple[int, ...]:
     return tuple(sorted(view for item in found if item.used for view in item.views))
 
 
-def contradicts(view: Sight) -> bool:
+def contradicts(view: ViewResult) -> bool:
     """Whether a view was left out because it contradicts the others."""
     return not view.used and view.reason.startswith(_CONTRADICTS)
 
 
-def named(sight: Sight) -> str:
+def named(view: ViewResult) -> str:
     """The number of a view, and who saw whom where that has names."""
-    of = _of(sight)
-    return f"{sight.view} ({of})" if of else str(sight.view)
+    of = _of(view)
+    return f"{view.view} ({of})" if of else str(view.view)
 
 
-def mark_of(view: Sight) -> str:
+def mark_of(view: ViewResult) -> str:
     """What became of a view: `used`, `left-out` for contradicting others, or `rejected`."""
     if view.used:
         return "used"
     return "left-out" if contradicts(view) else "rejected"
 
 
-def _outlying(views: Sequence[Sight]) -> dict[int, str]:
+def _outlying(views: Sequence[ViewResult]) -> dict[int, str]:
     """Words for the used views whose residual is many times as long as the median, by view."""
-    kinds: list[tuple[str, Callable[[Sight], float | None]]] = [
+    kinds: list[tuple[str, Callable[[ViewResult], float | None]]] = [
         ("mm", lambda view: view.residual_mm),
         ("deg", lambda view: view.residual_deg),
     ]

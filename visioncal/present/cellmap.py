@@ -1,12 +1,12 @@
 """The network of an aligned cell as it is drawn: its bodies side by side, and who saw whom."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from visioncal.core.number_format import significant
-from visioncal.present.parts import former_frames
-from visioncal.results import Alignment, Rms, Sight
-from visioncal.results.whole import left_out_rms, rms_of
+from visioncal.results import Rms, ViewResult
+from visioncal.results.tree import FrameTree
+from visioncal.results.views import left_out_rms, rms_of
 
 # How far frames stand apart, and the gap between bodies, in the units of the drawing.
 STEP, GAP = 1.5, 0.8
@@ -36,15 +36,15 @@ class Pair:
     unseen: Rms | None
 
 
-def pairs(found: Alignment) -> tuple[Pair, ...]:
+def pairs(views: Iterable[ViewResult]) -> tuple[Pair, ...]:
     """Lists who saw whom, and how well that fits."""
-    rows: dict[tuple[str, str], list[Sight]] = {}
-    for sight in found.sights:
-        rows.setdefault((sight.seer, sight.seen), []).append(sight)
+    rows: dict[tuple[str, str], list[ViewResult]] = {}
+    for view in views:
+        rows.setdefault((view.seer, view.seen), []).append(view)
     listed = []
     for (seer, seen), mine in rows.items():
-        used = sum(sight.used for sight in mine)
-        unseen = any(sight.used and sight.left_out_mm is not None for sight in mine)
+        used = sum(view.used for view in mine)
+        unseen = any(view.used and view.left_out_mm is not None for view in mine)
         rms = (rms_of(mine) if used else None, left_out_rms(mine) if unseen else None)
         listed.append(Pair(seer, seen, used, len(mine) - used, *rms))
     return tuple(listed)
@@ -73,33 +73,32 @@ class Body:
                 yield name, start + STEP * (at + 0.5), height
 
 
-def weakest_frame(found: Alignment) -> str:
+def weakest_frame(tree: FrameTree) -> str:
     """The frame whose place on its parent is known worst, of those as they hang last."""
-    edges = {name: found.edge_of(name) for name in _edged(found)}
+    edges = {name: tree.edge_of(name) for name in _edged(tree)}
     return max(edges, key=lambda index: edges[index].sigma_mm, default="")
 
 
-def sigma_words(found: Alignment, frame: str) -> str:
+def sigma_words(tree: FrameTree, frame: str) -> str:
     """How well the place of a frame on what it hangs on is known."""
-    if frame == found.reference:
+    if frame == tree.reference:
         return "the reference"
-    edge = found.edge_of(frame)
+    edge = tree.edge_of(frame)
     turned = f", {significant(edge.sigma_deg)}\N{DEGREE SIGN}" if edge.oriented else ""
     return f"{significant(edge.sigma_mm)} mm{turned}"
 
 
-def _edged(found: Alignment) -> list[str]:
-    former = former_frames(found)
-    return [frame for frame in found.frames if frame not in found.robots and frame not in former]
+def _edged(tree: FrameTree) -> list[str]:
+    return [name for name in tree.last if name not in tree.flanges]
 
 
-def bodies(found: Alignment) -> list[Body]:
+def bodies(tree: FrameTree) -> list[Body]:
     """The flanges with the cell in their middle; frames as they hung before are left out."""
-    flanges = list(found.robots)
+    flanges = list(tree.flanges)
     half = (len(flanges) + 1) // 2
     found_bodies = []
     for name in [*flanges[:half], "cell", *flanges[half:]]:
-        mine = [word for word in _edged(found) if found.frames[word] == name]
+        mine = [word for word in _edged(tree) if tree.parents[word] == name]
         top = tuple(name for name in mine if name.startswith(_SEERS))
         bottom = tuple(name for name in mine if name.startswith("base"))
         middle = tuple(name for name in mine if name not in top and name not in bottom)
@@ -107,18 +106,18 @@ def bodies(found: Alignment) -> list[Body]:
     return found_bodies
 
 
-def spans(found: Alignment) -> dict[str, tuple[float, float]]:
+def spans(tree: FrameTree) -> dict[str, tuple[float, float]]:
     """Where each body begins and ends, from left to right."""
     left, found_spans = 0.0, {}
-    for body in bodies(found):
+    for body in bodies(tree):
         found_spans[body.name] = (left, left + body.width)
         left += body.width + GAP
     return found_spans
 
 
-def places(found: Alignment) -> dict[str, tuple[float, float]]:
+def places(tree: FrameTree) -> dict[str, tuple[float, float]]:
     """Where each frame stands in the drawing, upwards; bodies themselves have none."""
-    begins = spans(found)
+    begins = spans(tree)
     return {
-        name: (x, y) for body in bodies(found) for name, x, y in body.places(begins[body.name][0])
+        name: (x, y) for body in bodies(tree) for name, x, y in body.places(begins[body.name][0])
     }

@@ -11,7 +11,7 @@ from visioncal.core.types import Target
 from visioncal.present import parts
 from visioncal.present.cellmap import pairs
 from visioncal.present.tables import Fact, Row, Table
-from visioncal.results import Alignment, Calibration, Edge, Rms
+from visioncal.results import Calibration, CellResult, Edge, Rms
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
 PLUS_MINUS, DEGREE = "\N{PLUS-MINUS SIGN}", "\N{DEGREE SIGN}"
@@ -118,7 +118,7 @@ def solver_table(calibration: Calibration) -> Table | None:
     return Table.of(titles, rows)
 
 
-def moved_table(cell: Alignment) -> Table:
+def moved_table(cell: CellResult) -> Table:
     """What moved while the session was taken, and what nothing ties to the rest."""
     rows = []
     for move in cell.moved:
@@ -135,8 +135,8 @@ def moved_table(cell: Alignment) -> Table:
 
 def residual_table(calibration: Calibration) -> Table:
     """Residuals of the fit, of views left out in turn, and of the declared hold-out set."""
-    validation, cell = calibration.validation, calibration.cell
-    left_out = None if cell is not None and not cell.left_out else validation.held_out
+    validation = calibration.validation
+    left_out = validation.held_out if validation.is_of_unseen else None
     sets = (
         ("used views, as fitted", calibration.rms),
         (f"left out in turn ({validation.method})", left_out),
@@ -154,16 +154,16 @@ def _rms_cells(rms: Rms) -> Iterator[str]:
 
 def pair_table(calibration: Calibration) -> Table | None:
     """How well what each camera saw of each target fits; None of one camera and one robot."""
-    cell = calibration.cell
-    if cell is None:
+    if calibration.cell is None:
         return None
+    with_unseen = calibration.validation.is_of_unseen
     titles = ["who", "saw", "used", "left out", "rms, mm", "rms, deg", "rms, px"]
-    if cell.left_out:
+    if with_unseen:
         titles += ["unseen, mm", "unseen, deg", "unseen, px"]
     rows = []
-    for pair in pairs(cell):
+    for pair in pairs(calibration.views):
         figures = [*_rms_cells(pair.rms)] if pair.rms else [significant(None)] * 3
-        if cell.left_out:
+        if with_unseen:
             figures += [*_rms_cells(pair.unseen)] if pair.unseen else [significant(None)] * 3
         rows.append((pair.seer, pair.seen, str(pair.used), str(pair.left_out), *figures))
     return Table.of(titles, rows, (0, 1))

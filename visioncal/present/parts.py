@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Target
-from visioncal.results import Alignment, Calibration, CameraResult, Sight
+from visioncal.results import Calibration, CameraResult
 from visioncal.results.arm import ArmSections
 from visioncal.results.sections import BoardResult, ClockResult, Intervals
 from visioncal.robot import Robot
@@ -44,7 +44,7 @@ class Levels:
 def cameras(calibration: Calibration) -> Mapping[str, CameraResult]:
     """The cameras by their frames."""
     if calibration.cell is not None:
-        return calibration.cell.cameras
+        return calibration.cell.lenses
     return {} if calibration.camera is None else {"": calibration.camera}
 
 
@@ -56,7 +56,7 @@ def image_width(calibration: Calibration) -> int | None:
 
 def arms(calibration: Calibration) -> Mapping[str, ArmSections]:
     """What was found of the arms."""
-    return {"": calibration} if calibration.cell is None else calibration.cell.arms
+    return {"": calibration} if calibration.cell is None else calibration.cell.robots
 
 
 def robots(calibration: Calibration) -> dict[str, Robot]:
@@ -64,7 +64,7 @@ def robots(calibration: Calibration) -> dict[str, Robot]:
     cell = calibration.cell
     models = {"": calibration.robot}
     if cell is not None:
-        models = {name: arm.model for name, arm in cell.arms.items()}
+        models = {name: robot.model for name, robot in cell.robots.items()}
     return {name: model for name, model in models.items() if model is not None}
 
 
@@ -106,20 +106,11 @@ def noise(calibration: Calibration) -> dict[str, Levels]:
     if cell is None:
         return {"": Levels(calibration.noise, {} if known is None else known.noise_95)}
     intervals = {} if cell.uncertainty is None else cell.uncertainty.noise_95
-    robots = cell.robots.values()
+    robots = cell.flanges.values()
     return {
         f"robot {name}" if name in robots else name: Levels(levels, intervals.get(name, {}))
         for name, levels in cell.noise.items()
     }
-
-
-def sights(calibration: Calibration) -> tuple[Sight, ...]:
-    """What became of each observation; of one camera, without names of who saw whom."""
-    if calibration.cell is not None:
-        return calibration.cell.sights
-    return tuple(
-        Sight(stop=view.view, seer="", seen="", **vars(view)) for view in calibration.views
-    )
 
 
 def frames(calibration: Calibration | None) -> Frames:
@@ -127,21 +118,13 @@ def frames(calibration: Calibration | None) -> Frames:
 
     Without a result, base and flange of one robot.
     """
-    cell = None if calibration is None else calibration.cell
-    if cell is None:
-        parents, robots = {"base": CELL, "flange": "base"}, {"flange": ""}
-        left, matrices = frozenset[str](), {"base": np.eye(4)}
-    else:
-        left, robots = former_frames(cell), dict(cell.robots)
-        parents = {name: on for name, on in cell.frames.items() if name not in left}
-        matrices = {cell.reference: np.eye(4)}
-    for name, edge in ({} if calibration is None else calibration.placed).items():
+    if calibration is None:
+        return Frames({"base": CELL, "flange": "base"}, {"base": np.eye(4)}, {"flange": ""})
+    tree = calibration.tree
+    parents, matrices = tree.last, {tree.reference: np.eye(4)}
+    for name, edge in calibration.placed.items():
         parent, _, child = name.partition("_from_")
-        if child not in left:
+        if child not in tree.former:
             parents[child], matrices[child] = parent, edge.matrix
+    robots = tree.flanges if calibration.cell is not None else dict.fromkeys(tree.flanges, "")
     return Frames(parents, matrices, robots)
-
-
-def former_frames(cell: Alignment) -> frozenset[str]:
-    """Frames as they hung before they moved."""
-    return frozenset(move.before for move in cell.moved)

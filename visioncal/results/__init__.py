@@ -1,29 +1,25 @@
 """The result of a calibration, its frames, and how they stand on disk."""
 
 from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
-from visioncal.results.alignment import Alignment, Moved, Sight, Untied
+from visioncal.results.cell import CellResult, Moved, Untied
 from visioncal.results.document import to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame, FrameFile, Observation
 from visioncal.results.lens import CameraResult
-from visioncal.results.parts import (
-    HELD_BACK,
-    NeedMet,
-    Picker,
-    Rms,
-    RobotResult,
-    SolverResult,
-    Validation,
-    ViewResult,
-)
+from visioncal.results.parts import NeedMet, Picker, RobotResult, SolverResult
 from visioncal.results.picking import picked
 from visioncal.results.result import Calibration
+from visioncal.results.views import HELD_BACK, Rms, Validation, ViewResult
+
+# What results of whole cells were once read into.
+Alignment = Calibration
 
 __all__ = [
     "HELD_BACK",
     "Alignment",
     "Calibration",
     "CameraResult",
+    "CellResult",
     "Edge",
     "Finding",
     "Frame",
@@ -34,7 +30,6 @@ __all__ = [
     "Picker",
     "Rms",
     "RobotResult",
-    "Sight",
     "SolverResult",
     "Step",
     "Untied",

@@ -1,14 +1,13 @@
 """What a calibration is made of, beside its transforms, and how its verdict stands on disk."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.core.codec import DROPPED, INLINE, KEPT, REST, Written
+from visioncal.core.codec import DROPPED, INLINE, REST, Written
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure
 from visioncal.core.types import Need
 from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
 from visioncal.results.arm import ArmSections
@@ -17,8 +16,6 @@ from visioncal.robot import Robot
 
 # Of all results of a calibration.
 SCHEMA: Literal[1] = 1
-# Why a view is in no fit although nothing is wrong with it.
-HELD_BACK = "held out of the fit by the session (role = holdout)"
 
 
 _OF_ROBOT = Written(
@@ -80,82 +77,6 @@ class RobotResult(ArmSections):
     """
 
     model: Annotated[Robot | None, _OF_ROBOT, REST] = None
-
-
-@dataclass(frozen=True)
-class ViewResult:
-    """What became of one view. A figure that could not be computed is None, and absent on disk.
-
-    Attributes:
-        view: The view's number.
-        used: Whether the fit used it.
-        reason: Why it was not used, in words; empty for a used view.
-        corners: How many corners were found.
-        rms_px: Reprojection error through the whole chain of frames [px].
-        residual_mm: Distance of the target, as this view places it, from its mean place [mm].
-        residual_deg: The same in rotation [deg].
-    """
-
-    view: int
-    used: bool
-    reason: Annotated[str, KEPT] = ""
-    corners: int | None = None
-    rms_px: float | None = None
-    residual_mm: float | None = None
-    residual_deg: float | None = None
-
-
-@dataclass(frozen=True)
-class Rms:
-    """Root mean square residuals.
-
-    `deg` is None where an instrument read places alone, `px` where no image was used.
-    """
-
-    mm: float
-    deg: float | None = None
-    px: float | None = None
-
-    @property
-    def words(self) -> str:
-        """In position and, where that is known, in rotation."""
-        turned = "" if self.deg is None else f" and {figure(self.deg)} deg"
-        return f"{figure(self.mm)} mm{turned}"
-
-
-def worst_view(views: Sequence[ViewResult], rms: Rms) -> int | None:
-    """The number of the view that is farthest off, used or not; None where none is known.
-
-    Args:
-        views: What became of each.
-        rms: Residuals of the used ones, in units of which millimetres, degrees and pixels compare.
-    """
-
-    def off(view: ViewResult) -> float:
-        pairs = (
-            (view.residual_mm, rms.mm),
-            (view.residual_deg, rms.deg),
-            (view.rms_px, rms.px),
-        )
-        return max((value / typical for value, typical in pairs if value and typical), default=0.0)
-
-    worst = max(views, key=off, default=None)
-    return worst.view if worst is not None and off(worst) else None
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Residuals of views that the fit had not seen.
-
-    Attributes:
-        method: How views were left out, in words.
-        held_out: Their residuals, over all used views in turn.
-        holdout: Residuals of the views that the session declares as `holdout`.
-    """
-
-    method: str
-    held_out: Rms
-    holdout: Rms | None = None
 
 
 @dataclass(frozen=True)

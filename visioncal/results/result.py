@@ -24,27 +24,22 @@ from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Step, Verdict
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.intervals import freedom_of
-from visioncal.results.alignment import FILE as ALIGNMENT
-from visioncal.results.alignment import Alignment, is_alignment
 from visioncal.results.arm import NOMINAL, ArmResult
-from visioncal.results.document import fields_from_document, to_document
+from visioncal.results.cell import CellResult
+from visioncal.results.document import ALIGNMENT, fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult
-from visioncal.results.parts import (
-    NeedMet,
-    Rms,
-    SolverResult,
-    Validation,
-    ViewResult,
-)
+from visioncal.results.parts import NeedMet, SolverResult
 from visioncal.results.ray_frame import RayFrame, ray_frame
 from visioncal.results.sections import CalibrationSections
-from visioncal.results.selecting import selected_fields, whole_fields
-from visioncal.results.whole import is_whole, read_whole
+from visioncal.results.selecting import selected_fields
+from visioncal.results.tree import FrameTree
+from visioncal.results.views import Rms, Validation, ViewResult
 from visioncal.robot import Loads, Robot, bent_joints
 from visioncal.robot.thermal import ThermalModel
 from visioncal.session.choosing import PARTS, Choice, Part
+from visioncal.session.frames import CELL
 
 if TYPE_CHECKING:
     from visioncal.present.report.drawing import Drawing
@@ -57,6 +52,8 @@ _SHOWN = 8
 class Calibration(CalibrationSections):
     """The result of calibrating one session; `save` writes it as calibration.json.
 
+    One camera, one robot and their targets have no names; what several have stands in `cell`.
+
     See also `CalibrationSections` and `ArmSections`, of which it has all attributes.
 
     Attributes:
@@ -64,7 +61,7 @@ class Calibration(CalibrationSections):
         session_sha256: Digest of the session's canonical content.
         created: When, in ISO 8601.
         mount: How the camera is mounted.
-        edges: The estimated edges by name, in the order of `joint_covariance`.
+        edges: The estimated transforms by name, in the order of `joint_covariance`.
         joint_covariance: (6 k, 6 k) covariance of all edges together, in that order.
         solvers: What every solver made of it.
         noise: Estimated standard deviations by name.
@@ -75,8 +72,8 @@ class Calibration(CalibrationSections):
         camera: The camera, where the session has one.
         robot: The nominal robot model, where the session names a known one.
         frames: Tools and fixtures by the transform that places them, as `flange_from_tool`.
-        cell: The whole cell that it stands for, whose frames `edges` places; None for one camera,
-            one robot and their targets. What is of one camera or robot, `of` takes out of it.
+        cell: What a whole cell has by name; None for one camera, one robot and their targets. What
+            is of one camera or robot, `of` takes out of it.
         need: What the task needs, and how likely picks meet it; None where that is not said.
     """
 
@@ -95,7 +92,7 @@ class Calibration(CalibrationSections):
     camera: CameraResult | None = None
     robot: Robot | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
-    cell: Alignment | None = None
+    cell: CellResult | None = None
     need: NeedMet | None = None
 
     @cached_property
@@ -106,12 +103,40 @@ class Calibration(CalibrationSections):
             return None
         return ray_frame(edge, self.edges[edge], self.camera)
 
-    @property
-    def whole_cell(self) -> Alignment | None:
-        """The whole cell, with what has joined it and the verdict as they are here."""
-        if self.cell is None:
-            return None
-        return replace(self.cell, placed=self.frames, verdict=self.verdict)
+    @cached_property
+    def tree(self) -> FrameTree:
+        """Its frames: what hangs on what, and how."""
+        known, cell = (self.edges, self.joint_covariance, self.frames), self.cell
+        if cell is not None:
+            former = frozenset(move.before for move in cell.moved)
+            return FrameTree(cell.reference, cell.tree, cell.flanges, *known, former)
+        ends = (name.partition("_from_") for name in self.edges)
+        placed = {child: parent for parent, _, child in ends}
+        parents = {"base": CELL, "flange": "base", **placed}
+        return FrameTree("base", parents, {"flange": "robot"}, *known)
+
+    @typed
+    def between(
+        self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
+    ) -> Edge:
+        """Places any frame in any other, with the covariance that the whole cell gives it.
+
+        That of tools and fixtures counts as independent of it; one whose rotation was not measured
+        has that of what it was placed in, without covariance.
+
+        Args:
+            first: The one: a frame of the cell, a tool or a fixture.
+            second: The other; likewise.
+            poses: (4, 4) `base_from_flange` by robot, where the two move before each other by it;
+                they count as exact. A robot that has no name goes by `robot`.
+
+        Returns:
+            `first_from_second`.
+
+        Raises:
+            DataError: There is no such frame, or a robot's pose is needed.
+        """
+        return self.tree.between(first, second, poses)
 
     @property
     def next_steps(self) -> tuple[Step, ...]:
@@ -119,11 +144,6 @@ class Calibration(CalibrationSections):
         doubtful = (name for name, frame in self.frames.items() if frame.verdict.status != "good")
         frames = (Step(f"Read what was found of {name} before it is used.") for name in doubtful)
         return (*self.verdict.next_steps, *frames)
-
-    @classmethod
-    def whole(cls, cell: Alignment) -> Self:
-        """The calibration that stands for a whole cell."""
-        return cls(**whole_fields(cell))
 
     @typed
     def of(
@@ -155,7 +175,7 @@ class Calibration(CalibrationSections):
             DataError: See `of`.
         """
         if self.cell is not None:
-            return type(self)(**selected_fields(self.cell, choice, needs))
+            return replace(self, **selected_fields(self, self.cell, choice, needs))
         if choice:
             raise DataError(
                 f"calibration {self.session_name!r} is of one camera and one robot, which have no "
@@ -412,18 +432,4 @@ class Calibration(CalibrationSections):
             DataError: It is not a calibration of a known schema.
         """
         with reading(label, "a calibration", "Calibrate the session again."):
-            document = parse_stored(text, label)
-            if is_whole(document):
-                return cls.whole(read_whole(document))
-            if is_alignment(document):
-                return cls.whole(Alignment.from_document(document))
-            fields = fields_from_document(document)
-            # Everything that looks through the camera starts from it.
-            camera = edge_names(fields["mount"])[0]
-            if camera not in fields["edges"]:
-                raise DataError(
-                    f"transforms.{camera} is missing, and mount is {fields['mount']!r}.",
-                    culprits=[f"transforms.{camera}"],
-                    next_step="Calibrate the session again.",
-                )
-            return cls(**fields)
+            return cls(**fields_from_document(parse_stored(text, label)))

@@ -406,25 +406,6 @@ class CalibrationSections(ArmSections):
         return dict(self.boards) if self.board is None else {"": self.board}
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CellSections:
-    """What was found of a whole cell beside its frames; None or empty where not computed.
-
-    Attributes:
-        boards: The boards by name, as they were found to be.
-        rigs: The rigs of points by name.
-        joint_fit: The unknowns of the fit and their covariance, for a later check.
-        uncertainty: How well it is known.
-        further: Sections that this version does not know, as the file has them.
-    """
-
-    boards: Mapping[str, BoardResult] = field(default_factory=dict)
-    rigs: Mapping[str, RigResult] = field(default_factory=dict)
-    joint_fit: CellJointFit | None = None
-    uncertainty: CellUncertainty | None = None
-    further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
-
-
 @dataclass(frozen=True)
 class CellDetails(Section):
     """Further figures of a whole cell: its `details` in calibration.json.

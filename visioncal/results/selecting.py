@@ -1,8 +1,8 @@
 """The calibration of one camera, one robot and one target out of that of a whole cell."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -10,63 +10,50 @@ from scipy.linalg import block_diag
 from visioncal.core.codec import entries
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Finding, Verdict
-from visioncal.results.alignment import Alignment, Sight
 from visioncal.results.arm import ArmSections
+from visioncal.results.cell import CellResult
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
-from visioncal.results.parts import Rms, RobotResult, Validation
+from visioncal.results.parts import RobotResult
 from visioncal.results.sections import ClockResult, JointFit, NoiseIntervals
-from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
+from visioncal.results.tree import FrameTree
+from visioncal.results.views import Rms, Validation, rms_of
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
-from visioncal.session.frames import CELL, frames_of_kind, robots_between, thing_name
+from visioncal.session.frames import frames_of_kind, robots_between, thing_name
 
-NOT_LEFT_OUT = "none was left out: the residuals of the whole cell's fit"
-
-
-def whole_fields(cell: Alignment) -> dict[str, Any]:
-    """The fields of a calibration that stands for a whole cell."""
-    rms = rms_of(cell.sights)
-    cameras = frames_of_kind(cell.frames, "camera")
-    carried = [bool(robots_between(cell.frames, camera, CELL)) for camera in cameras]
-    return {
-        "session_name": cell.session_name,
-        "session_sha256": cell.session_sha256,
-        "created": cell.created,
-        "mount": "eye-in-hand" if carried and all(carried) else "eye-to-hand",
-        "edges": cell.edges,
-        "joint_covariance": cell.joint_covariance,
-        "solvers": {},
-        "noise": {},
-        "views": view_results(cell.sights),
-        "rms": rms,
-        "validation": _validation(cell, cell.sights),
-        "verdict": cell.verdict,
-        "frames": cell.placed,
-        "cell": cell,
-        "need": cell.need,
-    }
+if TYPE_CHECKING:
+    from visioncal.results.result import Calibration
 
 
-def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) -> dict[str, Any]:
-    """The fields of the calibration of one camera, robot and target; see `Calibration.of`.
+def selected_fields(
+    whole: "Calibration", cell: CellResult, choice: Choice, needs: Collection[Part]
+) -> dict[str, Any]:
+    """The fields in which the calibration of one camera, robot and target is another.
+
+    Args:
+        whole: That of the whole cell.
+        cell: What it has by name.
+        choice: See `Calibration.chosen`.
+        needs: Likewise.
 
     Raises:
         DataError: There is no such thing, several are meant, or no robot parts these.
     """
-    chosen = _chosen(cell, choice, needs)
-    chain = _chain(cell, chosen)
-    nothing = np.zeros((0, len(cell.joint_covariance)))
+    chosen = _chosen(whole, choice, needs)
+    chain = _chain(whole.tree, chosen)
+    nothing = np.zeros((0, len(whole.joint_covariance)))
     jacobian = np.concatenate([nothing, *(pair[1] for pair in chain.values())])
-    covariance = jacobian @ cell.joint_covariance @ jacobian.T
-    arm = cell.arms.get(chosen.robot or "robot", RobotResult())
-    sights = [
-        sight
-        for sight in cell.sights
-        if chosen.camera in ("", sight.seer) and chosen.target in ("", sight.seen)
+    covariance = jacobian @ whole.joint_covariance @ jacobian.T
+    arm = cell.robots.get(chosen.robot or "robot", RobotResult())
+    views = [
+        view
+        for view in whole.views
+        if chosen.camera in ("", view.seer) and chosen.target in ("", view.seen)
     ]
-    rms, target = rms_of(sights), thing_name(chosen.target, "target")
-    camera = cell.cameras.get(chosen.camera)
-    return whole_fields(cell) | {
+    method = whole.validation.method if whole.validation.is_of_unseen else ""
+    rms, target = rms_of(views), thing_name(chosen.target, "target")
+    camera = cell.lenses.get(chosen.camera)
+    return {
         "mount": chosen.mount,
         "edges": {
             name: Edge(matrix, covariance[6 * at : 6 * at + 6, 6 * at : 6 * at + 6])
@@ -74,13 +61,13 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         },
         "joint_covariance": covariance,
         "noise": _noise(cell, chosen, rms),
-        "views": view_results(sights),
+        "views": tuple(view.of_pair for view in views),
         "rms": rms,
-        "validation": _validation(cell, sights),
-        "verdict": _verdict(cell),
+        "validation": Validation.of(method, views),
+        "verdict": _verdict(whole.verdict, cell),
         "camera": None if camera is None else camera.carried(jacobian),
         "robot": arm.model,
-        "frames": _placed(cell, chosen),
+        "frames": _placed(whole.tree, chosen),
         **{entry.name: getattr(arm, entry.name) for entry in entries(ArmSections)},
         "clock": _clock(cell, chosen),
         "uncertainty": _intervals(cell, chosen),
@@ -88,40 +75,36 @@ def selected_fields(cell: Alignment, choice: Choice, needs: Collection[Part]) ->
         "rig": cell.rigs.get(target),
         "joint_fit": _joint_fit(cell, chosen, jacobian),
         "cell": None,
-        "need": None if cell.need is None else cell.need.of(*_pair(chosen)),
+        "need": None if whole.need is None else whole.need.of(*_pair(chosen)),
+        "further": {},
     }
 
 
-def _validation(cell: Alignment, sights: Sequence[Sight]) -> Validation:
-    """Residuals of some observations by fits that were made without them."""
-    if not cell.left_out:
-        return Validation(NOT_LEFT_OUT, rms_of(sights), holdout_rms(sights))
-    return Validation(cell.left_out, left_out_rms(sights), holdout_rms(sights))
-
-
-def placed_name(cell: Alignment, choice: Choice, needs: Collection[Part], name: str) -> str:
+def placed_name(whole: "Calibration", choice: Choice, needs: Collection[Part], name: str) -> str:
     """What a transform of the smaller calibration is called in the whole cell's."""
-    chosen = _chosen(cell, choice, needs)
+    if whole.cell is None:
+        return name
+    chosen = _chosen(whole, choice, needs)
     parent, _, child = name.partition("_from_")
     frames = {"flange": chosen.flange, "base": chosen.base}
     return f"{frames[parent]}_from_{child}"
 
 
-def boards_before(cell: Alignment, choice: Choice, needs: Collection[Part]) -> dict[str, Edge]:
-    """The targets that stand still before a robot's base, as `base_from_target_floor`."""
-    base = _chosen(cell, choice, needs).base
+def boards_before(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> dict[str, Edge]:
+    """The targets that stand still before a robot's base in a cell: `base_from_target_floor`."""
+    if whole.cell is None:
+        return {}
+    base, tree = _chosen(whole, choice, needs).base, whole.tree
     return {
-        f"base_from_{name}": cell.between(base, name)
-        for name in frames_of_kind(cell.frames, "target")
-        if not robots_between(cell.frames, base, name)
+        f"base_from_{name}": tree.between(base, name)
+        for name in frames_of_kind(tree.parents, "target")
+        if not robots_between(tree.parents, base, name)
     }
 
 
-def _chosen(cell: Alignment, choice: Choice, needs: Collection[Part]) -> Chosen:
+def _chosen(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> Chosen:
     """What is meant, where all stood last; of what is neither needed nor named, nothing."""
-    before = {move.before for move in cell.moved}
-    frames = {name: on for name, on in cell.frames.items() if name not in before}
-    chosen = choose(frames, choice, needs, label=f"the cell {cell.session_name!r}")
+    chosen = choose(whole.tree.last, choice, needs, label=f"the cell {whole.session_name!r}")
     kept = {*needs, *(part for part in PARTS if choice.of(part))}
     return replace(
         chosen,
@@ -135,7 +118,7 @@ def _pair(chosen: Chosen) -> tuple[str, str]:
     return thing_name(chosen.camera, "camera"), chosen.robot or "robot"
 
 
-def _chain(cell: Alignment, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
+def _chain(tree: FrameTree, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Both transforms by name, as far as they are there, each with its slopes by all edges."""
     in_hand = chosen.mount == "eye-in-hand"
     of_camera, of_target = ("flange", "base") if in_hand else ("base", "flange")
@@ -144,10 +127,10 @@ def _chain(cell: Alignment, chosen: Chosen) -> dict[str, tuple[FloatArray, Float
         f"{of_camera}_from_cam": (frames[of_camera], chosen.camera),
         f"{of_target}_from_target": (frames[of_target], chosen.target),
     }
-    return {name: cell.way(*pair) for name, pair in ends.items() if pair[1]}
+    return {name: tree.way(*pair) for name, pair in ends.items() if pair[1]}
 
 
-def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
+def _noise(cell: CellResult, chosen: Chosen, rms: Rms) -> dict[str, float]:
     """The noise of corners and of the robot."""
     # Of poses that were measured without corners, that of camera and robot together is as this pair
     # scatters: the camera's own level is a mean over all that it sees, near and far.
@@ -164,38 +147,38 @@ def _noise(cell: Alignment, chosen: Chosen, rms: Rms) -> dict[str, float]:
     return found
 
 
-def _verdict(cell: Alignment) -> Verdict:
+def _verdict(verdict: Verdict, cell: CellResult) -> Verdict:
     if "arms" not in cell.details.further:
-        return cell.verdict
+        return verdict
     found = Finding(
         "arm_left_out",
         "The whole cell was fitted with errors of its arms, which this part of it does not have: "
         "by the poses as they are reported it is off by as much.",
     )
-    status = "check" if cell.verdict.status == "good" else cell.verdict.status
-    return replace(cell.verdict, status=status, findings=(found, *cell.verdict.findings))
+    status = "check" if verdict.status == "good" else verdict.status
+    return replace(verdict, status=status, findings=(found, *verdict.findings))
 
 
-def _placed(cell: Alignment, chosen: Chosen) -> dict[str, Frame]:
+def _placed(tree: FrameTree, chosen: Chosen) -> dict[str, Frame]:
     """Tools and fixtures of the robot, and in its base the fixtures of others beside it."""
     found: dict[str, Frame] = {}
-    for name, frame in cell.placed.items():
+    for name, frame in tree.placed.items():
         parent, _, child = name.partition("_from_")
         if parent == chosen.flange:
             found[f"flange_from_{child}"] = frame
         elif parent == chosen.base:
             found[f"base_from_{child}"] = frame
-        elif parent.startswith("base") and not robots_between(cell.frames, chosen.base, parent):
-            found[f"base_from_{child}"] = replace(frame, edge=cell.between(chosen.base, child))
+        elif parent.startswith("base") and not robots_between(tree.parents, chosen.base, parent):
+            found[f"base_from_{child}"] = replace(frame, edge=tree.between(chosen.base, child))
     return found
 
 
-def _clock(cell: Alignment, chosen: Chosen) -> ClockResult | None:
+def _clock(cell: CellResult, chosen: Chosen) -> ClockResult | None:
     """How far the camera's clock is ahead of the robot's."""
     return cell.details.clocks.get(f"{chosen.camera} and robot {chosen.robot or 'robot'}")
 
 
-def _intervals(cell: Alignment, chosen: Chosen) -> NoiseIntervals | None:
+def _intervals(cell: CellResult, chosen: Chosen) -> NoiseIntervals | None:
     """How well the robot's noise is known."""
     known = {} if cell.uncertainty is None else cell.uncertainty.noise_95
     found = known.get(chosen.robot or "robot", {})
@@ -203,7 +186,7 @@ def _intervals(cell: Alignment, chosen: Chosen) -> NoiseIntervals | None:
     return NoiseIntervals(noise_95=named) if named else None
 
 
-def _joint_fit(cell: Alignment, chosen: Chosen, jacobian: FloatArray) -> JointFit | None:
+def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointFit | None:
     """What `verify` predicts with: both edges, and lens and board as far as they are free."""
     fit = cell.joint_fit
     if fit is None or not (chosen.camera and chosen.target):
@@ -211,7 +194,7 @@ def _joint_fit(cell: Alignment, chosen: Chosen, jacobian: FloatArray) -> JointFi
     target = thing_name(chosen.target, "target")
     camera = thing_name(chosen.camera, "camera")
     lens_count = 0
-    if (known := cell.cameras.get(chosen.camera)) is not None:
+    if (known := cell.lenses.get(chosen.camera)) is not None:
         lens_count = 4 + len(known.camera.distortion)
     looks: list[int] = []
     columns: list[int] = []

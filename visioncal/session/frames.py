@@ -91,6 +91,12 @@ def thing_name(frame: str, kind: str) -> str:
     return frame.partition("_")[2] or kind
 
 
+def frame_called(frames: Iterable[str], kind: str, name: str) -> str:
+    """The frame of what `thing_name` calls so, which need not be among the frames."""
+    known = (word for word in frames_of_kind(frames, kind) if thing_name(word, kind) == name)
+    return next(known, frame_name(kind, "" if name == kind else name))
+
+
 def robots_between(frames: Mapping[str, str], first: str, second: str) -> tuple[str, ...]:
     """Names the robots by whose motion two frames move before each other."""
     chains = [set(_upwards(frames, frame)) for frame in (first, second)]

@@ -21,7 +21,7 @@ from visioncal.calibration.pipeline.fault_messages import (
     residuals,
     versions,
 )
-from visioncal.calibration.pipeline.holdout import held_sights
+from visioncal.calibration.pipeline.holdout import held_views
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.starting import sensors_of
@@ -40,7 +40,7 @@ from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, covariance_of, fit_problem
-from visioncal.results import Edge, Moved, Sight
+from visioncal.results import Edge, Moved, ViewResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Answer:
         held_out: Residuals of observations that were left out of the fit in turn.
         moved: What moved, in the order of time.
         faults: What wrong poses of robots explain.
-        sights: What became of each observation.
+        views: What became of each observation.
         sigmas: Estimated standard deviations, by frame or robot and by name.
     """
 
@@ -72,7 +72,7 @@ class Answer:
     held_out: HeldOut
     moved: tuple[Moved, ...]
     faults: tuple[PoseFault, ...]
-    sights: tuple[Sight, ...]
+    views: tuple[ViewResult, ...]
     sigmas: Mapping[str, Mapping[str, float]]
 
     @property
@@ -194,7 +194,7 @@ def answer_of(
         held_out,
         movements(solved),
         faults,
-        _sights(looked, cell, solved, held_out, faults),
+        _views(looked, cell, solved, held_out, faults),
         _sigmas(solved),
     )
 
@@ -232,9 +232,9 @@ def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
     return found
 
 
-def _sights(
+def _views(
     looked: Observed, cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
-) -> tuple[Sight, ...]:
+) -> tuple[ViewResult, ...]:
     """What became of each observation, in the order of the session's rows."""
     rows, used = solved.cell.rows, solved.agreed.used
     away, why = _away(solved), reasons(solved, faults)
@@ -247,20 +247,20 @@ def _sights(
     for at, row in enumerate(rows):
         mm, deg, px = _known(np.append(away[at], rms_px[at]))
         corners = solved.poses[at].corners
-        found[row.view] = Sight(
+        found[row.view] = ViewResult(
             row.view,
-            solved.cell.stops[row.station],
-            row.seer,
-            row.seen,
             bool(used[at]),
             why.get(row.view, ""),
-            mm,
-            deg,
             None if corners is None else len(corners.ids),
             px,
+            mm,
+            deg,
+            row.seer,
+            row.seen,
+            solved.cell.stops[row.station],
             *_known(unseen[at]),
         )
-    found |= held_sights(solved, looked)
+    found |= held_views(solved, looked)
     lost = solved.cell.reasons
     for observation in cell.session.observations:
         number = observation.view.number
@@ -268,8 +268,14 @@ def _sights(
             stop = (
                 cell.stops[observation.station] if observation.station < len(cell.stops) else number
             )
-            found[number] = Sight(
-                number, stop, observation.seer, observation.seen, False, lost.get(number, "")
+            why_not = lost.get(number, "")
+            found[number] = ViewResult(
+                number,
+                used=False,
+                reason=why_not,
+                seer=observation.seer,
+                seen=observation.seen,
+                stop=stop,
             )
     return tuple(
         found[index] for index in (view.number for view in cell.session.views) if index in found

@@ -7,11 +7,10 @@ from pathlib import Path
 from visioncal.calibration.pipeline.dense_corners import run_dense
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.running import Asked, known_at_first, run_steps
-from visioncal.calibration.pipeline.whole import alignment_of
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
 from visioncal.core.types import Corners, Progress
-from visioncal.results import Alignment, Calibration
+from visioncal.results import Calibration
 from visioncal.session import Session
 
 
@@ -92,8 +91,8 @@ def align(
     progress: Progress | None = None,
     threads: int | None = None,
     keep_corners: bool = False,
-) -> Alignment:
-    """Calibrates a whole cell, and gives its result in the older form; see `calibrate`.
+) -> Calibration:
+    """Calibrates a whole cell: another name for `calibrate`, which takes corners, too.
 
     Args:
         session: A session, or the path of its folder or recording.
@@ -107,7 +106,7 @@ def align(
         keep_corners: Likewise.
 
     Returns:
-        All frames with their joint covariance, and the verdict.
+        The result with its verdict; its `between` has any frame in any other.
 
     Raises:
         DataError: The input is wrong or shows no target.
@@ -122,4 +121,4 @@ def align(
         keep_corners=keep_corners,
     )
     needing = known.session.needing(need_mm, need_deg)
-    return alignment_of(run_steps(replace(known, session=needing, found_before=corners)))
+    return result_of(run_steps(replace(known, session=needing, found_before=corners)))

@@ -13,13 +13,13 @@ from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.pose_ambiguity import choose_by, chosen
-from visioncal.calibration.stages.validate import apart, chain_rms_px
+from visioncal.calibration.stages.validate import apart
 from visioncal.estimation.chain import scatter
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.parts import State
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
-from visioncal.results import HELD_BACK, Sight
+from visioncal.results import HELD_BACK, ViewResult
 from visioncal.results.arm import UnseenView
 
 
@@ -53,25 +53,20 @@ def held_back(solved: Solved, looked: Observed) -> Held | None:
         for view, pose, row in zip(views, predicted, rows, strict=True)
     ]
     looks = solved.looks
-    lenses = {} if looks is None else {problem: looks.camera(problem) for problem in looks.problems}
-    positions = np.zeros((0, 3)) if looks is None else np.concatenate(looks.corners)
     for at, (view, row) in enumerate(zip(views, rows, strict=True)):
-        camera = lenses.get(row.seer)
-        if view.corners is not None and camera is not None:
-            stack = CornerStack.of({view.view: view.corners}, positions)
-            poses = fit_poses(stack, camera, view.cam_from_target).cam_from_target
+        if looks is not None and view.corners is not None and row.seer in looks.problems:
+            stack, camera = CornerStack.of({view.view: view.corners}, looks.points), row.seer
+            poses = fit_poses(stack, looks.camera(camera), view.cam_from_target).cam_from_target
             views[at] = replace(view, cam_from_target=poses)
     return Held(tuple(rows), tuple(views), _problem(solved, looked, views))
 
 
-def held_sights(solved: Solved, looked: Observed) -> dict[int, Sight]:
+def held_views(solved: Solved, looked: Observed) -> dict[int, ViewResult]:
     """How far such observations are from what the rest of the cell predicts, by view."""
     held = held_back(solved, looked)
     if held is None:
         return {}
-    state, looks, problem = solved.agreed.fit.state, solved.looks, held.problem
-    lenses = {} if looks is None else {problem: looks.camera(problem) for problem in looks.problems}
-    positions = np.zeros((0, 3)) if looks is None else np.concatenate(looks.corners)
+    state, problem = solved.agreed.fit.state, held.problem
     away_m, away_rad = apart(problem, state)
     if solved.cell.mount is not None:
         among = set(solved.part.observations.observed)
@@ -79,16 +74,15 @@ def held_sights(solved: Solved, looked: Observed) -> dict[int, Sight]:
         from_mean = scatter(problem.subset(known), solved.part, state)
         away_m[known] = from_mean[0]
         away_rad[known] = np.where(np.isnan(away_rad[known]), np.nan, from_mean[1])
-    cameras = [lenses.get(row.seer) for row in held.rows]
-    corners = [view.corners for view in held.views]
-    rms_px = chain_rms_px(corners, problem.predicted(state), cameras, positions)
+    rms_px = solved.pixels(held.rows, held.views, problem.predicted(state), state)
     figures = np.stack([1e3 * away_m, np.rad2deg(away_rad), rms_px], axis=1)
     found = {}
-    for row, seen, each in zip(held.rows, corners, figures.tolist(), strict=True):
+    for row, seen, each in zip(held.rows, held.views, figures.tolist(), strict=True):
         mm, deg, px = (value if np.isfinite(value) else None for value in each)
-        stop, count = solved.cell.stops[row.station], None if seen is None else len(seen.ids)
-        found[row.view] = Sight(
-            row.view, stop, row.seer, row.seen, False, HELD_BACK, mm, deg, count, px
+        stop = solved.cell.stops[row.station]
+        count = None if seen.corners is None else len(seen.corners.ids)
+        found[row.view] = ViewResult(
+            row.view, False, HELD_BACK, count, px, mm, deg, row.seer, row.seen, stop
         )
     return found
 

@@ -40,15 +40,14 @@ from visioncal.estimation.observability import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.tree import Tree
-from visioncal.results import HELD_BACK, Edge, Rms, Sight
-from visioncal.results.whole import holdout_rms, left_out_rms, rms_of, view_results
+from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 
 
 def findings_of(known: RunState) -> Findings:
     """Puts together what a session is judged by."""
     answer, solved = known.solved, known.fitted
     tree = solved.cell.tree
-    tied = [sight for sight in answer.sights if {sight.seer, sight.seen} <= tree.branches.keys()]
+    tied = [view for view in answer.views if {view.seer, view.seen} <= tree.branches.keys()]
     explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
     of_arms = [
@@ -96,8 +95,7 @@ def _pickable(known: RunState) -> Fitted:
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return Fitted(
         answer.problem,
-        answer.state,
-        answer.noise,
+        answer.fit,
         answer.covariance,
         answer.held_out,
         middles_of(solved.cell),
@@ -177,7 +175,7 @@ def _of_cell(known: RunState) -> _Parts:
     )
 
 
-def _mount(sights: Sequence[Sight]) -> Mount:
+def _mount(sights: Sequence[ViewResult]) -> Mount:
     is_read = all(sight.seer.startswith("instrument") for sight in sights)
     return "instrument" if is_read else "eye-to-hand"
 
@@ -194,22 +192,19 @@ def _clock_words(known: RunState) -> Iterator[str]:
 
 
 def _pairs(
-    sights: Sequence[Sight], explained: Collection[int], answer: Answer, *, alone: bool
+    sights: Sequence[ViewResult], explained: Collection[int], answer: Answer, *, alone: bool
 ) -> list[Pair]:
     """What each camera saw of each target; of one camera and one robot, all that there is."""
-    rows: dict[tuple[str, str], list[Sight]] = {}
+    rows: dict[tuple[str, str], list[ViewResult]] = {}
     for sight in sights:
         rows.setdefault(("", "") if alone else (sight.seer, sight.seen), []).append(sight)
     return [
         Pair(
-            view_results(mine),
-            rms_of(mine),
-            left_out_rms(mine),
-            holdout_rms(mine),
+            mine,
             [
-                Rejection(sight.view, sight.reason)
-                for sight in mine
-                if _disagrees(sight) and sight.view not in explained
+                Rejection(view.view, view.reason)
+                for view in mine
+                if _disagrees(view) and view.view not in explained
             ],
             f"{seer} of {seen}" if len(rows) > 1 else "",
             *_weighed(answer, mine),
@@ -218,7 +213,7 @@ def _pairs(
     ]
 
 
-def _weighed(answer: Answer, sights: Sequence[Sight]) -> tuple[Rms, Rms]:
+def _weighed(answer: Answer, sights: Sequence[ViewResult]) -> tuple[Rms, Rms]:
     """What a sensor's noise makes of some sights, and by how much they are away when left out."""
     # A square varies as its mean does, so that views weigh by the inverse square of what is
     # expected of each where doubt begins: one whose own pose is known badly says nothing of the
@@ -248,13 +243,13 @@ def _weighed(answer: Answer, sights: Sequence[Sight]) -> tuple[Rms, Rms]:
     return noise, away
 
 
-def _disagrees(sight: Sight) -> bool:
+def _disagrees(view: ViewResult) -> bool:
     """Whether an observation was left out although its chain could be closed."""
-    return not sight.used and sight.residual_mm is not None and sight.reason != HELD_BACK
+    return not view.used and view.residual_mm is not None and view.reason != HELD_BACK
 
 
 def _sensors(
-    sights: Sequence[Sight],
+    sights: Sequence[ViewResult],
     noise: Mapping[str, Mapping[str, float]],
     shown_px: Mapping[str, float],
     known: RunState,
@@ -265,19 +260,19 @@ def _sensors(
     for seer in seers:
         mine = [sight for sight in sights if sight.seer == seer]
         lost = [
-            Rejection(sight.view, sight.reason)
-            for sight in mine
-            if not sight.used and sight.view not in set_aside
+            Rejection(view.view, view.reason)
+            for view in mine
+            if not view.used and view.view not in set_aside
         ]
         levels = noise.get(seer, {})
         found.append(
             Sensor(
-                sum(sight.used for sight in mine),
+                sum(view.used for view in mine),
                 lost,
-                [sight.view for sight in mine if _disagrees(sight)],
+                [view.view for view in mine if _disagrees(view)],
                 shown_px.get(seer, levels.get("pixel_px")),
                 levels.get("level", 1.0),
-                sum(sight.view in known.spared for sight in mine),
+                sum(view.view in known.spared for view in mine),
                 seer if len(seers) > 1 else "",
             )
         )

@@ -6,13 +6,19 @@ With it goes what a later look at the same cell has to know of the joint fit.
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Any, TypeVar
 
 import numpy as np
 
 from visioncal.calibration.pipeline.holdout import held_by_both_arms
 from visioncal.calibration.pipeline.lens_documents import boards_of, cameras_of, rigs_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.whole import alignment_of, arm_sections, pair_of
+from visioncal.calibration.pipeline.whole import (
+    arm_sections,
+    cell_edges,
+    cell_of,
+    noise_intervals,
+)
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.readings import Readings
@@ -31,11 +37,12 @@ from visioncal.results.sections import (
     PointResult,
     UncertaintyResult,
 )
-from visioncal.results.whole import holdout_rms, view_results
+from visioncal.results.views import rms_of
 from visioncal.session import View, frame_name
 from visioncal.session.frames import thing_name
 from visioncal.vision.targets import target_document
 
+_T = TypeVar("_T")
 _OF_LENS = "it serves the camera's lens alone (role = intrinsics)"
 _NO_POSE = (
     "no pose of the target: it has neither image nor rows in corners.csv nor cft_ nor meas_ columns"
@@ -51,33 +58,52 @@ def result_of(known: RunState) -> Calibration:
         RuntimeError: One has not.
     """
     findings, verdict = known.findings, known.verdict
-    if known.mount is None:
-        return Calibration.whole(alignment_of(known))
     if findings is None or verdict is None:
         raise RuntimeError("a step is missing")
-    session, answer, names = known.session, known.solved, _edge_names(known)
-    edges = [answer.edges[frame] for frame in names]
+    session, answer = known.session, known.solved
+    names = cell_edges(known) if known.mount is None else _edge_names(known)
     size = 6 * len(names)
     return Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
-        mount=known.mount,
-        edges=dict(zip(names.values(), edges, strict=True)),
+        edges={name: answer.edges[frame] for frame, name in names.items()},
         joint_covariance=answer.covariance[:size, :size],
-        solvers=_solvers(known, names),
-        noise=_noise(known),
-        views=_views(known),
-        rms=findings.rms,
-        validation=Validation(
-            answer.held_out.method, findings.held_out, holdout_rms(answer.sights)
-        ),
+        rms=rms_of(answer.views),
         verdict=verdict,
-        camera=next(iter(cameras_of(known).values()), None),
-        robot=known.robot,
-        need=need_met(findings.need, findings.picks),
-        **vars(_sections(known)),
+        need=need_met(findings.need, findings.picks, whole=known.mount is None),
+        **(_of_cell(known) if known.mount is None else _of_pair(known, names)),
     )
+
+
+def _of_cell(known: RunState) -> dict[str, Any]:
+    """What a result of a whole cell has besides."""
+    cell, answer = cell_of(known), known.solved
+    was_left_out = np.isfinite(answer.held_out.away_m).any()
+    method = answer.held_out.method if was_left_out else ""
+    return {
+        "mount": cell.mount,
+        "solvers": {},
+        "noise": {},
+        "views": answer.views,
+        "validation": Validation.of(method, answer.views, by_pair=True),
+        "cell": cell,
+    }
+
+
+def _of_pair(known: RunState, names: Mapping[str, str]) -> dict[str, Any]:
+    """What a result of one camera and one robot has besides."""
+    answer = known.solved
+    return {
+        "mount": known.session.mount,
+        "solvers": _solvers(known, names),
+        "noise": _noise(known),
+        "views": _views(known),
+        "validation": Validation.of(answer.held_out.method, answer.views),
+        "camera": next(iter(cameras_of(known).values()), None),
+        "robot": known.robot,
+        **vars(_sections(known)),
+    }
 
 
 def _edge_names(known: RunState) -> dict[str, str]:
@@ -106,7 +132,7 @@ def _solvers(known: RunState, names: Mapping[str, str]) -> dict[str, SolverResul
 
 def _views(known: RunState) -> tuple[ViewResult, ...]:
     """What became of each view of the session, in its order."""
-    seen = {result.view: result for result in view_results(known.solved.sights)}
+    seen = {view.view: view.of_pair for view in known.solved.views}
     return tuple(
         seen.get(view.number) or ViewResult(view.number, used=False, reason=_reason(known, view))
         for view in known.session.views
@@ -174,18 +200,13 @@ def _points(known: RunState) -> Iterator[PointResult]:
 
 def _uncertainty(known: RunState) -> UncertaintyResult:
     work, answer = known.work, known.solved
-    of = "combined" if answer.problem.is_combined else "robot"
-    (turn_rad, shift_m) = answer.intervals[0]
     tests = (misfit.alike for misfit in answer.misfits.values())
     alike = [test.factor for test in tests if test is not None and test.is_significant]
     return UncertaintyResult(
         point_cam_m=work.point_cam,
         budget_mm=work.budget_mm,
         radius95_mm=work.radius95_mm,
-        noise_95={
-            f"{of}_translation_mm": pair_of(1e3 * shift_m),
-            f"{of}_rotation_deg": pair_of(np.rad2deg(turn_rad)),
-        },
+        noise_95=_of_robot(known, noise_intervals(known)),
         spectrum=work.spectrum,
         inflation=max(alike, default=1.0),
     )
@@ -193,8 +214,6 @@ def _uncertainty(known: RunState) -> UncertaintyResult:
 
 def _noise(known: RunState) -> dict[str, float]:
     """Standard deviations per axis: of corners and flange, or of both as one without corners."""
-    sigma_rad, sigma_m = known.solved.noise.robots[0].tolist()
-    of = "combined" if known.solved.problem.is_combined else "robot"
     found = {
         name: value
         for of_frame in known.solved.sigmas.values()
@@ -207,10 +226,14 @@ def _noise(known: RunState) -> dict[str, float]:
         found["instrument_mm"] = 1e3 * known.readings.sigma_m
         if known.readings.are_poses:
             found["instrument_deg"] = float(np.rad2deg(known.readings.instrument.sigma_rad or 0.0))
-    return found | {
-        f"{of}_translation_mm": 1e3 * sigma_m,
-        f"{of}_rotation_deg": float(np.rad2deg(sigma_rad)),
-    }
+    return found | _of_robot(known, known.solved.sigmas)
+
+
+def _of_robot(known: RunState, levels: Mapping[str, Mapping[str, _T]]) -> dict[str, _T]:
+    """What is known of the levels of the only robot's noise, or of that of robot and camera."""
+    problem = known.solved.problem
+    of = "combined" if problem.is_combined else "robot"
+    return {f"{of}_{name}": level for name, level in levels[problem.robots[0]].items()}
 
 
 def _joint_fit_of(known: RunState) -> JointFit | None:

@@ -1,13 +1,13 @@
 """The fit of a whole cell, as the solver hands it on."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.cell import Cell
+from visioncal.calibration.stages.cell import Cell, Row
 from visioncal.calibration.stages.fit_messages import found_of_looks
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.side import FramesSide
@@ -124,14 +124,21 @@ class Solved:
             rows: (m,) the observations.
             state: The unknowns of the fit, or those of another one to a part of them.
         """
-        looks, chosen = self.looks_at(state), np.isin(np.arange(len(self.cell.rows)), rows)
+        chosen = np.isin(np.arange(len(self.cell.rows)), rows)
+        poses = self.agreed.problem.subset(chosen).predicted(state)
+        mine = [self.cell.rows[index] for index in rows]
+        return self.pixels(mine, [self.poses[index] for index in rows], poses, state)
+
+    def pixels(
+        self, rows: Sequence[Row], views: Sequence[ViewPoses], poses: FloatArray, state: State
+    ) -> FloatArray:
+        """Reprojection errors (m,) [px] of views whose targets are at (m, 4, 4) poses."""
+        looks = self.looks_at(state)
         if looks is None:
             return np.full(len(rows), np.nan)
-        poses = self.agreed.problem.subset(chosen).predicted(state)
         lenses = {problem: looks.camera(problem) for problem in looks.problems}
-        seen = [self.poses[index].corners for index in rows]
-        cameras = [lenses.get(self.cell.rows[index].seer) for index in rows]
-        return chain_rms_px(seen, poses, cameras, np.concatenate(looks.corners))
+        cameras = [lenses.get(row.seer) for row in rows]
+        return chain_rms_px([view.corners for view in views], poses, cameras, looks.points)
 
     @property
     def field_columns(self) -> IntArray:

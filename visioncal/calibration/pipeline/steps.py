@@ -171,9 +171,9 @@ def _solve(known: RunState) -> RunState:
 def _examine(known: RunState) -> RunState:
     check_answer(known)
     answer = answer_of(known.cell, known, known.fitted, known.convention)
-    out = (sight for sight in answer.sights if not sight.used and sight.view not in known.held_back)
+    out = (view for view in answer.views if not view.used and view.view not in known.held_back)
     known = replace(known, fit=answer.solved, answer=answer)
-    return known.noting(Rejection(sight.view, sight.reason) for sight in out)
+    return known.noting(Rejection(view.view, view.reason) for view in out)
 
 
 def _judge(known: RunState) -> RunState:

@@ -72,5 +72,5 @@ def _predicted(
     looks = known.fitted.looks
     if looks is None or seer not in looks.problems:
         return None
-    positions = np.concatenate(looks.corners)[corners.ids]
+    positions = looks.points[corners.ids]
     return predict_corners(looks.camera(seer), cam_from_target, positions)

@@ -1,6 +1,4 @@
-"""The result of a whole cell: its frames, each with respect to all others."""
-
-from datetime import UTC, datetime
+"""What a result of a whole cell has by name: its cameras, robots and targets."""
 
 import numpy as np
 
@@ -14,67 +12,59 @@ from visioncal.calibration.pipeline.lens_documents import (
 from visioncal.calibration.pipeline.network_ties import untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import robot_key
-from visioncal.calibration.stages.need import need_met
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import stops_of
-from visioncal.results import Alignment, RobotResult, Untied
+from visioncal.results import CellResult, RobotResult, Untied
 from visioncal.results.arm import ArmSections
 from visioncal.results.sections import CellDetails, CellUncertainty, Intervals
 from visioncal.robot import Robot
+from visioncal.session.frames import thing_name
 from visioncal.vision.targets import target_document
 
 
-def alignment_of(known: RunState) -> Alignment:
-    """Puts together what is known of a whole cell when all steps have run.
-
-    Raises:
-        RuntimeError: One has not.
-    """
+def cell_of(known: RunState) -> CellResult:
+    """Puts together what is known of a whole cell by name when all steps have run."""
     session, cell, solved, answer = known.session, known.cell, known.fitted, known.solved
-    if known.verdict is None or known.findings is None:
-        raise RuntimeError("a step is missing")
-    branches, edges = answer.problem.tree.branches, answer.edges
-    parents = {version.name: branches[version.key].parent for version in answer.versions.values()}
+    placed = cell_edges(known)
     kept = {
         name: branch.parent
         for name, branch in cell.tree.branches.items()
         if name in solved.cell.tree.branches
     }
-    size = 6 * len(edges)
-    return Alignment(
-        session_name=session.name,
-        session_sha256=session.digest(),
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
+    parents = {frame: name.partition("_from_")[0] for frame, name in placed.items()}
+    return CellResult(
         reference=cell.reference,
-        frames=kept | parents,
-        robots={flange: robot for robot, flange in solved.cell.tree.flanges.items()},
-        edges={f"{parents[name]}_from_{name}": edge for name, edge in edges.items()},
-        joint_covariance=answer.covariance[:size, :size],
-        cameras=cameras_of(known),
-        noise=answer.sigmas,
-        sights=answer.sights,
-        left_out=answer.held_out.method if np.isfinite(answer.held_out.away_m).any() else "",
-        moved=answer.moved,
-        untied=tuple(Untied(name, untied_words(cell, name)) for name in solved.untied),
-        weakest=weakest_link(solved.cell, answer.last_edges),
-        verdict=known.verdict,
-        details=_details(known),
-        arms=_arms(known),
+        tree=kept | parents,
+        cameras={thing_name(name, "camera"): lens for name, lens in cameras_of(known).items()},
+        robots=_robots(known),
         targets={
             name or "target": target_document(plate) for name, plate in session.plates.items()
         },
+        noise=answer.sigmas,
+        moved=answer.moved,
+        untied=tuple(Untied(name, untied_words(cell, name)) for name in solved.untied),
+        weakest=weakest_link(solved.cell, answer.last_edges),
+        details=_details(known),
         boards=boards_of(known),
         rigs=rigs_of(known),
         joint_fit=fit_section(known),
         uncertainty=CellUncertainty(
-            budget_mm={f"{parents[name]}_from_{name}": mm for name, mm in answer.budget_mm.items()},
-            noise_95=_intervals(known),
+            budget_mm={placed[frame]: mm for frame, mm in answer.budget_mm.items()},
+            noise_95=noise_intervals(known),
         ),
-        need=need_met(known.findings.need, known.findings.picks, whole=True),
     )
 
 
-def _arms(known: RunState) -> dict[str, RobotResult]:
+def cell_edges(known: RunState) -> dict[str, str]:
+    """The names of a whole cell's edges by the frames that they place."""
+    branches = known.solved.problem.tree.branches
+    named = known.solved.versions.values()
+    return {
+        version.name: f"{branches[version.key].parent}_from_{version.name}" for version in named
+    }
+
+
+def _robots(known: RunState) -> dict[str, RobotResult]:
     session, solved = known.session, known.fitted
     models = session.robot_documents
     found = {
@@ -101,19 +91,19 @@ def _details(known: RunState) -> CellDetails:
     return CellDetails({key.words: at.result() for key, at in known.solved.clocks(known).items()})
 
 
-def _intervals(known: RunState) -> dict[str, Intervals]:
+def noise_intervals(known: RunState) -> dict[str, Intervals]:
     """95 % intervals of the levels of robots, as the noise names them."""
     pairs = zip(known.solved.problem.robots, known.solved.intervals, strict=True)
     return {
         robot: {
-            "translation_mm": pair_of(1e3 * shift_m),
-            "rotation_deg": pair_of(np.rad2deg(turn_rad)),
+            "translation_mm": _ends(1e3 * shift_m),
+            "rotation_deg": _ends(np.rad2deg(turn_rad)),
         }
         for robot, (turn_rad, shift_m) in pairs
     }
 
 
-def pair_of(interval: FloatArray) -> tuple[float, float]:
+def _ends(interval: FloatArray) -> tuple[float, float]:
     """The ends of an interval."""
     low, high = interval.tolist()
     return low, high

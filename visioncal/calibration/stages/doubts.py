@@ -394,7 +394,7 @@ def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fi
 
 
 def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    used = sum(view.used for pair in findings.pairs for view in pair.views)
+    used = sum(view.used for view in findings.views)
     check, bad = limits.stops
     for arm in findings.arms:
         if arm.stops < check:

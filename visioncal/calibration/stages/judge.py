@@ -112,7 +112,7 @@ def _praise(findings: Findings, *, is_enough: bool) -> Finding:
         "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
         "compare later stops with it."
     )
-    used = sum(view.used for pair in findings.pairs for view in pair.views)
+    used = sum(view.used for view in findings.views)
     worst = findings.worst[0]
     return Finding(
         AGREEMENT,

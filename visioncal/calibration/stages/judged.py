@@ -1,15 +1,14 @@
 """What a verdict is made of: cameras, robots and targets as the fit has them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.types import Mount, Need, Rejection
 from visioncal.core.verdict import Finding
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
+from visioncal.results.views import holdout_rms, left_out_rms, rms_of
 from visioncal.session.frames import thing_name
 
 
@@ -19,9 +18,6 @@ class Pair:
 
     Attributes:
         views: What became of each view.
-        rms: Residuals of the used ones.
-        held_out: Residuals of these, left out in turn.
-        holdout: Residuals of those held back by the session; None where there are none.
         disagreeing: Those whose robot pose and image do not belong together.
         name: Both, by name; empty where there are no others.
         noise: What the sensor's own noise makes of its views.
@@ -29,13 +25,20 @@ class Pair:
     """
 
     views: Sequence[ViewResult]
-    rms: Rms
-    held_out: Rms
-    holdout: Rms | None = None
     disagreeing: Sequence[Rejection] = ()
     name: str = ""
     noise: Rms = field(default_factory=lambda: Rms(0.0, 0.0))
     away: Rms | None = None
+
+    @property
+    def held_out(self) -> Rms:
+        """Residuals of the used ones, left out in turn."""
+        return left_out_rms(self.views)
+
+    @property
+    def holdout(self) -> Rms | None:
+        """Residuals of those held back by the session; None where there are none."""
+        return holdout_rms(self.views)
 
 
 @dataclass(frozen=True)
@@ -156,33 +159,19 @@ class Findings:
         return f" --camera {thing_name(max(cameras, key=weak_m.__getitem__), 'camera')}"
 
     @property
+    def views(self) -> tuple[ViewResult, ...]:
+        """What became of each view."""
+        return tuple(view for pair in self.pairs for view in pair.views)
+
+    @property
     def rms(self) -> Rms:
         """Residuals of all used views."""
-        return self._pooled(lambda pair: pair.rms)
+        return rms_of(self.views)
 
     @property
     def held_out(self) -> Rms:
         """Residuals of all of them, left out in turn."""
-        return self._pooled(lambda pair: pair.held_out)
-
-    def _pooled(self, of: Callable[[Pair], Rms]) -> Rms:
-        if len(self.pairs) == 1:
-            return of(self.pairs[0])
-        counts = np.array([sum(view.used for view in pair.views) for pair in self.pairs])
-
-        def pooled(values: Sequence[float | None]) -> float | None:
-            known = [
-                (value, count)
-                for value, count in zip(values, counts, strict=True)
-                if value is not None
-            ]
-            if not any(count for _, count in known):
-                return None
-            squares, weights = np.array(known).T
-            return float(np.sqrt(np.average(squares**2, weights=weights)))
-
-        each = [of(pair) for pair in self.pairs]
-        return Rms(pooled([item.mm for item in each]) or 0.0, pooled([item.deg for item in each]))
+        return left_out_rms(self.views)
 
 
 def _is_offset_of(direction: Direction, frame: str) -> bool:

@@ -36,8 +36,9 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.solve import Solution
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import NeedMet, Picker
 from visioncal.session.frames import thing_name
@@ -138,8 +139,7 @@ class Fitted:
 
     Attributes:
         problem: The n observations of the fit.
-        state: The answer.
-        noise: Its levels.
+        fit: Their fit.
         covariance: (p, p) of the unknowns, with all that counts beside the noise.
         held_out: The observations' residuals by fits without their stops.
         middles: (3,) of each target, in its frame [m]; of others, their origin.
@@ -149,12 +149,10 @@ class Fitted:
         moved: (3, b) how the middle of each target moves with these, by its frame [m].
         whole: The observations of all pairs, merged or not, that the fit was made from.
         jitters: By which share the focal length of each camera changes from image to image.
-        inflation: By how much the covariance was multiplied because neighbouring stops err alike.
     """
 
     problem: Problem
-    state: State
-    noise: Noise
+    fit: Solution
     covariance: FloatArray
     held_out: HeldOut
     middles: Mapping[str, FloatArray]
@@ -164,7 +162,6 @@ class Fitted:
     moved: Mapping[str, FloatArray]
     whole: Problem
     jitters: Mapping[str, float]
-    inflation: float = 1.0
 
 
 def picks_of(fitted: Fitted, need: Need | None = None) -> tuple[Picks, ...]:
@@ -197,7 +194,7 @@ def _part(fitted: Fitted, rows: Sequence[int]) -> Fitted:
 
 def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     """Picks of what one camera sees by one robot, from the observations that it parts."""
-    problem, state, noise = fitted.problem, fitted.state, fitted.noise
+    problem, state, noise = fitted.problem, fitted.fit.state, fitted.fit.noise
     seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
     in_base = _in_base(problem, state, base)
     middles = np.array(
@@ -220,8 +217,7 @@ def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
     white = again = noise.robots[at]
     if unfitted is not None:
         off = unfitted.sigma * misfit_jacobian(fitted.whole, state, noise, robot, unfitted)
-        # Errors that follow the posture are why neighbours err alike.
-        covariance = covariance - fitted.inflation * off @ off.T
+        covariance = covariance - off @ off.T
         by_posture, in_time = _left_by_arm(fitted, robot, unfitted, off)
         if not whole:
             by_posture, in_time = (turned @ array @ turned.mT for array in (by_posture, in_time))
@@ -316,7 +312,7 @@ def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
         observations=replace(
             problem.observations,
             observed=(base,) * len(problem),
-            measured=problem.measured(fitted.state) @ invert(in_base),
+            measured=problem.measured(fitted.fit.state) @ invert(in_base),
             has_rotation=np.ones(len(problem), dtype=bool),
         ),
         effects=tuple(effects),
@@ -375,7 +371,7 @@ def _left_by_arm(
         (n, 6, 6) twice: of those that follow the posture, and of those that last. These are others
         than at the stops of the fit: as much as they have changed among these.
     """
-    problem, state = fitted.problem, fitted.state
+    problem, state = fitted.problem, fitted.fit.state
     widened = problem.with_effects([*problem.effects, errors.effect(robot)])
     values = np.concatenate([state.values, np.zeros(off.shape[1])])
     jacobian = widened.linear(replace(state, values=values), ideal=True).jacobian
@@ -406,8 +402,8 @@ def _of_arm(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
 
 def _unpredicted(fitted: Fitted) -> FloatArray:
     """(6, 6) by how much left-out views err more than is predicted, and than chance lets them."""
-    problem, noise = fitted.problem, fitted.noise
-    linear = problem.linear(fitted.state, ideal=True)
+    problem, noise = fitted.problem, fitted.fit.noise
+    linear = problem.linear(fitted.fit.state, ideal=True)
     expected = linear.covariance(fitted.covariance) + problem.total_covariance(linear, noise)
     held, found = fitted.held_out, np.zeros((6, 6))
     for away, axes in ((held.away_rad, slice(0, 3)), (held.away_m, slice(3, 6))):

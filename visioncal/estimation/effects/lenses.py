@@ -216,6 +216,11 @@ class CameraParameters:
         """A camera with its lens as it is taken to be."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
 
+    @property
+    def points(self) -> FloatArray:
+        """(c, 3) where the corners of all boards lie, each on its own board [m]."""
+        return np.concatenate(self.corners)
+
     def with_values(self, free: IntArray, found: FloatArray) -> "CameraParameters":
         """Returns them with (f,) values at some places."""
         values = self.values.copy()

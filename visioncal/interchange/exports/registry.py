@@ -41,7 +41,7 @@ from visioncal.interchange.exports.sources import (
     is_kind,
     placements,
 )
-from visioncal.results import Alignment, Calibration, Edge, Verdict
+from visioncal.results import Calibration, Edge, Verdict
 from visioncal.session.choosing import ARM, EYE, PARTS, Choice
 
 EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
@@ -87,7 +87,7 @@ def export(source: Source | Identified, to: str, selection: Selection = _EVERYTH
     """Writes a result in somebody else's format.
 
     Args:
-        source: A calibration, frames alone, an aligned cell, or an arm's identified dynamics.
+        source: A calibration, frames alone, or an arm's identified dynamics.
         to: The name of a format among `EXPORT_FORMATS`.
         selection: Which transform, in which direction, and what its frames are to be called; of
             an arm, in which form.
@@ -128,8 +128,7 @@ def _of_whole(
     source: Source, selection: Selection, form: ExportFormat | ArmFormat
 ) -> tuple[Source, Selection]:
     """Takes one robot's part out of a whole cell, where one is named or an arm is asked for."""
-    whole = Calibration.whole(source) if isinstance(source, Alignment) else source
-    if not isinstance(whole, Calibration) or whole.cell is None:
+    if not isinstance(source, Calibration) or source.cell is None:
         if selection.robot is not None or selection.target is not None:
             raise DataError(
                 "Which robot or target is meant is said of a whole cell alone, and this is none.",
@@ -139,11 +138,11 @@ def _of_whole(
         return source, selection
     named = selection.robot is not None or selection.target is not None
     if not named and not isinstance(form, ArmFormat):
-        return whole.cell, selection
+        return source, selection
     of_arm = isinstance(form, ArmFormat) or form.holds in ("tool", "fixture")
     needs = PARTS if selection.target is not None else ARM if of_arm else EYE
     choice = Choice(selection.camera, selection.robot, selection.target)
-    chosen = whole.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
+    chosen = source.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
     return chosen, replace(selection, camera=None, robot=None, target=None)
 
 
@@ -169,7 +168,7 @@ def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     """Picks what is to be exported.
 
     Args:
-        source: A calibration, frames alone, or an aligned cell.
+        source: A calibration, or frames alone.
         selection: What is asked for.
         form: The format that is to hold it.
 
@@ -247,7 +246,7 @@ def _named(form: ExportFormat, selection: Selection, there: Placements) -> str:
         return selection.edge
     if form.holds == "lens" and there.cell is not None:
         frame = next(name for name, lens in there.lenses.items() if lens is there.lens)
-        return f"{there.cell.frames[frame]}_from_{frame}"
+        return f"{there.cell.tree.parents[frame]}_from_{frame}"
     return there.default()
 
 

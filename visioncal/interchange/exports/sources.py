@@ -9,7 +9,6 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import Mount
 from visioncal.results import (
-    Alignment,
     Calibration,
     CameraResult,
     Edge,
@@ -18,7 +17,7 @@ from visioncal.results import (
     Verdict,
 )
 
-Source: TypeAlias = Calibration | FrameFile | Alignment
+Source: TypeAlias = Calibration | FrameFile
 Kind: TypeAlias = Literal["tool", "fixture"]
 
 # The camera's or the instrument's transform.
@@ -65,7 +64,7 @@ class Placements:
         words: What the source is, for messages.
         mount: How the camera is mounted; None where there is no calibration.
         lens: The camera, where there is one.
-        cell: The whole cell that was aligned: it places any of its frames in any other.
+        cell: The result of the whole cell: it places any of its frames in any other.
         lenses: Its cameras by frame.
     """
 
@@ -74,7 +73,7 @@ class Placements:
     words: str
     mount: Mount | None
     lens: CameraResult | None
-    cell: Alignment | None = None
+    cell: Calibration | None = None
     lenses: Mapping[str, CameraResult] = field(default_factory=dict)
 
     def find(self, name: str) -> tuple[Placement, tuple[str, str]]:
@@ -109,11 +108,12 @@ class Placements:
         if len(self.frames) == 1 and self.cell is None:
             return self.frames[0]
         if self.cell is not None:
-            known = list(self.cell.frames)
+            tree = self.cell.tree
+            known = list(tree.parents)
             raise DataError(
                 f"{self.words.capitalize()} has {', '.join(known)}: which is meant is not said.",
                 culprits=["--edge"],
-                next_step=f"Name two of them, as --edge {self.cell.reference}_from_{known[-1]}; "
+                next_step=f"Name two of them, as --edge {tree.reference}_from_{known[-1]}; "
                 "or all: --edge all.",
             )
         raise DataError(
@@ -161,14 +161,14 @@ def placements(source: Source, camera: str | None = None) -> Placements:
     """Lists what a source has.
 
     Args:
-        source: A calibration, frames alone, or an aligned cell.
-        camera: Which of the cell's cameras is meant: its name or its frame.
+        source: A calibration, or frames alone.
+        camera: Which of a whole cell's cameras is meant: its name or its frame.
 
     Raises:
         DataError: There is no such camera, or the source is of one camera.
     """
-    if isinstance(source, Alignment):
-        return _of_alignment(source, camera)
+    if isinstance(source, Calibration) and source.cell is not None:
+        return _of_cell(source, source.cell.lenses, camera)
     if camera is not None:
         raise DataError(
             "Which camera is meant is said of a whole cell alone, and this is none.",
@@ -188,28 +188,30 @@ def placements(source: Source, camera: str | None = None) -> Placements:
     )
 
 
-def _of_alignment(cell: Alignment, camera: str | None) -> Placements:
+def _of_cell(
+    source: Calibration, lenses: Mapping[str, CameraResult], camera: str | None
+) -> Placements:
     # The reference and the cell are one frame: without it, the tree would be in two.
-    placed = {
-        f"{on}_from_{name}": cell.edge_of(name)
-        for name, on in cell.frames.items()
-        if name not in cell.robots
+    tree = source.tree
+    edges = {
+        f"{on}_from_{name}": _in_cell(source, tree.edge_of(name))
+        for name, on in tree.parents.items()
+        if name not in tree.flanges
     }
-    edges = {name: _of_cell(cell, edge) for name, edge in placed.items()}
     lens = None
-    if camera is not None or len(cell.cameras) == 1:
-        lens = cell.cameras[_camera(cell, camera)]
-    frames = {name: _of_frame(frame) for name, frame in cell.placed.items()}
-    by_name, lenses = {**edges, **frames}, cell.cameras
-    return Placements(by_name, tuple(frames), "this alignment", None, lens, cell, lenses)
+    if camera is not None or len(lenses) == 1:
+        lens = lenses[_camera(lenses, camera)]
+    frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
+    by_name = {**edges, **frames}
+    return Placements(by_name, tuple(frames), "this alignment", None, lens, source, lenses)
 
 
-def _camera(cell: Alignment, camera: str | None) -> str:
-    known = list(cell.cameras)
+def _camera(lenses: Mapping[str, CameraResult], camera: str | None) -> str:
+    known = list(lenses)
     if camera is None:
         return known[0]
     for frame in (camera, f"cam_{camera}"):
-        if frame in cell.cameras:
+        if frame in lenses:
             return frame
     raise DataError(
         f"There is no camera {camera!r}; this alignment has {', '.join(known) or 'none'}.",
@@ -218,15 +220,16 @@ def _camera(cell: Alignment, camera: str | None) -> str:
     )
 
 
-def _of_cell(cell: Alignment, edge: Edge) -> Placement:
-    origin = f"aligned by visioncal from {cell.session_name!r}, {cell.created}"
-    return Placement(edge, origin, cell.verdict)
+def _in_cell(source: Calibration, edge: Edge) -> Placement:
+    origin = f"aligned by visioncal from {source.session_name!r}, {source.created}"
+    return Placement(edge, origin, source.verdict)
 
 
-def _between(cell: Alignment, first: str, second: str) -> Placement:
+def _between(source: Calibration, first: str, second: str) -> Placement:
     """Any frame in any other; trusted as the cell is, and the tool or the fixture that it has."""
-    whole = _of_cell(cell, cell.between(first, second))
-    for parent, frame in filter(None, (cell.placement(first), cell.placement(second))):
+    tree = source.tree
+    whole = _in_cell(source, tree.between(first, second))
+    for parent, frame in filter(None, (tree.placement(first), tree.placement(second))):
         if _WORST_FIRST.index(frame.verdict.status) < _WORST_FIRST.index(whole.verdict.status):
             whole = replace(whole, verdict=frame.verdict)
         origin = f"{whole.origin}; {_of_frame(frame).origin}"

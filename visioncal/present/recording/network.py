@@ -4,24 +4,25 @@ import rerun as rr
 
 from visioncal.present.cellmap import pairs, places, sigma_words, spans
 from visioncal.present.recording import colours, paths
-from visioncal.results import Alignment
+from visioncal.results import Calibration
 
 # The height of the bodies' names, and the drawing's units [px].
 _BODY_HEIGHT, _ACROSS_PX, _DOWN_PX = 3.6, 110.0, 120.0
 
 
-def log_network(stream: rr.RecordingStream, found: Alignment) -> None:
+def log_network(stream: rr.RecordingStream, calibration: Calibration) -> None:
     """Draws the network as a graph: frames with their sigmas, and who saw whom."""
     nodes: dict[str, tuple[float, float]] = {}
-    for body, (left, right) in spans(found).items():
+    tree = calibration.tree
+    for body, (left, right) in spans(tree).items():
         nodes[body] = (0.5 * (left + right), _BODY_HEIGHT)
-    nodes |= places(found)
-    words = {flange: f"robot {robot}" for flange, robot in found.robots.items()}
-    words[paths.CELL_FRAME] = f"the frame of {found.reference}"
-    labels = [f"{node}\n{words.get(node) or sigma_words(found, node)}" for node in nodes]
-    bodies = {paths.CELL_FRAME, *found.robots}
-    seen = [(pair.seer, pair.seen) for pair in pairs(found) if pair.used]
-    hangs = [(found.frames[node], node) for node in nodes if node != paths.CELL_FRAME]
+    nodes |= places(tree)
+    words = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
+    words[paths.CELL_FRAME] = f"the frame of {tree.reference}"
+    labels = [f"{node}\n{words.get(node) or sigma_words(tree, node)}" for node in nodes]
+    bodies = {paths.CELL_FRAME, *tree.flanges}
+    seen = [(pair.seer, pair.seen) for pair in pairs(calibration.views) if pair.used]
+    hangs = [(tree.parents[node], node) for node in nodes if node != paths.CELL_FRAME]
     stream.log(
         paths.NETWORK,
         rr.GraphNodes(

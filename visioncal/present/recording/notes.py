@@ -16,7 +16,7 @@ from visioncal.present.details import frame_facts, observation_table
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.markdown import fact_lines, markdown, plain, table_lines
 from visioncal.present.recording.recorder import send_rows
-from visioncal.results import Calibration, Frame, Sight
+from visioncal.results import Calibration, Frame, ViewResult
 from visioncal.results.arm import ArmResult, ArmSections
 from visioncal.session import View
 
@@ -53,7 +53,7 @@ def log_static(
     ):
         if text:
             stream.log(entity, markdown(text), static=True)
-    for seer in dict.fromkeys(sight.seer for sight in parts.sights(calibration)):
+    for seer in dict.fromkeys(view.seer for view in calibration.views):
         for plot in _PLOTS:
             for name, label, colour, marker, size in _MARKS:
                 points = rr.SeriesPoints(
@@ -71,7 +71,7 @@ def log_verdict(stream: rr.RecordingStream, verdict: Verdict, text: str) -> None
 
 def log_views(
     stream: rr.RecordingStream,
-    sights: Mapping[int, Sight],
+    sights: Mapping[int, ViewResult],
     rows: Mapping[int, View],
     unposed: Mapping[int, Sequence[str]] = MappingProxyType({}),
 ) -> None:
@@ -83,7 +83,7 @@ def log_views(
         rows: All views, by their places.
         unposed: The robots whose pose is not known at a view, by its place.
     """
-    by_seer: dict[str, dict[int, Sight]] = defaultdict(dict)
+    by_seer: dict[str, dict[int, ViewResult]] = defaultdict(dict)
     for row, sight in sights.items():
         by_seer[sight.seer][row] = sight
     for seer, mine in by_seer.items():
@@ -100,7 +100,7 @@ def log_views(
 
 
 def _log_residuals(
-    stream: rr.RecordingStream, plot: str, sights: Mapping[int, Sight], attribute: str
+    stream: rr.RecordingStream, plot: str, sights: Mapping[int, ViewResult], attribute: str
 ) -> None:
     """Logs a residual of the views, by their places in the session."""
     values = {row: getattr(sight, attribute) for row, sight in sights.items()}
@@ -152,7 +152,7 @@ def _verdict_lines(calibration: Calibration) -> Iterator[str]:
         yield from ("", plain(" ".join(facts.summary(calibration, known))))
     used = sum(view.used for view in calibration.views)
     yield from ("", f"{used} of {len(calibration.views)} views used.")
-    yield from _list(suspects.words for suspects in advice.left_out(parts.sights(calibration)))
+    yield from _list(suspects.words for suspects in advice.left_out(calibration.views))
 
 
 def _list(sentences: Iterable[str]) -> Iterator[str]:
@@ -198,7 +198,7 @@ def solvers_markdown(calibration: Calibration) -> str:
     return "" if table is None else "\n".join(["# Solvers compared", *table_lines(table)])
 
 
-def view_markdown(sight: Sight, unposed: Sequence[str] = ()) -> str:
+def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
     """What became of one view.
 
     Args:

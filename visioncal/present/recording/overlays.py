@@ -47,11 +47,11 @@ class Overlay:
         evidence: Mapping[int, ViewEvidence],
     ) -> "Overlay":
         """Chooses the factor by the used views."""
-        sights = () if calibration is None else parts.sights(calibration)
+        views = () if calibration is None else calibration.views
         width = None if calibration is None else parts.image_width(calibration)
         if width is None:
             width = 1280 if session.resolution is None else session.resolution[0]
-        used = frozenset(sight.view for sight in sights if sight.used)
+        used = frozenset(view.view for view in views if view.used)
         shown = [other for view, other in evidence.items() if view in used]
         active = any(view.corners is not None for view in evidence.values())
         return cls(
@@ -119,7 +119,7 @@ def image_frames(session: Session, calibration: Calibration | None) -> dict[int,
         return dict.fromkeys(range(len(session.views)), paths.IMAGE_FRAME)
     seers = {observation.view.number: observation.seer for observation in session.observations}
     seen_by = {row: seers.get(view.number, "") for row, view in enumerate(session.views)}
-    return {row: paths.image_frame(name) for row, name in seen_by.items() if name in cell.cameras}
+    return {row: paths.image_frame(name) for row, name in seen_by.items() if name in cell.lenses}
 
 
 def log_image_frames(stream: rr.RecordingStream, entity: str, frames: Mapping[int, str]) -> None:

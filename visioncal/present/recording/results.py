@@ -126,7 +126,7 @@ def _log_views(
     """Logs what became of each view, and how the arms had drifted."""
     views = dict(enumerate(session.views))
     rows = {view.number: row for row, view in views.items()}
-    sights = {rows[sight.view]: sight for sight in parts.sights(calibration) if sight.view in rows}
+    sights = {rows[view.view]: view for view in calibration.views if view.view in rows}
     unposed = {row: scene.unposed(view.number) for row, view in views.items()}
     notes.log_views(stream, sights, views, unposed)
     for name, arm in parts.arms(calibration).items():

@@ -113,7 +113,7 @@ class Scene:
         if calibration.cell is not None:
             axes = rr.TransformAxes3D(2.0 * _AXIS * self.size_m, show_frame=False)
             stream.log(paths.CELL, rr.CoordinateFrame(paths.CELL_FRAME), axes, static=True)
-            network.log_network(stream, calibration.cell)
+            network.log_network(stream, calibration)
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
         """Logs where everything is in each view.
@@ -267,8 +267,8 @@ class Scene:
             self.session.boards if any(view.cam_from_target is not None for view in seen) else {}
         )
         outlines = {name: board.closed_outline(target) for name, target in boards.items()}
-        sights = () if self.calibration is None else parts.sights(self.calibration)
-        seers = {sight.view: sight.seer or paths.CAM_FRAME for sight in sights}
+        views = () if self.calibration is None else self.calibration.views
+        seers = {view.view: view.seer or paths.CAM_FRAME for view in views}
         cameras = frames_of_kind(seers.values(), "camera")
         for row, (view, other) in enumerate(zip(self.session.views, seen, strict=True)):
             if (name := self.session.board_of(view)) not in boards:
@@ -285,10 +285,9 @@ class Scene:
 
     def _log_sights(self, stream: rr.RecordingStream) -> None:
         """Draws who saw whom in each view of a whole cell, as a line from one to the other."""
-        cell = None if self.calibration is None else self.calibration.cell
-        if cell is None:
+        if self.calibration is None or self.calibration.cell is None:
             return
-        sights = {sight.view: sight for sight in cell.sights}
+        sights = {view.view: view for view in self.calibration.views}
         strips: dict[int, list[FloatArray]] = {}
         rejected: dict[int, bool] = {}
         for row, view in enumerate(self.session.views):

@@ -11,7 +11,7 @@ from visioncal.present.advice import mark_of
 from visioncal.present.cellmap import weakest_frame
 from visioncal.present.facts import DEGREE, PLUS_MINUS, answering_solver, frame_words, of
 from visioncal.present.tables import Fact, Row, Table
-from visioncal.results import Alignment, Calibration, CameraResult, Edge, NeedMet, Verdict
+from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.sections import ClockResult, PointResult, TouchTest
@@ -73,14 +73,15 @@ def matrix_text(matrix: FloatArray) -> str:
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     """The handful of figures that most readers come for."""
-    validation, cell = calibration.validation, calibration.cell
+    validation = calibration.validation
     facts = [*need_facts(calibration.need, calibration.verdict)]
-    facts += _camera_sigmas(calibration) if cell is None else _cell_sigmas(cell)
+    sigmas = _camera_sigmas if calibration.cell is None else _cell_sigmas
+    facts += sigmas(calibration)
     for name, arm in parts.arms(calibration).items():
         if arm.arm is not None and arm.arm.workspace_sigma_mm is not None:
             sigma = f"{significant(arm.arm.workspace_sigma_mm.median)} mm"
             facts.append(Fact(f"all over the workspace{of(name)}, sigma", sigma))
-    if cell is None or cell.left_out:
+    if validation.is_of_unseen:
         turned = validation.held_out.deg
         note = "" if turned is None else f"{significant(turned)}{DEGREE}"
         facts.append(Fact("held-out residual", f"{significant(validation.held_out.mm)} mm", note))
@@ -104,17 +105,18 @@ def _camera_sigmas(calibration: Calibration) -> list[Fact]:
     ]
 
 
-def _cell_sigmas(cell: Alignment) -> list[Fact]:
+def _cell_sigmas(calibration: Calibration) -> list[Fact]:
     """How well the robots' bases are known in the first one's, and what is known worst."""
-    bases = [name for name in frames_of_kind(cell.frames, "base") if cell.frames[name] == CELL]
+    tree = calibration.tree
+    bases = [name for name in frames_of_kind(tree.parents, "base") if tree.parents[name] == CELL]
     facts = []
     for base in bases[1:]:
-        edge = cell.between(bases[0], base)
+        edge = tree.between(bases[0], base)
         sigma, turned = f"{significant(edge.sigma_mm)} mm", f"{significant(edge.sigma_deg)}{DEGREE}"
         facts.append(Fact(f"{base} in {bases[0]}, sigma", sigma, turned))
-    worst = weakest_frame(cell)
+    worst = weakest_frame(tree)
     if worst:
-        facts.append(Fact("least known", worst, f"{significant(cell.edge_of(worst).sigma_mm)} mm"))
+        facts.append(Fact("least known", worst, f"{significant(tree.edge_of(worst).sigma_mm)} mm"))
     return facts
 
 
@@ -226,13 +228,13 @@ def lens_facts(result: CameraResult) -> tuple[Fact, ...]:
 def view_table(calibration: Calibration, outlying: Collection[int]) -> Table:
     """What became of each view; rows have the names to which the recording's notes lead."""
     rows, words = [], {"used": "yes", "look": "look", "left-out": "left out", "rejected": "no"}
-    for sight in parts.sights(calibration):
-        figures = (sight.rms_px, sight.residual_mm, sight.residual_deg)
-        corners = significant(None) if sight.corners is None else str(sight.corners)
-        mark = "look" if sight.used and sight.view in outlying else mark_of(sight)
-        cells = (str(sight.view), corners, *map(significant, figures), words[mark])
-        names = (sight.seer, sight.seen) if sight.seer else ()
-        rows.append(Row((cells[0], *names, *cells[1:]), mark, f"view-{sight.view}"))
+    for view in calibration.views:
+        figures = (view.rms_px, view.residual_mm, view.residual_deg)
+        corners = significant(None) if view.corners is None else str(view.corners)
+        mark = "look" if view.used and view.view in outlying else mark_of(view)
+        cells = (str(view.view), corners, *map(significant, figures), words[mark])
+        names = (view.seer, view.seen) if view.seer else ()
+        rows.append(Row((cells[0], *names, *cells[1:]), mark, f"view-{view.view}"))
     titles = ("view", "corners", "px", "mm", "deg", "used")
     if calibration.cell is None:
         return Table.of(titles, rows, (5,))

@@ -16,12 +16,12 @@ from visioncal.present.cellmap import (
     weakest_frame,
 )
 from visioncal.present.facts import DEGREE
-from visioncal.present.parts import former_frames
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Box, Panel, Scale
 from visioncal.present.report.svg import Figure
 from visioncal.present.tables import Table
-from visioncal.results import Alignment
+from visioncal.results import Calibration
+from visioncal.results.tree import FrameTree
 from visioncal.session.frames import CELL
 
 _KINDS = {
@@ -40,49 +40,51 @@ _INCHES, _NARROWEST_IN = 0.72, 7.0
 _SMALL, _HEAD_PT = 7.0, 6.0
 
 
-def kinds(found: Alignment) -> str:
+def kinds(tree: FrameTree) -> str:
     """How many robots, cameras, boards and the like there are, in words."""
-    former, words = former_frames(found), []
+    words = []
     for kind, start in _KINDS.items():
-        count = sum(frame.startswith(start) and frame not in former for frame in found.frames)
+        count = sum(name.startswith(start) for name in tree.last)
         if count:
             words.append(f"{count} {kind}{'' if count == 1 else 's'}")
     return ", ".join(words)
 
 
-def known_in_each_other(found: Alignment) -> Iterator[Table]:
+def known_in_each_other(tree: FrameTree) -> Iterator[Table]:
     """How well frames of one body, the cell or a flange, are known in each other [mm, deg]."""
-    left = {*found.robots, *former_frames(found)}
-    for body in (CELL, *found.robots):
-        carried = [name for name, on in found.frames.items() if on == body and name not in left]
+    for body in (CELL, *tree.flanges):
+        carried = [
+            name for name, on in tree.last.items() if on == body and name not in tree.flanges
+        ]
         frames = carried if body == CELL else [body, *carried]
         if len(frames) > 1:
             # In the frame of a point alone nothing has a place: its axes are chosen.
-            turned = [frame for frame in frames if _is_turned(found, frame)]
-            rows = [(a, *(_between(found, a, b) for b in frames)) for a in turned]
+            turned = [frame for frame in frames if _is_turned(tree, frame)]
+            rows = [(a, *(_between(tree, a, b) for b in frames)) for a in turned]
             yield Table.of(("the cell" if body == CELL else body, *frames), rows)
 
 
-def _between(found: Alignment, first: str, second: str) -> str:
+def _between(tree: FrameTree, first: str, second: str) -> str:
     if first == second:
         return ""
-    edge = found.between(first, second)
-    degrees = f", {significant(edge.sigma_deg)}{DEGREE}" if _is_turned(found, second) else ""
+    edge = tree.between(first, second)
+    degrees = f", {significant(edge.sigma_deg)}{DEGREE}" if _is_turned(tree, second) else ""
     return f"{significant(edge.sigma_mm)} mm{degrees}"
 
 
-def _is_turned(found: Alignment, frame: str) -> bool:
+def _is_turned(tree: FrameTree, frame: str) -> bool:
     """Whether a frame's rotation was measured, or is what others are given in."""
-    return frame in (*found.robots, found.reference) or found.edge_of(frame).oriented
+    return frame in (*tree.flanges, tree.reference) or tree.edge_of(frame).oriented
 
 
-def graph(found: Alignment) -> Markup:
+def graph(calibration: Calibration) -> Markup:
     """Draws the network: bodies as boxes, their frames in them, and who saw whom between.
 
     Returns:
         The figure. In each frame's box stands the sigma of its place on what it hangs on.
     """
-    bodies, frames = spans(found), places(found)
+    tree = calibration.tree
+    bodies, frames = spans(tree), places(tree)
     right = max(span[1] for span in bodies.values())
     wide = _INCHES * (right + 0.3)
     figure = Figure(max(wide, _NARROWEST_IN), _INCHES * 4.5)
@@ -90,17 +92,19 @@ def graph(found: Alignment) -> Markup:
     box = Box(0.0, 0.0, figure.width, figure.height)
     panel = Panel(figure, box, Scale(-0.15 - spare, right + 0.15 + spare), Scale(-0.6, 3.5))
     for name, span in bodies.items():
-        _draw_body(panel, found, name, span)
-    seen = [pair for pair in pairs(found) if pair.seer in frames and pair.seen in frames]
+        _draw_body(panel, tree, name, span)
+    seen = [
+        pair for pair in pairs(calibration.views) if pair.seer in frames and pair.seen in frames
+    ]
     for pair in seen:
         _draw_pair(panel, pair, frames)
-    for flange, robot in found.robots.items():
-        _draw_robot(panel, frames, bodies, found.frames[flange], (flange, robot))
+    for flange, robot in tree.flanges.items():
+        _draw_robot(panel, frames, bodies, tree.parents[flange], (flange, robot))
     for pair in seen:
         _count_pair(panel, pair, frames)
-    worst = weakest_frame(found)
+    worst = weakest_frame(tree)
     for name, place in frames.items():
-        _draw_frame(panel, found, name, place, is_worst=name == worst)
+        _draw_frame(panel, tree, name, place, is_worst=name == worst)
     return figure.inline("The network of frames: who saw whom, sigma of each")
 
 
@@ -112,16 +116,16 @@ def _box(panel: Panel, left: float, low: float, right: float, high: float, pad: 
     return svg.rounded(float(x[0]), float(y[0]), *size, radius)
 
 
-def _draw_body(panel: Panel, found: Alignment, name: str, span: tuple[float, float]) -> None:
+def _draw_body(panel: Panel, tree: FrameTree, name: str, span: tuple[float, float]) -> None:
     outline = _box(panel, span[0], -0.35, span[1], 2.9, 0.08)
     panel.figure.path(outline, stroke=svg.LINE, width=1.2)
-    words = f"cell, the frame of {found.reference}" if name == CELL else name
+    words = f"cell, the frame of {tree.reference}" if name == CELL else name
     x, y = float(panel.x_at(0.5 * sum(span))), float(panel.y_at(3.2))
     panel.figure.text(x, y, words, anchor="middle", rise="middle", bold=True)
 
 
 def _draw_frame(
-    panel: Panel, found: Alignment, name: str, place: tuple[float, float], *, is_worst: bool
+    panel: Panel, tree: FrameTree, name: str, place: tuple[float, float], *, is_worst: bool
 ) -> None:
     x, y = place
     colour = svg.CHECK if is_worst else svg.INK
@@ -130,7 +134,7 @@ def _draw_frame(
     panel.figure.path(outline, fill=svg.CARD, stroke=colour, width=1.8 if is_worst else 0.9)
     size = min(_NAME_SIZE, _NAME_SIZE * _NAME_LENGTH / len(name))
     at = float(panel.x_at(x))
-    lines = ((0.1, name, size, svg.INK), (-0.1, sigma_words(found, name), _SMALL, colour))
+    lines = ((0.1, name, size, svg.INK), (-0.1, sigma_words(tree, name), _SMALL, colour))
     for rise, words, letters, ink in lines:
         height = float(panel.y_at(y + rise))
         panel.figure.text(at, height, words, size=letters, colour=ink, anchor="middle",

@@ -16,7 +16,7 @@ from visioncal.present.advice import named
 from visioncal.present.report import content, network
 from visioncal.present.report.templates import template
 from visioncal.present.report.thumbnails import Thumbnail, drawn, thumbnail
-from visioncal.results import Calibration, Sight
+from visioncal.results import Calibration, ViewResult
 from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
 
@@ -60,7 +60,7 @@ def render(
 ) -> str:
     """Renders the report as HTML text; see `write_report`."""
     cell, suspects = calibration.cell, advice.suspects(calibration)
-    about = calibration.mount if cell is None else network.kinds(cell)
+    about = calibration.mount if cell is None else network.kinds(calibration.tree)
     return template("report.html.j2").render(
         kind="Calibration report" if cell is None else "Alignment report",
         name=calibration.session_name,
@@ -91,13 +91,13 @@ def _pictures(
     calibration: Calibration, session: Session | None, evidence: Sequence[ViewEvidence]
 ) -> dict[str, object]:
     seen = {view.view: view for view in evidence}
-    sights = parts.sights(calibration)
-    extremes = _extremes(sights, seen)
+    views = calibration.views
+    extremes = _extremes(views, seen)
     magnify = _magnification(calibration, [seen[view.view] for _, view in extremes])
     pictures = None if session is None else _Pictures(session, seen)
     return {
         "used_pictures": pictures.of_used(extremes, magnify) if pictures else [],
-        "rejected_pictures": pictures.of_rejected(sights) if pictures else [],
+        "rejected_pictures": pictures.of_rejected(views) if pictures else [],
         "magnify": magnify,
     }
 
@@ -107,11 +107,13 @@ def _magnification(calibration: Calibration, shown: Sequence[ViewEvidence]) -> i
     return magnification(shown, parts.image_width(calibration) or 0)
 
 
-def _extremes(sights: Sequence[Sight], seen: Mapping[int, ViewEvidence]) -> list[tuple[str, Sight]]:
+def _extremes(
+    views: Sequence[ViewResult], seen: Mapping[int, ViewEvidence]
+) -> list[tuple[str, ViewResult]]:
     """The used views with the smallest and the largest reprojection error, and words for them."""
     drawn = [
         (view.rms_px, view)
-        for view in sights
+        for view in views
         if view.used
         and view.rms_px is not None
         and view.view in seen
@@ -132,7 +134,7 @@ class _Pictures:
     session: Session
     seen: Mapping[int, ViewEvidence]
 
-    def of_used(self, captioned: Sequence[tuple[str, Sight]], magnify: int) -> list[Thumbnail]:
+    def of_used(self, captioned: Sequence[tuple[str, ViewResult]], magnify: int) -> list[Thumbnail]:
         """Pictures with what was detected and predicted over them."""
         found = [
             self._of(view, caption, self.seen.get(view.view), magnify)
@@ -140,7 +142,7 @@ class _Pictures:
         ]
         return [item for item in found if item is not None]
 
-    def of_rejected(self, views: Sequence[Sight]) -> list[Thumbnail]:
+    def of_rejected(self, views: Sequence[ViewResult]) -> list[Thumbnail]:
         """The first few of the views that were not used, with their reasons."""
         found = (
             self._of(
@@ -155,7 +157,7 @@ class _Pictures:
         return list(islice((item for item in found if item is not None), _MAX_REJECTED_PICTURES))
 
     def _of(
-        self, view: Sight, caption: str, evidence: ViewEvidence | None, magnify: int
+        self, view: ViewResult, caption: str, evidence: ViewEvidence | None, magnify: int
     ) -> Thumbnail | None:
         """A view's picture; None where it has no image, which the table of views says anyway."""
         # Corners that another detector found are drawn on nothing where there is no image of them.

@@ -14,15 +14,14 @@ from visioncal.core.transforms import log, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.present.advice import contradicts
 from visioncal.present.coverage import directions_chart
-from visioncal.present.parts import sights
 from visioncal.present.placements import placement, target_frames
 from visioncal.present.report import bars, svg
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.svg import Figure
-from visioncal.results import Calibration, Rms, Sight
+from visioncal.results import Calibration, Rms, ViewResult
 from visioncal.results.evidence import ViewEvidence
-from visioncal.results.whole import rms_of
+from visioncal.results.views import rms_of
 from visioncal.session import Session
 
 # Beyond this many marks a bitmap is smaller than the vectors.
@@ -44,7 +43,7 @@ class _Measure:
     """A kind of residual: its label, its value of a view and of many, and where doubt begins."""
 
     label: str
-    value_of: Callable[[Sight], float | None]
+    value_of: Callable[[ViewResult], float | None]
     rms_of: Callable[[Rms], float | None]
     limit: float | None
 
@@ -79,14 +78,14 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     measures: tuple[_Measure, ...] = _MEASURES
     if calibration.cell is not None:
         measures = (replace(_MEASURES[0], limit=None),)
-    by_seer: dict[str, list[Sight]] = {}
-    for sight in sights(calibration):
-        by_seer.setdefault(sight.seer, []).append(sight)
+    by_seer: dict[str, list[ViewResult]] = {}
+    for view in calibration.views:
+        by_seer.setdefault(view.seer, []).append(view)
     shown = [
         (seer, mine, measure)
         for seer, mine in by_seer.items()
         for measure in measures
-        if any(measure.value_of(sight) is not None for sight in mine)
+        if any(measure.value_of(view) is not None for view in mine)
     ]
     if not shown:
         return Markup("")
@@ -96,10 +95,8 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     for (box,), (seer, mine, measure) in zip(rows, shown, strict=True):
         last = box is rows[-1][0]
         rms = calibration.rms if calibration.cell is None else rms_of(mine)
-        marked = [
-            Bar(str(sight.view), measure.value_of(sight), sight.used, _colour(sight, outlying))
-            for sight in mine
-        ]
+        marked = [Bar(str(view.view), measure.value_of(view), view.used, _colour(view, outlying))
+                  for view in mine]  # fmt: skip
         # Views of several cameras are other ones in each panel.
         labelled = last or calibration.cell is not None
         bars.draw(figure, box, marked, measure.rms_of(rms), limit=measure.limit,
@@ -108,7 +105,7 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     return figure.inline("Bars: residuals of each view")
 
 
-def _colour(view: Sight, outlying: Collection[int]) -> str:
+def _colour(view: ViewResult, outlying: Collection[int]) -> str:
     if view.used:
         return svg.CHECK if view.view in outlying else svg.ACCENT
     return svg.BAD if contradicts(view) else svg.MUTED

@@ -12,7 +12,7 @@ from visioncal.core.verdict import Verdict
 from visioncal.present import parts
 from visioncal.present.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.present.recording import colours, paths
-from visioncal.results import Alignment, Calibration
+from visioncal.results import Calibration, CellResult
 from visioncal.results.arm import ArmResult
 from visioncal.session import Session
 from visioncal.session.table import reported_matrices
@@ -34,22 +34,22 @@ class _Contents:
     turns: bool
     sight: bool
     seers: tuple[str, ...]
-    cell: Alignment | None
+    cell: CellResult | None
 
     @classmethod
     def of(cls, session: Session, calibration: Calibration | None) -> "_Contents":
         """Collects it."""
         joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
         cell = None if calibration is None else calibration.cell
-        sights = () if calibration is None else parts.sights(calibration)
+        views = () if calibration is None else calibration.views
         return cls(
             any(view.image or view.has_corners for view in session.views),
             min(joints, default=0) if cell is None else 0,
-            not all(sight.used for sight in sights),
+            not all(view.used for view in views),
             calibration is not None and bool(calibration.frames),
-            not sights or any(sight.residual_deg is not None for sight in sights),
+            not views or any(view.residual_deg is not None for view in views),
             session.mount != "instrument",
-            tuple(dict.fromkeys(sight.seer for sight in sights)) or ("",),
+            tuple(dict.fromkeys(view.seer for view in views)) or ("",),
             cell,
         )
 
