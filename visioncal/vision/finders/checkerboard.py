@@ -8,6 +8,15 @@ from visioncal.vision.finders.result import DetectedCorners, NotFound
 
 # OpenCV's search takes 170 bytes and a microsecond a pixel, and fails beyond such sides.
 MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
+# Its searches: a quick one, and two that are tried in turn.
+_FLAGS = (
+    0,
+    cv2.CALIB_CB_ACCURACY,
+    cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
+)
+# Dark and light squares, apart by so much of the contrast there, meet at so many corners of each
+# row and column; glare hides some.
+_APART, _CHECKERED = 0.25, 0.5
 
 
 def find_checkerboard(
@@ -33,19 +42,35 @@ def find_checkerboard(
             f"no board: in an image of {width} x {height} px no checkerboard is looked for (up to "
             f"{MOST_PIXELS / 1e6:.0f} million pixels; a ChArUco board is found in larger ones)"
         )
-    size = (target.columns, target.rows)
-    flags = 0 if quick else cv2.CALIB_CB_ACCURACY
-    found, px = cv2.findChessboardCornersSB(image, size, flags=flags)
-    if not found and not quick:
-        thorough = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, px = cv2.findChessboardCornersSB(image, size, flags=thorough)
-    if not found:
-        return NotFound(
-            f"no board: no checkerboard of {target.columns} x {target.rows} inner corners is seen"
-        )
-    grid = px.reshape(target.rows, target.columns, 2).astype(np.float64)
-    grid = _dark_corner_first(image, _right_handed(grid))
-    return DetectedCorners(np.arange(target.columns * target.rows), grid.reshape(-1, 2))
+    for flags in _FLAGS[:1] if quick else _FLAGS[1:]:
+        found, px = cv2.findChessboardCornersSB(image, (target.columns, target.rows), flags=flags)
+        if not found:
+            continue
+        grid = px.reshape(target.rows, target.columns, 2).astype(np.float64)
+        if _is_checkered(image, grid):
+            grid = _dark_corner_first(image, _right_handed(grid))
+            return DetectedCorners(np.arange(target.columns * target.rows), grid.reshape(-1, 2))
+    return NotFound(
+        f"no board: no checkerboard of {target.columns} x {target.rows} inner corners is seen"
+    )
+
+
+def _is_checkered(image: Image, grid: FloatArray) -> bool:
+    """Whether dark and light squares meet at the corners of a (rows, columns, 2) grid.
+
+    Of small boards OpenCV sometimes leaves out a row, and takes the board's edge for the last one.
+    """
+    wide = grid
+    for axis in (0, 1):
+        first, last = np.take(wide, [0], axis), np.take(wide, [-1], axis)
+        before, after = 2 * first - np.take(wide, [1], axis), 2 * last - np.take(wide, [-2], axis)
+        wide = np.concatenate([before, wide, after], axis=axis)
+    levels = _levels(image, wide)
+    one = np.stack([levels[:-1, :-1], levels[1:, 1:]])
+    other = np.stack([levels[:-1, 1:], levels[1:, :-1]])
+    apart = np.maximum(other.min(axis=0) - one.max(axis=0), one.min(axis=0) - other.max(axis=0))
+    meet = apart > _APART * np.ptp(np.concatenate([one, other]), axis=0)
+    return all(bool(np.all(meet.mean(axis=axis) >= _CHECKERED)) for axis in (0, 1))
 
 
 def _right_handed(grid: FloatArray) -> FloatArray:
@@ -64,9 +89,14 @@ def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
 
 
 def _starts_dark(image: Image, grid: FloatArray) -> bool:
-    centres = (grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4
-    at = np.round(centres).astype(int)
-    levels = image[at[..., 1], at[..., 0]].astype(float)
+    levels = _levels(image, grid)
     row, column = np.indices(levels.shape)
     even = (row + column) % 2 == 0
     return bool(levels[even].mean() < levels[~even].mean())
+
+
+def _levels(image: Image, grid: FloatArray) -> FloatArray:
+    """Grey levels (rows - 1, columns - 1) in the middles of a grid's squares."""
+    centres = (grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4
+    at = np.clip(np.round(centres).astype(int), 0, np.array(image.shape[::-1]) - 1)
+    return np.asarray(image[at[..., 1], at[..., 0]], float)
