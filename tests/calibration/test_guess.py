@@ -63,6 +63,16 @@ def test_a_planted_mistake_is_named(name, mount):
     assert guess.declared in guess.candidates
 
 
+def test_angles_about_two_axes_reach_beyond_those_about_three():
+    # The tool points down, and the middle angle about Z, Y, Z is 142 to 170 degrees; as a rotation
+    # that was made of it as if about Z, Y, X is written, it is 38 to 10.
+    poses = cell_poses("eye-in-hand")
+    angles = numbers(poses.true_robot, "euler-ZYZ-deg").read_as(Reading("euler-ZYX-deg"))
+    planted = replace(poses, robot=numbers(angles.poses()))
+    guess = guessed(planted)
+    assert is_named(guess, planted), guess.sentence
+
+
 @pytest.mark.parametrize("mount", MOUNTS)
 @pytest.mark.parametrize("is_measured", [True, False])
 @pytest.mark.parametrize(

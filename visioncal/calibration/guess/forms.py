@@ -83,12 +83,19 @@ def _mistaken(numbers: PoseNumbers) -> Iterator[Turns]:
     moving = [name for name in angles if name.split("-")[1].isupper()]
     for written in moving:
         yield from (Turns(form, written) for form in angles if form != written)
+        if not _is_about_two_axes(written):
+            yield from (Turns(form, written, True) for form in angles if _is_about_two_axes(form))
     if not _all_small(rotations):
         return
     in_radians = [name.replace("-deg", "-rad") for name in angles]
     for written in moving:
         yield from (Turns(form, written) for form in (*in_radians, "rotation-vector"))
     yield from (Turns(form, "rotation-vector-deg") for form in ("rotation-vector", *in_radians))
+
+
+def _is_about_two_axes(form: str) -> bool:
+    order = form.split("-")[1]
+    return order[0] == order[2]
 
 
 def _all_small(rotations: FloatArray) -> bool:
@@ -99,9 +106,12 @@ def _all_small(rotations: FloatArray) -> bool:
 
 def _read(numbers: PoseNumbers, turns: Sequence[Turns]) -> Forms:
     """Reads every way, each written form's numbers computed once; unreadable ways are dropped."""
-    one_of_each = {turn.written: turn for turn in turns}
-    written = {name: item.numbers(numbers) for name, item in one_of_each.items()}
-    pairs = [(turn, ROTATION_FORMS[turn.form].read(written[turn.written]).copy()) for turn in turns]
+    one_of_each = {(turn.written, turn.is_beyond): turn for turn in turns}
+    written = {key: item.numbers(numbers) for key, item in one_of_each.items()}
+    pairs = [
+        (turn, ROTATION_FORMS[turn.form].read(written[turn.written, turn.is_beyond]).copy())
+        for turn in turns
+    ]
     for _, rotations in pairs:
         rotations[~numbers.there] = np.nan
     # The declared way stays first even where it is unreadable; nothing of it will fit.

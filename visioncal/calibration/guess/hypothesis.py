@@ -21,6 +21,9 @@ SIGNS: tuple[Signs, ...] = ("", "mirror", "x", "y", "z")
 # Mirroring any one axis is the same up to half turns of both frames; y is taken.
 _MIRROR = np.array([1.0, -1.0, 1.0])
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+# The other three angles about three axes of the same rotation [deg]: the outer ones half a turn
+# farther on, the middle one's supplement.
+_HALF_TURNED, _BEYOND = 180.0, np.array([-1.0, 1.0, -1.0])
 # The orders of turns that makers of robots and libraries use, about moving and about fixed axes.
 _ORDERS = {
     form.rotation.split("-")[1].upper()
@@ -37,10 +40,13 @@ class Turns:
         form: A name among `ROTATION_FORMS`.
         written: Where the numbers at hand were made by misreading others: the form in which those
             were taken by mistake. They are got back by writing in it, and are read as `form`.
+        is_beyond: Whether their middle angles were beyond 90 degrees, to which those about three
+            axes are written: angles about two axes reach 180, as of a tool that points down.
     """
 
     form: str
     written: str = ""
+    is_beyond: bool = False
 
     def numbers(self, numbers: PoseNumbers) -> FloatArray:
         """(n, k) the numbers that `form` reads."""
@@ -50,7 +56,7 @@ class Turns:
         there: Mask = np.asarray(np.isfinite(rotations).all(axis=(1, 2)))
         written = np.full((len(rotations), ROTATION_FORMS[self.written].size), np.nan)
         written[there] = ROTATION_FORMS[self.written].write(rotations[there])
-        return written
+        return _HALF_TURNED - written * _BEYOND if self.is_beyond else written
 
     def rotations(self, numbers: PoseNumbers) -> FloatArray:
         """(n, 3, 3) rotations; NaN where the numbers are none."""
