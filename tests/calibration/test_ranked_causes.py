@@ -116,6 +116,17 @@ def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
     assert ids(judge(replace(changed(SOUND), warnings=(FIELD,)))) == ["lens_field"]
 
 
+@pytest.mark.parametrize(("sigma_m", "kinds"), [(1e-4, ["lens_field"]), (3e-4, [])])
+def test_what_picks_err_by_hardly_less_without_is_no_doubt(sigma_m, kinds) -> None:
+    # It moves them by up to 0.08 mm; they err by 0.17 and by 0.52 mm.
+    spread = np.diag(np.repeat([1e-6, sigma_m], 3) ** 2)[None]
+    picks = (Picks("cam", "robot", {"look": spread}, np.inf, 0.5),)
+    verdict = judge(replace(SOUND, picks=picks, warnings=(FIELD,)))
+    assert ids(verdict) == kinds
+    assert verdict.status == ("check" if kinds else "good")
+    assert any(finding.words == FIELD.words for finding in verdict.findings)
+
+
 def test_what_moves_with_the_time_passes_for_a_focus_and_not_the_other_way() -> None:
     focus = Finding("focus", "The lens changes its focal length.", mahalanobis_sq=300.0)
     assert ids(judge(changed(SOUND, warnings=(focus, DRIFT))))[0] == "moved_slowly"

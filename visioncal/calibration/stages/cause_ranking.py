@@ -319,6 +319,14 @@ def _odds(chance: float) -> float:
 
 # Without a source of a smaller share of the variance picks err by hardly less: by 5 %.
 _LEAST_SHARE = 0.1
+
+
+def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
+    """Whether picks would err by hardly less without what was found, however sure it is."""
+    least_mm = min((pick.budget_mm["total"] for pick in picks), default=0.0)
+    return found.up_to_mm**2 < _LEAST_SHARE * least_mm**2
+
+
 # What picks are limited by: as a kind, in words, and what helps.
 _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "calibration": (

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import ranked
+from visioncal.calibration.stages.cause_ranking import is_negligible, ranked
 from visioncal.calibration.stages.doubts import doubts_of, helping
 from visioncal.calibration.stages.judged import Findings
 from visioncal.calibration.stages.need import Picks, need_met
@@ -35,6 +35,10 @@ def judge(findings: Findings) -> Verdict:
         says what it needs, the chance that picks land within it decides: good from 0.95, check from
         0.5, bad below, and never good where something is not explained.
     """
+    small = [warning for warning in findings.warnings if is_negligible(warning, findings.picks)]
+    warnings = [warning for warning in findings.warnings if warning not in small]
+    notes = (*findings.notes, *(finding.words for finding in small))
+    findings = replace(findings, warnings=warnings, notes=notes)
     doubts = doubts_of(findings)
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
