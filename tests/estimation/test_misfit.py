@@ -399,7 +399,7 @@ def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
     (found,) = known.findings.warnings
     assert (found.views, "turned by 180 deg" in found.words) == ((5,), True)
     assert "mogrify -rotate 180 SESSION/images/005.png" in found.do.command
-    assert "its image is turned by 180 deg" in known.solved.sights[5].reason
+    assert "its image is turned by 180 deg" in known.solved.views[5].reason
     # 3 components: 5.4 is one in a thousand.
     assert mahalanobis_sq_of_place(cell, known) / 3 < 5.4
 
