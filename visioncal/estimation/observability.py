@@ -101,6 +101,22 @@ def check_observability(
     check_determined(problem, state, noise, _scene(problem, mount), pixel_px, looks=looks)
 
 
+def refuse_open_motion(problem: Problem, state: State, noise: Noise, mount: Mount) -> None:
+    """Refuses motion that leaves a direction open whatever the noise is, before anything is fitted.
+
+    Args:
+        problem: What the views measured.
+        state: Where a fit would start.
+        noise: As it starts.
+        mount: Where the camera is.
+
+    Raises:
+        DegenerateError: A direction is numerically null.
+    """
+    problem, noise = _at_typical_noise(problem, noise, {})
+    _refuse_null(problem, state, noise, _scene(problem, mount))
+
+
 @dataclass(frozen=True)
 class Scene:
     """How messages speak of a cell.
@@ -144,7 +160,9 @@ def check_determined(
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
     problem, noise = _at_typical_noise(problem, noise, pixel_px)
-    _refuse_open(problem.with_effects(()), State(state.edges, np.zeros(0)), noise, scene)
+    frames, placed = problem.with_effects(()), State(state.edges, np.zeros(0))
+    _refuse_null(frames, placed, noise, scene)
+    _refuse_vague(frames, placed, noise, scene)
     if looks and problem.effects:
         cause, advice = scene.undetermined
         first = problem.effects[0].determined
@@ -177,8 +195,8 @@ def _at_typical_noise(
     return typical, Noise(robots, np.minimum(noise.sensors, 1.0))
 
 
-def _refuse_open(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
-    """Refuses frames that are not determined at all, or not well enough."""
+def _refuse_null(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
+    """Refuses frames that are not determined at all."""
     counted = problem.counted
     found = spectrum(fisher_information(problem, state, noise)[np.ix_(counted, counted)])
     if found.ratio < _NULL_RATIO:
@@ -191,7 +209,6 @@ def _refuse_open(problem: Problem, state: State, noise: Noise, scene: Scene) -> 
             culprits=[culprit],
             next_step=scene.advice(frame, culprit),
         )
-    _refuse_vague(problem, state, noise, scene)
 
 
 def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:

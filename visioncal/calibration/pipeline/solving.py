@@ -26,14 +26,16 @@ from visioncal.calibration.stages.refine import lens_levels, refined
 from visioncal.calibration.stages.turned_images import Turned, turned_how
 from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import SolverName
-from visioncal.core.errors import ConvergenceError
-from visioncal.core.types import Mask
+from visioncal.core.errors import ConvergenceError, DegenerateError
+from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.moves import log_gain, slipped_joint
+from visioncal.estimation.observability import refuse_open_motion, too_little_motion
 from visioncal.estimation.outliers import Agreed, all_as_inliers, settle
 from visioncal.estimation.parts import Effect, State
+from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, estimate_noise, starting_noise
 from visioncal.session.frames import frame_name
 
@@ -42,6 +44,8 @@ from visioncal.session.frames import frame_name
 _ROUNDS, _AT_REST_RAD = 4, 1e-7
 # Where all goes astray, boards that are off by more begin as they were found.
 _FAR_SIZE = 5e-3
+# A focal length that corners leave open by more than this share needs an arm that tilts.
+_OPEN_FOCAL = 0.02
 
 
 def solve(
@@ -57,7 +61,8 @@ def solve(
 
     Raises:
         DataError: A level is asked for, and no arm has what it takes.
-        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+        DegenerateError: A robot is tied to nothing, a frame may be in two places, or the
+            motion of one robot leaves a direction, or the lens, open.
     """
     cell = with_poses(cell, looked)
     arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
@@ -68,6 +73,11 @@ def solve(
     if solver != "joint":
         cell, asked = replace(cell, priors=()), "hand-eye"
     begun = started(cell, looked)
+    if begun.cell.mount is not None and not looked.is_misread:
+        # Along a direction that nothing determines, the fit of lens and frames runs away.
+        noise = starting_noise(begun.problem)
+        refuse_open_motion(begun.problem, begun.state, noise, begun.cell.mount)
+        _refuse_open_lens(looked, begun.problem, begun.cell.mount)
     cell, poses = begun.cell, begun.poses
     sizes: Mapping[str, float] = {}
     if looked.is_misread:
@@ -92,6 +102,24 @@ def solve(
     found = replace(found, agreed=with_repeats(found.agreed))
     found = replace(found, arms=with_pose_errors(found.arms, found.part, found.agreed.fit))
     return found if solver == "joint" else _by_closed_form(found, solver)
+
+
+def _refuse_open_lens(looked: Observed, problem: Problem, mount: Mount) -> None:
+    """Refuses a lens that corners leave open and turns about one axis do not determine either."""
+    poses = problem.poses[problem.robots[0]]
+    words, _ = too_little_motion(poses, mount) if len(poses) > 1 else ("", "")
+    for look in looked.cameras.values() if words else ():
+        if look.lens is None or look.lens.covariance is None:
+            continue
+        sigmas = np.sqrt(np.diag(look.lens.covariance)[:2]) / look.lens.camera.matrix[:2]
+        if (focal := float(sigmas.max())) > _OPEN_FOCAL:
+            raise DegenerateError(
+                f"{words} Such motion does not determine the lens, of which the corners leave the "
+                f"focal length open to {100.0 * focal:.1f} %.",
+                culprits=["camera.matrix"],
+                next_step="Give matrix and distortion in [camera]; or add images of the board held "
+                "by hand, tilted by 30 to 45 degrees about different axes, with role = intrinsics.",
+            )
 
 
 def _without_misreported(agreed: Agreed, arms: Mapping[str, RobotArm], before: Mask) -> Agreed:

@@ -1,0 +1,120 @@
+"""Mistakes made in cells: what is said first. Sessions are made with numpy and OpenCV alone."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+import visioncal
+from visioncal.core.errors import DegenerateError
+
+COLUMNS, ROWS, SQUARE_M, RESOLUTION = 9, 6, 0.03, (1280, 800)
+MATRIX, DISTORTION = (1105.0, 1103.0, 652.0, 388.0), (-0.11, 0.07, 0.0006, -0.0004, 0.0)
+MIDDLE_M = np.array([COLUMNS, ROWS, 0.0]) * SQUARE_M / 2.0
+STATED_LENS = f"matrix = {list(MATRIX)}\ndistortion = {list(DISTORTION)}\n"
+
+
+def pose(xyz_m, *xyz_deg) -> RigidTransform:
+    """A pose by its place [m] and its turns about the fixed axes x, y, z [deg]."""
+    return RigidTransform.from_components(xyz_m, Rotation.from_euler("xyz", xyz_deg, degrees=True))
+
+
+FLANGE_FROM_CAM = pose([0.071, -0.032, 0.094], 3.0, -4.0, 88.0)
+BASE_FROM_TARGET = pose([0.62, -0.11, 0.012], 178.2, 0.0, 25.0)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What is real at one stop of a camera on the flange."""
+
+    cam_from_target: RigidTransform
+    flange_from_cam: RigidTransform = FLANGE_FROM_CAM
+    matrix: tuple[float, float, float, float] = MATRIX
+
+
+def looks(count: int, seed: int = 1) -> list[Stop]:
+    """Stops that look at the board's middle from all sides, tilted by up to 35 degrees."""
+    rng, stops = np.random.default_rng(seed), []
+    for _ in range(count):
+        turn = Rotation.from_euler("xyz", rng.uniform([-35, -35, -180], [35, 35, 180]), True)
+        place = [*rng.uniform(-0.06, 0.06, 2), rng.uniform(0.4, 0.65)]
+        stops.append(Stop(RigidTransform.from_components(place - turn.apply(MIDDLE_M), turn)))
+    return stops
+
+
+def about_the_axis(count: int, tilt_deg: float = 14.0, seed: int = 1) -> list[Stop]:
+    """Stops of an arm that turns the flange about its z alone, over a board that lies flat."""
+    rng, stops = np.random.default_rng(seed), []
+    flange_from_cam = pose([0.06, 0.02, 0.05], tilt_deg, 0.0, 86.0)
+    for _ in range(count):
+        turn = Rotation.from_euler("z", rng.uniform(-180.0, 180.0), degrees=True)
+        flat = (flange_from_cam.rotation.inv() * turn).as_matrix()
+        place = [*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.4, 0.55)]
+        rotation = Rotation.from_matrix(flat)
+        cam_from_target = RigidTransform.from_components(place - rotation.apply(MIDDLE_M), rotation)
+        stops.append(Stop(cam_from_target, flange_from_cam))
+    return stops
+
+
+def write(
+    folder: Path,
+    stops: Sequence[Stop],
+    camera: str = "",
+    more: str = "",
+    has_corners: Callable[[int], bool] = lambda _: True,
+) -> Path:
+    """Writes a session with corners.csv; robot and corners have noise of 0.03 mm and 0.1 px.
+
+    Args:
+        folder: Where.
+        stops: What is real.
+        camera: Further lines of `[camera]`.
+        more: Further tables of session.toml.
+        has_corners: Whether a view has rows in corners.csv.
+    """
+    rng = np.random.default_rng(5)
+    folder.mkdir()
+    (folder / "session.toml").write_text(
+        'schema = 1\nname = "cell"\nmount = "eye-in-hand"\ntarget = "charuco_9x6_30mm"\n'
+        f"[camera]\nresolution = {list(RESOLUTION)}\n{camera}{more}"
+    )
+    inner = np.mgrid[1:COLUMNS, 1:ROWS].T.reshape(-1, 2) * SQUARE_M
+    points = np.c_[inner, np.zeros(len(inner))]
+    views, corners = ["view,x_m,y_m,z_m,qx,qy,qz,qw"], ["view,point,u_px,v_px"]
+    for view, stop in enumerate(stops):
+        flange = BASE_FROM_TARGET * stop.cam_from_target.inv() * stop.flange_from_cam.inv()
+        numbers = [*flange.translation, *flange.rotation.as_quat()]
+        views.append(",".join(map(repr, [view, *map(float, numbers)])))
+        off = RigidTransform.from_exp_coords(rng.normal(size=6) * np.repeat([5e-5, 3e-5], 3))
+        seen = stop.cam_from_target * off
+        fx, fy, cx, cy = stop.matrix
+        lens = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        turn, place = seen.rotation.as_rotvec(), seen.translation
+        px, _ = cv2.projectPoints(points, turn, place, lens, np.array(DISTORTION))
+        for point, (u_px, v_px) in enumerate(px[:, 0] + rng.normal(0.0, 0.1, (len(points), 2))):
+            if has_corners(view):
+                corners.append(f"{view},{point},{u_px:.4f},{v_px:.4f}")
+    (folder / "views.csv").write_text("\n".join(views) + "\n")
+    (folder / "corners.csv").write_text("\n".join(corners) + "\n")
+    return folder
+
+
+def test_turning_about_one_axis_is_refused_before_the_fit_runs_away(tmp_path):
+    with pytest.raises(DegenerateError, match="offset along the tool's z is not determined at all"):
+        visioncal.calibrate(write(tmp_path / "axis", about_the_axis(18)))
+
+
+def test_an_arm_that_cannot_tilt_is_asked_for_its_lens(tmp_path):
+    stops = about_the_axis(18)
+    measured = "[prior.flange_from_cam]\nz_m = 0.05\nsigma_m = 0.0005\n"
+    with pytest.raises(DegenerateError, match="Such motion does not determine the lens") as caught:
+        visioncal.calibrate(write(tmp_path / "open", stops, more=measured))
+    assert "role = intrinsics" in caught.value.next_step
+    # With its lens stated, the measured height is enough.
+    stated = visioncal.calibrate(write(tmp_path / "stated", stops, STATED_LENS, measured))
+    off = stated.transforms["flange_from_cam"].inv() * stops[0].flange_from_cam
+    assert 1e3 * np.linalg.norm(off.translation) < 1.5
