@@ -18,7 +18,6 @@ from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -349,8 +348,10 @@ class Problem:
             return first, np.zeros((0, 0), dtype=np.int64)
         used, pairs = np.unique(np.concatenate(joined), return_inverse=True)
         pairs = pairs.reshape(-1, 2)
-        links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
-        units, of_key = connected_components(links, directed=False)
+        units, of_key = len(used), np.arange(len(used))
+        if np.any(pairs[:, 0] != pairs[:, 1]):  # some observations are through several robots
+            links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(used), len(used)))
+            units, of_key = connected_components(links, directed=False)
         order = np.lexsort((used % count, of_key))
         rows, sizes = of_key[order], np.bincount(of_key)
         robots = np.full((units, sizes.max()), -1, dtype=np.int64)
@@ -385,20 +386,17 @@ class Problem:
 
     def knowledge(self, state: State) -> Knowledge:
         """What is known of all p unknowns beside the observations, and half its gradient there."""
-        information = block_diag(
-            np.zeros((6 * len(self.unknown),) * 2),
-            *(effect.known.information for effect in self.effects),
-        )
-        gradient = np.zeros(self.size)
+        information, gradient = np.zeros((self.size, self.size)), np.zeros(self.size)
         for effect in self.effects:
             columns = self.effect_columns[effect.name]
+            information[columns, columns] = effect.known.information
             change = self.values_of(effect.name, state) - effect.values
             gradient[columns] = effect.known.gradient + effect.known.information @ change
         for prior in self.priors:
             away, jacobian = self.prior_rows(prior, state)
             information += jacobian.T @ jacobian
             gradient += jacobian.T @ away
-        return Knowledge(np.asarray(information), gradient)
+        return Knowledge(information, gradient)
 
     def prior_rows(self, prior: FramePrior, state: State) -> tuple[FloatArray, FloatArray]:
         """Residuals (d,) of a prior in units of its sigmas, and their slopes (d, p)."""
