@@ -83,7 +83,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A thousand modules make many objects that stay: looking for garbage among them as often as
     # Python does takes a twentieth of a small calibration's time, and finds none.
-    gc.set_threshold(20_000)
+    gc.set_threshold(20_000, 100)
     # Nor does Python find any among them as it ends, which takes as long again.
     atexit.register(gc.freeze)
     with _guarded_streams(), _WithoutPandas():
