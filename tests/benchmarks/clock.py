@@ -17,7 +17,7 @@ from results import few, wished, write_section
 from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import invert, log
-from visioncal.simulation import CellOptions, SweepOptions, sweep, sweep_session
+from visioncal.simulation import CellOptions, SweepOptions, cell_session, sweep
 
 SWEEPS = 20
 
@@ -62,12 +62,12 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome | None:
     how = replace(world.how, camera_minus_robot_s=ahead_s)
     moved = sweep(replace(world.cell, seed=seed), how)
     try:
-        result = calibrate(sweep_session(moved, "sweep"))
+        result = calibrate(cell_session(moved, "sweep", seen="poses"))
     except VisioncalError:
         return None
-    clock, name = result.clock, next(iter(moved.cell.transforms))
+    clock, name = result.clock, next(iter(moved.transforms))
     edge = result.edges[name]
-    error = log(invert(moved.cell.transforms[name]) @ edge.matrix)
+    error = log(invert(moved.transforms[name]) @ edge.matrix)
     return Outcome(
         clock.camera_minus_robot_s - ahead_s,
         clock.sigma_s,

@@ -53,7 +53,7 @@ def world(options) -> tuple[Cell, visioncal.Calibration, tuple[float, float, flo
     both = sent.reached & np.array([posture.reached for posture in nominal])
     found = []
     for joints in (np.array([posture.positions for posture in nominal]), sent.q):
-        seen = target_in_camera(mount, *true, forward(cell.true_arm, joints[both]))
+        seen = target_in_camera(mount, *true, forward(cell.robot.true_arm, joints[both]))
         away = np.linalg.inv(wanted[both]) - np.linalg.inv(seen)
         found.append(rms_mm(away[:, :3, 3]))
     return cell, result, (found[0], found[1], float(sent.reached.mean()))

@@ -17,7 +17,7 @@ import numpy as np
 from corners import CHARUCO, CHECKERBOARD, detected, peers, rms, shots
 from results import few, first, need, wished, write_section
 from support.boards import charuco
-from support.cells import calibrated, error_of, session_of
+from support.cells import calibrated, error_of, reporting, session_of
 from support.rendered import Shot, photograph
 from support.smeared import smeared
 
@@ -157,10 +157,10 @@ def errors_mm(
 ) -> Iterator[tuple[str, float, float]]:
     """X's distance from the truth, by kind of corners and by the robot's noise."""
     for noise in NOISES_MM:
-        poses = cell.base_from_flange if noise else cell.true_base_from_flange
+        poses = cell.robot.base_from_flange if noise else cell.robot.true_base_from_flange
         for kind, corners in kinds.items():
             known = calibrated(
-                replace(cell, base_from_flange=poses, corners=tuple(corners.values())),
+                reporting(cell, base_from_flange=poses, corners=tuple(corners.values())),
                 joints=False,
             )
             yield kind, noise, 1e3 * float(np.linalg.norm(error_of(cell, known)[3:6]))

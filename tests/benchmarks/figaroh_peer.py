@@ -80,7 +80,7 @@ class World:
     def truly(self, q: FloatArray) -> FloatArray:
         """(k, 4, 4) the true `cam_from_target` at (k, n) joint angles."""
         edges = np.array([*self.cell.transforms.values()])
-        return self.at(edges, forward(self.cell.true_arm, q))
+        return self.at(edges, forward(self.cell.robot.true_arm, q))
 
     def error_mm(self, predict: Predict) -> float:
         """Root mean square error of the camera's place in the target over the workspace."""
@@ -90,7 +90,7 @@ class World:
 
     def noise(self, *, inverted: bool) -> Noise:
         """The poses' true noise per axis, of `cam_from_target` or of its inverse."""
-        true, poses = self.truly(self.cell.joints), self.poses
+        true, poses = self.truly(self.cell.robot.joints), self.poses
         away = log(true @ invert(poses)) if inverted else log(invert(true) @ poses)
         square = np.mean(away**2, axis=0)
         return Noise(np.sqrt(square.reshape(1, 2, 3).mean(axis=2)), np.zeros(0))
@@ -114,7 +114,7 @@ def of_figaroh(world: World) -> dict[str, Found]:
     robot, found = load_robot(world.cell.options.robot), {}
     for name, chosen in settings.items():
         runs = [
-            calibrate(robot, world.cell.joints, world.world_from_marker, chosen)
+            calibrate(robot, world.cell.robot.joints, world.world_from_marker, chosen)
             for _ in range(1 if name == UNTOLD[0] else REPEATS)
         ]
         found[name] = world_view(world, runs[0].predict), min(run.seconds for run in runs)
@@ -140,15 +140,19 @@ def of_our_fit(world: World, *, told: bool) -> Found:
 
 def fitted(world: World, noise: Noise | None) -> tuple[FloatArray, ArmModel]:
     """Both edges and the arm; noise and sizes are estimated where the noise is not told."""
-    cell, q = world.cell, world.cell.joints
-    model = ArmModel.of(load_robot(cell.options.robot), q, cell.base_from_flange)
+    cell, q = world.cell, world.cell.robot.joints
+    model = ArmModel.of(load_robot(cell.options.robot), q, cell.robot.base_from_flange)
     basis = model.columns("links", q)
-    start = SOLVERS["shah"](robot_part(cell.base_from_flange, cell.options.mount), world.poses)
+    start = SOLVERS["shah"](
+        robot_part(cell.robot.base_from_flange, cell.options.mount), world.poses
+    )
     edges = np.stack([start.x, start.z])
     errors = {"links": ArmErrors(basis, SIZE_RAD, 0.0, of_links=True)}
     if noise is None:
         state = State(edges, np.zeros(0))
-        trials = ArmTrials(_chain(world, cell.base_from_flange), state, ROBOT, {"links": basis})
+        trials = ArmTrials(
+            _chain(world, cell.robot.base_from_flange), state, ROBOT, {"links": basis}
+        )
         level = fit_level(trials, LEVELS["geometry"])
         if level is None:
             raise RuntimeError("the arm's errors do not show")

@@ -22,8 +22,7 @@ from visioncal.calibration.pipeline import align
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
-from visioncal.simulation.network import simulate_network
-from visioncal.simulation.records import network_session
+from visioncal.simulation.records import cell_session
 
 VIEWS = (20, 60, 125, 250, 500, 1000)
 CAMERAS = (2, 4, 6, 8, 10)
@@ -65,8 +64,8 @@ def of_cameras(task: tuple[int, int, bool]) -> dict[str, float]:
         "stray_images": 6,
     }
     options = NetworkOptions(cameras=around, stops=stops, seed=1, **(faults if faulty else {}))
-    cell = simulate_network(options)
-    session = network_session(cell, "network", seen="names")
+    cell = simulate(options)
+    session = cell_session(cell, "network", seen="names")
     corners = {view_corners.view: view_corners for view_corners in cell.corners}
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begin = time.process_time()

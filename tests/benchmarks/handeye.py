@@ -26,7 +26,6 @@ from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.simulation import Cell, CellOptions, fine_camera, simulate, wide_camera
 from visioncal.simulation.boards import Sheet, corners_m
-from visioncal.simulation.observed_points import Network, whole
 
 SEEDS, FEW = 1000, 50
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"
@@ -94,7 +93,7 @@ def opencv_poses(cell: Cell) -> FloatArray:
 def opencv_errors(cell: Cell) -> FloatArray:
     """(methods, 2) rotation [rad] and translation [m] errors of X by each of OpenCV's solvers."""
     x, z = cell.transforms.values()
-    robot = cell.base_from_flange
+    robot = cell.robot.base_from_flange
     problem = Problem(
         robot if cell.options.mount == IN_HAND else invert(robot), opencv_poses(cell), x, z
     )
@@ -118,7 +117,7 @@ def mahalanobis_sq(error: FloatArray, covariance: FloatArray) -> float:
     return float(error @ np.linalg.solve(covariance, error)) / len(error)
 
 
-def edge_bound(cell: Network) -> FloatArray:
+def edge_bound(cell: Cell) -> FloatArray:
     """Least covariance (12, 12) of x and z of a cell whose board is as stated."""
     return network_bound(cell, "base", sizes=False).covariance
 
@@ -131,7 +130,7 @@ def against_the_bound(task: tuple[World, int]) -> list[float] | None:
         known = calibrated(cell)
     except VisioncalError:
         return None
-    bound, error = edge_bound(whole(cell)), error_of(cell, known)
+    bound, error = edge_bound(cell), error_of(cell, known)
     return [
         *squared(error),
         float(np.trace(bound[:3, :3])),
@@ -175,9 +174,8 @@ def with_wrong_views(task: tuple[World, int, int]) -> list[float] | None:
         known = calibrated(cell)
     except VisioncalError:
         return None
-    world = whole(cell)
-    right = tuple(sight for sight in world.sights if sight.view not in cell.wrong_views)
-    bound, error = edge_bound(replace(world, sights=right)), error_of(cell, known)
+    right = tuple(sight for sight in cell.sights if sight.view not in cell.wrong_views)
+    bound, error = edge_bound(replace(cell, sights=right)), error_of(cell, known)
     out = set(range(row.options.views)) - set(known.used)
     return [
         *squared(error),

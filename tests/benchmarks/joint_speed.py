@@ -82,7 +82,7 @@ def by_pyceres(cell: Cell, stacks: list[CornerStack], start: State) -> State:
     x, z = np.zeros(6), np.zeros(6)
     flanges = [np.zeros(6) for _ in stacks]
     covariance = np.diag(np.repeat(NOISE.robots[0] ** 2, 3))
-    for stack, robot, flange in zip(stacks, cell.base_from_flange, flanges, strict=True):
+    for stack, robot, flange in zip(stacks, cell.robot.base_from_flange, flanges, strict=True):
         problem.add_residual_block(ViewCost(stack, cell, robot, start), None, [x, z, flange])
         prior = pyceres.factors.NormalPrior(np.zeros(6), covariance)
         problem.add_residual_block(prior, None, [flange])
@@ -97,10 +97,10 @@ def by_pyceres(cell: Cell, stacks: list[CornerStack], start: State) -> State:
 def by_visioncal(cell: Cell, stack: CornerStack, start: State) -> State:
     with one_blas_thread():
         x, z = start.edges
-        predicted = invert(cell.base_from_flange @ x) @ z
+        predicted = invert(cell.robot.base_from_flange @ x) @ z
         fit = fit_poses(stack, cell.options.camera, predicted)
         covariance = PIXEL_PX**2 * covariance_from(fit.information)
-        problem = chain("eye-in-hand", cell.base_from_flange, fit.cam_from_target, covariance)
+        problem = chain("eye-in-hand", cell.robot.base_from_flange, fit.cam_from_target, covariance)
         return solve_problem(problem, start, NOISE)[0]
 
 

@@ -95,7 +95,7 @@ def of_poses(cell: Cell) -> RunState:
     rows = [
         [str(at), *numbers(robot), *numbers(camera)]
         for at, (robot, camera) in enumerate(
-            zip(cell.base_from_flange, cell.cam_from_target, strict=True)
+            zip(cell.robot.base_from_flange, cell.cam_from_target, strict=True)
         )
     ]
     document = {"schema": 1, "name": "poses", "mount": cell.options.mount}
@@ -120,7 +120,7 @@ def lands(
     true, found = next(iter(cell.transforms.values())), known.solved.state.edges[0]
     sigmas = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3)
     if cell.options.mount == "eye-in-hand":
-        reported = cell.base_from_flange[at]
+        reported = cell.robot.base_from_flange[at]
         true = reported @ exp(sigmas * rng.standard_normal(6)) @ true
         found = reported @ found
     shown = in_camera = cell.cam_from_target[at]

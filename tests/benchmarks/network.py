@@ -19,9 +19,9 @@ from visioncal.calibration.pipeline import align
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.results import Calibration
+from visioncal.simulation import Cell, simulate
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
-from visioncal.simulation.network import Network, simulate_network
-from visioncal.simulation.records import network_session
+from visioncal.simulation.records import cell_session
 
 CELLS = 50
 STOPS = 30
@@ -41,20 +41,20 @@ def drawn(options: NetworkOptions, seed: int) -> NetworkOptions:
     return replace(options, boards=boards, seed=seed)
 
 
-def aligned(cell: Network) -> Calibration:
-    session = network_session(cell, "network", seen="names")
+def aligned(cell: Cell) -> Calibration:
+    session = cell_session(cell, "network", seen="names")
     return align(
         session, corners={view_corners.view: view_corners for view_corners in cell.corners}
     )
 
 
-def away(cell: Network, found: Calibration, frames: Sequence[str]) -> FloatArray:
+def away(cell: Cell, found: Calibration, frames: Sequence[str]) -> FloatArray:
     """(6 f,) by which frames are off, on their right."""
     parts = []
     for name in frames:
-        truth = cell.transforms[name]
+        truth = cell.mountings[name]
         if found.cell.tree[name] == "cell":
-            truth = invert(cell.transforms[found.cell.reference]) @ truth
+            truth = invert(cell.mountings[found.cell.reference]) @ truth
         parts.append(log(invert(truth) @ found.tree.edge_of(name).matrix))
     return np.concatenate(parts)
 
@@ -71,7 +71,7 @@ class Clean:
 
 
 def clean(seed: int) -> Clean:
-    cell = simulate_network(drawn(NetworkOptions(stops=STOPS), seed))
+    cell = simulate(drawn(NetworkOptions(stops=STOPS), seed))
     begin = time.process_time()
     found = aligned(cell)
     taken = time.process_time() - begin
@@ -108,8 +108,8 @@ def faulty(seed: int) -> Faulty:
     half = Moved(board, int(rng.integers(STOPS // 3, 2 * STOPS // 3)))
     bumped = Moved(camera, int(rng.integers(STOPS // 3, 2 * STOPS // 3)))
     options = drawn(NetworkOptions(stops=STOPS), seed)
-    cell = simulate_network(replace(options, moved=(half, bumped), swapped_rows=1, stray_images=6))
-    good = simulate_network(options)
+    cell = simulate(replace(options, moved=(half, bumped), swapped_rows=1, stray_images=6))
+    good = simulate(options)
     found, before = aligned(cell), aligned(good)
     told = [_tells(found, move) for move in (half, bumped)]
     reasons = {sight.view: sight.reason for sight in found.views if not sight.used}
@@ -134,7 +134,7 @@ def _tells(found: Calibration, push: Moved) -> bool:
     )
 
 
-def _mm(cell: Network, found: Calibration) -> float:
+def _mm(cell: Cell, found: Calibration) -> float:
     return 1e3 * float(np.linalg.norm(away(cell, found, ["base_b"])[3:]))
 
 
@@ -145,7 +145,7 @@ def four_cameras_s() -> float:
     cameras = tuple(
         CameraAt(name, place_m=place) for name, place in zip(names, places, strict=True)
     )
-    cell = simulate_network(NetworkOptions(cameras=cameras, stops=40))
+    cell = simulate(NetworkOptions(cameras=cameras, stops=40))
     taken = []
     for _ in range(few(3, 1)):
         begin = time.process_time()

@@ -205,7 +205,7 @@ def one_axis(mount: str, seed: int) -> tuple[float, ...]:
     q = candidates(begun.cell, 400, seed=seed).q
     added = next_best(begun, PURPOSES["hand-eye"], q, 5, seed=seed)
     whole = simulate(
-        replace(options, motion="free"), np.concatenate([cell.joints, q[added.design.rows]])
+        replace(options, motion="free"), np.concatenate([cell.robot.joints, q[added.design.rows]])
     )
     known = calibrated(whole, level="hand-eye")
     obtained = sigmas(known.solved.covariance)

@@ -22,12 +22,11 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners, FloatArray
 from visioncal.results import Calibration
 from visioncal.session import Session
+from visioncal.simulation import Cell, simulate
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
-from visioncal.simulation.network import simulate_network
-from visioncal.simulation.observed_points import Network
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import BOARDS
-from visioncal.simulation.records import network_session
+from visioncal.simulation.records import cell_session
 
 CELLS = 50
 STOPS = 40
@@ -66,15 +65,15 @@ class World:
         corners: What is detected, by view.
     """
 
-    cell: Network
+    cell: Cell
     session: Session
     corners: Mapping[int, Corners]
 
 
 def world(seed: int) -> World:
-    cell = simulate_network(options(seed))
+    cell = simulate(options(seed))
     rng = np.random.default_rng([seed, 77])
-    session = network_session(cell, "everything", seen="names")
+    session = cell_session(cell, "everything", seen="names")
     height_m = cell.between("base_a", "base_b")[2, 3] + GAUGE_M * float(rng.standard_normal())
     prior = {"z_m": height_m, "sigma_m": GAUGE_M}
     built = Session.assemble(
@@ -144,18 +143,18 @@ def outcome(seed: int) -> Outcome:
     )
 
 
-def _zeros(found: Calibration, cell: Network, robot: str) -> FloatArray:
+def _zeros(found: Calibration, cell: Cell, robot: str) -> FloatArray:
     """(k,) errors over their sigmas of the joints' zeros."""
     rows = found.cell.robots[robot].arm.parameters
     zeros = [row for row in rows if row.name == "theta_rad"]
-    away = [zero.change for zero in zeros] - cell.true_arms[robot].offset
+    away = [zero.change for zero in zeros] - cell.robots[robot].true_arm.offset
     return np.asarray(away / [zero.sigma for zero in zeros])
 
 
-def _true(cell: Network, name: str, reference: str) -> FloatArray:
+def _true(cell: Cell, name: str, reference: str) -> FloatArray:
     """(4, 4) where a frame is on its flange, or in the cell."""
-    at = cell.transforms[name]
-    return invert(cell.transforms[reference]) @ at if cell.parents[name] == "cell" else at
+    at = cell.mountings[name]
+    return invert(cell.mountings[reference]) @ at if cell.parents[name] == "cell" else at
 
 
 def report(cells: Sequence[Outcome], taken_s: float) -> str:

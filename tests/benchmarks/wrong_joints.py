@@ -76,7 +76,7 @@ def looked_at(arm: str, seed: int) -> dict[Key, bool]:
             yes = is_named(changed, name) if is_slip else bool(alarms(changed))
             found[name, arm, with_poses] = yes
             if yes != is_slip:
-                model = of.options.robot, len(of.joints)
+                model = of.options.robot, len(of.robot.joints)
                 print(name, arm, with_poses, seed, *model, changed.words, changed.said()[:300])
     return found
 

@@ -29,9 +29,8 @@ from visioncal.simulation.layout import (
     PointAt,
     RobotAt,
 )
-from visioncal.simulation.network import simulate_network
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.records import cell_session, network_session
+from visioncal.simulation.records import cell_session
 from visioncal.simulation.rows import pose_row
 from visioncal.simulation.sag import Payload
 
@@ -44,13 +43,13 @@ RIGHT = CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera())
 
 
 def aligned(cell):
-    session = network_session(cell, "cell", seen="names")
+    session = cell_session(cell, "cell", seen="names")
     return align(session, corners={corner.view: corner for corner in cell.corners})
 
 
 @pytest.fixture(scope="module")
 def clean():
-    cell = simulate_network(NetworkOptions(stops=STOPS))
+    cell = simulate(NetworkOptions(stops=STOPS))
     return cell, aligned(cell)
 
 
@@ -142,7 +141,7 @@ def test_the_weakest_link_is_the_frame_that_is_known_worst(clean):
 def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
     pushes = (Moved("target_floor", 9), Moved("cam_right", 12))
     options = NetworkOptions(stops=STOPS, moved=pushes, swapped_rows=1, stray_images=3, seed=3)
-    cell = simulate_network(options)
+    cell = simulate(options)
     found = aligned(cell)
     assert [(value.frame, value.first_stop) for value in found.cell.moved] == [
         ("target_floor", 9),
@@ -167,7 +166,7 @@ def test_all_that_is_wrong_is_named_and_the_answer_is_that_of_a_sound_cell():
 def test_a_frame_that_moved_twice_has_three_places_however_its_moves_were_found():
     """The later push is found first."""
     pushes = (Moved("target_floor", 4), Moved("target_floor", 10))
-    found = aligned(simulate_network(NetworkOptions(stops=STOPS, moved=pushes, seed=3)))
+    found = aligned(simulate(NetworkOptions(stops=STOPS, moved=pushes, seed=3)))
     frame = "target_floor"
     befores = [f"{frame}_until_stop_3", f"{frame}_until_stop_9"]
     assert [value.before for value in found.cell.moved] == befores
@@ -177,7 +176,7 @@ def test_a_frame_that_moved_twice_has_three_places_however_its_moves_were_found(
 
 
 def test_a_robot_that_was_pushed_is_named_and_counts_as_it_stood_before():
-    cell = simulate_network(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
+    cell = simulate(NetworkOptions(stops=STOPS, moved=(Moved("base_b", 10),)))
     found = aligned(cell)
     (words,) = [reason for reason in found.verdict.reasons if "pushed" in reason]
     assert "by way of flange_b from stop 10 on" in words
@@ -192,7 +191,7 @@ def test_boards_that_look_alike_from_both_ends_are_told_apart_across_cameras():
         BoardAt("plate_a", "a", target=ALIKE),
         BoardAt("plate_b", "b", target=ALIKE),
     )
-    cell = simulate_network(NetworkOptions(boards=boards, stops=STOPS))
+    cell = simulate(NetworkOptions(boards=boards, stops=STOPS))
     found = aligned(cell)
     assert all(view.used for view in found.views)
     for frames in (("base_a", "base_b"), ("cam_left", "cam_right")):
@@ -204,7 +203,7 @@ def test_a_board_of_a_wholly_other_size_is_found_and_the_cell_is_where_it_is():
     floor, _, plate = OPTIONS.boards
     target = replace(floor.target, square_sigma_m=1e-5)
     boards = (replace(floor, target=target, scale=1.05), plate)
-    found = aligned(cell := simulate_network(replace(OPTIONS, boards=boards)))
+    found = aligned(cell := simulate(replace(OPTIONS, boards=boards)))
     (cause, *_) = found.verdict.causes
     assert cause.kind == "board_size"
     assert "the board floor is 5 % larger than stated" in cause.words
@@ -213,7 +212,7 @@ def test_a_board_of_a_wholly_other_size_is_found_and_the_cell_is_where_it_is():
 
 def test_lenses_come_from_images_of_their_own():
     cameras = (replace(LEFT, state_intrinsics=False), replace(RIGHT, state_intrinsics=False))
-    cell = simulate_network(NetworkOptions(cameras=cameras, lens_views=12, stops=STOPS))
+    cell = simulate(NetworkOptions(cameras=cameras, lens_views=12, stops=STOPS))
     assert LEFT.camera.resolution != RIGHT.camera.resolution
     found = aligned(cell)
     assert off(cell, found, "base_a", "base_b")[1] < 22.0
@@ -231,7 +230,7 @@ def test_lenses_come_from_images_of_their_own():
 @pytest.mark.parametrize("mode", ["auto", slow("hold")])
 def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     cell, right = clean
-    session = network_session(cell, "cell", seen="names")
+    session = cell_session(cell, "cell", seen="names")
     stated = session.document["cameras"]["left"]
     wrong = np.add(stated["matrix"], [8.0, 8.0, -3.0, 4.0])
     left = {**stated, "matrix": wrong.tolist(), "intrinsics": mode}
@@ -266,8 +265,8 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
 
 @pytest.mark.parametrize("pixel_px", [0.1, 1.0])
 def test_noise_of_corners_refuses_no_lens(pixel_px):
-    cell = simulate_network(NetworkOptions(stops=6, pixel_sigma_px=pixel_px))
-    session = network_session(cell, "cell", seen="names")
+    cell = simulate(NetworkOptions(stops=6, pixel_sigma_px=pixel_px))
+    session = cell_session(cell, "cell", seen="names")
     given = ("matrix", "distortion", "matrix_sigma_px")
     cameras = {
         name: {key: value for key, value in table.items() if key not in given}
@@ -283,8 +282,8 @@ def test_noise_of_corners_refuses_no_lens(pixel_px):
 
 def test_cameras_in_the_hand_and_poses_that_are_given():
     cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
-    cell = simulate_network(NetworkOptions(cameras=cameras, boards=(FLOOR,), stops=STOPS))
-    found = align(network_session(cell, "cell", seen="poses"))
+    cell = simulate(NetworkOptions(cameras=cameras, boards=(FLOOR,), stops=STOPS))
+    found = align(cell_session(cell, "cell", seen="poses"))
     away, squared = off(cell, found, "base_a", "base_b")
     assert np.linalg.norm(away[3:]) < 1e-3
     # The noise of the given poses is estimated, too: fewer are told than they are.
@@ -302,9 +301,7 @@ TRACKERS = (InstrumentAt("t1", (0.0, -3.0, 1.2)), InstrumentAt("t2", (0.5, 3.0, 
 
 
 def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera():
-    cell = simulate_network(
-        NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12)
-    )
+    cell = simulate(NetworkOptions(cameras=(), instruments=TRACKERS, points=POINTS, stops=12))
     # The second stands alone but for the points in the cell.
     kept = [
         reading
@@ -322,8 +319,8 @@ def test_instruments_and_the_points_that_they_share_tie_robots_without_a_camera(
 
 
 def test_readings_of_one_instrument_in_millimetres_are_refused_in_a_cell():
-    cell = simulate_network(NetworkOptions(instruments=TRACKERS, points=POINTS, stops=4))
-    session = network_session(cell, "cell", seen="names")
+    cell = simulate(NetworkOptions(instruments=TRACKERS, points=POINTS, stops=4))
+    session = cell_session(cell, "cell", seen="names")
     views = tuple(
         replace(
             view,
@@ -342,9 +339,7 @@ def test_readings_of_one_instrument_in_millimetres_are_refused_in_a_cell():
 
 
 def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
-    cell = simulate_network(
-        NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=STOPS)
-    )
+    cell = simulate(NetworkOptions(instruments=TRACKERS[:1], points=POINTS[:3], stops=STOPS))
     found = aligned(cell)
     (remedy,) = {value.remedy for value in found.cell.untied if value.frame == "instrument_t1"}
     assert "read points on a robot's flange" in remedy
@@ -358,8 +353,8 @@ ERRING = (
 
 @pytest.mark.slow
 def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for():
-    cell = simulate_network(NetworkOptions(robots=ERRING, stops=STOPS))
-    session = network_session(cell, "cell", seen="names")
+    cell = simulate(NetworkOptions(robots=ERRING, stops=STOPS))
+    session = cell_session(cell, "cell", seen="names")
     corners = {view_corners.view: view_corners for view_corners in cell.corners}
     reported = align(session, corners=corners, level="hand-eye")
     assert sum("follow the arm's posture" in reason for reason in reported.verdict.reasons) == 2
@@ -368,7 +363,7 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
     for robot in ("a", "b"):
         kinematics = found.cell.robots[robot].arm
         assert kinematics.level == "offsets"
-        true = cell.true_arms[robot].offset - cell.arms[robot].offset
+        true = cell.robots[robot].true_arm.offset - cell.robots[robot].arm.offset
         arm = kinematics.robot
         told = arm.chain.functions[:, 0] - load_robot("ur5e").chain.functions[:, 0]
         # What the first joint and the last take may be the base's and the flange's: they stay about
@@ -392,7 +387,9 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
         assert after == pytest.approx(held_out["offsets"], rel=1e-9)
         one = found.of("cam_left", robot, f"target_plate_{robot}")
         np.testing.assert_allclose(
-            one.standing(cell.joints[robot]), arm.base_from_flange(cell.joints[robot]), atol=1e-12
+            one.standing(cell.robots[robot].joints),
+            arm.base_from_flange(cell.robots[robot].joints),
+            atol=1e-12,
         )
         written = document(found, "robot-dh", Selection(robot=robot))
         assert f"theta_offset_rad = {told[1]:.6f}"[:-2] in written.text
@@ -406,7 +403,7 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
 
 def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
     cell, _ = clean
-    session = network_session(cell, "cell", seen="names")
+    session = cell_session(cell, "cell", seen="names")
     columns = [column for column in session.columns if not column.startswith("q")]
     columns += ["qx", "qy", "qz", "qw"]
     bare = Session.assemble(
@@ -425,19 +422,19 @@ def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
 
 def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
     boards = (FLOOR, BoardAt("plate_a", "a"))
-    cell = simulate_network(NetworkOptions(boards=boards, stops=8))
+    cell = simulate(NetworkOptions(boards=boards, stops=8))
     with pytest.raises(DegenerateError, match="nothing ties base_b to base_a") as caught:
         aligned(cell)
     assert "put a board on flange_b and let cam_left, cam_right see it" in caught.value.next_step
 
 
 def test_few_stops_are_said_to_be_few():
-    cell = simulate_network(NetworkOptions(stops=6))
+    cell = simulate(NetworkOptions(stops=6))
     found = aligned(cell)
     assert found.verdict.status == "check"
     assert "Robot a: only 6 stops are used; 10 or more are needed" in found.verdict.reasons[0]
     with pytest.raises(DegenerateError, match=r"too few, .* all 2 stops of robot b"):
-        aligned(simulate_network(NetworkOptions(stops=2)))
+        aligned(simulate(NetworkOptions(stops=2)))
 
 
 def one_camera(cell):
@@ -513,7 +510,7 @@ def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
     wall = BoardAt("wall", place_m=(3.0, 0.0, 0.05))
     apart = CameraAt("apart", place_m=(3.0, -1.0, 1.1), looks_at_m=(3.0, 0.0, 0.05))
     boards = (FLOOR, BoardAt("plate_a", "a"), BoardAt("plate_b", "b"), wall)
-    cell = simulate_network(NetworkOptions(cameras=(LEFT, RIGHT, apart), boards=boards, stops=12))
+    cell = simulate(NetworkOptions(cameras=(LEFT, RIGHT, apart), boards=boards, stops=12))
     found = aligned(cell)
     assert {value.frame for value in found.cell.untied} == {"cam_apart", "target_wall"}
     assert found.verdict.status == "check"
@@ -525,7 +522,7 @@ def test_a_camera_that_sees_nothing_but_its_own_board_is_reported():
 def test_a_camera_that_a_board_ties_either_way_round_is_refused():
     beside = CameraAt("right", place_m=(0.15, 0.95, 1.25), looks_at_m=(0.0, 0.0, 0.05))
     boards = (replace(FLOOR, target=ALIKE), BoardAt("plate_a", "a"))
-    cell = simulate_network(
+    cell = simulate(
         NetworkOptions(
             robots=(RobotAt("a", (-0.6, 0.0, 0.0)),),
             cameras=(LEFT, beside),
@@ -544,7 +541,7 @@ def test_a_camera_that_a_board_ties_either_way_round_is_refused():
 @pytest.mark.slow
 def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
     cell, _ = clean
-    session = network_session(cell, "cell", seen="names")
+    session = cell_session(cell, "cell", seen="names")
     corners = {corner.view: corner for corner in cell.corners}
     held = set(list(corners)[::7])
     views = [replace(view, holdout=view.number in held) for view in session.views]
@@ -599,7 +596,7 @@ def with_elbow_of_b(session, change):
 @pytest.mark.slow
 def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
     cell, _ = clean
-    session, corners = network_session(cell, "cell", seen="names"), dict(enumerate(cell.corners))
+    session, corners = cell_session(cell, "cell", seen="names"), dict(enumerate(cell.corners))
     moved = with_elbow_of_b(session, lambda value: value | {"q3_rad": value["q3_rad"] + 0.2})
     found = align(moved, corners=corners)
     (words,) = [reason for reason in found.verdict.reasons if "elbow_joint" in reason]
@@ -635,7 +632,7 @@ def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path
     options = NetworkOptions(
         robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate_a", "a"),), stops=STOPS
     )
-    session = network_session(simulate_network(options), "cell", seen="poses")
+    session = cell_session(simulate(options), "cell", seen="poses")
     session.save(tmp_path / "session")
     out = tmp_path / "out"
     done = visioncal("calibrate", tmp_path / "session", "-o", out, "--json")
@@ -685,16 +682,17 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
 
 def reported(cell, robot, poses):
     """A session in which one robot reports other poses, and what was seen in its images."""
-    told = {**cell.base_from_flange, robot: poses}
-    session = network_session(replace(cell, base_from_flange=told), "cell", seen="names")
+    told = replace(cell.robots[robot], base_from_flange=poses)
+    cell = replace(cell, robots={**cell.robots, robot: told})
+    session = cell_session(cell, "cell", seen="names")
     return session, {corner.view: corner for corner in cell.corners}
 
 
 @pytest.mark.slow
 def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
-    cell = simulate_network(NetworkOptions(stops=40))
+    cell = simulate(NetworkOptions(stops=40))
     share = np.linspace(-0.5, 0.5, 40)[:, None]
-    crept = exp(share * np.array([0, 0, 0, 0, 6e-4, 0])) @ cell.base_from_flange["a"]
+    crept = exp(share * np.array([0, 0, 0, 0, 6e-4, 0])) @ cell.robots["a"].base_from_flange
     session, corners = reported(cell, "a", crept)
     (said,) = [
         reason for reason in align(session, corners=corners).verdict.reasons if "drift" in reason
@@ -704,7 +702,7 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     assert float(said.split("moved by ")[1].split(" mm")[0]) == pytest.approx(0.6, abs=0.1)
     rng = np.random.default_rng(1)
     alike = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 4, axis=0)
-    session, corners = reported(cell, "b", cell.base_from_flange["b"] @ exp(alike))
+    session, corners = reported(cell, "b", cell.robots["b"].base_from_flange @ exp(alike))
     found = align(session, corners=corners)
     assert any(reason.startswith("Robot b: neighbouring stops") for reason in found.verdict.reasons)
     assert not any(reason.startswith("Robot a:") for reason in found.verdict.reasons)
@@ -721,7 +719,7 @@ def test_a_board_of_another_size_is_found_beside_arms_that_err():
     boards = (replace(FLOOR, scale=1.002), BoardAt("plate_a", "a"), BoardAt("plate_b", "b"))
     cameras = (replace(LEFT, camera=fine_camera()), RIGHT, CameraAt("hand", "b"))
     options = NetworkOptions(robots, cameras, boards, stops=2 * STOPS)
-    found = aligned(simulate_network(options))
+    found = aligned(simulate(options))
     floor = found.cell.boards["floor"]
     # Four of its sigmas: one run in fifteen thousand.
     assert abs(floor.shape["scale"] - 0.002) < 4 * floor.sigma["scale"] < 4e-4
@@ -737,7 +735,7 @@ def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     scales = {"floor": 1.002, "plate_a": 0.999, "plate_b": 1.001}
     boards = (replace(board, scale=scales[board.name]) for board in NetworkOptions().boards)
     found = aligned(
-        simulate_network(NetworkOptions(tuple(robots), boards=tuple(boards), stops=STOPS, seed=5))
+        simulate(NetworkOptions(tuple(robots), boards=tuple(boards), stops=STOPS, seed=5))
     )
     shapes = {name: found.cell.boards[name].shape["scale"] for name in scales}
     # Against each other they are known to some hundred-thousandths.
@@ -755,7 +753,7 @@ def test_errors_of_an_arm_that_are_free_on_the_way_may_be_no_unknowns_at_the_end
         replace(board, scale=float(scale))
         for board, scale in zip(NetworkOptions().boards, scales, strict=True)
     ]
-    cell = simulate_network(NetworkOptions(boards=tuple(boards), stops=30, seed=47))
+    cell = simulate(NetworkOptions(boards=tuple(boards), stops=30, seed=47))
     found = aligned(cell)
     # The worst of fifty such cells; chi-square of 6 beyond 28 is 0.01 %.
     assert off(cell, found, "base_a", "base_b")[1] < 28.0

@@ -21,9 +21,9 @@ from visioncal.simulation import (
     CameraAt,
     NetworkOptions,
     RobotAt,
-    simulate_network,
+    simulate,
     wide_camera,
-    write_network,
+    write_session,
 )
 
 SMALL = replace(wide_camera(), resolution=(640, 480), matrix=np.array([560.0, 559.0, 321.0, 238.0]))
@@ -49,7 +49,7 @@ OPTIONS = NetworkOptions(
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    return write_network(simulate_network(OPTIONS), tmp_path_factory.mktemp("cell") / "cell")
+    return write_session(simulate(OPTIONS), tmp_path_factory.mktemp("cell") / "cell")
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def out(folder, tmp_path_factory) -> Path:
 
 
 def test_pictures_of_several_cameras_are_one_cell(out):
-    cell, found = simulate_network(OPTIONS), Calibration.load(out)
+    cell, found = simulate(OPTIONS), Calibration.load(out)
     for frame in ("base_b", "cam_left", "cam_right"):
         edge = found.between("base_a", frame)
         off = log((np.linalg.inv(edge.matrix) @ cell.between("base_a", frame))[None])[0]

@@ -362,7 +362,9 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     row = "shoulder_lift_joint" if convention == "modified" else "shoulder_pan_joint"
     alpha = changes[row, "alpha_rad"]
     assert alpha["sigma"] < 1e-4
-    assert alpha["identified"] == pytest.approx(cell.true_arm.alpha[0], abs=4 * alpha["sigma"])
+    assert alpha["identified"] == pytest.approx(
+        cell.robot.true_arm.alpha[0], abs=4 * alpha["sigma"]
+    )
     places = found["workspace_map"]
     assert 150 < len(places) <= 200
     assert all(0.0 < place["sigma_mm"] < 5.0 and place["z_m"] > 0.0 for place in places)

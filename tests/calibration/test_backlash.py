@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import arm_found, calibrated
+from support.cells import arm_found, calibrated, reporting
 from support.wrong_arms import COBOT, GOOD, SAGGING
 
 from visioncal.calibration.pipeline.result import result_of
@@ -45,7 +45,7 @@ def test_play_is_in_the_result(worn):
 def test_an_arm_that_is_right_but_for_its_play(way):
     cell = simulate(replace(GOOD, views=40, backlash_rad=PLAY, seed=3))
     # Some write the side that the joints moved to; a dead-band is a width all the same.
-    known = calibrated(replace(cell, approach=way * cell.approach))
+    known = calibrated(reporting(cell, approach=way * cell.robot.approach))
     assert known.robot_arm.kinematics.level == "backlash"
     told = [play.deadband_rad for play in arm_found(known).plays]
     assert told == pytest.approx(PLAY, abs=1.5e-4)
@@ -61,5 +61,5 @@ def test_an_arm_that_is_right_but_for_its_play(way):
 @pytest.mark.slow
 def test_stops_from_one_side_tell_no_play():
     cell = simulate(replace(SAGGING, backlash_rad=PLAY, seed=2))
-    known = calibrated(replace(cell, approach=np.ones(len(cell.approach))))
+    known = calibrated(reporting(cell, approach=np.ones(len(cell.robot.approach))))
     assert arm_found(known).plays == ()

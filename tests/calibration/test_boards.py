@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
-from support.cells import arm_found, calibrated, error_of
+from support.cells import arm_found, board_numbers, calibrated, error_of, reporting, showing
 
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.pipeline.guess_inputs import guess_session
@@ -115,7 +115,7 @@ def test_each_board_adds_six_values_that_are_determined():
     assert known.robot_arm.kinematics.level == "geometry"
     assert (counts.columns, counts.identifiable, counts.determined) == (54, 36, 36)
     # The first board alone determines thirty.
-    one = calibrated(without(cell, set(np.flatnonzero(cell.shown.boards == 1).tolist())))
+    one = calibrated(without(cell, set(np.flatnonzero(board_numbers(cell) == 1).tolist())))
     counts = arm_found(one).numbers.counts
     assert (counts.columns, counts.identifiable) == (48, 30)
 
@@ -126,7 +126,7 @@ def error_m(cell, known):
     q = postures(robot)
     x, z, *_ = cell.transforms.values()
     board = known.solved.state.edges[1]
-    true = invert(x) @ forward(cell.true_arm, q) @ z
+    true = invert(x) @ forward(cell.robot.true_arm, q) @ z
     ours = invert(known.solved.state.edges[0]) @ robot.base_from_flange(q) @ board
     return float(np.sqrt(np.mean(np.sum((true - ours)[:, :3, 3] ** 2, axis=1))))
 
@@ -135,12 +135,14 @@ def test_a_wrong_view_of_one_board_is_named():
     cell = simulate(replace(TWO, seed=4))
     corners = list(cell.corners)
     # One view of the second board shows it shifted by two squares.
-    slipped = next(at for at in np.flatnonzero(cell.shown.boards == 1) if len(corners[at].ids) > 40)
+    slipped = next(
+        at for at in np.flatnonzero(board_numbers(cell) == 1) if len(corners[at].ids) > 40
+    )
     pose = cell.cam_from_target[slipped] @ exp(np.array([0, 0, 0.02, 0.03, 0.0, 0.0]))
     turned = replace(cell.exact_corners[slipped], view=int(slipped))
-    points = corners_m(cell.sheets[1])[turned.ids] @ pose[:3, :3].T + pose[:3, 3]
+    points = corners_m(cell.layout.boards[1])[turned.ids] @ pose[:3, :3].T + pose[:3, 3]
     corners[slipped] = replace(turned, px=project(cell.options.camera, points))
-    known = calibrated(replace(cell, corners=tuple(corners)))
+    known = calibrated(showing(cell, corners))
     assert set(range(len(corners))) - set(known.used) == {slipped}
     assert "disagrees with the other views" in known.reasons[slipped]
     assert any(f"View {slipped} was left out" in reason for reason in known.verdict.reasons)
@@ -173,7 +175,7 @@ def test_files_from_before_boards_were_sheared_mean_the_same_values():
 
 def test_one_view_places_a_board():
     cell = simulate(replace(TWO, second=replace(Second(), target=BOARDS["charuco"]), seed=6))
-    further = np.flatnonzero(cell.shown.boards == 1)
+    further = np.flatnonzero(board_numbers(cell) == 1)
     known = calibrated(without(cell, set(further[1:].tolist())))
     result = result_of(known)
     edges = result.edges
@@ -190,7 +192,7 @@ def test_one_view_places_a_board():
 
 def test_noise_that_the_data_show_refuses_no_board():
     cell = simulate(replace(TWO, pixel_sigma_px=0.5, robot_sigma_m=7e-3, seed=7))
-    further = np.flatnonzero(cell.shown.boards == 1)
+    further = np.flatnonzero(board_numbers(cell) == 1)
     known = calibrated(without(cell, set(further[1:].tolist())), joints=False)
     # One view by a flange that errs by 7 mm an axis; the geometry is that of an ordinary cell.
     assert result_of(known).edges["base_from_target_second"].sigma_mm > 10.0
@@ -199,7 +201,7 @@ def test_noise_that_the_data_show_refuses_no_board():
 
 def test_a_board_that_is_never_seen_is_told():
     cell = simulate(replace(TWO, seed=8))
-    further = set(np.flatnonzero(cell.shown.boards == 1).tolist())
+    further = set(np.flatnonzero(board_numbers(cell) == 1).tolist())
     known = calibrated(without(cell, further))
     assert list(result_of(known).edges) == ["flange_from_cam", "base_from_target_first"]
     assert any("No usable view shows target second" in reason for reason in known.verdict.reasons)
@@ -208,8 +210,8 @@ def test_a_board_that_is_never_seen_is_told():
 def test_too_few_views_of_any_board_are_refused():
     cell = simulate(replace(TWO, seed=9))
     kept = {
-        *np.flatnonzero(cell.shown.boards == 0)[:2],
-        *np.flatnonzero(cell.shown.boards == 1)[:2],
+        *np.flatnonzero(board_numbers(cell) == 0)[:2],
+        *np.flatnonzero(board_numbers(cell) == 1)[:2],
     }
     with pytest.raises(DegenerateError, match="first in 2, second in 2"):
         calibrated(without(cell, set(range(len(cell.corners))) - kept))
@@ -256,7 +258,7 @@ def test_the_turn_of_a_symmetric_board_is_told_by_its_other_views():
 
 def test_inverse_poses_are_told_by_the_views_of_one_board(tmp_path):
     cell = simulate(replace(TWO, seed=14))
-    inverse = replace(cell, base_from_flange=invert(cell.base_from_flange))
+    inverse = reporting(cell, base_from_flange=invert(cell.robot.base_from_flange))
     session = Session.load(write_session(inverse, tmp_path / "pairs", images=False))
     guess = guess_session(session)
     assert not guess.declared.closes

@@ -9,20 +9,20 @@ from visioncal.calibration.pipeline import align
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration
+from visioncal.simulation import Cell, simulate
+from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import CameraAt, NetworkOptions, RobotAt
-from visioncal.simulation.network import Network, simulate_network
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.records import network_session
-from visioncal.simulation.warmup import Heat
+from visioncal.simulation.records import cell_session
 
 # Chi-square of six and of twelve degrees of freedom is below these but for one in a thousand.
 OF_SIX, OF_TWELVE = 22.5, 32.9
 
 
 @pytest.fixture(scope="module")
-def cell() -> Network:
+def cell() -> Cell:
     """Two robots before two cameras; one of them is cold at the first of 40 stops."""
-    return simulate_network(
+    return simulate(
         NetworkOptions(
             robots=(
                 RobotAt("a", (-0.6, 0.0, 0.0), warms_up=True),
@@ -40,7 +40,7 @@ def cell() -> Network:
 
 @pytest.fixture(scope="module")
 def session(cell):
-    return network_session(cell, "cell", seen="names")
+    return cell_session(cell, "cell", seen="names")
 
 
 def aligned(cell, session, level):

@@ -10,20 +10,20 @@ from scipy.spatial.transform import Rotation
 from visioncal.calibration.pipeline import align
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
+from visioncal.simulation import simulate
 from visioncal.simulation.layout import CameraAt, NetworkOptions
-from visioncal.simulation.network import simulate_network
-from visioncal.simulation.records import network_session
+from visioncal.simulation.records import cell_session
 
 STOPS = 14
 
 
 @pytest.fixture(scope="module")
 def cell():
-    return simulate_network(NetworkOptions(stops=STOPS))
+    return simulate(NetworkOptions(stops=STOPS))
 
 
 def aligned(cell, prior, **columns):
-    session = network_session(cell, "cell", seen="names")
+    session = cell_session(cell, "cell", seen="names")
     session = replace(session, document={**session.document, "prior": prior}, **columns)
     return align(session, corners={corner.view: corner for corner in cell.corners})
 
@@ -71,8 +71,8 @@ def test_a_prior_that_is_wrong_is_named_with_what_the_observations_say(cell):
 def test_a_camera_that_sees_nothing_of_the_rest_is_tied_by_a_drawing():
     """A stereo rig: the right camera is known from the left one, and sees a board by itself."""
     options = NetworkOptions(stops=STOPS)
-    cell = simulate_network(options)
-    session = network_session(cell, "cell", seen="names")
+    cell = simulate(options)
+    session = cell_session(cell, "cell", seen="names")
     # Of the right camera, only what it sees of the floor is left.
     kept = [
         view
@@ -121,8 +121,8 @@ def test_a_prior_of_no_fixed_place_is_refused(cell, prior, words):
 
 def test_cameras_of_other_mounts_take_priors_too():
     options = NetworkOptions(stops=STOPS, cameras=(CameraAt("hand", "a"), CameraAt("left")))
-    cell = simulate_network(options)
-    truth = cell.transforms["cam_hand"]
+    cell = simulate(options)
+    truth = cell.mountings["cam_hand"]
     prior = {"flange_a_from_cam_hand": {"x_m": float(truth[0, 3]), "sigma_m": 1e-6}}
     found = aligned(cell, prior)
     assert found.tree.edge_of("cam_hand").matrix[0, 3] == pytest.approx(truth[0, 3], abs=4e-6)

@@ -18,9 +18,9 @@ from visioncal.simulation import (
     BOARDS,
     BoardAt,
     CameraAt,
+    cell_session,
     fine_camera,
-    network_session,
-    simulate_network,
+    simulate,
 )
 from visioncal.simulation.rows import POSE, pose_row
 
@@ -42,7 +42,7 @@ CELL = replace(
 
 @pytest.fixture(scope="module")
 def session():
-    return recorded(simulate_network(CELL))
+    return recorded(simulate(CELL))
 
 
 def rewritten(session, change, document=None):
@@ -185,7 +185,7 @@ def test_a_camera_whose_corners_are_bad_is_named(session):
 @pytest.mark.slow
 def test_a_board_of_another_size_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], target=BOARDS["checkerboard"], scale=1.004))
-    verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
+    verdict = align(recorded(simulate(replace(CELL, boards=boards)))).verdict
     assert verdict.status == "check"
     (reason,) = [reason for reason in verdict.reasons if "larger than stated" in reason]
     assert reason.startswith("By the robot's motion the board plate_b is 0.4 % larger than stated")
@@ -194,7 +194,7 @@ def test_a_board_of_another_size_is_named():
 
 def test_a_board_that_is_bent_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], bow_m=1e-3))
-    verdict = align(recorded(simulate_network(replace(CELL, boards=boards)))).verdict
+    verdict = align(recorded(simulate(replace(CELL, boards=boards)))).verdict
     assert any(reason.startswith("The board plate_b is not flat") for reason in verdict.reasons)
     assert sum("not flat" in reason for reason in verdict.reasons) == 1
 
@@ -323,7 +323,7 @@ def test_a_board_of_another_size_is_named_with_all_views_used(which, scale, seed
     boards = list(CELL.boards)
     boards[which] = replace(boards[which], target=BOARDS["checkerboard"], scale=scale)
     cell = replace(CELL, boards=tuple(boards), stops=24, seed=seed)
-    found = align(recorded(simulate_network(cell)))
+    found = align(recorded(simulate(cell)))
     assert found.verdict.causes[0].kind == "board_size"
     assert words in found.verdict.causes[0].words
     assert all(view.used for view in found.views)
@@ -393,7 +393,7 @@ def test_exchanges_are_tried_only_where_views_disagree(session, monkeypatch):
 @pytest.mark.parametrize("seed", [6, 7])
 def test_poses_that_were_measured_worse_than_others_are_no_outliers(seed):
     # A board that is seen squarely turns unseen: errors of its pose have no single size.
-    poses = network_session(simulate_network(replace(CELL, seed=seed)), "two arms", seen="poses")
+    poses = cell_session(simulate(replace(CELL, seed=seed)), "two arms", seen="poses")
     found = align(poses)
     assert found.verdict.status == "good"
     assert all(view.used for view in found.views)

@@ -26,16 +26,16 @@ from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, Stream, View
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 from visioncal.simulation import (
+    Cell,
     CellOptions,
-    Sweep,
     SweepOptions,
+    cell_session,
     forward,
     measured_poses,
     simulate,
     sweep,
-    sweep_session,
     truth_path,
-    write_sweep,
+    write_session,
 )
 
 AHEAD_S = 0.0372
@@ -49,24 +49,24 @@ def clocked_of(session):
     return clocked
 
 
-def swept(seed=0, mount="eye-in-hand", how=SHORT, **options) -> Sweep:
+def swept(seed=0, mount="eye-in-hand", how=SHORT, **options) -> Cell:
     return sweep(CellOptions(seed=seed, mount=mount, pixel_sigma_px=0.1, **options), how)
 
 
 @pytest.fixture(scope="module")
-def moved() -> Sweep:
+def moved() -> Cell:
     return swept()
 
 
 @pytest.fixture(scope="module")
 def session(moved) -> Session:
-    return sweep_session(moved, "swept")
+    return cell_session(moved, "swept", seen="poses")
 
 
 @pytest.fixture(scope="module")
 def long() -> Session:
     """Of 20 s, long enough to tell how a clock runs."""
-    return sweep_session(swept(how=SweepOptions()), "swept")
+    return cell_session(swept(how=SweepOptions()), "swept", seen="poses")
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_a_clock_that_changes_is_named_and_taken_out(long, sound, stamp, words):
 def test_a_clock_that_runs_evenly_is_not_doubted_for_an_arm_that_errs(mount):
     for seed in range(3):
         moved = swept(seed, mount, SweepOptions(), dh_sigma_m=5e-4, dh_sigma_rad=5e-4)
-        assert not clocked_of(sweep_session(moved, "swept")).warnings
+        assert not clocked_of(cell_session(moved, "swept", seen="poses")).warnings
 
 
 def stating(session: Session, ahead_s: float) -> Session:
@@ -135,8 +135,8 @@ def x_error(cell, result) -> tuple[np.ndarray, np.ndarray]:
     [(1, "eye-in-hand", AHEAD_S), (2, "eye-to-hand", -0.61), (3, "eye-in-hand", 0.0)],
 )
 def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
-    sweep = swept(seed, mount, replace(SHORT, camera_minus_robot_s=ahead_s))
-    result = calibrate(sweep_session(sweep, "swept"))
+    cell = swept(seed, mount, replace(SHORT, camera_minus_robot_s=ahead_s))
+    result = calibrate(cell_session(cell, "swept", seen="poses"))
     clock = result.clock
     error_s = clock.camera_minus_robot_s - ahead_s
     assert clock.method == "motion"
@@ -145,7 +145,7 @@ def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
     assert abs(error_s) < 2e-4
     assert abs(error_s) < 4 * clock.sigma_s
     assert clock.sigma_s < 1e-4
-    error, covariance = x_error(sweep.cell, result)
+    error, covariance = x_error(cell, result)
     # Six degrees of freedom: one in ten thousand is beyond.
     assert error @ np.linalg.solve(covariance, error) < 27.9
 
@@ -153,17 +153,20 @@ def test_the_offset_is_told_by_a_sweep(seed, mount, ahead_s):
 def test_another_sweep_verifies_the_camera(session):
     known = calibrate(session)
     again = swept(recording=1)
-    held = verify(sweep_session(again, "again"), known)
+    held = verify(cell_session(again, "again", seen="poses"), known)
     assert held.passed
     assert held.seen.stops > 20
-    knocked = sweep_session(swept(recording=1, camera_moved_m=2e-3), "knocked")
+    knocked = cell_session(swept(recording=1, camera_moved_m=2e-3), "knocked", seen="poses")
     assert verify(knocked, known).named[0].name == "camera"
 
 
 def test_stamps_that_jitter_are_told_worse(moved):
-    noise_s = 3e-3 * np.random.default_rng(6).standard_normal(len(moved.frames_s))
-    jittered = replace(moved, frames_s=moved.frames_s + noise_s)
-    timed = sweep_session(jittered, "jittered")
+    noise_s = 3e-3 * np.random.default_rng(6).standard_normal(len(moved.sights))
+    sights = [
+        replace(sight, stamp_s=sight.stamp_s + late_s)
+        for sight, late_s in zip(moved.sights, noise_s, strict=True)
+    ]
+    timed = cell_session(replace(moved, sights=tuple(sights)), "jittered", seen="poses")
     sigma_s = clocked_of(timed).clock.sigma_s
     # 3 ms of noise at some 200 frames make 0.2 ms, give or take how evenly they tell it.
     assert 1e-4 < sigma_s < 6e-4
@@ -173,13 +176,13 @@ def test_images_are_placed_in_time_by_their_corners(moved):
     result = result_of(calibrated_sweep(moved))
     assert abs(result.clock.camera_minus_robot_s - AHEAD_S) < 1e-4
     assert result.noise["pixel_px"] == pytest.approx(0.1, rel=0.05)
-    error, covariance = x_error(moved.cell, result)
+    error, covariance = x_error(moved, result)
     assert error @ np.linalg.solve(covariance, error) < 27.9
 
 
 def test_joints_are_placed_in_time_too(moved, session):
     columns = ("stamp_s", *(f"q{at}_rad" for at in range(1, 7)))
-    values = np.stack([moved.robot[name] for name in columns], axis=1)
+    values = np.stack([moved.streams["robot"][name] for name in columns], axis=1)
     robot = load_robot("ur10e").document
     joints = replace(session, robot_document=robot).with_streams({"arm": Stream(columns, values)})
     result = calibrate(joints, level="offsets")
@@ -202,12 +205,12 @@ def test_a_folder_and_its_recording_give_the_same(session, tmp_path):
 
 
 def test_a_sweep_is_written_with_its_truth(moved, tmp_path):
-    folder = write_sweep(moved, tmp_path / "sweep")
+    folder = write_session(moved, tmp_path / "sweep", images=False)
     truth = json.loads(truth_path(folder).read_text())
     assert truth["camera_minus_robot_s"] == AHEAD_S
     again = Session.load(folder)
-    np.testing.assert_array_equal(again.streams["robot"].values, moved.robot.values)
-    assert again.views[3].stamp_s == moved.frames_s[3]
+    np.testing.assert_array_equal(again.streams["robot"].values, moved.streams["robot"].values)
+    assert again.views[3].stamp_s == moved.sights[3].stamp_s
     assert again.warnings == ()
 
 
@@ -250,14 +253,16 @@ def test_frames_that_others_stand_for_do_not_make_a_gap_a_larger_share(session):
 def dwelling(ahead_s: float, at_rest: int = 20) -> Session:
     """A cell's stops, each held for 1.2 s: views in the middle of rests, the last ones in moves."""
     cell = simulate(CellOptions(seed=4, pixel_sigma_px=0.1))
-    times_s = np.arange(0.0, 2.2 * len(cell.joints) - 1.0, 0.008)
+    times_s = np.arange(0.0, 2.2 * len(cell.robot.joints) - 1.0, 0.008)
     stop, phase_s = np.divmod(times_s, 2.2)
     share = np.clip(phase_s - 1.2, 0.0, 1.0)
     share = share**3 * (10 - 15 * share + 6 * share**2)
     here = stop.astype(int)
-    there = np.minimum(here + 1, len(cell.joints) - 1)
-    joints = cell.joints[here] + share[:, None] * (cell.joints[there] - cell.joints[here])
-    poses = quaternions(forward(cell.arm, joints))
+    there = np.minimum(here + 1, len(cell.robot.joints) - 1)
+    joints = cell.robot.joints[here] + share[:, None] * (
+        cell.robot.joints[there] - cell.robot.joints[here]
+    )
+    poses = quaternions(forward(cell.robot.arm, joints))
     views = [
         View(at, numbers=dict(zip(MEASURED_CAM_POSE, row, strict=True)) | {
             "stamp_s": 2.2 * at + (0.6 if at < at_rest else 1.3) + ahead_s
@@ -475,7 +480,7 @@ def test_frames_that_are_in_the_fit_tell_the_offset_once():
 
 
 def test_views_with_poses_of_their_own_ask_no_stream(moved, session):
-    rows = quaternions(moved.cell.base_from_flange).tolist()
+    rows = quaternions(moved.robot.base_from_flange).tolist()
     posed = tuple(
         replace(view, numbers={**view.numbers, **dict(zip(POSE, row, strict=True))})
         for view, row in zip(session.views, rows, strict=True)

@@ -20,13 +20,11 @@ from visioncal.session.selecting import is_whole_cell
 from visioncal.simulation import (
     CellOptions,
     NetworkOptions,
-    network_session,
+    cell_session,
     simulate,
-    simulate_network,
 )
 from visioncal.simulation.optics import wide_camera
 from visioncal.simulation.options import BOARDS
-from visioncal.simulation.records import cell_session
 
 CAMERA = wide_camera()
 # A quarter of the pixels, a robot without noise.
@@ -182,7 +180,7 @@ def test_what_has_no_images_of_a_board_is_refused(cell):
 
 
 def test_a_whole_cell_is_refused():
-    whole = network_session(simulate_network(NetworkOptions()), "cell", seen="names")
+    whole = cell_session(simulate(NetworkOptions()), "cell", seen="names")
     assert is_whole_cell(whole)
     with pytest.raises(DataError, match="dense corners cannot be asked of a whole cell"):
         package.calibrate(whole, dense=True)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.bound import compliance_bound
-from support.cells import arm_found, calibrated
+from support.cells import arm_found, calibrated, reporting
 from support.loaded import COMPLIANCE, HUNG, STRETCHED, deflection_m, loaded, predicted_m
 from support.planned import postures_in_view, true_cell
 from support.wrong_arms import CARRIED, COBOT, GOOD, SAGGING, WRONG_LINKS, error_m
@@ -69,7 +69,7 @@ def test_the_calibrated_arm_stands_where_the_real_one_does_under_any_load(carryi
     result_of(known).save(tmp_path / "calibration.json")
     result = visioncal.Calibration.load(tmp_path / "calibration.json")
     q, load = postures(load_robot("ur10e"))[:40], Payload(8.0, (0.0, 0.03, 0.15), (0, 0, -30.0))
-    real = cell.flange_at(q, [load] * len(q)) - cell.flange_at(q)
+    real = cell.robot.flange_at(q, [load] * len(q)) - cell.robot.flange_at(q)
     ours = result.base_from_flange(
         q, payload_kg=load.kg, payload_m=load.centre_m, force_n=load.force_n
     )
@@ -124,8 +124,8 @@ def test_a_payload_that_is_not_as_stated_is_told(carrying):
     cell, known = carrying
     factor = arm_found(known).springs.payload
     assert abs(factor.value - 1.0) < 3.0 * factor.sigma
-    light = tuple(replace(payload, kg=payload.kg / 2.0) for payload in cell.payloads)
-    wrong = calibrated(replace(cell, payloads=light))
+    light = tuple(replace(load, kg=load.kg / 2.0) for load in cell.robot.loads)
+    wrong = calibrated(reporting(cell, loads=light))
     assert arm_found(wrong).springs.payload.value > 1.3
     assert any("Load and bend do not fit" in reason for reason in wrong.verdict.reasons)
     assert wrong.verdict.status != "good"

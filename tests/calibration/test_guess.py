@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
+from support.cells import showing
 from support.commands import visioncal as visioncal_command
 from support.mistakes import MISTAKES, OTHER, guessed, is_named, measured, numbers, seen_in, sound
 
@@ -447,9 +448,9 @@ def test_a_board_that_looks_the_same_turned_does_not_hide_sound_poses():
         )
         for view_corners in cell.corners
     ]
-    known = measured(replace(cell, corners=tuple(seen)))
+    known = measured(showing(cell, seen))
     assert len(known.poses[0].cam_from_target) > 1
-    guess = guess_seen(known, numbers(cell.base_from_flange))
+    guess = guess_seen(known, numbers(cell.robot.base_from_flange))
     assert guess.best is guess.declared
     assert guess.declared.closes
 

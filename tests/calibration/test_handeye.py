@@ -28,7 +28,7 @@ NOISE = Noise.of_robot(1e-3, 5e-4)
 
 def problem_of(cell, camera=None):
     seen = cell.cam_from_target if camera is None else camera
-    return chain(cell.options.mount, cell.base_from_flange, seen)
+    return chain(cell.options.mount, cell.robot.base_from_flange, seen)
 
 
 def state_of(*edges):

@@ -130,7 +130,7 @@ def test_a_robot_that_never_moved_is_named_before_the_lens_that_this_leaves_open
     corners = [(seen.ids, seen.px + NOISE_PX * rng.normal(size=seen.px.shape)) for _ in range(12)]
     session = Session.from_corners(
         corners,
-        np.tile(cell.base_from_flange[0], (12, 1, 1)),
+        np.tile(cell.robot.base_from_flange[0], (12, 1, 1)),
         cell.options.target,
         wide_camera().resolution,
         mount="eye-in-hand",

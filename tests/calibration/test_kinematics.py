@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.bound import workspace_bound_m
-from support.cells import arm_found, calibrated, error_of, known_of
+from support.cells import arm_found, calibrated, error_of, known_of, reporting
 from support.marks import slow
 from support.wrong_arms import GOOD, WRONG_LINKS, error_m, target_in_camera
 
@@ -49,7 +49,7 @@ def test_offsets_alone_are_told_from_wrong_links():
     assert by_name["offsets"].held_out_mm < 1.05 * by_name["geometry"].held_out_mm
     # Those of the first and the last joint hide in base and tool; the others are told to 0.1 mrad.
     found = known.robot_arm.model.robot.chain.functions[1:5, 0]
-    true = (cell.true_arm.offset - cell.arm.offset)[1:5]
+    true = (cell.robot.true_arm.offset - cell.robot.arm.offset)[1:5]
     assert found == pytest.approx(true, abs=3e-4)
 
 
@@ -104,10 +104,10 @@ def test_links_that_are_off_by_little_count_in_the_covariance():
 def test_an_eccentric_gear_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=2, views=40))
     # The encoders of joints 2 and 3 tell what their axes do but for a wave of 1 mrad.
-    reported = cell.joints.copy()
-    reported[:, 1:3] -= 1e-3 * np.sin(cell.joints[:, 1:3])
+    reported = cell.robot.joints.copy()
+    reported[:, 1:3] -= 1e-3 * np.sin(cell.robot.joints[:, 1:3])
     robot = known_of(cell).robot
-    wavy = replace(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
+    wavy = reporting(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
     known = calibrated(wavy)
     assert known.robot_arm.kinematics.level == "eccentricity"
     # Told to a few tenths of a milliradian beside errors of all links.
@@ -117,10 +117,10 @@ def test_an_eccentric_gear_is_told():
 @pytest.mark.slow
 def test_a_wrong_gear_ratio_is_told():
     cell = simulate(replace(WRONG_LINKS, seed=2, views=40, branches=True))
-    reported = cell.joints.copy()
+    reported = cell.robot.joints.copy()
     reported[:, 1:4] *= 1.0 - 1e-3
     robot = known_of(cell).robot
-    geared = replace(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
+    geared = reporting(cell, joints=reported, base_from_flange=robot.base_from_flange(reported))
     known = calibrated(geared)
     assert known.robot_arm.kinematics.level == "eccentricity"
     assert "ratios" in known.robot_arm.kinematics.errors
@@ -242,9 +242,9 @@ def test_touches_close_on_the_calibrated_arm():
     result = result_of(calibrated(cell))
     rng, tip, point = np.random.default_rng(0), np.array([0.034, 0.001, 0.16]), [0.45, 0.1, 0.1]
     turns = Rotation.from_euler("xyz", rng.uniform(-0.6, 0.6, (12, 3))).as_matrix()
-    turns = forward(cell.true_arm, cell.joints[:1])[0, :3, :3] @ turns
+    turns = forward(cell.robot.true_arm, cell.robot.joints[:1])[0, :3, :3] @ turns
     poses = compose(turns, np.array(point) - turns @ tip)
-    reach = inverse(cell.true_arm, poses, np.tile(cell.joints[0], (12, 1)))
+    reach = inverse(cell.robot.true_arm, poses, np.tile(cell.robot.joints[0], (12, 1)))
     q, names = reach.joints[reach.solved], tuple(map(str, range(int(reach.solved.sum()))))
     nothing = ("",) * len(q)
     rows = TouchRows("t", names, names, result.robot.base_from_flange(q), q, nothing, nothing)

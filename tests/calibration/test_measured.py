@@ -266,7 +266,7 @@ def test_a_plan_counts_what_was_measured():
     prior = dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_m": SIGMA_M}
     begun = begin(SoFar(run(cell, {"flange_from_cam": prior})))
     (world,) = worlds_of(
-        [begun.cell], PURPOSES["hand-eye"], cell.joints[:1], recorded=begun.recorded
+        [begun.cell], PURPOSES["hand-eye"], cell.robot.joints[:1], recorded=begun.recorded
     )
     covariance = world.covariance(np.arange(0))
     # Without a further stop: the three lengths are known to what they were measured to, or better.

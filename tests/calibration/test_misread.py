@@ -118,9 +118,9 @@ def test_rows_without_poses_are_not_taken_by_misread_joints():
 
 def test_degrees_are_known_by_their_fit_and_not_by_their_size():
     # A table whose zeros are where the arm works: all angles are within a few degrees.
-    middle = IN_HAND.joints.mean(axis=0)
+    middle = IN_HAND.robot.joints.mean(axis=0)
     robot = with_zeros(load_robot("ur5e"), middle)
-    near = 0.1 * (IN_HAND.joints - middle)
+    near = 0.1 * (IN_HAND.robot.joints - middle)
     poses = robot.base_from_flange(near)
     assert np.abs(np.rad2deg(near)).max() < 13.0
     assert not guess_joints(robot, near, poses).stands_out
@@ -131,20 +131,20 @@ def test_degrees_are_known_by_their_fit_and_not_by_their_size():
 def test_two_turns_are_no_degrees():
     # Joints of many arms turn by two turns either way.
     robot = load_robot("ur5e")
-    q = IN_HAND.joints + 2.0 * np.pi * np.where(IN_HAND.joints > 0.0, -1.0, 1.0)
+    q = IN_HAND.robot.joints + 2.0 * np.pi * np.where(IN_HAND.robot.joints > 0.0, -1.0, 1.0)
     assert not guess_joints(robot, q, robot.base_from_flange(q)).stands_out
 
 
 def test_poses_that_turn_about_one_axis_accuse_nobody():
     robot = load_robot("ur5e")
-    q = np.tile(IN_HAND.joints[0], (12, 1))
+    q = np.tile(IN_HAND.robot.joints[0], (12, 1))
     q[:, 5] += np.linspace(-1.0, 1.0, 12)
     assert not guess_joints(robot, q * [1, 1, -1, 1, 1, -1], robot.base_from_flange(q)).stands_out
 
 
 def test_readings_that_no_row_tells_apart_are_all_named():
     robot = load_robot("ur5e")
-    q = IN_HAND.joints.copy()
+    q = IN_HAND.robot.joints.copy()
     # These two never move, and stand alike: exchanged with a third they are the same.
     q[:, 1] = q[:, 4] = -1.2
     guess = guess_joints(robot, q[:, [0, 2, 1, 3, 4, 5]], robot.base_from_flange(q))
@@ -176,7 +176,7 @@ def test_a_lost_encoder_is_found_and_not_thrown_away(with_poses):
     assert theta["elbow_joint"].change == pytest.approx(np.deg2rad(10.0), abs=5e-3)
     # What is seen of the target hardly depends on whose errors the last tenths of a degree are.
     found = known.robot_arm.model.robot.base_from_flange(joints)
-    true = IN_HAND.true_base_from_flange
+    true = IN_HAND.robot.true_base_from_flange
     moved, moves = invert(found[:-1]) @ found[1:], invert(true[:-1]) @ true[1:]
     away = np.linalg.norm((moved - moves)[:, :3, 3], axis=1)
     assert np.median(away) < 1e-3
@@ -229,7 +229,7 @@ def test_arms_move_with_their_base_and_their_zeros(as_chain):
     if as_chain:
         robot = robot.corrected()
     base = exp(TURN)
-    q = IN_HAND.joints
+    q = IN_HAND.robot.joints
     assert placed_at(robot, base).base_from_flange(q) == pytest.approx(
         base @ robot.base_from_flange(q), abs=1e-12
     )
@@ -246,5 +246,5 @@ def test_the_other_convention_of_a_table_is_the_arm_that_was_meant():
     document = table_document(table_of(robot, "modified")) | {"convention": "standard"}
     other, convention = other_convention(type(robot).from_document(document))
     assert convention == "modified"
-    guess = guess_joints(other, IN_HAND.joints, robot.base_from_flange(IN_HAND.joints))
+    guess = guess_joints(other, IN_HAND.robot.joints, robot.base_from_flange(IN_HAND.robot.joints))
     assert guess.declared.score < 1e-3

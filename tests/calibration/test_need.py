@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated
+from support.cells import calibrated, showing
 from support.sound_findings import SOUND, changed, directions
 
 from visioncal.calibration.pipeline.judging import findings_of
@@ -114,7 +114,7 @@ def test_a_focus_that_changes_from_image_to_image_does_so_at_a_pick(mount: str) 
         )
         for view_corners in cell.corners
     ]
-    (picks,) = calibrated(replace(cell, corners=tuple(zoomed)), joints=False).findings.picks
+    (picks,) = calibrated(showing(cell, zoomed), joints=False).findings.picks
     # Twenty views know a standard deviation to a sixth; three of that.
     assert picks.budget_mm["look"] == pytest.approx(1e3 * share * picks.distance_m, rel=0.5)
 

@@ -36,7 +36,7 @@ AMBIGUOUS = replace(
 def with_camera(cell, off_px=(0, 0, 0, 0), **table):
     """What the session says of the camera: a matrix that is off, and more fields."""
     stated = replace(cell.options.camera, matrix=cell.options.camera.matrix + off_px)
-    told = session_of(replace(cell, stated_camera=stated))
+    told = session_of(replace(cell, stated={"": stated}))
     return replace(told, document=told.document | {"camera": told.document["camera"] | table})
 
 

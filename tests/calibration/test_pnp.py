@@ -35,7 +35,7 @@ def poses_of(cell, corners=None):
 def chosen_of(result, cell):
     """The views with the one pose that the robot's motion leaves to each."""
     first = np.array([view.cam_from_target[0] for view in result.views])
-    problem = chain("eye-in-hand", cell.base_from_flange, first)
+    problem = chain("eye-in-hand", cell.robot.base_from_flange, first)
     return init_frames(problem, result.views, {"target": cell.options.target})
 
 
@@ -126,8 +126,8 @@ def test_symmetric_boards_are_made_consistent_by_the_motion(size):
     choice = chosen_of(result, cell)
     assert not choice.rejections
     camera = np.array([view.cam_from_target[0] for view in choice.views])
-    answer = SOLVERS["park"](cell.base_from_flange, camera)
-    placed = cell.base_from_flange @ answer.x @ camera
+    answer = SOLVERS["park"](cell.robot.base_from_flange, camera)
+    placed = cell.robot.base_from_flange @ answer.x @ camera
     # Views agree to the noise, not to within a board's width.
     assert np.ptp(placed[:, :3, 3], axis=0).max() < 2e-3
     # The camera's transform does not depend on which end is called first.

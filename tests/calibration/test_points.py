@@ -601,11 +601,11 @@ def drawn(tmp_path: Path) -> Path:
     cell = simulate(CellOptions(views=12, seed=4))
     session = Session.from_corners(
         [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
-        cell.base_from_flange,
+        cell.robot.base_from_flange,
         cell.options.target,
-        cell.stated_camera.resolution,
+        cell.stated[""].resolution,
         mount=IN_HAND,
-        camera=cell.stated_camera,
+        camera=cell.stated[""],
     )
     session.save(tmp_path / "drawn")
     return tmp_path / "drawn"
@@ -620,11 +620,11 @@ def test_a_view_that_is_far_off_by_its_own_noise_alone_stays():
             (corners_.ids, corners_.px + 2.0 * rng.standard_normal(corners_.px.shape))
             for corners_ in cell.exact_corners
         ],
-        cell.base_from_flange,
+        cell.robot.base_from_flange,
         cell.options.target,
-        cell.stated_camera.resolution,
+        cell.stated[""].resolution,
         mount=IN_HAND,
-        camera=cell.stated_camera,
+        camera=cell.stated[""],
     )
     # Without it, view 13 is five degrees off, beyond what is near on the lever of rotations.
     assert all(view.used for view in calibrate(session).views)
@@ -707,13 +707,13 @@ def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, d
     (tmp_path / "rig.toml").write_text('kind = "points"\npoints = "rig.csv"\n')
     session = Session.from_corners(
         [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
-        cell.base_from_flange,
+        cell.robot.base_from_flange,
         load_target("rig.toml", tmp_path),
-        cell.stated_camera.resolution,
+        cell.stated[""].resolution,
         mount=mount,
-        camera=cell.stated_camera,
+        camera=cell.stated[""],
         robot=options.robot,
-        q=cell.joints,
+        q=cell.robot.joints,
     )
     result = calibrate(session)
     found = [cause.words for cause in result.verdict.causes if cause.kind == "board_size"]

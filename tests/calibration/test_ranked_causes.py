@@ -275,9 +275,9 @@ def session_of(cell: Cell, base_from_flange: np.ndarray) -> Session:
         [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
         base_from_flange,
         cell.options.target,
-        cell.stated_camera.resolution,
+        cell.stated[""].resolution,
         mount=cell.options.mount,
-        camera=cell.stated_camera,
+        camera=cell.stated[""],
     )
 
 
@@ -285,7 +285,7 @@ def session_of(cell: Cell, base_from_flange: np.ndarray) -> Session:
 def test_positions_in_millimetres_are_answered_and_named(mount):
     """What they would leave open is no fault of the motion."""
     cell = simulate(CellOptions(mount=mount, views=12, seed=4))
-    flange = cell.base_from_flange.copy()
+    flange = cell.robot.base_from_flange.copy()
     flange[:, :3, 3] *= 1e3
     verdict = calibrate(session_of(cell, flange)).verdict
     assert verdict.status == "bad"
@@ -299,7 +299,7 @@ def test_rows_that_were_shuffled_are_named(mount, shuffled, named):
     cell = simulate(CellOptions(mount=mount, views=18, seed=4))
     order = np.arange(18)
     order[:shuffled] = np.random.default_rng(1).permutation(shuffled)
-    session = session_of(cell, cell.base_from_flange[order])
+    session = session_of(cell, cell.robot.base_from_flange[order])
     verdict = calibrate(session).verdict
     assert ("poses are not those of the images" in verdict.top[0]) == named
     assert verdict.status == ("bad" if named else "check")
@@ -309,7 +309,7 @@ def test_rows_that_were_shuffled_are_named(mount, shuffled, named):
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped):
     cell = simulate(CellOptions(mount=mount, views=18, seed=3))
-    flange = cell.base_from_flange.copy()
+    flange = cell.robot.base_from_flange.copy()
     if bumped:
         # Camera, or board, stand elsewhere on the flange from the tenth view on.
         on_flange = next(
@@ -336,7 +336,7 @@ def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped)
 def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named(mount, which, since):
     cell = simulate(CellOptions(mount=mount, views=18, seed=3))
     switched = exp(np.array([0.0, 0.5, 0.7, 0.02, -0.01, 0.18]))
-    flange = cell.base_from_flange.copy()
+    flange = cell.robot.base_from_flange.copy()
     flange[since:] = flange[since:] @ switched if which == "tool" else switched @ flange[since:]
     cause = calibrate(session_of(cell, flange)).verdict.causes[0]
     assert cause.kind == "something_moved"
@@ -351,10 +351,10 @@ def test_a_frame_of_the_controller_that_is_switched_on_midway_is_named(mount, wh
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_a_held_lens_that_is_wrong_is_no_board_of_another_size(mount):
     cell = simulate(CellOptions(mount=mount, views=12, seed=2))
-    lens = cell.stated_camera
+    lens = cell.stated[""]
     session = Session.from_corners(
         [(view_corners.ids, view_corners.px) for view_corners in cell.corners],
-        cell.base_from_flange,
+        cell.robot.base_from_flange,
         "charuco_9x6_30mm",
         lens.resolution,
         mount=mount,

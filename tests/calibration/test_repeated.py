@@ -14,10 +14,9 @@ from visioncal.session.corners import CornerTable
 from visioncal.simulation import (
     BOARDS,
     CellOptions,
-    network_session,
+    cell_session,
     read_cell,
     simulate,
-    simulate_network,
 )
 from visioncal.simulation.rows import pose_row
 
@@ -46,7 +45,7 @@ def of_one_camera(images, *, stops, trembling_m=0.0, bias_px=0.0):
     cell = simulate(CellOptions(views=12, cut_views=0.0, seed=3))
     rng = np.random.default_rng(8)
     rows, shown = [], []
-    for stop, pose in enumerate(cell.base_from_flange):
+    for stop, pose in enumerate(cell.robot.base_from_flange):
         exact = cell.exact_corners[stop]
         exact = bent(exact, bias_px) if bias_px else exact
         for _ in range(images):
@@ -82,8 +81,8 @@ def of_a_cell(images, *, stops, seed, bias_px=0.0):
     )
     # Beside such a robot, corners are nearly exact.
     robots = tuple(replace(robot, robot_sigma_m=1e-4) for robot in options.robots)
-    cell = simulate_network(replace(options, stops=14, boards=boards, robots=robots, seed=seed))
-    told = network_session(cell, "repeated", seen="names")
+    cell = simulate(replace(options, stops=14, boards=boards, robots=robots, seed=seed))
+    told = cell_session(cell, "repeated", seen="names")
     columns = [
         column for column in told.columns if column != "image" and (stops or column != "stop")
     ]
@@ -116,9 +115,9 @@ def bent(corners, bias_px):
 
 
 def off(cell, found, name):
-    edge, truth = found.edges[name], cell.transforms[name.partition("_from_")[2]]
+    edge, truth = found.edges[name], cell.mountings[name.partition("_from_")[2]]
     if name.startswith("cell"):
-        truth = invert(cell.transforms["base_a"]) @ truth
+        truth = invert(cell.mountings["base_a"]) @ truth
     return misfit(edge.matrix, edge.covariance, truth)
 
 

@@ -23,7 +23,7 @@ SIDEWAYS = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
 def session(poses=None, joints=None, stops=None):
     """A session of poses or joint angles or both, one row each."""
     views = []
-    for at in range(len(CELL.joints)):
+    for at in range(len(CELL.robot.joints)):
         numbers = {}
         if poses is not None:
             turn = Rotation.from_matrix(poses[at][:3, :3]).as_quat()
@@ -49,7 +49,9 @@ def in_pairs(values, step):
     ],
 )
 def test_rows_of_one_stop_that_lie_apart_are_refused(of_joints, step, words):
-    name, values = ("joints", CELL.joints) if of_joints else ("poses", CELL.base_from_flange)
+    name, values = (
+        ("joints", CELL.robot.joints) if of_joints else ("poses", CELL.robot.base_from_flange)
+    )
     apart = session(**{name: in_pairs(values, step)}, stops=np.arange(8) // 2)
     with pytest.raises(DataError, match=r"rows of stop 0 \(views 0, 1\)") as caught:
         reported_poses(apart, ROBOT)
@@ -59,14 +61,14 @@ def test_rows_of_one_stop_that_lie_apart_are_refused(of_joints, step, words):
 
 
 def test_rows_of_one_stop_may_be_read_anew():
-    anew = in_pairs(CELL.base_from_flange, lambda pose: pose @ exp(5e-4 * SIDEWAYS))
+    anew = in_pairs(CELL.robot.base_from_flange, lambda pose: pose @ exp(5e-4 * SIDEWAYS))
     assert len(reported_poses(session(anew, stops=np.arange(8) // 2), ROBOT).base_from_flange) == 8
 
 
 def test_one_row_whose_pose_and_joints_disagree_is_named():
-    poses = CELL.base_from_flange.copy()
+    poses = CELL.robot.base_from_flange.copy()
     poses[5] = poses[5] @ exp(0.3 * SIDEWAYS)
-    (found,) = reported_poses(session(poses, CELL.joints), ROBOT).warnings
+    (found,) = reported_poses(session(poses, CELL.robot.joints), ROBOT).warnings
     assert found.views == (5,)
     assert found.words.startswith(
         "Pose and joint angles disagree in view 5, by up to 300 mm and under 0.001 deg"
@@ -74,7 +76,7 @@ def test_one_row_whose_pose_and_joints_disagree_is_named():
 
 
 def test_joints_of_another_robot_are_noticed_whatever_single_rows_say():
-    stated = session(CELL.base_from_flange, CELL.joints)
+    stated = session(CELL.robot.base_from_flange, CELL.robot.joints)
     (sentence,) = (
         warning.reason for warning in reported_poses(stated, load_robot("ur5e")).warnings
     )
@@ -84,7 +86,7 @@ def test_joints_of_another_robot_are_noticed_whatever_single_rows_say():
 
 
 def test_rows_in_millimetres_beside_others_in_metres_are_named():
-    poses = CELL.base_from_flange.copy()
+    poses = CELL.robot.base_from_flange.copy()
     poses[[2, 5], :3, 3] *= 1e3
     reported = reported_poses(session(poses), None)
     assert [rejection.view for rejection in reported.rejections] == [2, 5]

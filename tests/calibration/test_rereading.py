@@ -137,7 +137,7 @@ def test_a_board_in_millimetres_is_read_so_and_said(cell):
 def mirrored_cell(folder, *, corners=True):
     """Writes a cell whose corners.csv is mirrored, or else whose robot's frame is left-handed."""
     cell = simulate(CellOptions(views=18, seed=3))
-    flange, width = cell.base_from_flange, cell.stated_camera.resolution[0]
+    flange, width = cell.robot.base_from_flange, cell.stated[""].resolution[0]
     mirror = np.eye(4) if corners else np.diag([1.0, -1.0, 1.0, 1.0])
     seen = [
         view_corners.px * [-1, 1] + [width - 1, 0] if corners else view_corners.px
@@ -147,7 +147,7 @@ def mirrored_cell(folder, *, corners=True):
         [(view_corners.ids, px) for view_corners, px in zip(cell.corners, seen, strict=True)],
         mirror @ flange @ mirror,
         replace(cell.options.target, square_sigma_m=1e-7),
-        cell.stated_camera.resolution,
+        cell.stated[""].resolution,
         mount="eye-in-hand",
     ).save(folder)
     return cell

@@ -23,7 +23,7 @@ from visioncal.estimation.effects.delays import (
 from visioncal.present.recording import write_recording
 from visioncal.present.report.content import method_facts
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, Sweep, SweepOptions, sweep, sweep_session, write_sweep
+from visioncal.simulation import Cell, CellOptions, SweepOptions, cell_session, sweep, write_session
 from visioncal.simulation.layout import NetworkOptions
 from visioncal.vision.targets import numbered_positions
 
@@ -33,13 +33,13 @@ HURRIED = SweepOptions(stops=8, camera_minus_robot_s=0.037, readout_s=READOUT_S)
 MOUNTED = pytest.mark.parametrize("mount", MOUNTS)
 
 
-def swept(seed: int, how: SweepOptions = HURRIED, **options) -> Sweep:
+def swept(seed: int, how: SweepOptions = HURRIED, **options) -> Cell:
     return sweep(CellOptions(seed=seed, pixel_sigma_px=0.1, **options), how)
 
 
-def x_error(moved: Sweep, known: RunState) -> np.ndarray:
+def x_error(moved: Cell, known: RunState) -> np.ndarray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
-    return log(invert(next(iter(moved.cell.transforms.values()))) @ known.solved.state.edges[0])
+    return log(invert(next(iter(moved.transforms.values()))) @ known.solved.state.edges[0])
 
 
 def distance(error: np.ndarray, covariance: np.ndarray) -> float:
@@ -65,9 +65,9 @@ def test_a_target_moves_in_front_of_the_camera_as_finite_motion_has_it(mount):
 
 def test_corners_move_with_the_readout_as_differences_say():
     moved = swept(0, replace(HURRIED, stops=3))
-    camera, target = moved.cell.options.camera, moved.cell.options.target
+    camera, target = moved.options.camera, moved.options.target
     stack = CornerStack.of(
-        {view_corners.view: view_corners for view_corners in moved.cell.corners},
+        {view_corners.view: view_corners for view_corners in moved.corners},
         numbered_positions([target]),
     )
     shares = shares_of(EFFECTS, stack, camera)
@@ -87,11 +87,9 @@ def test_corners_move_with_the_readout_as_differences_say():
 
 def test_the_simulation_takes_every_row_at_its_own_time():
     moved, still = swept(1), swept(1, replace(HURRIED, readout_s=0.0))
-    cell, camera = moved.cell, moved.cell.options.camera
+    cell, camera = moved, moved.options.camera
     away_px = []
-    for at, (late, stamped) in enumerate(
-        zip(cell.exact_corners, still.cell.exact_corners, strict=True)
-    ):
+    for at, (late, stamped) in enumerate(zip(cell.exact_corners, still.exact_corners, strict=True)):
         both, here, there = np.intersect1d(late.ids, stamped.ids, return_indices=True)
         off = late.px[here] - stamped.px[there]
         rows = late.px[here, 1] / (camera.resolution[1] - 1) - 0.5
@@ -142,7 +140,7 @@ def test_a_global_shutter_is_not_mistaken(seed):
 
 
 def test_it_is_said_and_written(tmp_path):
-    folder = write_sweep(swept(5), tmp_path / "swept")
+    folder = write_session(swept(5), tmp_path / "swept", images=False)
     result = calibrate(folder)
     shutter = result.clock.shutter
     assert shutter.kind == "rolling"
@@ -160,7 +158,9 @@ def test_it_is_said_and_written(tmp_path):
 
 
 def test_poses_that_others_measured_say_nothing_of_rows():
-    session = sweep_session(swept(6, replace(HURRIED, readout_s=0.0, stops=5)), "swept")
+    session = cell_session(
+        swept(6, replace(HURRIED, readout_s=0.0, stops=5)), "swept", seen="poses"
+    )
     assert calibrate(session).clock.shutter is None
 
 

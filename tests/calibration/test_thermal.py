@@ -27,7 +27,7 @@ from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.robot.thermal import Heating, Inputs, OnlineCompensator, ThermalModel
 from visioncal.session.streams import Stream
-from visioncal.simulation import Heat, Round, WarmUpOptions, simulate_warm_up
+from visioncal.simulation import Heat, Round, WarmUpOptions, cell_session, simulate_warm_up
 from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
 
 ROBOT = load_robot("ur5e")
@@ -73,7 +73,7 @@ def test_a_hundred_minutes_predict_five_hours(learnt, told, limit):
 
 
 def test_coefficients_are_within_their_sigmas(learnt):
-    found, heat = learnt["temperatures"].calibration.drift, learnt["temperatures"].truth.heat
+    found, heat = learnt["temperatures"].calibration.drift, learnt["temperatures"].heat
     sigmas = np.sqrt(np.diag(found.covariance))
     off = np.concatenate(
         [found.growth_per_k - heat.growth_per_k, found.drift_rad_per_k - heat.drift_rad_per_k]
@@ -93,7 +93,7 @@ def test_what_is_not_told_stays_at_its_prior_and_is_named(learnt):
 
 
 def test_what_is_open_about_the_drift_counts_in_the_edges_covariance(learnt):
-    known, truth = learnt["currents"].calibration, learnt["currents"].truth.cell.transforms
+    known, truth = learnt["currents"].calibration, learnt["currents"].truth.transforms
     away = [log(invert(true) @ known.edges[name].matrix) for name, true in truth.items()]
     error = np.concatenate(away)
     # Chi-square of 12 degrees of freedom is below 32.9 but for one in a thousand; a drift taken for
@@ -274,7 +274,8 @@ def still(**changes):
     """A session at a constant temperature."""
     heat = replace(Heat.drawn(0), k_per_a2=np.zeros(6), ambient_swing_k=0.0)
     short = Round(minutes=30.0)
-    return simulate_warm_up(WarmUpOptions(CELL, heat, short, hours=0.6)).session("still", **changes)
+    how = WarmUpOptions(CELL, heat, short, hours=0.6, **changes)
+    return cell_session(simulate_warm_up(how), "still", seen="poses")
 
 
 def test_a_session_at_one_temperature_is_refused():
@@ -287,13 +288,11 @@ def test_a_session_at_one_temperature_is_refused():
 
 
 def test_currents_that_warm_nothing_yet_are_refused():
+    short = Round(minutes=4.0, every_s=120.0)
+    how = WarmUpOptions(CELL, round=short, hours=0.1, temperatures=False)
+    session = cell_session(simulate_warm_up(how), "short", seen="poses")
     with pytest.raises(DegenerateError, match="% of the way"):
-        calibrate(
-            simulate_warm_up(
-                WarmUpOptions(CELL, round=Round(minutes=4.0, every_s=120.0), hours=0.1)
-            ).session("short", temperatures=False),
-            level="thermal",
-        )
+        calibrate(session, level="thermal")
 
 
 def test_a_session_without_temperatures_is_refused_by_the_columns_that_lack(learnt):
@@ -414,7 +413,7 @@ def test_correct_goes_by_the_temperatures(learnt, tmp_path):
 def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
     found = learnt["temperatures"]
     # 24 views and then six again, every five minutes; the poses that are told are the same ones.
-    assert len(np.unique(found.truth.cell.base_from_flange, axis=0)) == 24
+    assert len(np.unique(found.truth.robot.base_from_flange, axis=0)) == 24
     stations = {observation.station for observation in found.session.observations}
     assert len(stations) == len(found.session.views)
 
@@ -423,8 +422,8 @@ def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
 def test_an_instrument_that_reads_points_sees_the_drift(learnt, points):
     """A place alone does not part a flange's rotation from its own: nothing fails at that."""
     truth = learnt["temperatures"].truth
-    shop = tracked(Tracked(points=points), truth.cell.joints)
-    moved = truth.cell.true_base_from_flange @ invert(truth.cell.base_from_flange)
+    shop = tracked(Tracked(points=points), truth.robot.joints)
+    moved = truth.robot.true_base_from_flange @ invert(truth.robot.base_from_flange)
     base = shop.base_from_instrument
     read = [(stop, at, invert(base) @ moved[stop] @ base @ array) for stop, at, array in shop.rows]
     plain = session_of(replace(shop, rows=tuple(read)))

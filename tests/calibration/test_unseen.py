@@ -78,11 +78,11 @@ def test_without_a_calibrated_arm_there_is_nothing_to_compare(cell):
             known = stage.run(known)
     assert result_of(known).arm is None
     reported = [view.base_from_flange for view in view_evidence(known)]
-    assert np.array_equal(reported, cell.base_from_flange)
+    assert np.array_equal(reported, cell.robot.base_from_flange)
 
 
 def test_evidence_has_the_calibrated_arm_s_poses(cell, known):
     ours = np.stack([view.base_from_flange for view in view_evidence(known)])
-    expected = known.robot_arm.model.robot.base_from_flange(cell.joints)
+    expected = known.robot_arm.model.robot.base_from_flange(cell.robot.joints)
     assert np.array_equal(ours, expected)
-    assert not np.allclose(ours, cell.base_from_flange, atol=1e-4)
+    assert not np.allclose(ours, cell.robot.base_from_flange, atol=1e-4)

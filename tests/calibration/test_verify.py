@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 from support.beyond import with_field
-from support.cells import calibrated, known_of, session_of
+from support.cells import board_numbers, calibrated, known_of, reporting, session_of
 from support.commands import visioncal
 from support.later import ANYHOW, FITTED, Change, again, knock, known_again, usual
 from support.marks import slow
@@ -33,9 +33,8 @@ from visioncal.present.report.check import render_check
 from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, Payload, simulate, write_session
+from visioncal.simulation import CellOptions, Payload, Second, simulate, write_session
 from visioncal.simulation.boards import centre_m
-from visioncal.simulation.second import Second
 from visioncal.vision.targets import numbered_positions
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -148,7 +147,7 @@ def test_one_stop_is_no_robot_that_scatters(place):
 
 
 def test_a_board_that_was_turned_by_much_is_told(place):
-    middle = compose(np.eye(3), centre_m(place.cell.sheets[0]))
+    middle = compose(np.eye(3), centre_m(place.cell.board()))
     turn = exp(np.array([0.02, -0.05, 2.5, 0.0, 0.02, 0.0]))
     moved = log(middle @ turn @ invert(middle))
     found = checked(place, np.random.default_rng(4), Change(board=moved))
@@ -189,10 +188,10 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     assert names(checked(place, rng, Change(noise_factor=8.0))) == ["robot_noise"]
     prior_calibration, cell = CalibrationPrior.of(place.calibration), again(place.cell, rng)
     # The third image was taken at another pose than is written beside it.
-    wrong = cell.joints.copy()
+    wrong = cell.robot.joints.copy()
     wrong[2] = wrong[2] + 0.02
     found = check(
-        seen_by(known_of(replace(cell, joints=wrong)), prior_calibration), prior_calibration
+        seen_by(known_of(reporting(cell, joints=wrong)), prior_calibration), prior_calibration
     )
     assert names(found) == ["view 2"]
     assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
@@ -269,7 +268,7 @@ def test_one_of_two_boards_that_moved_is_named():
     prior_calibration = CalibrationPrior.of(calibration)
     assert len(prior_calibration.boards) == 2
     known = known_of(cell)
-    shown = cell.shown.boards
+    shown = board_numbers(cell)
     pushed = np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0])
     assert check(seen_by(known, prior_calibration), prior_calibration).passed
     assert shown.max() == 1
@@ -295,10 +294,10 @@ def test_one_of_two_boards_that_moved_is_named():
 
 def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_path):
     cell = simulate(CellOptions(views=24, seed=3))
-    flange = cell.base_from_flange.copy()
+    flange = cell.robot.base_from_flange.copy()
     # Two images of one stop stand in the rows of another.
     flange[[4, 9]] = flange[[9, 4]]
-    wrong = replace(cell, base_from_flange=flange)
+    wrong = reporting(cell, base_from_flange=flange)
     session = Session.load(write_session(wrong, tmp_path / "cell", images=False))
     calibration = calibrate(session)
     assert [view.view for view in calibration.views if not view.used] == [4, 9]

@@ -14,7 +14,7 @@ from visioncal.cli import planned_motions
 from visioncal.core.transforms import invert
 from visioncal.dynamics.excitation import ExcitationRequest
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, simulate, simulate_network, write_session
+from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.simulation.dynamics import real_dynamics
 from visioncal.simulation.exercise import exercise_session, record, slow_sweep
 
@@ -157,7 +157,7 @@ def test_of_a_fixture(place):
 
 
 def test_of_a_whole_cell(place):
-    recorded(simulate_network(OPTIONS)).save(place / "cell")
+    recorded(simulate(OPTIONS)).save(place / "cell")
 
     def pushed(row):
         is_there = (row["stop"], row["robot"]) == ("5", "a")

@@ -17,7 +17,7 @@ from visioncal.results import Calibration, RobotResult
 from visioncal.results.compare import compare
 from visioncal.results.compensation import correct
 from visioncal.session import Session
-from visioncal.simulation import Moved, simulate_network
+from visioncal.simulation import Moved, simulate
 
 # Chi-square of six and of three exceed these in one case of a thousand.
 MOST, MOST_OF_THREE = 22.5, 16.3
@@ -46,7 +46,7 @@ def place(cell, tmp_path_factory):
 def bumped(place):
     """The same cell, whose fixed camera was pushed before the later stops."""
     shift = Moved("cam_left", LATER, shift_m=0.002)
-    cell = simulate_network(replace(OPTIONS, moved=(shift,)))
+    cell = simulate(replace(OPTIONS, moved=(shift,)))
     part(recorded(cell), LATER, OPTIONS.stops).save(place / "bumped")
     return place / "bumped"
 

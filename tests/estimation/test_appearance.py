@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.cells import calibrated, error_of, known_of
+from support.cells import calibrated, error_of, known_of, showing
 from support.marks import slow
 
 from visioncal.core.transforms import invert, log
@@ -155,7 +155,7 @@ def printed_anew(cell, change):
         )
         for corner, pose in zip(cell.corners, cell.cam_from_target, strict=True)
     )
-    return replace(cell, corners=corners)
+    return showing(cell, corners)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -220,7 +220,7 @@ def test_a_size_that_is_held_counts_by_what_the_views_say_against_it():
 def with_lens(cell, off, **table):
     """What is known at the end where the session states a lens that is off by (4,) pixels."""
     wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
-    told = replace(cell, stated_camera=wrong)
+    told = replace(cell, stated={"": wrong})
     session = known_of(told).session
     camera = session.document["camera"] | table
     return calibrated(
@@ -286,7 +286,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     cell = simulate(replace(FINE, seed=5, views=15))
     off = np.array([6.0, 6.0, -8.0, 5.0])
     wrong = replace(cell.options.camera, matrix=cell.options.camera.matrix + off)
-    told = replace(cell, stated_camera=wrong)
+    told = replace(cell, stated={"": wrong})
     known = calibrated(told)
     assert any("given intrinsics do not fit" in warning.reason for warning in known.warnings)
     refined = known.fitted.looks.camera("cam")

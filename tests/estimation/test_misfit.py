@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated, error_of
+from support.cells import calibrated, error_of, reporting, showing
 from support.marks import slow
 from support.problems import observed, world
 
@@ -34,8 +34,8 @@ MOUNTS = ("eye-in-hand", "eye-to-hand")
 
 def with_moving_base(cell, twist):
     """The cell with its base creeping by a twist from the first view to the last."""
-    share = np.linspace(-0.5, 0.5, len(cell.base_from_flange))[:, None]
-    return replace(cell, base_from_flange=exp(share * twist) @ cell.base_from_flange)
+    share = np.linspace(-0.5, 0.5, len(cell.robot.base_from_flange))[:, None]
+    return reporting(cell, base_from_flange=exp(share * twist) @ cell.robot.base_from_flange)
 
 
 def answered(cell):
@@ -75,7 +75,7 @@ def test_a_bump_is_told_from_a_creep(mount):
     for seed in (0, 2, 5):
         cell = simulate(replace(FINE, mount=mount, seed=seed))
         lifted = np.where(np.arange(20) < 9, 0.0, 1e-3)[:, None] * np.eye(6)[5]
-        moved = replace(cell, base_from_flange=exp(lifted) @ cell.base_from_flange)
+        moved = reporting(cell, base_from_flange=exp(lifted) @ cell.robot.base_from_flange)
         _, known = answered(moved)
         words = [warning.reason for warning in known.warnings if "moved at once" in warning.reason]
         assert len(words) == 1
@@ -88,8 +88,8 @@ def test_what_a_block_of_stops_alone_determines_is_not_left_out():
     measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
     # The last block's stops are the only ones that see a second target.
     targets = ("target_a",) * 22 + ("target_b",) * 2
-    edges = inliers(chain("eye-in-hand", cell.base_from_flange, measured)).fit.state.edges
-    problem = chain("eye-in-hand", cell.base_from_flange, measured, targets=targets)
+    edges = inliers(chain("eye-in-hand", cell.robot.base_from_flange, measured)).fit.state.edges
+    problem = chain("eye-in-hand", cell.robot.base_from_flange, measured, targets=targets)
     fit = fit_problem(problem, State(edges[[0, 1, 1]], np.zeros(0)), None)
     found = neighbours(problem, fit.state, fit.noise, ROBOT)
     assert not found.is_significant
@@ -101,7 +101,7 @@ def test_a_bump_among_measured_poses_is_found():
     cell = simulate(replace(FINE, views=24, seed=1))
     lifted = np.where(np.arange(24) < 12, 0.0, 2e-3)[:, None] * np.eye(6)[5]
     measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
-    problem = chain("eye-in-hand", exp(lifted) @ cell.base_from_flange, measured)
+    problem = chain("eye-in-hand", exp(lifted) @ cell.robot.base_from_flange, measured)
     assert problem.is_combined
     found = misfits(problem, inliers(problem).fit, {})[ROBOT]
     assert found.moved is None
@@ -118,9 +118,9 @@ def test_a_bump_is_in_the_covariance(mount):
             transform for name, transform in cell.transforms.items() if name.startswith("flange")
         )
         later = on_flange @ exp(np.array([0.001, 0, 0, 0, 1.6e-3, 1.2e-3]))
-        flange = cell.base_from_flange.copy()
+        flange = cell.robot.base_from_flange.copy()
         flange[10:] = flange[10:] @ on_flange @ invert(later)
-        result, known = answered(replace(cell, base_from_flange=flange))
+        result, known = answered(reporting(cell, base_from_flange=flange))
         assert [cause.kind for cause in known.verdict.causes][:1] == ["moved_at_once"]
         assert not {"weak_motion", "place", "calibration"} & {
             finding.kind for finding in known.verdict.findings
@@ -156,7 +156,7 @@ def test_a_turning_base_moves_the_target_by_its_distance(mount):
     turn = np.array([2e-3, 0, 0, 0, 0, 0.0])
     result, _ = answered(with_moving_base(cell, turn))
     z = cell.transforms["base_from_target" if mount == "eye-in-hand" else "flange_from_target"]
-    target = z if mount == "eye-in-hand" else (cell.base_from_flange @ z).mean(axis=0)
+    target = z if mount == "eye-in-hand" else (cell.robot.base_from_flange @ z).mean(axis=0)
     found = of_fit(drift, result)
     moved = np.linalg.norm(np.cross(turn[:3], target[:3, 3]))
     # Where the target is, noise leaves some 0.03 mm; the flange moves by 0.2 mm more or less.
@@ -193,7 +193,7 @@ def test_stops_that_err_in_groups_are_noticed():
     rng = np.random.default_rng(0)
     cell = simulate(replace(FINE, views=30, seed=1))
     group = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 3, axis=0)
-    together = replace(cell, base_from_flange=cell.base_from_flange @ exp(group))
+    together = reporting(cell, base_from_flange=cell.robot.base_from_flange @ exp(group))
     result, known = answered(together)
     assert of_fit(neighbours, result).is_significant
     assert any("last from stop to stop" in warning.reason for warning in known.warnings)
@@ -312,7 +312,7 @@ def test_errors_follow_the_stated_covariance_with_the_misfit_tests_on():
 
 def through_a_wavy_lens(cell, sigma_px, rng):
     """The cell with corners displaced by a smooth field, which no lens model has."""
-    waves = rng.normal(size=(2, 200, 2)) / (0.2 * cell.stated_camera.resolution[0])
+    waves = rng.normal(size=(2, 200, 2)) / (0.2 * cell.stated[""].resolution[0])
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, 200))
     weights = rng.normal(size=(2, 200)) * np.sqrt(2 / 200) * sigma_px
 
@@ -321,9 +321,7 @@ def through_a_wavy_lens(cell, sigma_px, rng):
             [np.cos(px @ waves[name].T + phases[name]) @ weights[name] for name in (0, 1)], axis=1
         )
 
-    return replace(
-        cell, corners=tuple(replace(corner, px=moved(corner.px)) for corner in cell.corners)
-    )
+    return showing(cell, tuple(replace(corner, px=moved(corner.px)) for corner in cell.corners))
 
 
 def test_noise_of_corners_is_no_field_of_the_lens():
@@ -394,7 +392,7 @@ def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
     last = np.array(camera.resolution) - 1.0
     corners = list(cell.corners)
     corners[5] = replace(corners[5], px=last - corners[5].px)
-    known = calibrated(replace(cell, corners=tuple(corners)), joints=False)
+    known = calibrated(showing(cell, corners), joints=False)
     assert [warning.kind for warning in known.findings.warnings] == ["turned_images"]
     (found,) = known.findings.warnings
     assert (found.views, "turned by 180 deg" in found.words) == ((5,), True)
@@ -445,4 +443,4 @@ def breathing(cell, share):
         replace(corner, px=corner.px + zoom * (corner.px - centre))
         for corner, zoom in zip(cell.corners, zooms, strict=True)
     ]
-    return replace(cell, corners=tuple(corners))
+    return showing(cell, corners)

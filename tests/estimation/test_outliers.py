@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated, error_of
+from support.cells import calibrated, error_of, reporting, showing
 from support.marks import slow
 
 from visioncal.core.errors import DegenerateError
@@ -47,7 +47,7 @@ def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch
     # Poses that others measured: no covariance, and some are many times worse than most.
     noise = 3e-4 * np.random.default_rng(0).standard_t(3, (600, 6))
     seen = cell.cam_from_target @ exp(noise)
-    found = inliers(chain("eye-in-hand", cell.base_from_flange, seen))
+    found = inliers(chain("eye-in-hand", cell.robot.base_from_flange, seen))
     # All views but one or two belong to the noise, of which the search first left out fifty.
     assert found.used.sum() >= 598
     assert len(fits) < 25
@@ -55,9 +55,9 @@ def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch
 
 def test_two_exchanged_rows_are_found():
     cell = simulate(replace(WORLDS["fine, given"], seed=2))
-    poses = cell.base_from_flange.copy()
+    poses = cell.robot.base_from_flange.copy()
     poses[[4, 11]] = poses[[11, 4]]
-    known = calibrated(replace(cell, base_from_flange=poses), joints=False)
+    known = calibrated(reporting(cell, base_from_flange=poses), joints=False)
     assert set(range(20)) - set(known.used) == {4, 11}
 
 
@@ -75,7 +75,9 @@ def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
     rng = np.random.default_rng(0)
     noise = np.repeat([np.deg2rad(1.0), 0.01], 3) * rng.standard_normal((60, 6))
     noise[17, 1] += np.deg2rad(100.0)
-    found = inliers(chain("eye-in-hand", cell.base_from_flange, cell.cam_from_target @ exp(noise)))
+    found = inliers(
+        chain("eye-in-hand", cell.robot.base_from_flange, cell.cam_from_target @ exp(noise))
+    )
     assert np.flatnonzero(~found.used).tolist() == [17]
 
 
@@ -121,9 +123,9 @@ def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, meas
 
 def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
     cell = simulate(replace(WORLDS["fine, given"], seed=1))
-    still = np.repeat(cell.base_from_flange[:1], 20, axis=0)
+    still = np.repeat(cell.robot.base_from_flange[:1], 20, axis=0)
     with pytest.raises(DegenerateError, match="all 20 used views are from one pose") as caught:
-        calibrated(replace(cell, base_from_flange=still), joints=False)
+        calibrated(reporting(cell, base_from_flange=still), joints=False)
     assert caught.value.culprits == ("the camera's offset from the tool",)
 
 
@@ -146,13 +148,13 @@ def test_a_square_is_the_distance_from_what_the_others_predict():
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_rows_that_are_exchanged_and_an_image_of_another_row_are_named(mount):
     cell = simulate(CellOptions(mount=mount, seed=3))
-    poses = cell.base_from_flange.copy()
+    poses = cell.robot.base_from_flange.copy()
     poses[[4, 9]] = poses[[9, 4]]
     corners = [
         replace(cell.corners[2], view=7) if view_corners.view == 7 else view_corners
         for view_corners in cell.corners
     ]
-    known = calibrated(replace(cell, base_from_flange=poses, corners=tuple(corners)), joints=False)
+    known = calibrated(reporting(showing(cell, corners), base_from_flange=poses), joints=False)
     verdict = known.verdict
     assert verdict.status == "check"
     (words,) = [reason for reason in verdict.reasons if "exchanged" in reason]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import calibrated
+from support.cells import calibrated, showing
 
 from visioncal.core.transforms import invert, log
 from visioncal.estimation.viewnoise import weights_by_view
@@ -58,7 +58,7 @@ def test_sharp_and_blurred_views_have_their_own_covariance():
         )
         for at, view_corners in enumerate(cell.corners)
     ]
-    uneven = replace(cell, corners=tuple(corners))
+    uneven = showing(cell, corners)
     known = calibrated(uneven)
     assert len(known.used) == 24
     # 72 degrees of freedom tell a mean square to 17 %; one noise for all gives 0.2 and 1.8.

@@ -430,6 +430,6 @@ def test_a_camera_that_was_stated_beside_measured_poses_looks(tmp_path, target):
     expected = base_from_target[:3, :3] @ point + base_from_target[:3, 3]
     plane = Plane.through(base_from_target[:3, 2], expected)
     px = project(stated, in_cam[None])
-    (found,) = locate(again, px, plane, cell.base_from_flange[0], sigma_px=0.1)
+    (found,) = locate(again, px, plane, cell.robot.base_from_flange[0], sigma_px=0.1)
     assert found.holds(expected)
     assert found.radius95_mm < 1.0

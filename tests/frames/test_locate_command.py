@@ -90,7 +90,7 @@ def test_one_image_needs_a_target_and_a_pose(cell, capsys, tmp_path):
     made, calibration, session = cell
     image = tmp_path / "shot.png"
     image.write_bytes(picture(made.options.mount, 1))
-    pose = None if made.options.mount == TO_HAND else pose_words(made.base_from_flange[1])
+    pose = None if made.options.mount == TO_HAND else pose_words(made.robot.base_from_flange[1])
     wanted = {"source": image, "calibration": calibration, "target": "charuco_9x6_30mm"}
     (found,) = shown(capsys, **wanted, pose=pose)
     (same,) = shown(capsys, source=session, calibration=calibration, view=31)
@@ -108,7 +108,7 @@ def test_one_image_needs_a_target_and_a_pose(cell, capsys, tmp_path):
 
 def test_pixels_are_placed_on_planes(cell, capsys):
     made, file, session = cell
-    at = None if made.options.mount == TO_HAND else made.base_from_flange[1]
+    at = None if made.options.mount == TO_HAND else made.robot.base_from_flange[1]
     given = {"calibration": file, "pose": None if at is None else pose_words(at)}
     plane = Plane.horizontal(-0.05, 2e-4)
     (expected,) = locate(Calibration.load(file), np.array([[700.0, 350.0]]), plane, at)

@@ -57,7 +57,7 @@ def sights_of(cell, parent, place, rng, count=6, target=BOARD):
     """Images of a target that sits at a place of the parent, at stops of the calibration."""
     x, sights = next(iter(cell.transforms.values())), []
     for at in range(count):
-        reported = cell.base_from_flange[at]
+        reported = cell.robot.base_from_flange[at]
         flange = really(cell, reported, rng)
         base_from_cam = flange @ x if cell.options.mount == IN_HAND else x
         base_from_target = flange @ place if parent == "flange" else place
@@ -157,7 +157,7 @@ def test_a_moved_target_and_a_wrong_pose_are_named(cell):
     sights = sights_of(made, parent, place, rng, count=7)
     clean = place_seen(calibration, sights, BOARD, parent)
     assert not clean.warnings
-    sights[2] = replace(sights[2], base_from_flange=made.base_from_flange[8])
+    sights[2] = replace(sights[2], base_from_flange=made.robot.base_from_flange[8])
     slipped = sights_of(made, parent, place @ exp(np.array([0, 0, 0.01, 0.002, 0, 0])), rng, 6)
     sights[5] = slipped[5]
     found = place_seen(calibration, sights, BOARD, parent)

@@ -83,7 +83,7 @@ def test_the_tools_point_may_lie_beside_the_board():
 def test_a_moved_board_is_left_out_and_named():
     cell, calibration = calibrated_cell(IN_HAND)
     rows = shots(cell, 6)
-    rows[2] = replace(rows[2], base_from_flange=cell.base_from_flange[9])
+    rows[2] = replace(rows[2], base_from_flange=cell.robot.base_from_flange[9])
     frame = seen_frame(session_of(cell, rows), calibration, "fixture")
     wrong = frame.observations[2]
     assert not wrong.used
@@ -127,7 +127,8 @@ def test_one_image_or_one_stop_checks_nothing():
     same = seen_frame(session_of(cell, [shots(cell, 1)[0]] * 4), calibration, "fixture")
     assert "of one stop of the robot" in same.verdict.reasons[0]
     moved = [
-        replace(shots(cell, 1)[0], base_from_flange=value) for value in cell.base_from_flange[:4]
+        replace(shots(cell, 1)[0], base_from_flange=value)
+        for value in cell.robot.base_from_flange[:4]
     ]
     numbered = session_of(cell, shots(cell, 4), stop=["1", "1", "2", "2"])
     with pytest.raises(DataError, match="the rows of stop 1"):
@@ -140,7 +141,9 @@ def test_one_image_or_one_stop_checks_nothing():
 def test_joints_lead_to_the_flange_where_poses_are_missing():
     cell, calibration = calibrated_cell(IN_HAND)
     robot = load_robot("ur10e")
-    columns = {f"q{at + 1}_rad": [repr(float(q[at])) for q in cell.joints[:3]] for at in range(6)}
+    columns = {
+        f"q{at + 1}_rad": [repr(float(q[at])) for q in cell.robot.joints[:3]] for at in range(6)
+    }
     session = session_of(cell, [Shot(at, None) for at in range(3)], **columns)
     known = replace(calibration, robot=robot)
     by_joints = seen_frame(session, known, "fixture")

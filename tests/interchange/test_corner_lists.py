@@ -25,7 +25,7 @@ REQUESTED = ImportOptions(
 
 def poses(folder: Path, *, named: bool = True) -> Path:
     lines = ["x,y,z,qx,qy,qz,qw" + ",image" * named]
-    for name, row in zip(NAMES, quaternions(CELL.base_from_flange).tolist(), strict=True):
+    for name, row in zip(NAMES, quaternions(CELL.robot.base_from_flange).tolist(), strict=True):
         lines.append(",".join([*map(repr, row), *[name] * named]))
     path = folder / "poses.csv"
     path.write_text("\n".join(lines))

@@ -39,7 +39,7 @@ def test_at_rest_corners_are_as_good_as_in_a_written_session(mount):
     scene, live = prepare_scene(cell), LiveView(cell)
     written = [errors_px(render(scene, index), cell.exact_corners[index]) for index in range(3)]
     taken = [
-        errors_px(live.picture(cell.joints[name, None]), cell.exact_corners[name])
+        errors_px(live.picture(cell.robot.joints[name, None]), cell.exact_corners[name])
         for name in (0, 1, 2)
     ]
     # Both are the detector's noise on other grain: over 100 corners their rms differ by some 15 %.
@@ -49,7 +49,7 @@ def test_at_rest_corners_are_as_good_as_in_a_written_session(mount):
 def test_each_picture_has_grain_of_its_own_and_nothing_else_differs():
     cell = a_cell()
     live = LiveView(cell)
-    first, second = (live.picture(cell.joints[0, None]).astype(float) for _ in range(2))
+    first, second = (live.picture(cell.robot.joints[0, None]).astype(float) for _ in range(2))
     # The difference of two draws of the sensor's noise.
     assert np.std(first - second) == pytest.approx(np.sqrt(2) * cell.options.image_noise, rel=0.03)
 
@@ -59,7 +59,7 @@ def test_a_slow_motion_moves_corners_to_the_middle_of_the_exposure():
     live = LiveView(cell)
     for size in (2e-4, 1e-3):  # under 1 px, and some 4 px: made of exact and of shifted pictures
         shares = np.linspace(-0.5, 0.5, 5)[:, None]
-        image = live.picture(cell.joints[0] + shares * size * SWAY)
+        image = live.picture(cell.robot.joints[0] + shares * size * SWAY)
         # A smear is symmetric about its middle, so its corners stay; a mistake in its direction or
         # middle would move them by a pixel.
         assert np.abs(errors_px(image, cell.exact_corners[0]).mean(axis=0)).max() < 0.05
@@ -67,7 +67,7 @@ def test_a_slow_motion_moves_corners_to_the_middle_of_the_exposure():
 
 def test_a_fast_motion_leaves_no_board_to_be_found():
     cell = a_cell()
-    swept = cell.joints[0] + np.linspace(-0.5, 0.5, 5)[:, None] * 0.02 * SWAY
+    swept = cell.robot.joints[0] + np.linspace(-0.5, 0.5, 5)[:, None] * 0.02 * SWAY
     image = LiveView(cell).picture(swept)
     found = find_charuco(image, TARGET)
     assert not isinstance(found, DetectedCorners) or len(found.ids) < 0.8 * len(
@@ -79,7 +79,7 @@ def test_an_arm_that_looks_elsewhere_sees_no_board():
     cell = a_cell()
     live = LiveView(cell)
     for turn in (1.5, 2.5, -2.5):
-        away = cell.joints[0] + np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0])
+        away = cell.robot.joints[0] + np.array([0.0, 0.0, 0.0, turn, 0.0, 0.0])
         assert not isinstance(find_charuco(live.picture(away[None]), TARGET), DetectedCorners)
 
 
@@ -95,7 +95,7 @@ def a_camera(true_joints=None, **options):
     def sleep(seconds):
         time.at += seconds
 
-    told = true_joints or (lambda moments: np.tile(cell.joints[0], (len(moments), 1)))
+    told = true_joints or (lambda moments: np.tile(cell.robot.joints[0], (len(moments), 1)))
     camera = RehearsalCamera(cell, told, pace=Pace(10.0, 0.02), clock=Clock(lambda: time.at, sleep))
     return cell, time, camera
 
@@ -117,7 +117,7 @@ def test_the_arm_is_asked_for_the_time_of_exposure():
 
     def told(moments):
         asked.extend(moments)
-        return np.tile(cell.joints[0], (len(moments), 1))
+        return np.tile(cell.robot.joints[0], (len(moments), 1))
 
     cell, _, camera = a_camera(told)
     frame = camera.frame()
@@ -143,7 +143,7 @@ def test_the_camera_outlives_a_controller_that_dies():
     def told(moments):
         if moments[0] > 100.1:
             raise DriverError("gone")
-        return np.tile(cell.joints[0], (len(moments), 1))
+        return np.tile(cell.robot.joints[0], (len(moments), 1))
 
     cell, _, camera = a_camera(told, image_noise=0.0)
     first = camera.frame()
@@ -152,6 +152,6 @@ def test_the_camera_outlives_a_controller_that_dies():
 
 
 def test_intrinsics_are_told_only_where_the_cell_states_them():
-    assert np.array_equal(a_camera()[2].factory.matrix, a_cell().stated_camera.matrix)
+    assert np.array_equal(a_camera()[2].factory.matrix, a_cell().stated[""].matrix)
     _, _, camera = a_camera(state_intrinsics=False)
     assert camera.factory is None

@@ -411,7 +411,7 @@ def test_the_export_names_the_socket_and_warns_without_the_devices_own():
 
 def test_a_rehearsals_camera_goes_through_the_pipeline():
     cell = simulate(CellOptions(views=1))
-    seen = RehearsalCamera(cell, lambda at: np.tile(cell.joints[0], (len(at), 1)))
+    seen = RehearsalCamera(cell, lambda at: np.tile(cell.robot.joints[0], (len(at), 1)))
     camera = HostedOak(seen.frame, seen.resolution, factory=seen.factory, settings=seen.settings)
     frame = camera.frame(timeout_s=PATIENT_S)
     assert frame.image.shape == (800, 1280)

@@ -163,7 +163,7 @@ def test_a_poor_session_gets_its_missing_stops_and_gives_a_result(one_axis, tmp_
     document = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
     added = np.array([stop["q"] for stop in document["stops"]])
     cell = simulate(ONE_AXIS)
-    both = np.concatenate([cell.joints, added])
+    both = np.concatenate([cell.robot.joints, added])
     whole = simulate(replace(ONE_AXIS, motion="free"), both)
     session = write_session(whole, tmp_path / "whole")
     planned = sorted(stop["view"] for stop in document["stops"])

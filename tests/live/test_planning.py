@@ -5,7 +5,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from support.cells import calibrated, exact
+from support.cells import calibrated, exact, reporting
 from support.planned import next_best, plan_cell, postures_in_view, so_far_of, true_cell
 
 from visioncal.core.errors import DataError
@@ -22,8 +22,7 @@ from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.recorded import Guess, begin
 from visioncal.live.planning.selection import CRITERIA
 from visioncal.robot import load_robot
-from visioncal.simulation import CellOptions, fine_camera, simulate
-from visioncal.simulation.options import Second
+from visioncal.simulation import CellOptions, Second, fine_camera, simulate
 from visioncal.vision.targets import corner_positions
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -48,7 +47,7 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     options = exact(replace(CELL, mount=mount, views=6, cut_views=0.0))
     seen = so_far_of(simulate(options)).known
     cell = replace(true_cell(options), noise=Noise.of_robot(5e-5, 3e-5), pixel_px=0.05)
-    q = simulate(options).joints
+    q = simulate(options).robot.joints
     factors = stop_factors(cell, HAND_EYE, q)
     problem = seen.fitted.part
     # The same corners at the plan's noise; exact ones count as seen to a millionth of a pixel.
@@ -68,7 +67,7 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_more_stops_tell_more_of_everything(mount, purpose):
     options = replace(CELL, mount=mount, views=12, cut_views=0.0)
-    cell, q = true_cell(options), simulate(options).joints
+    cell, q = true_cell(options), simulate(options).robot.joints
     world = worlds_of([cell], purpose, q)[0]
     size = world.factors.shape[2]
     assert size == {"hand-eye": 13, "offsets": 19, "kinematics": 49}[purpose.name]
@@ -238,7 +237,9 @@ def test_five_planned_stops_make_a_session_about_one_axis_solvable(mount):
     assert "determines what was open" in added.helps[0]
     assert "->" in added.helps[-1]
     rows = added.design.rows
-    known = calibrated(simulate(free, np.concatenate([cell.joints, q[rows]])), level="hand-eye")
+    known = calibrated(
+        simulate(free, np.concatenate([cell.robot.joints, q[rows]])), level="hand-eye"
+    )
     covariance = known.solved.covariance
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     # The noise of 13 stops is told to a fifth, and that of 8 beforehand to a fourth; what a lens
@@ -263,7 +264,7 @@ def test_open_edges_are_those_nearest_to_what_is_known(mount):
     off = np.array([np.linalg.norm(item.x[:3, 3] - begun.cell.x[:3, 3]) for item in drawn])
     assert off.max() > 0.02
     middle = corner_positions(options.target).mean(axis=0)
-    there = [item.cam_from_target(cell.joints)[:, :3] @ [*middle, 1.0] for item in drawn]
+    there = [item.cam_from_target(cell.robot.joints)[:, :3] @ [*middle, 1.0] for item in drawn]
     assert np.ptp(there, axis=0).max() < 2e-3
 
 
@@ -305,7 +306,7 @@ def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     cell = simulate(options)
     found = so_far_of(cell)
     begun = begin(found)
-    world = worlds_of([begun.cell], HAND_EYE, cell.joints[:3], recorded=begun.recorded)[0]
+    world = worlds_of([begun.cell], HAND_EYE, cell.robot.joints[:3], recorded=begun.recorded)[0]
     solved = found.known.solved
     # How well levels of noise are known is told of data alone.
     covariance = solved.covariance - solved.beside["noise_level"]
@@ -325,8 +326,8 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     if case == "neighbours alike":
         cell = simulate(replace(CELL, views=30, seed=1))
         off = np.random.default_rng(0).standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3)
-        alike = cell.base_from_flange @ exp(np.repeat(off, 3, axis=0))
-        cell = replace(cell, base_from_flange=alike)
+        alike = cell.robot.base_from_flange @ exp(np.repeat(off, 3, axis=0))
+        cell = reporting(cell, base_from_flange=alike)
     poses = {} if case == "estimated" else {"joints": False, "robot": load_robot("ur5e")}
     found = so_far_of(cell, **poses)
     known = found.known

@@ -93,7 +93,7 @@ def test_the_cell_is_guessed_as_roughly_as_is_said(mount):
         assert mm == pytest.approx(1e3 * GUESS_M, rel=2e-3)
         assert deg == pytest.approx(np.rad2deg(GUESS_RAD), rel=1e-9)
         np.testing.assert_array_equal(guess, same)
-    assert np.abs(cell.truth.true_arm.offset).min() > 0.0
+    assert np.abs(cell.truth.robot.true_arm.offset).min() > 0.0
 
 
 def test_errors_are_weighed_by_what_the_calibration_says():

@@ -24,8 +24,8 @@ from visioncal.simulation import (
     BoardAt,
     CameraAt,
     NetworkOptions,
-    network_session,
-    simulate_network,
+    cell_session,
+    simulate,
 )
 
 KEPT = Path(__file__).parents[1] / "data"
@@ -38,22 +38,22 @@ OPTIONS = NetworkOptions(
 
 @pytest.fixture(scope="module")
 def cell():
-    return simulate_network(OPTIONS)
+    return simulate(OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def session(cell) -> Session:
-    return network_session(cell, "cell", seen="poses")
+    return cell_session(cell, "cell", seen="poses")
 
 
 def true_result(cell, session) -> Calibration:
     """What calibrating a simulated cell would give, were it exact."""
-    origin = invert(cell.transforms["base_a"])
+    origin = invert(cell.mountings["base_a"])
     edges = {
         f"{cell.parents[name]}_from_{name}": Edge(
             origin @ transform if cell.parents[name] == "cell" else transform, 1e-8 * np.eye(6)
         )
-        for name, transform in cell.transforms.items()
+        for name, transform in cell.mountings.items()
         if name != "base_a"
     }
     views = tuple(
@@ -127,7 +127,7 @@ def test_a_changed_result_is_noticed(cell, session, tmp_path):
 
 
 def test_images_that_are_missing_leave_the_rest(cell, tmp_path):
-    session = network_session(cell, "cell", seen="names")
+    session = cell_session(cell, "cell", seen="names")
     assert isinstance(session.images, MemoryImages)
     write_outputs(tmp_path, session, Run(true_result(cell, session), ()))
     assert read_session(tmp_path / "recording.rrd").digest() == session.digest()

@@ -14,7 +14,7 @@ from support.whole_cells import OPTIONS, recorded
 import visioncal as package
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.report.certificate import Signed, write_certificate
-from visioncal.simulation import simulate_network
+from visioncal.simulation import simulate
 
 
 def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
@@ -42,7 +42,7 @@ def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
 
 
 def test_the_certificate_of_a_whole_cell_names_all_that_is_in_it(tmp_path):
-    session = recorded(simulate_network(replace(OPTIONS, stops=10)))
+    session = recorded(simulate(replace(OPTIONS, stops=10)))
     page = tmp_path / "certificate.html"
     write_certificate(page, package.calibrate(session), session, Signed())
     words = Page(page.read_text("utf-8")).words

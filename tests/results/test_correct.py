@@ -53,7 +53,7 @@ def by_poses(cell) -> Calibration:
 @pytest.fixture(scope="module")
 def exact(cell, result) -> Calibration:
     """A calibration that found the true arm to the last digit."""
-    arm, nominal = cell.true_arm, result.robot
+    arm, nominal = cell.robot.true_arm, result.robot
     numbers = zip(arm.a, arm.alpha, arm.beta, arm.d, arm.offset, strict=True)
     keys = ("a_m", "alpha_rad", "beta_rad", "d_m", "theta_offset_rad")
     rows = [dict(zip(keys, map(float, number), strict=True)) for number in numbers]
@@ -92,7 +92,7 @@ def test_the_true_arm_brings_the_camera_to_where_it_is_wanted(cell, result, by_p
     x, z = cell.transforms.values()
 
     def seen(q):
-        return invert(forward(cell.true_arm, q) @ x) @ z
+        return invert(forward(cell.robot.true_arm, q) @ x) @ z
 
     sent = visioncal.correct(result, flange, HOME)
     assert sent.reached.all()
@@ -115,7 +115,7 @@ def test_a_model_that_is_the_truth_is_inverted_exactly(cell, exact):
     flange = targets_near(50, exact, size=1.0)
     sent = visioncal.correct(exact, flange, HOME)
     assert sent.reached.all()
-    assert forward(cell.true_arm, sent.q) == pytest.approx(flange, abs=1e-9)
+    assert forward(cell.robot.true_arm, sent.q) == pytest.approx(flange, abs=1e-9)
     assert (sent.off_m < 1e-9).all()
     assert (sent.off_rad < 1e-9).all()
     # Links off by 0.5 mm and 1 mrad, on an arm that reaches 0.9 m.

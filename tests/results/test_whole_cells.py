@@ -32,8 +32,8 @@ from visioncal.simulation import (
     BoardAt,
     NetworkOptions,
     RobotAt,
-    network_session,
-    simulate_network,
+    cell_session,
+    simulate,
 )
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
@@ -128,7 +128,7 @@ def test_what_was_left_out_is_predicted_as_by_a_fit_without_it(cell, found, fold
     mine = [view for view in found.views if view.stop == stop and view.left_out_px is not None]
     away = []
     for value in mine:
-        robots = {name: cell.base_from_flange[name][stop] for name in ("a", "b")}
+        robots = {name: cell.robots[name].base_from_flange[stop] for name in ("a", "b")}
         pose = again.between(value.seer, value.seen, robots).matrix
         seen = session.corners[value.view]
         positions = corner_positions(session.plates[value.seen.removeprefix("target_")])
@@ -208,7 +208,7 @@ def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_pa
     options = NetworkOptions(
         robots=(RobotAt("a", (-0.6, 0.0, 0.0)),), boards=(BoardAt("plate", "a"),), stops=12
     )
-    several = recorded(simulate_network(options))
+    several = recorded(simulate(options))
     plain = {name: several.document[name] for name in ("schema", "name", "cameras")}
     columns = [column for column in several.columns if column not in ("robot", "target")]
     session = Session.assemble(
@@ -226,7 +226,7 @@ def test_an_only_robot_and_target_without_names_are_called_by_their_kinds(tmp_pa
 
 
 def test_a_stated_camera_of_measured_poses_is_kept(cell):
-    whole = package.calibrate(network_session(cell, "poses", seen="poses"), need_mm=0.1)
+    whole = package.calibrate(cell_session(cell, "poses", seen="poses"), need_mm=0.1)
     found = whole.of("left", "b")
     assert found.camera.camera.resolution == (2448, 2048)
     assert not found.camera.estimated
@@ -290,7 +290,7 @@ def test_a_session_of_one_pair_has_its_rows_with_the_poses_of_their_stops(cell, 
     assert [view.number for view in one.views] == [observation.view.number for observation in seen]
     for view in one.views:
         pose = view.base_from_flange().as_matrix()
-        np.testing.assert_allclose(pose, cell.base_from_flange["a"][view.stop], atol=1e-12)
+        np.testing.assert_allclose(pose, cell.robots["a"].base_from_flange[view.stop], atol=1e-12)
     assert one.robot_document == session.robot_documents["a"]
     assert one.corners.keys() == {view.number for view in one.views}
     assert one.of() is one
@@ -343,7 +343,7 @@ def test_what_a_whole_cell_does_not_have_is_refused(cell):
 
 
 def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
-    cell = simulate_network(replace(OPTIONS, stray_images=2, swapped_rows=1, seed=3))
+    cell = simulate(replace(OPTIONS, stray_images=2, swapped_rows=1, seed=3))
     session = recorded(cell)
     found = package.calibrate(session)
     assert {view.view for view in found.views if not view.used} == set(cell.wrong_views)

@@ -88,15 +88,16 @@ def test_an_arm_of_unknown_masses_weighs_nothing():
 def test_a_simulated_cell_sags_and_has_play():
     rigid = simulate(CellOptions(views=6))
     soft = simulate(CellOptions(views=6, compliance_rad_per_nm=COMPLIANCE, payloads=(LOAD,)))
-    away = soft.true_base_from_flange - rigid.true_base_from_flange
+    away = soft.robot.true_base_from_flange - rigid.robot.true_base_from_flange
     # A cobot with 5 kg sinks by some centimetre.
     assert -0.1 < away[:, 2, 3].mean() < -2e-3
-    assert np.array_equal(soft.base_from_flange, rigid.base_from_flange)
+    assert np.array_equal(soft.robot.base_from_flange, rigid.robot.base_from_flange)
     worn = simulate(CellOptions(views=6, backlash_rad=(0.0, 2e-4, 0.0, 0.0, 0.0, 0.0)))
-    assert worn.approach.tolist() == [-1, 1, -1, 1, -1, 1]
+    assert worn.robot.approach.tolist() == [-1, 1, -1, 1, -1, 1]
     # A joint that came from above stays above its encoder.
-    up = rigid.joints + np.outer(worn.approach, [0, 1e-4, 0, 0, 0, 0])
-    exact = forward(rigid.true_arm, up) @ (
-        np.linalg.inv(forward(rigid.true_arm, rigid.joints)) @ rigid.true_base_from_flange
+    up = rigid.robot.joints + np.outer(worn.robot.approach, [0, 1e-4, 0, 0, 0, 0])
+    exact = forward(rigid.robot.true_arm, up) @ (
+        np.linalg.inv(forward(rigid.robot.true_arm, rigid.robot.joints))
+        @ rigid.robot.true_base_from_flange
     )
-    assert worn.true_base_from_flange == pytest.approx(exact, abs=1e-12)
+    assert worn.robot.true_base_from_flange == pytest.approx(exact, abs=1e-12)

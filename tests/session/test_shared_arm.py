@@ -25,14 +25,14 @@ def session_of(cell, name, **changed) -> Session:
     options = cell.options
     return Session.from_corners(
         [(corner.ids, corner.px) for corner in cell.corners],
-        cell.base_from_flange,
+        cell.robot.base_from_flange,
         options.target,
-        cell.stated_camera.resolution,
+        cell.stated[""].resolution,
         **{
             "mount": options.mount,
-            "camera": cell.stated_camera,
+            "camera": cell.stated[""],
             "robot": options.robot,
-            "q": cell.joints,
+            "q": cell.robot.joints,
             "name": name,
             **changed,
         },
@@ -53,7 +53,7 @@ def sessions(cells):
 def error_mm(cell, calibration) -> float:
     """How far the camera's place seen from the board is off, all over the workspace [mm, rms]."""
     q = postures(calibration.calibrated_robot)
-    true = target_in_camera("eye-in-hand", *cell.transforms.values(), cell.flange_at(q))
+    true = target_in_camera("eye-in-hand", *cell.transforms.values(), cell.robot.flange_at(q))
     edges = [transform.as_matrix() for transform in calibration.transforms.values()]
     ours = target_in_camera("eye-in-hand", *edges, calibration.base_from_flange(q).as_matrix())
     away = (invert(true) - invert(ours))[:, :3, 3]

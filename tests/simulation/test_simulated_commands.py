@@ -16,9 +16,9 @@ from visioncal.results import Calibration
 from visioncal.session import Session
 from visioncal.simulation import (
     cell_names,
-    network_session,
+    cell_session,
     read_cell,
-    simulate_network,
+    simulate,
 )
 from visioncal.simulation.dynamics import real_dynamics
 
@@ -290,13 +290,13 @@ def test_currents_stand_for_torques_by_gains_that_the_truth_has(place):
 
 def test_a_file_of_ones_own_says_what_a_cell_is_made_of(place):
     (place / "own.toml").write_text(OWN + PUSHED)
-    cell = simulate_network(read_cell(str(place / "own.toml")))
+    cell = simulate(read_cell(str(place / "own.toml")))
     assert [robot.robot for robot in cell.options.robots] == ["ur10e"]
     assert cell.options.cameras[0].camera.resolution == (2448, 2048)
     assert cell.options.boards[0].scale == 1.002
     assert {reading.point for reading in cell.readings} == {"ball"}
     assert cell.options.moved[0].from_stop == 4
-    assert network_session(cell, "own", seen="poses").cameras.keys() == {"top"}
+    assert cell_session(cell, "own", seen="poses").cameras.keys() == {"top"}
     done("simulate", place / "own", "--cell", place / "own.toml", "--no-images", "--seed", 3)
     content, _ = truth_of(place / "own")
     assert (content["options"]["seed"], content["options"]["stops"]) == (3, 6)
@@ -364,9 +364,9 @@ def test_a_sweep_of_a_cell_with_a_rolling_shutter_has_corners(place):
 
 def test_a_sweep_comes_after_what_was_pushed(place):
     (place / "later.toml").write_text(OWN + PUSHED + SWEPT)
-    cell = simulate_network(read_cell(str(place / "later.toml")))
+    cell = simulate(read_cell(str(place / "later.toml")))
     (place / "before.toml").write_text(OWN + SWEPT)
-    still = simulate_network(read_cell(str(place / "before.toml")))
+    still = simulate(read_cell(str(place / "before.toml")))
     pushed, unmoved = (
         {sight.stamp_s: sight.cam_from_target for sight in its.sights if sight.stamp_s is not None}
         for its in (cell, still)
@@ -386,7 +386,7 @@ def test_the_page_s_cell_can_be_made(tmp_path):
         part for part in page.read_text("utf-8").split("```toml")[1:] if "[[moved]]" in part
     ]
     (tmp_path / "cell.toml").write_text(shown.partition("```")[0])
-    cell = simulate_network(read_cell(str(tmp_path / "cell.toml")))
+    cell = simulate(read_cell(str(tmp_path / "cell.toml")))
     assert cell.sights
     assert cell.readings
 
@@ -427,7 +427,7 @@ def test_a_description_with_a_mistake_is_refused_by_its_field(old, new, words, t
     assert old in OWN + PUSHED + SWEPT
     (tmp_path / "own.toml").write_text((OWN + PUSHED + SWEPT).replace(old, new))
     with pytest.raises(DataError, match=words.replace("[robots.NAME]", r"\[robots.NAME\]")):
-        simulate_network(read_cell(str(tmp_path / "own.toml")))
+        simulate(read_cell(str(tmp_path / "own.toml")))
 
 
 @pytest.mark.parametrize(

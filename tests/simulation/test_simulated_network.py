@@ -20,13 +20,11 @@ from visioncal.simulation import (
     PointAt,
     RobotAt,
     Second,
-    network_session,
+    cell_session,
     simulate,
-    simulate_network,
-    write_network,
+    write_session,
 )
-from visioncal.simulation.network import is_symmetric
-from visioncal.simulation.observed_points import whole
+from visioncal.simulation.imaging import is_symmetric
 
 EVEN = replace(BOARDS["checkerboard"], name="even", columns=8, rows=6)
 OPTIONS = NetworkOptions(
@@ -47,21 +45,21 @@ ONE_ARM = NetworkOptions(
 
 @pytest.fixture(scope="module")
 def cell():
-    return simulate_network(OPTIONS)
+    return simulate(OPTIONS)
 
 
 def chained(cell, frame, robots):
     """`cell_from_frame` by the poses that rows tell, written out anew."""
-    parent, placed = cell.parents[frame], cell.transforms[frame]
+    parent, placed = cell.parents[frame], cell.mountings[frame]
     if parent == "cell":
         return placed
     name = parent.removeprefix("flange_")
     told = robots[name].base_from_flange().as_matrix()
-    return cell.transforms[f"base_{name}"] @ told @ placed
+    return cell.mountings[f"base_{name}"] @ told @ placed
 
 
 def test_rows_tell_all_that_their_observations_need(cell):
-    session = network_session(cell, "cell", seen="poses")
+    session = cell_session(cell, "cell", seen="poses")
     assert session.frames["target_even"] == "cell"
     assert session.frames["cam_hand"] == "flange_a"
     assert session.frames["point_ball"] == "flange_b"
@@ -86,7 +84,7 @@ def test_rows_tell_all_that_their_observations_need(cell):
 
 
 def test_faults_are_where_the_truth_says(cell):
-    faulty = simulate_network(
+    faulty = simulate(
         replace(
             OPTIONS,
             swapped_rows=1,
@@ -134,9 +132,9 @@ def test_it_is_written_whole_with_pictures_and_truth(tmp_path):
         stops=1,
         lens_views=1,
     )
-    cell = simulate_network(options)
-    session = Session.load(write_network(cell, tmp_path / "cell"))
-    assert session.digest() == network_session(cell, "cell").digest()
+    cell = simulate(options)
+    session = Session.load(write_session(cell, tmp_path / "cell"))
+    assert session.digest() == cell_session(cell, "cell").digest()
     assert all(session.images.exists(view.image) for view in session.views if view.image)
     assert [view.image for view in session.views if view.is_of_lens] == [
         f"lens_low/{cell.sights[-1].view:04d}.png"
@@ -156,19 +154,19 @@ def test_robots_of_a_whole_cell_give_way_and_carry_what_rows_say():
         backlash_rad=(0.0, 1e-3, 0.0, 0.0, 0.0, 0.0),
         payloads=loads,
     )
-    cell = simulate_network(replace(ONE_ARM, robots=(soft,)))
+    cell = simulate(replace(ONE_ARM, robots=(soft,)))
     for robot in (soft, replace(soft, payloads=())):
         expected = robot.flange_at(
-            cell.true_arms["a"],
-            cell.joints["a"],
+            cell.robots["a"].true_arm,
+            cell.robots["a"].joints,
             robot.loads(STOPS),
             np.resize([-1.0, 1.0], STOPS),
         )
-        away = np.abs(expected - cell.true_base_from_flange["a"]).max(axis=(1, 2))
+        away = np.abs(expected - cell.robots["a"].true_base_from_flange).max(axis=(1, 2))
         # The second load of 5 kg bends the arm by some tenths of a millimetre.
         assert (away[::2] < 1e-12).all()
         assert (away[1::2] > 1e-5).all() == (not robot.payloads)
-    for view in network_session(cell, "cell", seen="corners").views:
+    for view in cell_session(cell, "cell", seen="corners").views:
         if view.text.get("robot"):
             assert view.numbers["payload_kg"] == loads[view.stop % 2].kg
             assert view.text["approach"] == "-+"[view.stop % 2]
@@ -176,16 +174,10 @@ def test_robots_of_a_whole_cell_give_way_and_carry_what_rows_say():
 
 def test_stops_of_a_whole_cell_are_misreported_where_the_truth_says():
     exact = RobotAt("a", (-0.6, 0.0, 0.0), robot_sigma_m=0.0, robot_sigma_rad=0.0, wrong_stops=2)
-    cell = simulate_network(replace(ONE_ARM, robots=(exact,)))
-    mm, deg = np.array(
-        [
-            pose_difference(*both)
-            for both in zip(
-                cell.base_from_flange["a"], cell.true_base_from_flange["a"], strict=True
-            )
-        ]
-    ).T
-    wrong = np.isin(np.arange(STOPS), cell.wrong_stops["a"])
+    robot = simulate(replace(ONE_ARM, robots=(exact,))).robot
+    both = zip(robot.base_from_flange, robot.true_base_from_flange, strict=True)
+    mm, deg = np.array([pose_difference(*pair) for pair in both]).T
+    wrong = np.isin(np.arange(STOPS), robot.wrong_stops)
     assert wrong.sum() == 2
     assert ((mm > 4.9) == wrong).all()
     assert ((deg > 0.9) == wrong).all()
@@ -195,8 +187,8 @@ def test_stops_of_a_whole_cell_are_misreported_where_the_truth_says():
 
 def test_cameras_of_a_whole_cell_are_misstated_and_write_their_own_images(tmp_path):
     low = CameraAt("low", place_m=(0.0, -0.5, 0.7), lens_mismatch_px=0.5, jpeg_quality=80)
-    cell = simulate_network(replace(ONE_ARM, cameras=(low,), stops=1))
-    session = Session.load(write_network(cell, tmp_path / "cell"))
+    cell = simulate(replace(ONE_ARM, cameras=(low,), stops=1))
+    session = Session.load(write_session(cell, tmp_path / "cell"))
     assert {view.image.rpartition(".")[2] for view in session.views} == {"jpg"}
     assert all(session.images.exists(view.image) for view in session.views)
     off = np.array(session.cameras["low"].matrix) - low.camera.matrix
@@ -204,8 +196,8 @@ def test_cameras_of_a_whole_cell_are_misstated_and_write_their_own_images(tmp_pa
 
 
 def test_corners_stand_in_for_images():
-    cell = simulate_network(replace(ONE_ARM, lens_views=2))
-    session = network_session(cell, "cell", seen="corners")
+    cell = simulate(replace(ONE_ARM, lens_views=2))
+    session = cell_session(cell, "cell", seen="corners")
     assert "image" not in session.columns
     assert [view.has_corners for view in session.views] == [True] * len(cell.sights)
     assert session.corner_table is not None
@@ -215,14 +207,13 @@ def test_corners_stand_in_for_images():
 
 
 def test_one_robot_with_one_camera_is_a_cell_whose_things_have_no_names():
-    cell = simulate(CellOptions(views=4, second=Second()))
-    single = whole(cell)
+    single = simulate(CellOptions(views=4, second=Second()))
     assert single.robot_of("cam") == ""
     assert single.robot_of("target_first") is None
     for sight in single.sights:
-        board = single.transforms[f"target_{sight.board}"]
-        flange = single.true_base_from_flange[""][sight.stop]
-        seen = invert(flange @ single.transforms["cam"]) @ board
+        board = single.mountings[f"target_{sight.board}"]
+        flange = single.robot.true_base_from_flange[sight.stop]
+        seen = invert(flange @ single.mountings["cam"]) @ board
         # A product of matrices of order one.
         np.testing.assert_allclose(seen, sight.cam_from_target, atol=1e-12)
 
@@ -231,4 +222,4 @@ def test_what_is_nowhere_is_refused():
     with pytest.raises(DataError, match="hand is on 'c'; there are a, b, cell"):
         NetworkOptions(cameras=(CameraAt("hand", "c"),))
     with pytest.raises(DataError, match="'target_flor' cannot be pushed"):
-        simulate_network(replace(OPTIONS, moved=(Moved("target_flor"),)))
+        simulate(replace(OPTIONS, moved=(Moved("target_flor"),)))

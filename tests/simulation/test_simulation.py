@@ -75,17 +75,19 @@ def test_exact_chain_closes(mount, robot):
     cell = simulate(exact(CellOptions(mount=mount, robot=robot, views=8, seed=4)))
     # A dozen products of matrices of order one: a few units in the last place each.
     np.testing.assert_allclose(
-        base_from_target_chain(cell, cell.base_from_flange),
+        base_from_target_chain(cell, cell.robot.base_from_flange),
         np.broadcast_to(base_from_target(cell), (8, 4, 4)),
         atol=1e-12,
     )
-    np.testing.assert_array_equal(cell.base_from_flange, forward(cell.arm, cell.joints))
+    np.testing.assert_array_equal(
+        cell.robot.base_from_flange, forward(cell.robot.arm, cell.robot.joints)
+    )
 
 
 def test_noisy_chain_closes_on_the_truth_only():
     cell = simulate(CellOptions(views=6, dh_sigma_m=3e-4, dh_sigma_rad=5e-4, wrong_views=1))
-    truth = base_from_target_chain(cell, cell.true_base_from_flange) - base_from_target(cell)
-    report = base_from_target_chain(cell, cell.base_from_flange) - base_from_target(cell)
+    truth = base_from_target_chain(cell, cell.robot.true_base_from_flange) - base_from_target(cell)
+    report = base_from_target_chain(cell, cell.robot.base_from_flange) - base_from_target(cell)
     assert np.abs(truth).max() < 1e-12  # Rounding, as above.
     # Arm errors of 0.3 mm and 0.5 mrad at a metre cannot leave any report within 0.01 mm.
     assert np.linalg.norm(report[:, :3, 3], axis=1).min() > 1e-5
@@ -97,10 +99,11 @@ def worn_joints(seed):
 
 def test_worn_joints_turn_beyond_their_encoders_by_waves_of_the_stated_size():
     waves = [
-        forward(simulate(worn_joints(seed)).true_arm, np.zeros((1, 6)))[0] for seed in range(2)
+        forward(simulate(worn_joints(seed)).robot.true_arm, np.zeros((1, 6)))[0]
+        for seed in range(2)
     ]
     assert not np.allclose(waves[0], waves[1], atol=1e-6)
-    arms = [simulate(worn_joints(seed)).true_arm for seed in range(60)]
+    arms = [simulate(worn_joints(seed)).robot.true_arm for seed in range(60)]
     sizes = np.std([arm.waves for arm in arms], axis=(0, 2))
     # 360 draws each: a standard deviation is told to 4 %; three of these.
     np.testing.assert_allclose(sizes, [1e-3, 1e-3, 1e-4, 1e-4], rtol=0.12)
@@ -115,7 +118,7 @@ def test_mistaken_intrinsics_are_off_by_what_was_asked_for():
     for camera in (wide_camera(), fine_camera(), fisheye_camera()):
         cell = simulate(CellOptions(views=1, camera=camera, lens_mismatch_px=0.3))
         px = np.random.default_rng(5).uniform(0.0, 1.0, (500, 2)) * np.array(camera.resolution)
-        away = project(cell.stated_camera, rays(camera, px)) - px
+        away = project(cell.stated[""], rays(camera, px)) - px
         # 500 random pixels against the grid that the size is set on: the edge counts most, a
         # fisheye's above all.
         assert np.sqrt(np.mean(np.sum(away**2, axis=1))) == pytest.approx(0.3, rel=0.25)
@@ -185,41 +188,43 @@ def test_same_seed_same_cell_and_each_option_has_its_own_randomness():
     np.testing.assert_array_equal(once.corners[2].px, again.corners[2].px)
     np.testing.assert_array_equal(render(prepare_scene(once), 0), render(prepare_scene(again), 0))
     shaken = simulate(dataclasses.replace(options, robot_sigma_m=1e-3, pixel_sigma_px=0.5))
-    np.testing.assert_array_equal(shaken.joints, once.joints)
+    np.testing.assert_array_equal(shaken.robot.joints, once.robot.joints)
     assert not np.array_equal(shaken.cam_from_target, once.cam_from_target)
     other = simulate(dataclasses.replace(options, seed=12))
-    assert np.abs(other.joints - once.joints).max() > 0.1
+    assert np.abs(other.robot.joints - once.robot.joints).max() > 0.1
 
 
 def test_given_postures_are_moved_to_in_the_same_cell():
     drawn = simulate(CellOptions(views=6, wrong_views=0, seed=3))
-    chosen = simulate(CellOptions(views=20, wrong_views=0, seed=3), drawn.joints[[4, 1]])
-    assert np.array_equal(chosen.joints, drawn.joints[[4, 1]])
+    chosen = simulate(CellOptions(views=20, wrong_views=0, seed=3), drawn.robot.joints[[4, 1]])
+    assert np.array_equal(chosen.robot.joints, drawn.robot.joints[[4, 1]])
     assert len(chosen.corners) == 2
     for name, true in drawn.transforms.items():
         assert np.array_equal(chosen.transforms[name], true)
     # The flange stands there but for the repeatability, drawn anew: 0.03 mm, 0.05 mrad an axis.
-    away = log(invert(drawn.true_base_from_flange[[4, 1]]) @ chosen.true_base_from_flange)
+    away = log(
+        invert(drawn.robot.true_base_from_flange[[4, 1]]) @ chosen.robot.true_base_from_flange
+    )
     assert np.abs(away).max() < 4e-4
 
 
 def test_another_draw_is_of_the_same_cell():
     first, again = (simulate(CellOptions(views=4, dh_sigma_m=1e-3, draw=name)) for name in (0, 1))
-    assert np.array_equal(first.joints, again.joints)
+    assert np.array_equal(first.robot.joints, again.robot.joints)
     assert all(
         np.array_equal(transform, other)
         for transform, other in zip(
             first.transforms.values(), again.transforms.values(), strict=True
         )
     )
-    assert not np.any(first.true_arm.d == again.true_arm.d)
+    assert not np.any(first.robot.true_arm.d == again.robot.true_arm.d)
     assert not np.any(first.corners[0].px == again.corners[0].px)
 
 
 def test_repeatability_comes_out_as_asked():
     sigmas = {"robot_sigma_m": 2e-4, "robot_sigma_rad": 5e-4}
     cell = simulate(dataclasses.replace(exact(CellOptions(views=200)), **sigmas))
-    twists = log(invert(cell.base_from_flange) @ cell.true_base_from_flange)
+    twists = log(invert(cell.robot.base_from_flange) @ cell.robot.true_base_from_flange)
     # 600 draws give a spread to 3 %, and each axis' mean to 7 % of it.
     assert twists[:, :3].std() == pytest.approx(5e-4, rel=0.1)
     assert twists[:, 3:].std() == pytest.approx(2e-4, rel=0.1)
@@ -231,21 +236,21 @@ def test_arm_errors_are_drawn_in_proportion():
         simulate(dataclasses.replace(exact(CellOptions(views=5)), dh_sigma_m=s, dh_sigma_rad=s))
         for s in (1e-5, 1e-4)
     )
-    np.testing.assert_array_equal(small.joints, large.joints)
+    np.testing.assert_array_equal(small.robot.joints, large.robot.joints)
     shifts = [
-        cell.true_base_from_flange[:, :3, 3] - cell.base_from_flange[:, :3, 3]
+        cell.robot.true_base_from_flange[:, :3, 3] - cell.robot.base_from_flange[:, :3, 3]
         for cell in (small, large)
     ]
     # Linear to within the square of the larger error, 1e-4 of a metre or so.
     np.testing.assert_allclose(10.0 * shifts[0], shifts[1], atol=1e-6)
     assert np.linalg.norm(shifts[1], axis=1).min() > 1e-5
     # The nominal arm stays the maker's.
-    np.testing.assert_array_equal(large.arm.a, ur_arm("ur10e").a)
+    np.testing.assert_array_equal(large.robot.arm.a, ur_arm("ur10e").a)
 
 
 def test_wrong_views_are_as_wrong_as_promised():
     cell = simulate(dataclasses.replace(exact(CellOptions(views=30, seed=5)), wrong_views=9))
-    error = invert(cell.true_base_from_flange) @ cell.base_from_flange
+    error = invert(cell.robot.true_base_from_flange) @ cell.robot.base_from_flange
     shift, turn = np.linalg.norm(error[:, :3, 3], axis=1), np.rad2deg(rotation_angle(error))
     wrong = np.isin(np.arange(30), cell.wrong_views)
     assert wrong.sum() == 9
@@ -259,12 +264,14 @@ def test_wrong_views_are_as_wrong_as_promised():
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_poor_motions_are_as_poor_as_they_say(mount):
     shifted = simulate(exact(CellOptions(mount=mount, views=6, motion="translation")))
-    relative = invert(shifted.base_from_flange[:1]) @ shifted.base_from_flange[1:]
+    relative = invert(shifted.robot.base_from_flange[:1]) @ shifted.robot.base_from_flange[1:]
     # The inverse kinematics ends at machine precision or a little above it.
     assert rotation_angle(relative).max() < 1e-8
     assert np.linalg.norm(relative[:, :3, 3], axis=1).min() > 0.005
     turned = simulate(exact(CellOptions(mount=mount, views=6, motion="one_axis")))
-    twists = log(invert(turned.base_from_flange[:1]) @ turned.base_from_flange[1:])[:, :3]
+    twists = log(invert(turned.robot.base_from_flange[:1]) @ turned.robot.base_from_flange[1:])[
+        :, :3
+    ]
     angles = np.linalg.norm(twists, axis=1)
     assert angles.max() > 0.3
     axes = twists / angles[:, None]
@@ -396,10 +403,10 @@ def test_written_session_loads_and_its_truth_lies_beside_it(tmp_path, quality):
     assert dataclasses.replace(session.target, name="own") == target
     np.testing.assert_array_equal(session.camera.matrix, SMALL.matrix)
     for view in session.views:
-        np.testing.assert_array_equal(view.joints_rad, cell.joints[view.number])
+        np.testing.assert_array_equal(view.joints_rad, cell.robot.joints[view.number])
         # Through a quaternion and back: rounding.
         reported = view.base_from_flange().as_matrix()
-        np.testing.assert_allclose(reported, cell.base_from_flange[view.number], atol=1e-12)
+        np.testing.assert_allclose(reported, cell.robot.base_from_flange[view.number], atol=1e-12)
         data = np.frombuffer(session.images.read(view.image), np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED).astype(float)
         # JPEG at 90 keeps grey levels to a few; PNG keeps them all.

@@ -46,7 +46,7 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
         q: (k, n) postures at which the error counts, as the encoders have them [rad].
     """
     covariance = _arm_bound(cell)
-    at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.sheets[0])
+    at = np.zeros(3) if cell.options.mount == "eye-in-hand" else centre_m(cell.board())
     turn = np.concatenate([np.cross(at, np.eye(3)), np.eye(3)], axis=1)
     stood = [_held(cell, value) for value in q]
     jacobian = [turn @ _carried(cell, held) @ _pose_jacobian(cell, held) for held in stood]
@@ -59,7 +59,7 @@ def compliance_bound(cell: Cell) -> FloatArray:
     Beside all that `workspace_bound_m` has unknown. Of the springs no more is known beforehand than
     how stiff the softest is.
     """
-    return np.sqrt(np.diag(_arm_bound(cell))[-cell.arm.a.size :]) / _TORQUE_NM
+    return np.sqrt(np.diag(_arm_bound(cell))[-cell.robot.arm.a.size :]) / _TORQUE_NM
 
 
 def _arm_bound(cell: Cell) -> FloatArray:
@@ -68,7 +68,7 @@ def _arm_bound(cell: Cell) -> FloatArray:
     size = 12 + len(arm)
     information = np.diag(np.concatenate([np.zeros(12), arm**-2.0, look**-2.0]))
     for view, pose in enumerate(cell.cam_from_target):
-        seen, held = cell.corners[view].ids, _held(cell, cell.joints[view], view)
+        seen, held = cell.corners[view].ids, _held(cell, cell.robot.joints[view], view)
         by_pose = _jacobian(
             lambda value, pose=pose, seen=seen: _seen(cell, pose @ exp(value), seen), 6
         )
@@ -88,7 +88,7 @@ def _arm_bound(cell: Cell) -> FloatArray:
 
 def _slack(cell: Cell, held: "_Held") -> FloatArray:
     """Covariance (6, 6) of the flange's error at a stop: what it does not repeat, and ripple."""
-    options, arm, q = cell.options, cell.true_arm, held.standing
+    options, arm, q = cell.options, cell.robot.true_arm, held.standing
     covariance = np.diag(np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** 2)
     middle = invert(forward(arm, q[None])[0])
     turned = _jacobian(lambda array: log(middle @ forward(arm, (q + array)[None])[0]), len(q))
@@ -123,10 +123,10 @@ class _Held:
 
 def _held(cell: Cell, q: FloatArray, view: int | None = None) -> _Held:
     """The joints (n,) at a stop, with what it carried at a view."""
-    options, arm = cell.options, cell.true_arm
+    options, arm = cell.options, cell.robot.true_arm
     if not options.compliance_rad_per_nm:
         return _Held(q, np.zeros(len(q)))
-    load = () if view is None else cell.payloads[view : view + 1]
+    load = () if view is None else cell.robot.loads[view : view + 1]
     giving = giving_of(arm, options.compliance_rad_per_nm, options.mass_share, ())
     standing = sagging(arm, giving, q[None], load)
     return _Held(standing[0], load_torques(arm, giving, standing, load)[0])
@@ -144,7 +144,7 @@ def _arm_sigmas(cell: Cell) -> FloatArray:
 
     A spring's is how far it bends under `_TORQUE_NM`. Waves are those of eccentric joints.
     """
-    options, count = cell.options, cell.arm.a.size
+    options, count = cell.options, cell.robot.arm.a.size
     offset = np.hypot(options.dh_sigma_rad, options.offset_sigma_rad)
     each = [options.dh_sigma_m] * 2 + [options.dh_sigma_rad] * 2 + [offset]
     if options.eccentricity_sigma_rad:
@@ -162,7 +162,7 @@ def _pose_jacobian(cell: Cell, held: _Held, *, slack: bool = False) -> FloatArra
 
 
 def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:
-    arm, count = cell.true_arm, cell.arm.a.size
+    arm, count = cell.robot.true_arm, cell.robot.arm.a.size
     a, d, alpha, beta, offset = change[12 : 12 + 5 * count].reshape(5, count)
     moved = replace(
         arm,
@@ -192,7 +192,7 @@ def _seen(cell: Cell, pose: FloatArray, ids: IntArray, look: Sequence[float] = (
         own, (scale, aspect, *bends) = np.split(look, [4 + len(camera.distortion)])
         camera = _other_lens(camera, own)
         points = points * [1.0 + scale - 0.5 * aspect, 1.0 + scale + 0.5 * aspect, 1.0]
-        u, v = (points - centre_m(cell.sheets[0]))[:, :2].T / np.abs(points[:, :2]).max()
+        u, v = (points - centre_m(cell.board()))[:, :2].T / np.abs(points[:, :2]).max()
         points[:, 2] += sum(by * u**a * v**b for by, (a, b) in zip(bends, _BENDS, strict=True))
     return project(camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()
 

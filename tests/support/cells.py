@@ -1,5 +1,6 @@
 """Runs the stages on simulated corners, without images: what detection would give is given."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +12,10 @@ from visioncal.calibration.stages.cameras import detect_targets
 from visioncal.calibration.stages.joints import Matched
 from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.transforms import invert, log
+from visioncal.core.types import Corners
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
-from visioncal.simulation import Cell, CellOptions, Sweep, cell_session
+from visioncal.simulation import Cell, CellOptions, cell_session
 from visioncal.simulation.rows import POSE
 
 
@@ -44,8 +46,12 @@ def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **c
     """What is known after detection; without `joints`, poses are all that is said of the robot."""
     model = load_robot(cell.options.robot) if robot is None else robot
     known = joints or robot is not None
-    matched = Matched(model, dict(enumerate(cell.joints)) if joints else {}) if known else None
-    reported = Reported(dict(enumerate(cell.base_from_flange)), matched=matched)
+    stops = {sight.view: sight.stop for sight in cell.sights}
+    told = {view: cell.robot.joints[at] for view, at in stops.items()} if joints else {}
+    reported = Reported(
+        {view: cell.robot.base_from_flange[at] for view, at in stops.items()},
+        matched=Matched(model, told) if known else None,
+    )
     known = replace(RunState(session_of(cell)), robots={"": reported}, **changes)
     return detect_targets(known, {view_corners.view: view_corners for view_corners in cell.corners})
 
@@ -59,19 +65,36 @@ def calibrated(cell: Cell, **changes) -> RunState:
     return known
 
 
-def calibrated_sweep(moved: Sweep) -> RunState:
+def calibrated_sweep(moved: Cell) -> RunState:
     """What is known at the end of the way, from the corners of a sweep's frames."""
-    known = replace(known_of(moved.cell, joints=False), robots={})
+    known = replace(known_of(moved, joints=False), robots={})
     views = [
-        replace(view, numbers={"stamp_s": stamp_s})
-        for view, stamp_s in zip(known.session.views, moved.frames_s.tolist(), strict=True)
+        replace(view, numbers={"stamp_s": sight.stamp_s})
+        for view, sight in zip(known.session.views, moved.sights, strict=True)
     ]
-    session = replace(known.session, views=tuple(views)).with_streams({"robot": moved.robot})
+    session = replace(known.session, views=tuple(views)).with_streams(moved.streams)
     known = replace(known, session=session)
     for stage in STAGES:
         if stage.name not in ("robot", "detect"):
             known = stage.run(known)
     return known
+
+
+def reporting(cell: Cell, **changes) -> Cell:
+    """A cell whose only robot reports otherwise."""
+    return replace(cell, robots={"": replace(cell.robot, **changes)})
+
+
+def showing(cell: Cell, corners: Iterable[Corners]) -> Cell:
+    """A cell in whose images other corners are found."""
+    sights = zip(cell.sights, corners, strict=True)
+    return replace(cell, sights=tuple(replace(sight, corners=item) for sight, item in sights))
+
+
+def board_numbers(cell: Cell) -> np.ndarray:
+    """(m,) which of the boards each image shows."""
+    names = [board.name for board in cell.layout.boards]
+    return np.array([names.index(sight.board) for sight in cell.sights])
 
 
 def error_of(cell: Cell, known: RunState) -> np.ndarray:

@@ -46,7 +46,7 @@ def _scene(mount: Mount):
 
 def shots(cell: Cell, count: int) -> list[Shot]:
     """The cell's first views as they were taken."""
-    return [Shot(at, cell.base_from_flange[at]) for at in range(count)]
+    return [Shot(at, cell.robot.base_from_flange[at]) for at in range(count)]
 
 
 def session_of(cell: Cell, rows: Sequence[Shot], **more: Sequence[str]) -> Session:

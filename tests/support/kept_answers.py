@@ -22,12 +22,14 @@ from visioncal.core.transforms import invert, log
 from visioncal.results.sections import CalibrationSections
 from visioncal.session import Session
 from visioncal.simulation import (
+    BOARDS,
     CellOptions,
+    Second,
     SweepOptions,
+    cell_session,
     fine_camera,
     simulate,
     sweep,
-    sweep_session,
     tracked,
 )
 from visioncal.simulation.layout import (
@@ -38,9 +40,6 @@ from visioncal.simulation.layout import (
     PointAt,
     RobotAt,
 )
-from visioncal.simulation.network import simulate_network
-from visioncal.simulation.options import BOARDS, Second
-from visioncal.simulation.records import network_session
 from visioncal.simulation.sag import Payload
 
 KEPT = Path(__file__).parents[1] / "data" / "answers.json"
@@ -156,13 +155,15 @@ def _tracked(options: tracked.Tracked, **document) -> Callable[[], Answer]:
 
 
 def _swept(options: CellOptions, how: SweepOptions) -> Callable[[], Answer]:
-    return lambda: _of_calibration(calibrate(sweep_session(sweep(options, how), "sweep")))
+    return lambda: _of_calibration(
+        calibrate(cell_session(sweep(options, how), "sweep", seen="poses"))
+    )
 
 
 def _network(level: str = "auto", **options) -> Callable[[], Answer]:
     def case() -> Answer:
-        cell = simulate_network(NetworkOptions(**options))
-        session: Session = network_session(cell, "network", seen="names")
+        cell = simulate(NetworkOptions(**options))
+        session: Session = cell_session(cell, "network", seen="names")
         corners = {view_corners.view: view_corners for view_corners in cell.corners}
         return _of_cell(align(session, level=level, corners=corners))
 

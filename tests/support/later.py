@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from support.cells import calibrated, known_of
+from support.cells import calibrated, known_of, reporting, showing
 from support.wrong_arms import WRONG_LINKS, target_in_camera
 
 from visioncal.calibration.pipeline.result import result_of
@@ -63,18 +63,20 @@ def again(
         stops: How many.
     """
     change = change or Change()
-    rows = FITTED + rng.choice(len(cell.joints) - FITTED, stops, replace=False)
+    rows = FITTED + rng.choice(len(cell.robot.joints) - FITTED, stops, replace=False)
     fresh, options = cell.only(rows.tolist()), cell.options
     sigma = np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3)
     jitter = exp(change.noise_factor * sigma * rng.standard_normal((stops, 6)))
-    flange = cell.flange_at(fresh.joints + change.joints_rad, fresh.payloads) @ jitter
+    flange = (
+        cell.robot.flange_at(fresh.robot.joints + change.joints_rad, fresh.robot.loads) @ jitter
+    )
     x, z = cell.transforms.values()
     moved = x @ exp(change.camera), z @ exp(change.board)
     poses = target_in_camera(options.mount, *moved, flange)
     corners = tuple(
         _detected(cell, at, pose, rng, change.board_scale) for at, pose in enumerate(poses)
     )
-    return replace(fresh, true_base_from_flange=flange, corners=corners)
+    return reporting(showing(fresh, corners), true_base_from_flange=flange)
 
 
 def _detected(
@@ -82,7 +84,7 @@ def _detected(
 ) -> Corners:
     """The board as it was printed, as a detector reports it."""
     camera = cell.options.camera
-    px = project(camera, scale * corners_m(cell.sheets[0]) @ pose[:3, :3].T + pose[:3, 3])
+    px = project(camera, scale * corners_m(cell.board()) @ pose[:3, :3].T + pose[:3, 3])
     ids = np.flatnonzero(np.all((px > 0) & (px < np.array(camera.resolution) - 1), axis=1))
     noise = cell.options.pixel_sigma_px * rng.standard_normal((len(ids), 2))
     return Corners(view, ids, px[ids] + noise, cell.options.blur_px)

@@ -251,7 +251,7 @@ def fake_plan(stops: int = 5, seed: int = 2, mount: CameraMount = "eye-in-hand")
     # The simulated camera sits close to the wrist: the links are thin, so that nothing is near.
     limits = Limits(clearance_m=0.0, floor_m=None)
     cell = replace(true_cell(options), limits=limits, robot=_thin(load_robot("ur5e")))
-    q = simulate(options).joints
+    q = simulate(options).robot.joints
     none = np.zeros((0, 6))
     planned = tuple(
         Stop(at + 1, value, none, f"words of stop {at + 1}") for at, value in enumerate(q)

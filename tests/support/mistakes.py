@@ -75,7 +75,7 @@ def seen_in(cell: Cell) -> Poses:
     known = measured(cell)
     views = sorted(known.poses)
     camera = np.array([known.poses[view].cam_from_target[0] for view in views])
-    return sound(cell.base_from_flange[views], camera, cell.options.mount)
+    return sound(cell.robot.base_from_flange[views], camera, cell.options.mount)
 
 
 def guessed(poses: Poses) -> Guess:

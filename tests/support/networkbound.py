@@ -14,8 +14,8 @@ import numpy as np
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import frame_name
+from visioncal.simulation import Cell, Sight
 from visioncal.simulation.boards import corners_m
-from visioncal.simulation.observed_points import Network, Sight, board_named, camera_named
 from visioncal.simulation.optics import project
 
 # Small enough for central differences to be exact to 1e-8, large enough for rounding.
@@ -42,7 +42,7 @@ class Bound:
         return self.covariance[at : at + 6, at : at + 6]
 
 
-def network_bound(cell: Network, reference: str = "base_a", *, sizes: bool = True) -> Bound:
+def network_bound(cell: Cell, reference: str = "base_a", *, sizes: bool = True) -> Bound:
     """Computes the bound; `reference` stands for the cell.
 
     Args:
@@ -50,14 +50,14 @@ def network_bound(cell: Network, reference: str = "base_a", *, sizes: bool = Tru
         reference: The base that stands for it.
         sizes: Whether boards' sizes are unknown; else they are as stated.
     """
-    frames = tuple(transform for transform in cell.transforms if transform != reference)
+    frames = tuple(mounting for mounting in cell.mountings if mounting != reference)
     places = {name: slice(6 * at, 6 * at + 6) for at, name in enumerate(frames)}
     size = 6 * len(frames)
-    boards = cell.options.boards if sizes else ()
+    boards = cell.layout.boards if sizes else ()
     for board in boards:
         places[f"size {board.name}"] = slice(size, size + 1)
         size += 1
-    for camera in cell.options.cameras:
+    for camera in cell.layout.cameras:
         if not camera.state_intrinsics:
             count = 4 + len(camera.camera.distortion)
             places[f"lens {camera.name}"] = slice(size, size + count)
@@ -67,9 +67,9 @@ def network_bound(cell: Network, reference: str = "base_a", *, sizes: bool = Tru
         at = places[f"size {board.name}"].start
         target = board.target
         information[at, at] = (target.square_m / target.square_sigma_m) ** 2
-    robots = [robot.name for robot in cell.options.robots]
-    sigmas = np.concatenate([robot.sigma for robot in cell.options.robots])
-    for stop in range(-1, cell.options.stops):
+    robots = [robot.name for robot in cell.layout.robots]
+    sigmas = np.concatenate([robot.sigma for robot in cell.layout.robots])
+    for stop in range(-1, cell.layout.stops):
         between = np.zeros((len(sigmas), size))
         own = np.diag(sigmas**-2.0)
         for sight in (sight for sight in cell.sights if sight.stop == stop):
@@ -84,7 +84,7 @@ def network_bound(cell: Network, reference: str = "base_a", *, sizes: bool = Tru
 
 
 def _jacobian(
-    cell: Network, sight: Sight, places: Mapping[str, slice], robots: list[str], size: int
+    cell: Cell, sight: Sight, places: Mapping[str, slice], robots: list[str], size: int
 ) -> tuple[FloatArray, FloatArray]:
     """How one sight's pixels move with the unknowns and the flanges, in units of their noise."""
     camera, board = frame_name("camera", sight.camera), frame_name("target", sight.board)
@@ -113,7 +113,7 @@ def _jacobian(
     return every[:, :size], every[:, size:]
 
 
-def _differences(cell: Network, sight: Sight, key: str, width: int) -> FloatArray:
+def _differences(cell: Cell, sight: Sight, key: str, width: int) -> FloatArray:
     steps = _STEP * np.eye(width)
     return np.stack(
         [
@@ -124,10 +124,10 @@ def _differences(cell: Network, sight: Sight, key: str, width: int) -> FloatArra
     )
 
 
-def _pixels(cell: Network, sight: Sight, key: str, change: FloatArray) -> FloatArray:
+def _pixels(cell: Cell, sight: Sight, key: str, change: FloatArray) -> FloatArray:
     """Flat pixels of a sight when one thing changes."""
-    camera = camera_named(cell.options, sight.camera).camera
-    sheet = board_named(cell.options, sight.board)
+    camera = cell.camera(sight.camera).camera
+    sheet = cell.board(sight.board)
     kind, _, name = key.partition(" ")
     if kind == "lens" and name == sight.camera:
         matrix = camera.matrix + _THOUSAND * change[:4]
@@ -144,14 +144,19 @@ def _pixels(cell: Network, sight: Sight, key: str, change: FloatArray) -> FloatA
     return project(camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()
 
 
-def _place(cell: Network, stop: int, frame: str, key: str, change: FloatArray) -> FloatArray:
+def _place(cell: Cell, stop: int, frame: str, key: str, change: FloatArray) -> FloatArray:
     """(4, 4) `cell_from_frame` when one thing changes."""
-    place = cell.transforms[frame] @ (exp(change) if key == frame else np.eye(4))
+    place = cell.mountings[frame] @ (exp(change) if key == frame else np.eye(4))
     robot = cell.robot_of(frame)
     if robot is None:
         return place
     base = frame_name("base", robot)
-    flange = cell.true_base_from_flange[robot][stop]
+    flange = cell.robots[robot].true_base_from_flange[stop]
     if key == f"flange {robot}":
         flange = flange @ exp(change)
-    return cell.transforms[base] @ (exp(change) if key == base else np.eye(4)) @ flange @ place
+    return (
+        cell.mountings.get(base, np.eye(4))
+        @ (exp(change) if key == base else np.eye(4))
+        @ flange
+        @ place
+    )

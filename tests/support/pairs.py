@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from support.cells import calibrated
+from support.cells import calibrated, reporting
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import exp, invert
@@ -26,12 +26,10 @@ def with_moved_camera(cell: Cell, twist: np.ndarray) -> Cell:
     x, z = cell.transforms.values()
     moved = x @ exp(twist)
     if cell.options.mount == "eye-in-hand":
-        flanges = cell.base_from_flange @ x @ invert(moved)
+        flanges = cell.robot.base_from_flange @ x @ invert(moved)
     else:
-        flanges = moved @ invert(x) @ cell.base_from_flange
-    names = edge_names(cell.options.mount)
-    edges = dict(zip(names, (moved, z), strict=True))
-    return replace(cell, transforms=edges, base_from_flange=flanges)
+        flanges = moved @ invert(x) @ cell.robot.base_from_flange
+    return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": moved, "target": z})
 
 
 def with_moved_board(cell: Cell, twist: np.ndarray) -> Cell:
@@ -39,12 +37,10 @@ def with_moved_board(cell: Cell, twist: np.ndarray) -> Cell:
     x, z = cell.transforms.values()
     moved = z @ exp(twist)
     if cell.options.mount == "eye-in-hand":
-        flanges = moved @ invert(z) @ cell.base_from_flange
+        flanges = moved @ invert(z) @ cell.robot.base_from_flange
     else:
-        flanges = cell.base_from_flange @ z @ invert(moved)
-    names = edge_names(cell.options.mount)
-    edges = dict(zip(names, (x, moved), strict=True))
-    return replace(cell, transforms=edges, base_from_flange=flanges)
+        flanges = cell.robot.base_from_flange @ z @ invert(moved)
+    return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": x, "target": moved})
 
 
 def with_moved_result(calibration: Calibration, cell: Cell, twist: np.ndarray) -> Calibration:

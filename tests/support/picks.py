@@ -79,7 +79,7 @@ def stand(cell: Cell, rng: np.random.Generator) -> Stand:
     edge = next(iter(cell.transforms.values()))
     if cell.options.mount == "eye-to-hand":
         return Stand(None, edge)
-    near = cell.base_from_flange[rng.integers(len(cell.base_from_flange))]
+    near = cell.robot.base_from_flange[rng.integers(len(cell.robot.base_from_flange))]
     reported = near @ exp(rng.normal(0.0, np.repeat([0.1, 0.03], 3)))
     return Stand(reported, really(cell, reported, rng) @ edge)
 

@@ -52,7 +52,7 @@ def true_cell(options: CellOptions) -> PlanCell:
 def postures_in_view(options: CellOptions, count: int) -> FloatArray:
     """(k, n) random postures from which the simulated camera sees the whole board [rad]."""
     free = replace(options, views=count, motion="free", branches=True, roll_rad=np.pi)
-    return simulate(replace(free, cut_views=0.0)).joints
+    return simulate(replace(free, cut_views=0.0)).robot.joints
 
 
 @dataclass(frozen=True)

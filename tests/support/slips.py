@@ -46,8 +46,8 @@ class Identifiability:
     @classmethod
     def of(cls, cell: Cell, *, with_poses: bool) -> "Identifiability":
         """A sound session."""
-        poses = cell.base_from_flange if with_poses else None
-        return cls(cell, cell.joints, poses, read_robot_document(cell.options.robot))
+        poses = cell.robot.base_from_flange if with_poses else None
+        return cls(cell, cell.robot.joints, poses, read_robot_document(cell.options.robot))
 
     @property
     def session(self) -> Session:
@@ -191,7 +191,7 @@ def in_the_world(told: Identifiability, rng: np.random.Generator) -> Identifiabi
 
 def as_built(told: Identifiability, _: np.random.Generator) -> Identifiability:
     """Poses of a controller that knows how its own arm was built."""
-    return replace(told, poses=told.cell.true_base_from_flange)
+    return replace(told, poses=told.cell.robot.true_base_from_flange)
 
 
 def as_identified(told: Identifiability, rng: np.random.Generator) -> Identifiability:

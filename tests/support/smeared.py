@@ -25,7 +25,7 @@ def smeared(cell: Cell, *, disc_px: float = 0.0, motion_px: float = 0.0) -> Sess
             its own.
     """
     scene, session, files = prepare_scene(cell), session_of(cell), {}
-    for at, (pose, joints) in enumerate(zip(cell.cam_from_target, cell.joints, strict=True)):
+    for at, (pose, joints) in enumerate(zip(cell.cam_from_target, cell.robot.joints, strict=True)):
         light = light_on(scene, pose, joints, samples=SAMPLES)
         rng = np.random.default_rng([cell.options.seed, at])
         along = rng.uniform(0, np.pi)

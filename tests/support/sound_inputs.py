@@ -31,9 +31,7 @@ from visioncal.simulation import (
     NetworkOptions,
     RobotAt,
     simulate,
-    simulate_network,
     wide_camera,
-    write_network,
     write_session,
 )
 from visioncal.simulation.dynamics import Body, real_dynamics
@@ -89,7 +87,7 @@ def _board(_: Inputs, path: Path) -> None:
 def typed() -> str:
     """What is typed to `record` at each picture of the board: take it, its pose, it is right."""
     lines = []
-    for pose in simulate(BOARD).base_from_flange:
+    for pose in simulate(BOARD).robot.base_from_flange:
         turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
         lines += ["", f"p[{', '.join(f'{value:.6f}' for value in [*pose[:3, 3], *turn])}]", ""]
     return "\n".join([*lines, "q", ""])
@@ -145,7 +143,7 @@ def _network(_: Inputs, path: Path) -> None:
         ),
         stops=6,
     )
-    write_network(simulate_network(options), path)
+    write_session(simulate(options), path)
     path.with_name(path.name + ".truth.json").unlink()
 
 

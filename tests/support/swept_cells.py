@@ -6,11 +6,11 @@ from visioncal.core.types import Corners
 from visioncal.session import Session
 from visioncal.simulation import (
     CameraAt,
-    Network,
+    Cell,
     NetworkOptions,
     Swept,
-    network_session,
-    simulate_network,
+    cell_session,
+    simulate,
 )
 
 AHEAD_S = 0.037
@@ -19,13 +19,13 @@ SIDE = CameraAt("side", place_m=(0.9, 0.1, 1.3), at_stops=False)
 HOW = Swept("side", "b", "plate_b", camera_minus_robot_s=AHEAD_S, frames_hz=30.0)
 
 
-def cell_of(options: NetworkOptions, how: Swept = HOW) -> Network:
+def cell_of(options: NetworkOptions, how: Swept = HOW) -> Cell:
     """A cell with one more camera, at the side, which sees a board on a moving flange."""
-    return simulate_network(replace(options, cameras=(*options.cameras, SIDE), sweeps=(how,)))
+    return simulate(replace(options, cameras=(*options.cameras, SIDE), sweeps=(how,)))
 
 
-def swept_session(cell: Network) -> tuple[Session, dict[int, Corners]]:
+def swept_session(cell: Cell) -> tuple[Session, dict[int, Corners]]:
     """The cell's session, and what is detected in its images."""
-    return network_session(cell, "swept", seen="names"), {
+    return cell_session(cell, "swept", seen="names"), {
         view_corners.view: view_corners for view_corners in cell.corners
     }

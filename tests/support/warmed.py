@@ -12,9 +12,9 @@ from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.robot.thermal import Inputs
 from visioncal.session import Session
-from visioncal.simulation import CellOptions, WarmUp, WarmUpOptions, simulate_warm_up
+from visioncal.simulation import Cell, CellOptions, WarmUpOptions, cell_session, simulate_warm_up
+from visioncal.simulation.heat import Heat, Warming, heated_poses
 from visioncal.simulation.optics import fine_camera
-from visioncal.simulation.warmup import heated_poses
 
 # What 100 minutes are to predict: the rest of five hours [s].
 TRAINED_S, END_S = 6000.0, 18000.0
@@ -29,12 +29,16 @@ class Warmed:
 
     Attributes:
         truth: What really was.
+        heat: What heats the arm.
+        warming: Its temperatures, all through.
         session: What was recorded of it.
         calibration: What was made of that.
         whole: What heats the arm, until the end.
     """
 
-    truth: WarmUp
+    truth: Cell
+    heat: Heat
+    warming: Warming
     session: Session
     calibration: Calibration
     whole: Inputs
@@ -44,12 +48,13 @@ def warmed(
     options: CellOptions = CELL, *, temperatures: bool = True, level: str = "thermal", **changes
 ) -> Warmed:
     """Simulates a warm-up and calibrates with it."""
-    truth = simulate_warm_up(replace(WarmUpOptions(options), **changes))
-    session = truth.session("warm-up", temperatures=temperatures)
-    whole = session.with_streams({"heat": truth.warming.recorded(temperatures=temperatures)})
-    inputs, missing = inputs_of(whole, truth.cell.joints.shape[1])
+    how = replace(WarmUpOptions(options, temperatures=temperatures), **changes)
+    truth, warming = simulate_warm_up(how), how.warming()
+    session = cell_session(truth, "warm-up", seen="poses")
+    whole = session.with_streams({"heat": warming.recorded(temperatures=temperatures)})
+    inputs, missing = inputs_of(whole, truth.robot.joints.shape[1])
     assert inputs is not None, missing
-    return Warmed(truth, session, calibrate(session, level=level), inputs)
+    return Warmed(truth, how.heats, warming, session, calibrate(session, level=level), inputs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +85,13 @@ class Drift:
 def drift_of(found: Warmed) -> Drift:
     """Predicts the drift, all over the workspace."""
     truth, model = found.truth, found.calibration.drift
-    nominal = load_robot(truth.cell.options.robot)
+    nominal = load_robot(truth.options.robot)
     q = postures(nominal)[:PLACES]
     at_s = np.linspace(TRAINED_S, END_S, len(q))
     links = model.heating.links_c(found.whole, at_s)
     cold = model.heating.links_c(found.whole, found.whole.stamps_s[:1])[0]
-    arm, heat = truth.cell.true_arm, truth.heat
-    really = truth.warming.at(at_s)
+    arm, heat = truth.robot.true_arm, found.heat
+    really = found.warming.at(at_s)
     hot, still = (
         heated_poses(arm, heat, q, array)[:, :3, 3]
         for array in (really, np.full_like(really, heat.ambient_c))

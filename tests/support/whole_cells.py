@@ -11,12 +11,12 @@ from visioncal.simulation import (
     BOARDS,
     BoardAt,
     CameraAt,
-    Network,
+    Cell,
     NetworkOptions,
     RobotAt,
+    cell_session,
     fine_camera,
-    network_session,
-    simulate_network,
+    simulate,
 )
 
 # Boards whose size is known: else it is most of what a target's place is uncertain by.
@@ -39,9 +39,9 @@ OPTIONS = NetworkOptions(
 LATER = 20
 
 
-def recorded(cell: Network) -> Session:
+def recorded(cell: Cell) -> Session:
     """The session of a cell, with its corners in the place of images."""
-    return network_session(cell, "two arms", seen="corners")
+    return cell_session(cell, "two arms", seen="corners")
 
 
 def part(session: Session, first: int, end: int) -> Session:
@@ -53,7 +53,7 @@ def part(session: Session, first: int, end: int) -> Session:
     return replace(session, views=views, corner_table=session.corner_table.of_views(numbers))
 
 
-def saved(folder: Path, cell: Network) -> tuple[Path, Path]:
+def saved(folder: Path, cell: Cell) -> tuple[Path, Path]:
     """Writes what is to be calibrated, and what comes later."""
     session = recorded(cell)
     part(session, 0, LATER).save(folder / "session")
@@ -67,11 +67,11 @@ def misfit(matrix, covariance, truth):
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def simulated(seed: int = 0) -> Network:
-    return simulate_network(replace(OPTIONS, seed=seed))
+def simulated(seed: int = 0) -> Cell:
+    return simulate(replace(OPTIONS, seed=seed))
 
 
-def truth(cell: Network, first: str, second: str):
+def truth(cell: Cell, first: str, second: str):
     """Where a frame is in another of the same body: one of them may be a flange or a base."""
-    of_first = np.eye(4) if first.startswith("flange") else cell.transforms[first]
-    return invert(of_first) @ cell.transforms[second]
+    of_first = np.eye(4) if first.startswith("flange") else cell.mountings[first]
+    return invert(of_first) @ cell.mountings[second]

@@ -45,11 +45,11 @@ def error_m(cell, known, robot):
     """
     q = postures(getattr(robot, "nominal", robot))
     mount, edges = cell.options.mount, known.solved.state.edges
-    true = target_in_camera(mount, *cell.transforms.values(), cell.flange_at(q))
-    true = true @ told_frame(cell.sheets[0])
+    true = target_in_camera(mount, *cell.transforms.values(), cell.robot.flange_at(q))
+    true = true @ told_frame(cell.board())
     ours = target_in_camera(mount, *edges, robot.base_from_flange(q))
     if mount == "eye-in-hand":
         away = (invert(true) - invert(ours))[:, :3, 3]
     else:
-        away = (true - ours)[:, :3] @ [*centre_m(cell.sheets[0]), 1.0]
+        away = (true - ours)[:, :3] @ [*centre_m(cell.board()), 1.0]
     return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))

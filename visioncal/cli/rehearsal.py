@@ -156,7 +156,7 @@ class Rehearsal:
         say, times = answers().print, self.times_s
         print_summary(self.calibration, verbose=False)
         truth = self.cell.truth
-        say(truth_table(self.calibration, truth.transforms, truth.options.camera))
+        say(truth_table(self.calibration, truth.transforms, truth.camera().camera))
         error = self.error
         verb = "is explained by" if error.passed else "is more than"
         say(

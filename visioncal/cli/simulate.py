@@ -15,7 +15,7 @@ from visioncal.core.errors import DataError
 
 # Help does not wait for them.
 if TYPE_CHECKING:
-    from visioncal.simulation import CellOptions
+    from visioncal.simulation import Cell, CellOptions
     from visioncal.simulation.tracked import Tracked
 Read: TypeAlias = Literal["point", "points", "probe"]
 
@@ -167,23 +167,9 @@ class SimulateOptions:
 
 def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
     """Write a simulated session, and its truth in a file beside it."""
-    from visioncal.cli.simulated_cell import CENTRE_M, exercise_options, whole_cell
+    from visioncal.cli.simulated_cell import CENTRE_M, exercise_options, exercised, whole_cell
     from visioncal.session.saving import refuse_filled
-    from visioncal.simulation import (
-        BOARDS,
-        CAMERAS,
-        CellOptions,
-        Payload,
-        Round,
-        Second,
-        SweepOptions,
-        WarmUpOptions,
-        simulate_warm_up,
-        truth_path,
-        write_sweep,
-        write_warm_up,
-    )
-    from visioncal.simulation import sweep as swept
+    from visioncal.simulation import BOARDS, CAMERAS, CellOptions, Payload, Second, truth_path
     from visioncal.simulation.exercise import write_exercise
     from visioncal.simulation.tracked import Tracked, tracked, write_tracked
 
@@ -211,42 +197,59 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
     # Rendering takes its time.
     refuse_filled(folder.absolute())
     if asked.cell is not None:
-        whole_cell(asked.cell, asked, options, given)
+        cell = whole_cell(asked.cell, options, given, asked.instrument)
+        _write(exercised(cell, asked) if asked.torques else cell, asked)
     elif asked.instrument is not None:
         stops = asked.views if "views" in given else Tracked.stops
         write_tracked(tracked(_read_by(asked.instrument, options, stops)), folder)
     elif asked.torques:
         write_exercise(exercise_options(asked, asked.robot, asked.seed), folder)
-    elif asked.warm_up:
-        how = WarmUpOptions(options, round=Round(first=asked.views))
-        write_warm_up(simulate_warm_up(how), folder, temperatures=not asked.currents)
-    elif asked.sweep:
-        clocks = SweepOptions(
-            camera_minus_robot_s=1e-3 * asked.clock_offset_ms, readout_s=1e-3 * asked.readout_ms
-        )
-        write_sweep(swept(options, clocks), folder)
     else:
-        _single(options, asked)
+        _write(_single(options, asked), asked)
     say(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _single(options: "CellOptions", asked: SimulateOptions) -> None:
-    """Writes a cell of one robot, and what its tool touched."""
-    from visioncal.simulation import simulate, touch, write_session
+def _single(options: "CellOptions", asked: SimulateOptions) -> "Cell":
+    """A cell of one robot: at stops, in a sweep, or while it warms up."""
+    from visioncal.simulation import (
+        Round,
+        SweepOptions,
+        WarmUpOptions,
+        simulate,
+        simulate_warm_up,
+        sweep,
+    )
 
-    cell = simulate(options)
+    if asked.warm_up:
+        how = Round(first=asked.views)
+        warms = WarmUpOptions(options, round=how, temperatures=not asked.currents)
+        return simulate_warm_up(warms)
+    if asked.sweep:
+        clocks = SweepOptions(
+            camera_minus_robot_s=1e-3 * asked.clock_offset_ms, readout_s=1e-3 * asked.readout_ms
+        )
+        return sweep(options, clocks)
+    return simulate(options)
+
+
+def _write(cell: "Cell", asked: SimulateOptions) -> None:
+    """Writes a cell, and what its robots touched."""
+    from visioncal.simulation import touch, write_session
+
+    count = len(cell.sights)
     with shown_progress(quiet=False) as progress:
         write_session(
             cell,
             asked.folder,
-            lambda share: progress("render", round(share * options.views), options.views),
-            images=asked.images,
+            lambda share: progress("render", round(share * count), count),
+            images=asked.images and not (asked.sweep or asked.warm_up),
             touched=touch(cell) if asked.touches else None,
         )
 
 
 def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
     """What an instrument reads of the arm of a cell."""
+    from visioncal.simulation import ArmOptions
     from visioncal.simulation.tracked import THREE, Tracked
 
     return Tracked(
@@ -254,7 +257,7 @@ def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
         points=THREE if instrument == "points" else THREE[:1],
         poses=instrument == "probe",
         seed=options.seed,
-        **options.of_arm,
+        **options.part(ArmOptions),
     )
 
 

@@ -6,12 +6,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.cli.progress import shown_progress
 from visioncal.cli.simulate import Read, SimulateOptions
 from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (
     CameraAt,
+    Cell,
     CellOptions,
     InstrumentAt,
     Moved,
@@ -19,13 +19,16 @@ from visioncal.simulation import (
     PointAt,
     RobotAt,
     read_cell,
-    simulate_network,
-    touch_network,
-    write_network,
+    simulate,
 )
 from visioncal.simulation.dynamics import Body
-from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise, seed_of
-from visioncal.simulation.records import Seen
+from visioncal.simulation.exercise import (
+    ExerciseOptions,
+    Senses,
+    exercise,
+    seed_of,
+    with_exercises,
+)
 from visioncal.simulation.tracked import THREE, Tracked
 
 _T = TypeVar("_T", RobotAt, CameraAt)
@@ -48,35 +51,26 @@ _GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 
 
 def whole_cell(
-    name: str, asked: SimulateOptions, options: CellOptions, given: frozenset[str]
-) -> None:
-    """Writes a whole cell; what the user gives comes before what is described."""
-    described = _described(name, options, given, asked.instrument)
-    cell = simulate_network(described)
+    name: str, options: CellOptions, given: frozenset[str], instrument: Read | None
+) -> Cell:
+    """Simulates a whole cell; what the user gives comes before what is described."""
+    cell = simulate(_described(name, options, given, instrument))
     if not (cell.sights or cell.readings):
         raise DataError(
             f"--cell {name}: nothing in this cell is seen or read.",
             culprits=[name],
             next_step="Give it a camera that sees a target, or an instrument and points.",
         )
-    exercised = {
-        robot.name: exercise(exercise_options(asked, robot.robot, seed_of(described.seed, at)))
-        for at, robot in enumerate(described.robots if asked.torques else ())
+    return cell
+
+
+def exercised(cell: Cell, asked: SimulateOptions) -> Cell:
+    """The cell with streams of torques of all its robots."""
+    done = {
+        robot.name: exercise(exercise_options(asked, robot.robot, seed_of(cell.options.seed, at)))
+        for at, robot in enumerate(cell.layout.robots)
     }
-    touched = touch_network(cell) if asked.touches else {}
-    # Rows of an image that are not of one moment have no pose.
-    row_by_row = any(sweep.readout_s for sweep in described.sweeps)
-    without_images: Seen = "corners" if row_by_row else "poses"
-    with shown_progress(quiet=False) as progress:
-        count = len(cell.sights)
-        write_network(
-            cell,
-            asked.folder,
-            lambda share: progress("render", round(share * count), count),
-            seen="images" if asked.images else without_images,
-            touched=touched,
-            exercised=exercised,
-        )
+    return with_exercises(cell, done)
 
 
 def _described(

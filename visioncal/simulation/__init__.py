@@ -5,20 +5,22 @@ projection or a wrong chain cannot hide by being wrong in both.
 """
 
 from visioncal.simulation.arms import Arm, arm_named, forward, ur_arm
-from visioncal.simulation.cell import Cell, simulate
+from visioncal.simulation.cell import Cell, Reading, Sight, SimulatedRobot
 from visioncal.simulation.described import cell_names, read_cell
+from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
+    CellOptions,
     InstrumentAt,
     Moved,
     NetworkOptions,
     PointAt,
     RobotAt,
+    Second,
     Swept,
 )
-from visioncal.simulation.network import simulate_network
-from visioncal.simulation.observed_points import Network, Sight
+from visioncal.simulation.observing import simulate
 from visioncal.simulation.optics import (
     CAMERAS,
     fine_camera,
@@ -27,36 +29,15 @@ from visioncal.simulation.optics import (
     rays,
     wide_camera,
 )
-from visioncal.simulation.options import (
-    BOARDS,
-    CameraOptions,
-    CellOptions,
-    Second,
-    SweepOptions,
-)
+from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
 from visioncal.simulation.real_arm import ArmOptions
-from visioncal.simulation.records import (
-    cell_session,
-    measured_poses,
-    network_session,
-    sweep_session,
-    write_network,
-    write_session,
-    write_sweep,
-)
+from visioncal.simulation.records import cell_session, measured_poses, write_session
 from visioncal.simulation.render import Scene, prepare_scene, render
 from visioncal.simulation.sag import Payload
-from visioncal.simulation.sweep import Sweep, sweep
-from visioncal.simulation.touching import touch, touch_network
+from visioncal.simulation.sweep import sweep
+from visioncal.simulation.touching import touch
 from visioncal.simulation.truth import Truth, read_truth, truth_path
-from visioncal.simulation.warmup import (
-    Heat,
-    Round,
-    WarmUp,
-    WarmUpOptions,
-    simulate_warm_up,
-    write_warm_up,
-)
+from visioncal.simulation.warmup import Round, WarmUpOptions, simulate_warm_up
 
 __all__ = [
     "BOARDS",
@@ -71,20 +52,19 @@ __all__ = [
     "Heat",
     "InstrumentAt",
     "Moved",
-    "Network",
     "NetworkOptions",
     "Payload",
     "PointAt",
+    "Reading",
     "RobotAt",
     "Round",
     "Scene",
     "Second",
     "Sight",
-    "Sweep",
+    "SimulatedRobot",
     "SweepOptions",
     "Swept",
     "Truth",
-    "WarmUp",
     "WarmUpOptions",
     "arm_named",
     "cell_names",
@@ -93,7 +73,6 @@ __all__ = [
     "fisheye_camera",
     "forward",
     "measured_poses",
-    "network_session",
     "prepare_scene",
     "project",
     "rays",
@@ -101,17 +80,11 @@ __all__ = [
     "read_truth",
     "render",
     "simulate",
-    "simulate_network",
     "simulate_warm_up",
     "sweep",
-    "sweep_session",
     "touch",
-    "touch_network",
     "truth_path",
     "ur_arm",
     "wide_camera",
-    "write_network",
     "write_session",
-    "write_sweep",
-    "write_warm_up",
 ]

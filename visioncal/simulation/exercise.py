@@ -1,13 +1,14 @@
 """Motions of a simulated arm, and what its controller records of them."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.session import Session, Stream
+from visioncal.simulation.cell import Cell
 from visioncal.simulation.dynamics import Body, DynamicArm, drive_torques, real_dynamics
 from visioncal.simulation.truth import write_truth
 
@@ -171,6 +172,19 @@ def exercise(options: ExerciseOptions) -> Exercised:
     }
     streams = {name: record(built, motion, rng, options.senses) for name, motion in motions.items()}
     return Exercised(streams, empty)
+
+
+def with_exercises(cell: Cell, exercised: Mapping[str, Exercised]) -> Cell:
+    """A cell with what its robots' controllers recorded of motions: streams are `ROBOT_MOTION`."""
+    streams = {
+        f"{robot}_{motion}": stream
+        for robot, done in exercised.items()
+        for motion, stream in done.streams.items()
+    }
+    arms = {robot: asdict(item.arm) for robot, item in exercised.items()}
+    return replace(
+        cell, streams={**cell.streams, **streams}, facts={**cell.facts, "dynamics": arms}
+    )
 
 
 def write_exercise(options: ExerciseOptions, folder: Path | str) -> Path:

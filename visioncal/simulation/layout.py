@@ -1,18 +1,25 @@
-"""What a simulated cell of several robots, cameras and boards is made of, and its faults."""
+"""What simulated cells are made of, and their faults."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
+from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
-from visioncal.core.types import Target
+from visioncal.core.types import Mount, Target
 from visioncal.simulation.boards import Sheet
 from visioncal.simulation.draws import DrawOptions
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
+from visioncal.simulation.poses import Motion, Viewpoints
 from visioncal.simulation.real_arm import ArmOptions
 
 # Where robots meet [m].
 MIDDLE_M = (0.0, 0.0, 0.4)
 CELL = "cell"
+# An operator's pace: a stop every so many seconds [s].
+_PACE_S = 4.0
+# What a session calls the boards of a cell with a second one.
+_TWO_BOARDS = ("first", "second")
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,8 @@ class Swept(SweepOptions):
 class NetworkOptions(DrawOptions):
     """A simulated cell with several of a kind: two robots, two fixed cameras and three boards.
 
-    Nothing hides anything else: what is in a camera's image is seen.
+    All stand where they are said to, but for a little. Nothing hides anything else: what is in a
+    camera's image is seen.
 
     Attributes:
         robots: The robots.
@@ -220,3 +228,105 @@ class NetworkOptions(DrawOptions):
     def first_pushed(self, moved: Moved) -> int:
         """The first stop after a push."""
         return self.stops // 2 if moved.from_stop is None else moved.from_stop
+
+    @property
+    def layout(self) -> "NetworkOptions":
+        """What there is, as of every cell."""
+        return self
+
+
+@dataclass(frozen=True, kw_only=True)
+class Second(Sheet):
+    """A second board of a cell. Every other stop looks at it; it is seen wherever it is in view.
+
+    Attributes:
+        turn_rad: How far around the base it lies from the first (eye-in-hand), or to which side of
+            the flange it leans (eye-to-hand) [rad].
+        tilt_rad: How far it leans: towards the base, or aside [rad].
+    """
+
+    target: Target = BOARDS["checkerboard"]
+    turn_rad: float = 1.4
+    tilt_rad: float = 0.3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CellOptions(ArmOptions, CameraOptions, DrawOptions):
+    """A simulated cell of one robot and one camera, in places of chance.
+
+    The defaults are a well-kept one.
+
+    Attributes:
+        mount: Where the camera is.
+        views: Number of views.
+        target: The board as its file states it.
+        distance_m: Least and greatest distance of the camera from the board's centre [m]; None
+            takes a range in which the board fills the image well, for a camera beside the robot
+            within 0.7 to 1.2 m.
+        tilt_rad: Least and greatest angle between the view and the board's normal [rad].
+        roll_rad: Greatest turn about the optical axis, either way [rad].
+        motion: `free`; or, too poor for hand-eye calibration, turning about `one_axis` only or
+            `translation` alone.
+        branches: Whether the arm takes its elbow, shoulder and wrist either way, from view to view;
+            else all postures are near one another, as an operator would teach them.
+        cut_views: Share of the views in which the image's edge may cut a ChArUco board.
+        wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
+        board_scale: Printed size over stated size.
+        board_bow_m: How far the board's corners are bent away from the camera [m].
+        second: A second board; None for a cell with one.
+        camera_moved_m: How far the camera was pushed from where it sits in this cell [m].
+    """
+
+    mount: Mount = "eye-in-hand"
+    views: int = 20
+    target: Target = BOARDS["charuco"]
+    distance_m: tuple[float, float] | None = None
+    tilt_rad: tuple[float, float] = Viewpoints.tilt_rad
+    roll_rad: float = Viewpoints.roll_rad
+    motion: Motion = Viewpoints.motion
+    branches: bool = False
+    cut_views: float = Viewpoints.cut_views
+    wrong_views: int = 0
+    board_scale: float = 1.0
+    board_bow_m: float = 0.0
+    second: Second | None = None
+    camera_moved_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.views < 1:
+            raise DataError(f"simulation: views is {self.views}, at least 1 is needed.")
+        if not 0 <= self.wrong_views <= self.views:
+            raise DataError(
+                f"simulation: wrong_views is {self.wrong_views}, 0 to {self.views} are possible."
+            )
+        if not 0.0 <= self.tilt_rad[0] <= self.tilt_rad[1] < 1.5:
+            raise DataError(
+                f"simulation: tilt_rad is {self.tilt_rad}, an ascending range in 0 to 1.5 is "
+                "needed: beyond it the camera looks at the board's edge."
+            )
+
+    @property
+    def layout(self) -> NetworkOptions:
+        """What there is, as of every cell: a robot, a camera and an only board have no names."""
+        camera_on, board_on = ("", CELL) if self.mount == "eye-in-hand" else (CELL, "")
+        sheets = [Sheet(target=self.target, scale=self.board_scale, bow_m=self.board_bow_m)]
+        sheets += [self.second] if self.second else []
+        names = _TWO_BOARDS if self.second else ("",)
+        return NetworkOptions(
+            robots=(
+                RobotAt("", (0.0, 0.0, 0.0), wrong_stops=self.wrong_views, **self.part(ArmOptions)),
+            ),
+            cameras=(CameraAt("", camera_on, **self.part(CameraOptions)),),
+            boards=tuple(
+                BoardAt(name, board_on, target=sheet.target, scale=sheet.scale, bow_m=sheet.bow_m)
+                for name, sheet in zip(names, sheets, strict=True)
+            ),
+            stops=self.views,
+            pace_s=_PACE_S,
+            **self.part(DrawOptions),
+        )
+
+    def part(self, kind: type[ArmOptions | CameraOptions | DrawOptions]) -> dict[str, Any]:
+        """The fields of a part by their names, for options that have such a part likewise."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(kind)}

@@ -8,7 +8,7 @@ from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, Image
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import centre_m, corners_m, outline_m
-from visioncal.simulation.cell import Cell, before_camera
+from visioncal.simulation.cell import Cell
 from visioncal.simulation.draws import Stream
 from visioncal.simulation.optics import project, rays
 from visioncal.simulation.rasters import Float32Array, Patch, between, trace
@@ -28,19 +28,21 @@ class LiveView:
     """Takes pictures of a cell's board from wherever its arm is.
 
     Args:
-        cell: The cell, with one board. Its true arm, edges, lens and noise are what counts; the
-            views that it was built with do not matter.
+        cell: The cell, of one robot, one camera and one board. Its true arm, mountings, lens and
+            noise are what counts; the views that it was built with do not matter.
 
     Raises:
         DataError: The cell has two boards, or OpenCV does not have the target's dictionary.
     """
 
     def __init__(self, cell: Cell) -> None:
-        if len(cell.sheets) != 1:
+        boards = cell.layout.boards
+        if len(boards) != 1:
             raise DataError(
-                f"simulation: the cell has {len(cell.sheets)} boards; live pictures show one."
+                f"simulation: the cell has {len(boards)} boards; live pictures show one."
             )
         self._cell = cell
+        self._before = cell.seen_from("", "", "")
         self._scene = prepare_scene(cell)
         self._count = 0
         # The light of the last posture at rest; the noise alone is drawn anew for each picture.
@@ -63,12 +65,12 @@ class LiveView:
         else:
             light = self._smeared(joints, smear_px)
         self._count += 1
-        options = self._cell.options
-        return developed(light, options, options.stream(Stream.IMAGES, 1, self._count))
+        noise = self._cell.options.stream(Stream.IMAGES, 1, self._count)
+        return developed(light, self._cell.camera(), noise)
 
     def cam_from_target(self, joints: FloatArray) -> FloatArray:
         """Where the board really is before the camera: (k, n) joints [rad] to (k, 4, 4)."""
-        return before_camera(self._cell.transforms, forward(self._cell.true_arm, joints))
+        return self._before(forward(self._cell.robot.true_arm, joints))
 
     def _still(self, pose: FloatArray, posture: FloatArray) -> Float32Array:
         if self._rest is None or self._moved_px(self._rest[0][None], pose[None])[0] > _STILL_PX:
@@ -103,9 +105,9 @@ class LiveView:
         """Moves a picture as if all that it shows were as far away as the board."""
         # A smear is as long as it should be at the board's middle, and symmetric to the true place
         # of every corner everywhere.
-        camera = self._cell.options.camera
+        camera = self._cell.camera().camera
         raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
-        depth = float((middle[:3, :3] @ centre_m(self._cell.sheets[0]) + middle[:3, 3])[2])
+        depth = float((middle[:3, :3] @ centre_m(self._cell.board()) + middle[:3, 3])[2])
         plane = compose(np.eye(3), np.array([0.0, 0.0, depth if depth > 0.0 else _FAR_M]))
         plane_from_now = invert(now_from_middle @ plane)
         aims = raster.directions @ plane_from_now[:3, :3].T
@@ -118,23 +120,22 @@ class LiveView:
 
     def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """(k,) bounds on how far the picture moves between poses (k, 4, 4) of the board [px]."""
-        centre = centre_m(self._cell.sheets[0])
+        centre = centre_m(self._cell.board())
         ahead = first[:, :3, :3] @ centre + first[:, :3, 3]
         behind = second[:, :3, :3] @ centre + second[:, :3, 3]
         distance = np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
         shift = np.linalg.norm(behind - ahead, axis=1) / distance
         turn = rotation_angle(second @ invert(first))
-        return np.asarray(self._cell.options.camera.matrix[0] * (shift + turn))
+        return np.asarray(self._cell.camera().camera.matrix[0] * (shift + turn))
 
 
 def _faces(cell: Cell, cam_from_target: FloatArray) -> bool:
     """Tells whether the board's printed side may be in the picture, at least in part."""
-    points = np.concatenate(
-        [corners_m(cell.sheets[0]), outline_m(cell.sheets[0], margin_m(cell.sheets[0].target))]
-    )
+    board = cell.board()
+    points = np.concatenate([corners_m(board), outline_m(board, margin_m(board.target))])
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     cosines = points_cam[:, 2] / np.linalg.norm(points_cam, axis=1)
-    camera = cell.options.camera
+    camera = cell.camera().camera
     ends = (
         np.array(np.meshgrid(*((0.0, index - 1.0) for index in camera.resolution))).reshape(2, 4).T
     )

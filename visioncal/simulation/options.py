@@ -1,21 +1,15 @@
-"""What a simulated cell is made of, and how good or bad it is."""
+"""Boards, cameras and sweeps of simulated cells, and how good or bad they are."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
-from visioncal.core.types import Camera, Mount, Target
-from visioncal.simulation.boards import Sheet
-from visioncal.simulation.draws import DrawOptions
+from visioncal.core.types import Camera, Target
 from visioncal.simulation.optics import mistaken, wide_camera
-from visioncal.simulation.real_arm import ArmOptions
 
 _APRILTAGS = "DICT_APRILTAG_36h11"
-Motion: TypeAlias = Literal["free", "one_axis", "translation"]
 
 
 def _tags() -> Target:
@@ -134,73 +128,3 @@ class SweepOptions:
     def __post_init__(self) -> None:
         if self.stops < 2 or min(self.pace_s, self.robot_hz, self.frames_hz) <= 0.0:
             raise DataError("simulation: a sweep needs two stops, and times and rates above 0.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Second(Sheet):
-    """A second board of a cell. Every other stop looks at it; it is seen wherever it is in view.
-
-    Attributes:
-        turn_rad: How far around the base it lies from the first (eye-in-hand), or to which side of
-            the flange it leans (eye-to-hand) [rad].
-        tilt_rad: How far it leans: towards the base, or aside [rad].
-    """
-
-    target: Target = BOARDS["checkerboard"]
-    turn_rad: float = 1.4
-    tilt_rad: float = 0.3
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CellOptions(ArmOptions, CameraOptions, DrawOptions):
-    """A simulated cell of one robot and one camera. The defaults are a well-kept one.
-
-    Attributes:
-        mount: Where the camera is.
-        views: Number of views.
-        target: The board as its file states it.
-        distance_m: Least and greatest distance of the camera from the board's centre [m]; None
-            takes a range in which the board fills the image well, for a camera beside the robot
-            within 0.7 to 1.2 m.
-        tilt_rad: Least and greatest angle between the view and the board's normal [rad].
-        roll_rad: Greatest turn about the optical axis, either way [rad].
-        motion: `free`; or, too poor for hand-eye calibration, turning about `one_axis` only or
-            `translation` alone.
-        branches: Whether the arm takes its elbow, shoulder and wrist either way, from view to view;
-            else all postures are near one another, as an operator would teach them.
-        cut_views: Share of the views in which the image's edge may cut a ChArUco board.
-        wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
-        board_scale: Printed size over stated size.
-        board_bow_m: How far the board's corners are bent away from the camera [m].
-        second: A second board; None for a cell with one.
-        camera_moved_m: How far the camera was pushed from where it sits in this cell [m].
-    """
-
-    mount: Mount = "eye-in-hand"
-    views: int = 20
-    target: Target = BOARDS["charuco"]
-    distance_m: tuple[float, float] | None = None
-    tilt_rad: tuple[float, float] = (0.1, 0.75)
-    roll_rad: float = 1.3
-    motion: Motion = "free"
-    branches: bool = False
-    cut_views: float = 0.1
-    wrong_views: int = 0
-    board_scale: float = 1.0
-    board_bow_m: float = 0.0
-    second: Second | None = None
-    camera_moved_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        if self.views < 1:
-            raise DataError(f"simulation: views is {self.views}, at least 1 is needed.")
-        if not 0 <= self.wrong_views <= self.views:
-            raise DataError(
-                f"simulation: wrong_views is {self.wrong_views}, 0 to {self.views} are possible."
-            )
-        if not 0.0 <= self.tilt_rad[0] <= self.tilt_rad[1] < 1.5:
-            raise DataError(
-                f"simulation: tilt_rad is {self.tilt_rad}, an ascending range in 0 to 1.5 is "
-                "needed: beyond it the camera looks at the board's edge."
-            )

@@ -1,10 +1,13 @@
 """Where a simulated camera stands to look at a board: views on a cap above it."""
 
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.transforms import compose
-from visioncal.core.types import FloatArray
+from visioncal.core.types import Camera, FloatArray
 from visioncal.simulation.boards import (
     Sheet,
     centre_m,
@@ -14,7 +17,8 @@ from visioncal.simulation.boards import (
     pattern_box,
 )
 from visioncal.simulation.optics import rays, sees
-from visioncal.simulation.options import CellOptions
+
+Motion: TypeAlias = Literal["free", "one_axis", "translation"]
 
 # The print stays this far from the image's edge in views that show it whole [px].
 MARGIN_PX = 12.0
@@ -22,69 +26,93 @@ MARGIN_PX = 12.0
 LEAST_SHARE = 0.6
 
 
-def _working_distance_m(options: CellOptions) -> tuple[float, float]:
-    """Least and greatest distance between camera and board [m]."""
-    if options.distance_m is not None:
-        return options.distance_m
-    left, top, right, bottom = pattern_box(options.target)
-    focal, short_side = float(options.camera.matrix[0]), min(options.camera.resolution)
-    full = focal * float(np.hypot(right - left, bottom - top)) / short_side
-    near, far = full / 1.15, full / 0.7
-    if options.mount == "eye-in-hand":
-        return near, far
-    return min(max(near, 0.7), 1.0), min(max(far, 1.0), 1.2)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Viewpoints:
+    """From where a camera looks at a board.
 
-
-def mean_view(options: CellOptions, sheet: Sheet) -> FloatArray:
-    """The view that the others are spread around: straight, at the mean distance, (4, 4)."""
-    middle = 0.5 * sum(_working_distance_m(options))
-    return compose(np.eye(3), np.array([0.0, 0.0, middle]) - centre_m(sheet))
-
-
-def draw_views(
-    options: CellOptions, sheet: Sheet, count: int, rng: np.random.Generator
-) -> FloatArray:
-    """Draws views and keeps those in which the board is where it should be in the image.
-
-    Returns:
-        (k, 4, 4) `cam_from_target`, k <= count.
+    Attributes:
+        camera: The camera's optics.
+        board: The board.
+        distance_m: Least and greatest distance of the camera from the board's centre [m].
+        tilt_rad: Least and greatest angle between the view and the board's normal [rad].
+        roll_rad: Greatest turn about the optical axis, either way [rad].
+        motion: `free`; or, too poor for hand-eye calibration, turning about `one_axis` only or
+            `translation` alone.
+        cut_views: Share of the views in which the image's edge may cut a board that is found in
+            part.
     """
-    rotation = _rotations(options, count, rng)
-    distance = rng.uniform(*_working_distance_m(options), size=count)
-    # At most this share of the views may be cut.
-    may_be_cut = rng.random(count) < (options.cut_views if found_in_part(options.target) else 0)
-    reach = np.where(may_be_cut, 0.4, 0.3)[:, None]
-    aim = (0.5 + reach * rng.uniform(-1.0, 1.0, size=(count, 2))) * np.array(
-        options.camera.resolution
-    )
-    centre = distance[:, None] * rays(options.camera, aim)
-    cam_from_target = compose(rotation, centre - rotation @ centre_m(sheet))
-    whole = sees(options.camera, _place(cam_from_target, outline_m(sheet, 0.0)), MARGIN_PX)
-    seen = sees(options.camera, _place(cam_from_target, corners_m(sheet)), MARGIN_PX)
-    fits = whole.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
-    return np.asarray(cam_from_target[fits])
+
+    camera: Camera
+    board: Sheet
+    distance_m: tuple[float, float]
+    tilt_rad: tuple[float, float] = (0.1, 0.75)
+    roll_rad: float = 1.3
+    motion: Motion = "free"
+    cut_views: float = 0.1
+
+    def mean(self) -> FloatArray:
+        """The view that the others are spread around: straight, at the mean distance, (4, 4)."""
+        middle = 0.5 * sum(self.distance_m)
+        return compose(np.eye(3), np.array([0.0, 0.0, middle]) - centre_m(self.board))
+
+    def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Draws views and keeps those in which the board is where it should be in the image.
+
+        Returns:
+            (k, 4, 4) `cam_from_target`, k <= count.
+        """
+        rotation = self._rotations(count, rng)
+        distance = rng.uniform(*self.distance_m, size=count)
+        # At most this share of the views may be cut.
+        share = self.cut_views if found_in_part(self.board.target) else 0
+        may_be_cut = rng.random(count) < share
+        reach = np.where(may_be_cut, 0.4, 0.3)[:, None]
+        aim = (0.5 + reach * rng.uniform(-1.0, 1.0, size=(count, 2))) * np.array(
+            self.camera.resolution
+        )
+        centre = distance[:, None] * rays(self.camera, aim)
+        cam_from_target = compose(rotation, centre - rotation @ centre_m(self.board))
+        whole = sees(self.camera, _place(cam_from_target, outline_m(self.board, 0.0)), MARGIN_PX)
+        seen = sees(self.camera, _place(cam_from_target, corners_m(self.board)), MARGIN_PX)
+        fits = whole.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
+        return np.asarray(cam_from_target[fits])
+
+    def _rotations(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """(count, 3, 3) rotations: the board's tilt about an axis in its plane, then the roll."""
+        low, high = self.tilt_rad
+        # Uniform on the cap's area: the cosine of the tilt is uniform.
+        tilt = np.arccos(rng.uniform(np.cos(high), np.cos(low), size=count))
+        azimuth = rng.uniform(-np.pi, np.pi, size=count)
+        roll = rng.uniform(-self.roll_rad, self.roll_rad, size=count)
+        if self.motion != "free":
+            tilt, azimuth = np.full(count, 0.5 * (low + high)), np.full(count, 0.6)
+        axis = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
+        tilted = Rotation.from_rotvec(tilt[:, None] * axis)
+        along_z = roll[:, None] * np.array([0.0, 0.0, 1.0])
+        if self.motion == "translation":
+            turned = tilted
+        elif self.motion == "one_axis":
+            # The board turns about its own normal, so that all relative rotations share that axis.
+            turned = tilted * Rotation.from_rotvec(along_z)
+        else:
+            turned = Rotation.from_rotvec(along_z) * tilted
+        return np.asarray(turned.as_matrix(), dtype=float)
 
 
-def _rotations(options: CellOptions, count: int, rng: np.random.Generator) -> FloatArray:
-    """(count, 3, 3) rotations: the board's tilt about an axis in its plane, then the roll."""
-    low, high = options.tilt_rad
-    # Uniform on the cap's area: the cosine of the tilt is uniform.
-    tilt = np.arccos(rng.uniform(np.cos(high), np.cos(low), size=count))
-    azimuth = rng.uniform(-np.pi, np.pi, size=count)
-    roll = rng.uniform(-options.roll_rad, options.roll_rad, size=count)
-    if options.motion != "free":
-        tilt, azimuth = np.full(count, 0.5 * (low + high)), np.full(count, 0.6)
-    axis = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)], axis=1)
-    tilted = Rotation.from_rotvec(tilt[:, None] * axis)
-    along_z = roll[:, None] * np.array([0.0, 0.0, 1.0])
-    if options.motion == "translation":
-        turned = tilted
-    elif options.motion == "one_axis":
-        # The board turns about its own normal, so that all relative rotations share that axis.
-        turned = tilted * Rotation.from_rotvec(along_z)
-    else:
-        turned = Rotation.from_rotvec(along_z) * tilted
-    return np.asarray(turned.as_matrix(), dtype=float)
+def looking_at(point: FloatArray, away: FloatArray, distance_m: float) -> FloatArray:
+    """(4, 4) where an upright camera is that looks at a point along -`away` from so far."""
+    right = np.cross(-away, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(-away, right), -away], axis=1)
+    return compose(rotation, point + distance_m * away)
+
+
+def filling_m(camera: Camera, board: Sheet) -> tuple[float, float]:
+    """Least and greatest distance at which a board fills a camera's image well [m]."""
+    left, top, right, bottom = pattern_box(board.target)
+    focal, short_side = float(camera.matrix[0]), min(camera.resolution)
+    full = focal * float(np.hypot(right - left, bottom - top)) / short_side
+    return full / 1.15, full / 0.7
 
 
 def _place(cam_from_target: FloatArray, points: FloatArray) -> FloatArray:

@@ -1,8 +1,7 @@
 """A robot's arm as it was built: off its data sheet, giving way, and repeating so well."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,11 +33,6 @@ class ArmOptions(ArmErrors):
     payloads: tuple[Payload, ...] = ()
     mass_share: float = 1.0
     backlash_rad: tuple[float, ...] = ()
-
-    @property
-    def of_arm(self) -> dict[str, Any]:
-        """The fields of an arm by their names, for options that have an arm likewise."""
-        return {field.name: getattr(self, field.name) for field in fields(ArmOptions)}
 
     @property
     def sigma(self) -> FloatArray:

@@ -4,7 +4,6 @@ One robot with one camera is a cell whose things have no names: its session has 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -17,21 +16,13 @@ from visioncal.core.types import Camera, FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name, target_document
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
-from visioncal.simulation.cell import Cell
-from visioncal.simulation.exercise import Exercised
-from visioncal.simulation.layout import CELL, BoardAt, CameraAt
-from visioncal.simulation.observed_points import (
-    Network,
-    Sight,
-    board_named,
-    camera_named,
-    whole,
-)
+from visioncal.simulation.cell import Cell, Sight
+from visioncal.simulation.draws import Stream
+from visioncal.simulation.layout import BoardAt, CameraAt, CellOptions
 from visioncal.simulation.optics import project
 from visioncal.simulation.options import BOARDS
-from visioncal.simulation.render import Scene, encode, network_scene, render
+from visioncal.simulation.render import Scene, encode, prepare_scene, render
 from visioncal.simulation.rows import POSE, load_row, pose_row
-from visioncal.simulation.sweep import Sweep
 from visioncal.simulation.touching import Touching, write_touches
 from visioncal.simulation.truth import truth_of, write_truth
 
@@ -52,56 +43,7 @@ def write_session(
     progress: Callable[[float], None] | None = None,
     *,
     images: bool = True,
-    touched: Touching | None = None,
-) -> Path:
-    """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
-
-    Args:
-        cell: The cell.
-        folder: The session's folder; it must not hold anything yet.
-        progress: Called with the share of the images that is done, 0 to 1.
-        images: Whether to render images. Without them the session holds pose pairs: cam_from_target
-            as a PnP with `pixel_sigma_px` of noise would measure it, and neither camera nor target.
-        touched: What its robot touched.
-
-    Returns:
-        The session's folder.
-
-    Raises:
-        DataError: The folder cannot be written, or the target cannot be drawn.
-    """
-    folder = Path(folder)
-    seen: Seen = "images" if images else "poses"
-    session = cell_session(cell, folder.name, progress, seen=seen)
-    return _write(session, folder, truth_of(cell), {} if touched is None else {"": touched})
-
-
-def write_sweep(moved: Sweep, folder: Path | str) -> Path:
-    """Writes a sweep as a session's folder, and its truth beside it.
-
-    Each frame is a view with its time and `cam_from_target` as a PnP would measure it, or with its
-    corners where the camera takes an image row by row; the robot's poses and joints are in
-    `streams/robot.csv`, by another clock.
-
-    Returns:
-        The session's folder.
-
-    Raises:
-        DataError: The folder cannot be written.
-    """
-    folder, how = Path(folder), moved.options
-    clock = {"camera_minus_robot_s": how.camera_minus_robot_s, "readout_s": how.readout_s}
-    return _write(sweep_session(moved, folder.name), folder, truth_of(moved.cell) | clock, {})
-
-
-def write_network(
-    cell: Network,
-    folder: Path | str,
-    progress: Progress | None = None,
-    *,
-    seen: Seen = "images",
     touched: Mapping[str, Touching] | None = None,
-    exercised: Mapping[str, Exercised] | None = None,
 ) -> Path:
     """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
 
@@ -109,9 +51,10 @@ def write_network(
         cell: The cell.
         folder: The session's folder; it must not hold anything yet.
         progress: Called with the share of the images that is done, 0 to 1.
-        seen: What rows have of what was seen.
+        images: Whether to render images. Without them rows have cam_from_target as a PnP with
+            `pixel_sigma_px` of noise would measure it; or corners, where a camera takes its images
+            row by row.
         touched: What its robots touched, by their names.
-        exercised: What their controllers recorded of motions; streams are `ROBOT_MOTION`.
 
     Returns:
         The session's folder.
@@ -120,28 +63,14 @@ def write_network(
         DataError: The folder cannot be written, or a target cannot be drawn.
     """
     folder = Path(folder)
-    streams = {
-        f"{robot}_{motion}": stream
-        for robot, done in (exercised or {}).items()
-        for motion, stream in done.streams.items()
-    }
-    session = network_session(cell, folder.name, progress, seen=seen)
-    truth = _truth_of_network(cell)
-    if exercised:
-        truth["dynamics"] = {robot: asdict(item.arm) for robot, item in exercised.items()}
-    every = session.with_streams({**session.streams, **streams})
-    return _write(every, folder, truth, touched or {})
-
-
-def _write(
-    session: Session, folder: Path, truth: dict[str, Any], touched: Mapping[str, Touching]
-) -> Path:
-    """Writes a session, what robots touched, and the truth of both."""
+    without: Seen = "poses" if all(sight.at_once for sight in cell.sights) else "corners"
+    session = cell_session(cell, folder.name, progress, seen="images" if images else without)
     session.save(folder)
+    truth = truth_of(cell)
     if touched:
         write_touches(touched, folder)
-    for robot, touching in touched.items():
-        truth["transforms"] |= touching.transforms(robot)
+        for robot, touching in touched.items():
+            truth["transforms"] |= touching.transforms(robot)
     write_truth(folder, truth)
     return folder
 
@@ -149,28 +78,12 @@ def _write(
 def cell_session(
     cell: Cell, name: str, progress: Progress | None = None, *, seen: Seen = "images"
 ) -> Session:
-    """The session of a cell of one robot and one camera.
+    """The session of a cell; see `write_session`.
 
-    With poses it has neither camera nor target, but for the names of two boards.
+    With `seen="names"`, `Cell.corners` is what was detected in the images that are not there. With
+    poses of an only camera and an only board it has neither of the two.
     """
-    return network_session(whole(cell), name, progress, seen=seen)
-
-
-def sweep_session(moved: Sweep, name: str) -> Session:
-    """The session of a sweep: frames with measured poses or corners, and the robot's stream."""
-    frames = whole(moved.cell, taken_s=moved.frames_s)
-    seen: Seen = "corners" if moved.options.readout_s else "poses"
-    return network_session(frames, name, seen=seen).with_streams({"robot": moved.robot})
-
-
-def network_session(
-    cell: Network, name: str, progress: Progress | None = None, *, seen: Seen = "images"
-) -> Session:
-    """The session of a cell of several robots; see `write_network`.
-
-    With `seen="names"`, `Network.corners` is what was detected in the images that are not there.
-    """
-    if seen in ("images", "poses") and any(sweep.readout_s for sweep in cell.options.sweeps):
+    if seen in ("images", "poses") and not all(sight.at_once for sight in cell.sights):
         raise DataError(
             "simulation: images and poses are those of a moment, and a sweep has readout_s.",
             next_step="Leave readout_s out, or write corners: visioncal simulate --no-images.",
@@ -190,7 +103,7 @@ def network_session(
         *numbers,
         *last,
     )
-    boards = [board for board in cell.options.boards if board.name or seen != "poses"]
+    boards = [board for board in cell.layout.boards if board.name or seen != "poses"]
     documents = {board.name: target_document(board.target) for board in boards}
     single = next(iter(documents.values()), None)
     return Session.assemble(
@@ -203,10 +116,13 @@ def network_session(
     ).with_streams(cell.streams)
 
 
-def _rows(cell: Network, sights: Sequence[Sight], seen: Seen) -> list[View]:
+def _rows(cell: Cell, sights: Sequence[Sight], seen: Seen) -> list[View]:
     """The rows of what cameras saw, of what instruments read, and of poses alone."""
-    views = {sight.view: _row(cell, sight, seen) for sight in sights}
-    turned = {instrument.name for instrument in cell.options.instruments if instrument.sigma_rad}
+    poses = measured_poses(cell) if seen == "poses" else [None] * len(sights)
+    views = {
+        sight.view: _row(cell, sight, seen, pose) for sight, pose in zip(sights, poses, strict=True)
+    }
+    turned = {instrument.name for instrument in cell.layout.instruments if instrument.sigma_rad}
     for reading in cell.readings:
         robot = cell.robot_of(frame_name("point", reading.point))
         keys = POSE if reading.instrument in turned else POSE[:3]
@@ -219,18 +135,18 @@ def _rows(cell: Network, sights: Sequence[Sight], seen: Seen) -> list[View]:
     return [views[number] for number in sorted(views)]
 
 
-def _document(cell: Network, name: str, seen: Seen) -> dict[str, Any]:
+def _document(cell: Cell, name: str, seen: Seen) -> dict[str, Any]:
     """What session.toml says."""
-    options = cell.options
+    layout = cell.layout
     document: dict[str, Any] = {"schema": 1, "name": name}
-    if any(not camera.name for camera in options.cameras):
-        in_hand = cell.parents[frame_name("camera", "")] != CELL
+    if any(not camera.name for camera in layout.cameras):
+        in_hand = cell.parents["cam"] == "flange"
         document["mount"] = "eye-in-hand" if in_hand else "eye-to-hand"
-    robots = {robot.name: {"model": robot.robot, "tip": "flange"} for robot in options.robots}
+    robots = {robot.name: {"model": robot.robot, "tip": "flange"} for robot in layout.robots}
     cameras = {
-        camera.name: _camera_table(camera, cell.stated[camera.name]) for camera in options.cameras
+        camera.name: _camera_table(camera, cell.stated[camera.name]) for camera in layout.cameras
     }
-    boards = {board.name: {"target": _target_place(board)} for board in options.boards}
+    boards = {board.name: {"target": _target_place(board)} for board in layout.boards}
     if seen == "poses":
         # Of the only camera and the only board, measured poses say all.
         cameras.pop("", None)
@@ -238,14 +154,14 @@ def _document(cell: Network, name: str, seen: Seen) -> dict[str, Any]:
     document |= _tables("robot", robots)
     document |= boards[""] if "" in boards else _tables("target", boards)
     document |= _tables("camera", cameras)
-    if any(robot.name for robot in options.robots):
+    if any(robot.name for robot in layout.robots):
         document["frames"] = {
             word: on for word, on in cell.parents.items() if not word.startswith("base")
         }
     instruments = {
         instrument.name: {"sigma_m": instrument.sigma_m}
         | ({"sigma_rad": instrument.sigma_rad} if instrument.sigma_rad else {})
-        for instrument in options.instruments
+        for instrument in layout.instruments
     }
     return document | _tables("instrument", instruments)
 
@@ -271,12 +187,11 @@ def _target_place(board: BoardAt) -> str:
     return board.target.name if shipped else f"{frame_name('target', board.name)}.toml"
 
 
-def _row(cell: Network, sight: Sight, seen: Seen) -> View:
-    """The row of what a camera saw."""
+def _row(cell: Cell, sight: Sight, seen: Seen, measured: FloatArray | None) -> View:
+    """The row of what a camera saw, with the board's pose where that was measured."""
     text = {"camera": sight.camera, "target": sight.board}
     numbers = {} if sight.stamp_s is None else {"stamp_s": sight.stamp_s}
-    if seen == "poses":
-        measured = measured_pose(cell, sight)
+    if measured is not None:
         numbers |= {f"cft_{key}": value for key, value in pose_row(measured).items()}
     image = _image(cell, sight) if seen in ("images", "names") else ""
     if sight.stamp_s is not None:
@@ -290,7 +205,7 @@ def _row(cell: Network, sight: Sight, seen: Seen) -> View:
 
 
 def _view(
-    cell: Network,
+    cell: Cell,
     number: int,
     stop: int,
     robot: str | None,
@@ -302,14 +217,15 @@ def _view(
     state = {} if cell.stamps_s is None else {"stamp_s": float(cell.stamps_s[stop])}
     words = dict(text)
     if robot is not None:
-        state |= pose_row(cell.base_from_flange[robot][stop])
-        joints = cell.joints[robot][stop].tolist()
+        stood = cell.robots[robot]
+        state |= pose_row(stood.base_from_flange[stop])
+        joints = stood.joints[stop].tolist()
         state |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
-        if robot in cell.loads:
-            state |= load_row(cell.loads[robot][stop])
+        if stood.loads:
+            state |= load_row(stood.loads[stop])
         words = {"robot": robot, **words}
-        if robot in cell.approach:
-            words["approach"] = "+" if cell.approach[robot][stop] > 0 else "-"
+        if stood.approach is not None:
+            words["approach"] = "+" if stood.approach[stop] > 0 else "-"
     return View(number, image, stop=stop, numbers={**state, **numbers}, text=_named(words))
 
 
@@ -330,36 +246,39 @@ def _corners(sights: Sequence[Sight]) -> CornerTable:
 
 
 def measured_poses(cell: Cell) -> FloatArray:
-    """(m, 4, 4) `cam_from_target` as a PnP on the noisy corners of each view would give it.
+    """`cam_from_target` as a PnP on the noisy corners of each image would give it.
+
+    It knows a board by its stated size: one that is larger is seen so much nearer. The error is
+    drawn from the covariance of a least-squares fit of the pose to the corners that are seen,
+    `pixel_sigma_px` squared times the inverse of their Gram matrix.
+
+    Returns:
+        (m, 4, 4), of all images but those of lenses alone.
 
     Raises:
-        DataError: A view shows too few corners for a pose.
+        DataError: An image shows too few corners for a pose.
     """
-    single = whole(cell)
-    return np.array([measured_pose(single, sight) for sight in single.sights])
+    options, sights = cell.options, [sight for sight in cell.sights if not sight.is_of_lens]
+    if isinstance(options, CellOptions):
+        draws = [*options.stream(Stream.PAIRS).standard_normal((len(sights), 6))]
+    else:
+        numbers = [sight.view for sight in sights]
+        draws = [options.stream(Stream.MEASURED, number).standard_normal(6) for number in numbers]
+    return np.array([_measured_pose(cell, *pair) for pair in zip(sights, draws, strict=True)])
 
 
-def measured_pose(cell: Network, sight: Sight) -> FloatArray:
-    """(4, 4) `cam_from_target` as a PnP on the noisy corners of an image would give it.
-
-    It knows the board by its stated size: one that is larger is seen so much nearer.
-
-    The error is drawn from the covariance of a least-squares fit of the pose to the corners that
-    are seen, `pixel_sigma_px` squared times the inverse of their Gram matrix.
-
-    Raises:
-        DataError: The image shows too few corners for a pose.
-    """
-    ids, sheet = sight.exact.ids, board_named(cell.options, sight.board)
+def _measured_pose(cell: Cell, sight: Sight, white: FloatArray) -> FloatArray:
+    """(4, 4) `cam_from_target` as measured, by (6,) white noise."""
+    ids, board = sight.exact.ids, cell.board(sight.board)
     if ids.size < 4:
         raise DataError(f"simulation: view {sight.view} shows {ids.size} corners, a pose needs 4.")
-    camera = camera_named(cell.options, sight.camera).camera
-    jacobian = _pose_jacobian(camera, sight.cam_from_target, corners_m(sheet)[ids])
+    camera = cell.camera(sight.camera).camera
+    jacobian = _pose_jacobian(camera, sight.cam_from_target, corners_m(board)[ids])
     # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
     factor = np.linalg.qr(jacobian, mode="r")
-    off = exp(cell.options.pixel_sigma_px * np.linalg.solve(factor, sight.draws))
+    off = exp(cell.options.pixel_sigma_px * np.linalg.solve(factor, white))
     measured = sight.cam_from_target @ off
-    measured[:3, 3] /= sheet.scale
+    measured[:3, 3] /= board.scale
     return np.asarray(measured)
 
 
@@ -371,8 +290,8 @@ def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArr
     return np.asarray((ahead - behind).T / (2.0 * _STEP))
 
 
-def _image(cell: Network, sight: Sight) -> str:
-    quality = camera_named(cell.options, sight.camera).jpeg_quality
+def _image(cell: Cell, sight: Sight) -> str:
+    quality = cell.camera(sight.camera).jpeg_quality
     suffix = "png" if quality is None else "jpg"
     if not sight.camera:
         return f"images/{sight.view:03d}.{suffix}"
@@ -380,32 +299,15 @@ def _image(cell: Network, sight: Sight) -> str:
     return f"{folder}/{sight.view:04d}.{suffix}"
 
 
-def _rendered(cell: Network, progress: Progress | None) -> dict[str, bytes]:
+def _rendered(cell: Cell, progress: Progress | None) -> dict[str, bytes]:
     """Takes the pictures, each of which shows one board."""
     scenes: dict[tuple[str, str], Scene] = {}
     files: dict[str, bytes] = {}
-    for camera in cell.options.cameras:
+    for camera in cell.layout.cameras:
         for at, sight in enumerate(sight for sight in cell.sights if sight.camera == camera.name):
             seen = sight.camera, sight.board
-            scene = scenes.get(seen) or scenes.setdefault(seen, network_scene(cell, *seen))
+            scene = scenes.get(seen) or scenes.setdefault(seen, prepare_scene(cell, *seen))
             files[_image(cell, sight)] = encode(render(scene, at), camera.jpeg_quality)
             if progress is not None:
                 progress(len(files) / len(cell.sights))
     return files
-
-
-def _truth_of_network(cell: Network) -> dict[str, Any]:
-    return {
-        "schema": 1,
-        "parents": cell.parents,
-        "transforms": dict(cell.transforms),
-        "wrong_views": cell.wrong_views,
-        "wrong_stops": cell.wrong_stops,
-        "moved": [
-            {"frame": move.frame, "from_stop": cell.options.first_pushed(move)}
-            for move in cell.options.moved
-        ],
-        "options": asdict(cell.options),
-        "arms": {name: asdict(arm) for name, arm in cell.true_arms.items()},
-        "base_from_flange": cell.true_base_from_flange,
-    }

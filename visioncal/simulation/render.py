@@ -17,15 +17,8 @@ from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm, link_frames, reach_m
 from visioncal.simulation.boards import Sheet, bow_depth_m, outline_m, unit_m
-from visioncal.simulation.cell import Cell
+from visioncal.simulation.cell import Cell, Sight
 from visioncal.simulation.draws import Stream
-from visioncal.simulation.observed_points import (
-    Network,
-    Sight,
-    board_named,
-    camera_named,
-    whole,
-)
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CameraOptions
 from visioncal.simulation.rasters import (
@@ -103,34 +96,28 @@ class Scene:
     noise: Callable[[int], np.random.Generator]
 
 
-def prepare_scene(cell: Cell, board: int = 0) -> Scene:
+def prepare_scene(cell: Cell, camera: str = "", board: str | None = None) -> Scene:
     """Draws the textures of a cell, which takes longer than one of its pictures.
 
     Args:
         cell: The cell.
-        board: Which of two boards the pictures are to show; they show no other.
+        camera: The camera, where it has a name.
+        board: Which board the pictures are to show; they show no other. None takes the first.
 
     Raises:
         DataError: OpenCV does not have the target's dictionary.
     """
-    single = whole(cell)
-    return network_scene(single, "", single.options.boards[board].name)
-
-
-def network_scene(cell: Network, camera: str, board: str) -> Scene:
-    """Draws the textures of what one camera sees of one board; see `prepare_scene`."""
-    options, optics = cell.options, camera_named(cell.options, camera)
+    options, optics = cell.options, cell.camera(camera)
     sights = [sight for sight in cell.sights if sight.camera == camera]
-    sheet = board_named(options, board)
-    place = [camera_at.name for camera_at in options.cameras].index(camera)
+    sheet = cell.layout.boards[0] if board is None else cell.board(board)
+    place = [camera_at.name for camera_at in cell.layout.cameras].index(camera)
     # The first draws as the only one does.
     rng = options.stream(Stream.BACKDROP, *((place,) if place else ()))
-    seer, holder = frame_name("camera", camera), cell.robot_of(frame_name("target", board))
+    seer, holder = frame_name("camera", camera), cell.robot_of(frame_name("target", sheet.name))
     arm, joints, cam_from_base = None, np.zeros((0, 0)), np.eye(4)
     if holder is not None and cell.robot_of(seer) is None:
-        arm, joints = cell.arms[holder], cell.joints[holder]
-        cam_from_cell = invert(cell.transforms[seer])
-        cam_from_base = cam_from_cell @ cell.transforms[frame_name("base", holder)]
+        arm, joints = cell.robots[holder].arm, cell.robots[holder].joints
+        cam_from_base = cell.between(seer, frame_name("base", holder))
     return Scene(
         camera=optics,
         board=sheet,

@@ -12,11 +12,10 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.session import frame_name
 from visioncal.simulation.arms import Arm, arm_named, forward
 from visioncal.simulation.boards import centre_m
-from visioncal.simulation.cell import home_posture, looking_at, reached
 from visioncal.simulation.draws import Stream
 from visioncal.simulation.layout import CELL, MIDDLE_M, BoardAt, CameraAt, NetworkOptions, RobotAt
-from visioncal.simulation.options import CellOptions
-from visioncal.simulation.poses import draw_views, mean_view
+from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
+from visioncal.simulation.reach import home_posture, reached
 
 # No link comes lower over its own base than this [m].
 _LEAST_HEIGHT_M = 0.02
@@ -31,17 +30,18 @@ _DEPTH_M = 0.15
 
 def parents_of(options: NetworkOptions) -> dict[str, str]:
     """What each frame but the flanges hangs on, by its name in a session."""
-    parents = {frame_name("base", robot.name): CELL for robot in options.robots}
+    parents = {frame_name("base", robot.name): CELL for robot in options.robots if robot.name}
+    root = CELL if parents else "base"
     for kind, things in (
         ("camera", options.cameras),
         ("target", options.boards),
         ("point", options.points),
     ):
         for thing in things:
-            on = CELL if thing.on == CELL else frame_name("flange", thing.on)
+            on = root if thing.on == CELL else frame_name("flange", thing.on)
             parents[frame_name(kind, thing.name)] = on
     return parents | {
-        frame_name("instrument", instrument.name): CELL for instrument in options.instruments
+        frame_name("instrument", instrument.name): root for instrument in options.instruments
     }
 
 
@@ -85,8 +85,7 @@ def _camera(camera: CameraAt, rng: np.random.Generator) -> FloatArray:
     # A camera above all has no upright; it takes the cell's y for that.
     away[1] -= 1e-6
     distance = float(np.linalg.norm(away))
-    straight = compose(np.eye(3), np.array([0.0, 0.0, distance]))
-    return looking_at(goal, away / distance, straight)
+    return looking_at(goal, away / distance, distance)
 
 
 def _board(board: BoardAt, rng: np.random.Generator) -> FloatArray:
@@ -113,14 +112,14 @@ class _Aim:
         board: The board.
         carries_camera: Whether it is the camera that the robot carries.
         other: The robot that carries the other of the two; `cell` for none.
-        cell: What draws views of this board by this camera.
+        views: From where this camera is to look at this board.
     """
 
     camera: CameraAt
     board: BoardAt
     carries_camera: bool
     other: str
-    cell: CellOptions
+    views: Viewpoints
 
 
 def _aims(options: NetworkOptions, robot: RobotAt, stand: Sequence[str]) -> list[_Aim]:
@@ -133,26 +132,18 @@ def _aims(options: NetworkOptions, robot: RobotAt, stand: Sequence[str]) -> list
             carries_camera = camera.on == robot.name
             other = board.on if carries_camera else camera.on
             if other == CELL or other in stand:
-                cell = _drawing(options, camera, board)
-                found.append(_Aim(camera, board, carries_camera, other, cell))
+                views = _viewpoints(camera, board)
+                found.append(_Aim(camera, board, carries_camera, other, views))
     return found
 
 
-def _drawing(options: NetworkOptions, camera: CameraAt, board: BoardAt) -> CellOptions:
-    """A cell of this camera and this board alone, which says from where views are drawn."""
-    distance = None
+def _viewpoints(camera: CameraAt, board: BoardAt) -> Viewpoints:
+    """From where a camera is to look at a board."""
+    distance_m = filling_m(camera.camera, board)
     if camera.on == CELL:
         far = float(np.linalg.norm(np.array(camera.place_m) - camera.looks_at_m))
-        distance = (far - _DEPTH_M, far + _DEPTH_M)
-    return CellOptions(
-        robot=options.robots[0].robot,
-        mount="eye-to-hand" if camera.on == CELL else "eye-in-hand",
-        target=board.target,
-        camera=camera.camera,
-        distance_m=distance,
-        pixel_sigma_px=options.pixel_sigma_px,
-        seed=options.seed,
-    )
+        distance_m = far - _DEPTH_M, far + _DEPTH_M
+    return Viewpoints(camera=camera.camera, board=board, distance_m=distance_m)
 
 
 def postures(options: NetworkOptions, placed: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -200,7 +191,7 @@ def _reached(
             chosen[left] = rng.choice(reachable, int(left.sum()))
         for at in np.unique(chosen[left]):
             aim, stops = aims[at], np.flatnonzero(left & (chosen == at))
-            views = draw_views(aim.cell, aim.board, 4 * len(stops), rng)
+            views = aim.views.draw(4 * len(stops), rng)
             if not len(views):
                 continue
             stops = stops[: len(views)]
@@ -228,7 +219,7 @@ def _home(
     stops: int,
 ) -> FloatArray | None:
     """(n,) a posture in the middle of an aim's; None where the robot does not reach that."""
-    straight = mean_view(aim.cell, aim.board)[None]
+    straight = aim.views.mean()[None]
     for stop in range(min(stops, 1 if aim.other == CELL else _STOPS_TRIED)):
         middle = _flanges(robot, aim, placed, flanges, np.array([stop]), straight)
         try:

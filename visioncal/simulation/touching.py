@@ -14,16 +14,10 @@ from visioncal.core.files import write_atomically
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
-from visioncal.simulation.arms import Arm, forward, inverse, reach_m
-from visioncal.simulation.cell import (
-    LEAST_DEXTERITY,
-    Cell,
-    home_posture,
-    lowest_m,
-)
+from visioncal.simulation.arms import forward, inverse, reach_m
+from visioncal.simulation.cell import Cell, SimulatedRobot
 from visioncal.simulation.draws import Stream
-from visioncal.simulation.observed_points import Network, whole
-from visioncal.simulation.real_arm import ArmOptions
+from visioncal.simulation.reach import LEAST_DEXTERITY, home_posture, lowest_m
 from visioncal.simulation.rows import pose_row
 
 # How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
@@ -45,21 +39,6 @@ _DRAWN_M = np.array(
 _ROUNDS = 6
 _EXACT = 1e-8
 _TRIES = 40
-
-
-@dataclass(frozen=True, eq=False)
-class _Toucher:
-    """An arm that touches.
-
-    Attributes:
-        options: How it gives way, and its repeatability.
-        arm: The nominal arm.
-        true_arm: The arm as it was built.
-    """
-
-    options: ArmOptions
-    arm: Arm
-    true_arm: Arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,38 +91,28 @@ class Touching:
         ]
 
 
-def touch(cell: Cell) -> Touching:
-    """Touches a point by the tool's tip, axis and plane, and then a fixture by the tip.
-
-    Args:
-        cell: The cell; its arm touches without a load, and errs as it does before the camera.
-
-    Raises:
-        DataError: The arm does not reach enough postures.
-    """
-    return touch_network(whole(cell))[""]
-
-
-def touch_network(cell: Network) -> dict[str, Touching]:
+def touch(cell: Cell) -> dict[str, Touching]:
     """What each robot of a cell touches: with a tool of its own, a fixture before it.
+
+    A point by the tool's tip, axis and plane, and then the fixture by the tip. The arm touches
+    without a load, and errs as it does before the camera.
 
     Raises:
         DataError: An arm does not reach enough postures.
     """
     found = {}
-    for at, robot in enumerate(cell.options.robots):
-        toucher = _Toucher(robot, cell.arms[robot.name], cell.true_arms[robot.name])
+    for at, (name, robot) in enumerate(cell.robots.items()):
         # The first draws as the only one does.
         rng = cell.options.stream(Stream.TOUCHES, *((at,) if at else ()))
-        found[robot.name] = _touching(toucher, rng)
+        found[name] = _touching(robot, rng)
     return found
 
 
-def _touching(toucher: _Toucher, rng: np.random.Generator) -> Touching:
+def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
     turn = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix()
     flange_from_tool = compose(turn, rng.uniform([-0.04, -0.04, 0.12], [0.04, 0.04, 0.18]))
     lies = Rotation.from_rotvec([*rng.normal(0.0, 0.03, 2), rng.uniform(-0.5, 0.5)]).as_matrix()
-    reach = reach_m(toucher.arm)
+    reach = reach_m(robot.arm)
     base_from_fixture = compose(lies, np.array([0.45 * reach, -0.1 * reach, 0.12 * reach]))
 
     far, aside = rng.uniform(0.08, 0.12, 4), rng.uniform(-0.02, 0.02, 2)
@@ -152,7 +121,7 @@ def _touching(toucher: _Toucher, rng: np.random.Generator) -> Touching:
     in_tool = np.concatenate([np.zeros((10, 3)), along, across])
     corner = np.tile(base_from_fixture[:3, 3] + [0.0, 0.0, 0.05], (len(in_tool), 1))
     kinds = ("point",) * 10 + ("z",) * 2 + ("xz",) * 2
-    tip = _touched(toucher, flange_from_tool, corner, in_tool, {"kind": kinds}, rng)
+    tip = _touched(robot, flange_from_tool, corner, in_tool, {"kind": kinds}, rng)
 
     featured = np.zeros((9, 3))
     featured[3:6, 0], featured[6:, :2] = rng.uniform(0.1, 0.25, 3), rng.uniform(0.1, 0.2, (3, 2))
@@ -160,7 +129,7 @@ def _touching(toucher: _Toucher, rng: np.random.Generator) -> Touching:
 
     def on_fixture(places: FloatArray, columns: Mapping[str, tuple[str, ...]]) -> Touched:
         met = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
-        return _touched(toucher, flange_from_tool, met, np.zeros_like(met), columns, rng)
+        return _touched(robot, flange_from_tool, met, np.zeros_like(met), columns, rng)
 
     names = tuple(_name(at) for at in range(len(_DRAWN_M)))
     return Touching(
@@ -177,7 +146,7 @@ def _name(at: int) -> str:
 
 
 def _touched(
-    toucher: _Toucher,
+    robot: SimulatedRobot,
     flange_from_tool: FloatArray,
     places: FloatArray,
     in_tool: FloatArray,
@@ -189,8 +158,8 @@ def _touched(
     reached = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     straight = compose(down.as_matrix(), met[0] - down.apply(reached[0]))
-    home = home_posture(toucher.arm, straight[None], rng)
-    joints = np.zeros((len(met), toucher.arm.a.size))
+    home = home_posture(robot.arm, straight[None], rng)
+    joints = np.zeros((len(met), robot.arm.a.size))
     left = np.ones(len(met), dtype=bool)
     for _ in range(_TRIES):
         count = int(left.sum())
@@ -203,30 +172,32 @@ def _touched(
         goals[:, :3, :3] = turns.as_matrix()
         goals[:, :3, 3] = met[left] - turns.apply(reached[left])
         # Once the joints are where they read, the flange stands off by its repeatability.
-        goals = goals @ exp(-toucher.options.sigma * rng.standard_normal((count, 6)))
-        found, good = _standing(toucher, goals, home)
+        goals = goals @ exp(-robot.options.sigma * rng.standard_normal((count, 6)))
+        found, good = _standing(robot, goals, home)
         joints[np.flatnonzero(left)[good]] = found[good]
         left[left] = np.logical_not(good)
         if not left.any():
-            return Touched(columns, forward(toucher.arm, joints), joints)
+            return Touched(columns, forward(robot.arm, joints), joints)
     raise DataError(
-        f"simulation: the {toucher.arm.name} reaches {len(met) - int(left.sum())} of {len(met)} "
+        f"simulation: the {robot.arm.name} reaches {len(met) - int(left.sum())} of {len(met)} "
         "touches.",
         next_step="Take another robot or seed.",
     )
 
 
-def _standing(toucher: _Toucher, goals: FloatArray, home: FloatArray) -> tuple[FloatArray, Mask]:
+def _standing(
+    robot: SimulatedRobot, goals: FloatArray, home: FloatArray
+) -> tuple[FloatArray, Mask]:
     """(m, n) joints at which the real arm stands at (m, 4, 4), and (m,) which of them serve."""
     joints, aims = np.tile(home, (len(goals), 1)), goals
     for _ in range(_ROUNDS):
-        reach = inverse(toucher.true_arm, aims, joints)
+        reach = inverse(robot.true_arm, aims, joints)
         joints = reach.joints
-        stands = toucher.options.flange_at(toucher.true_arm, joints)
+        stands = robot.flange_at(joints)
         aims = goals @ invert(stands) @ aims
     good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
     good &= np.abs(stands - goals).max(axis=(1, 2)) < _EXACT
-    return joints, good & (lowest_m(toucher.arm, joints) > 0.0)
+    return joints, good & (lowest_m(robot.arm, joints) > 0.0)
 
 
 def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:

@@ -12,6 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import decode_text, read_bytes, write_atomically
 from visioncal.core.types import Camera, FloatArray
 from visioncal.simulation.cell import Cell
+from visioncal.simulation.layout import CellOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,19 +84,40 @@ def read_truth(path: Path | str) -> Truth:
 
 def truth_of(cell: Cell) -> dict[str, Any]:
     """What a truth's file says of a cell."""
-    options = asdict(cell.options)
+    of_cell = _of_one if isinstance(cell.options, CellOptions) else _of_several
+    return {"schema": 1} | of_cell(cell) | dict(cell.facts)
+
+
+def _of_one(cell: Cell) -> dict[str, Any]:
+    """Of a cell of one robot and one camera, view by view."""
+    options, arm = asdict(cell.options), asdict(cell.robot.true_arm)
     camera = options.pop("camera")
-    arm = asdict(cell.true_arm)
     del arm["name"]
     return {
-        "schema": 1,
-        "transforms": dict(cell.transforms),
+        "transforms": cell.transforms,
         "camera": camera,
         "wrong_views": cell.wrong_views,
         "options": options,
         "arm": arm,
-        "base_from_flange": cell.true_base_from_flange,
+        "base_from_flange": cell.robot.true_base_from_flange[[sight.stop for sight in cell.sights]],
         "cam_from_target": cell.cam_from_target,
+    }
+
+
+def _of_several(cell: Cell) -> dict[str, Any]:
+    """Of a cell whose things have names, stop by stop."""
+    layout, robots = cell.layout, cell.robots
+    return {
+        "parents": cell.parents,
+        "transforms": dict(cell.mountings),
+        "wrong_views": cell.wrong_views,
+        "wrong_stops": {name: robot.wrong_stops for name, robot in robots.items()},
+        "moved": [
+            {"frame": move.frame, "from_stop": layout.first_pushed(move)} for move in layout.moved
+        ],
+        "options": asdict(cell.options),
+        "arms": {name: asdict(robot.true_arm) for name, robot in robots.items()},
+        "base_from_flange": {name: robot.true_base_from_flange for name, robot in robots.items()},
     }
 
 

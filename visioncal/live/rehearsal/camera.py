@@ -85,12 +85,12 @@ class RehearsalCamera:
     @property
     def resolution(self) -> tuple[int, int]:
         """(width, height) of its pictures [px]."""
-        return self._cell.options.camera.resolution
+        return self._cell.camera().camera.resolution
 
     @property
     def factory(self) -> Camera | None:
         """The intrinsics as the cell states them; None where it states none."""
-        return self._cell.stated_camera if self._cell.options.state_intrinsics else None
+        return self._cell.stated[""] if self._cell.camera().state_intrinsics else None
 
     @property
     def settings(self) -> Mapping[str, str | float]:

@@ -69,14 +69,14 @@ def rehearsed_cell(options: RehearsalOptions) -> RehearsedCell:
     )
     cell = simulate(wanted)
     controller = ControllerOptions(robot=options.robot, seed=options.seed, errors=_WORN)
-    truth = replace(cell, true_arm=true_arm(controller))
-    return RehearsedCell(truth, controller, _known(truth, options.seed))
+    robot = replace(cell.robot, true_arm=true_arm(controller))
+    truth = replace(cell, robots={"": robot})
+    return RehearsedCell(truth, controller, _known(truth, wanted))
 
 
-def _known(truth: Cell, seed: int) -> PlanCell:
+def _known(truth: Cell, options: CellOptions) -> PlanCell:
     """The cell as its user would describe it to `visioncal plan`."""
-    options = truth.options
-    draws = np.random.default_rng([seed, _GUESSES]).standard_normal((2, 2, 3))
+    draws = np.random.default_rng([options.seed, _GUESSES]).standard_normal((2, 2, 3))
     ways = draws / np.linalg.norm(draws, axis=2, keepdims=True)
     off = exp((ways * np.array([[GUESS_RAD], [GUESS_M]])).reshape(2, 6))
     x, z = truth.transforms.values()
@@ -85,7 +85,7 @@ def _known(truth: Cell, seed: int) -> PlanCell:
     return PlanCell(
         options.mount,
         load_robot(options.robot),
-        truth.stated_camera,
+        truth.stated[""],
         options.target,
         x @ off[0],
         z @ off[1],

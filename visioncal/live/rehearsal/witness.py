@@ -46,7 +46,7 @@ class Witness:
             return
         with closing(TruthClient(self.bench.controller.host)) as truth:
             really = truth.state([found.frame.stamp_s]).base_from_flange[0]
-        recorded = forward(self.bench.cell.truth.true_arm, found.state.q[None])[0]
+        recorded = forward(self.bench.cell.truth.robot.true_arm, found.state.q[None])[0]
         self.away_mm.append(pose_difference(recorded, really)[0])
 
 

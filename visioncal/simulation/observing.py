@@ -1,0 +1,266 @@
+"""Simulates a cell: mounts it, moves its robots, and looks at its boards."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.arguments import typed
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import exp, invert
+from visioncal.core.types import FloatArray, Mask
+from visioncal.session import frame_name
+from visioncal.simulation import one_robot, standing
+from visioncal.simulation.arms import arm_named, forward
+from visioncal.simulation.cell import Cell, Reading, Sight, SimulatedRobot
+from visioncal.simulation.draws import Stream
+from visioncal.simulation.faults import misreported, with_faults
+from visioncal.simulation.heat import Heat, heated_flanges, warm_up
+from visioncal.simulation.imaging import detected, looks_at, seen_in
+from visioncal.simulation.layout import CellOptions, NetworkOptions
+from visioncal.simulation.passage import with_sweep
+from visioncal.simulation.poses import Viewpoints, filling_m
+
+# The same sources of randomness in cells of several robots.
+_OF_SEVERAL = {Stream.ARM: Stream.ARMS, Stream.ROBOT: Stream.ROBOTS}
+
+
+@typed
+def simulate(options: CellOptions | NetworkOptions, postures: FloatArray | None = None) -> Cell:
+    """Builds a cell, moves its robots and looks at the boards.
+
+    Args:
+        options: What the cell is made of. The same options give the same cell.
+        postures: (m, n) joint angles to which the robot of `CellOptions` moves, one a stop,
+            whatever the camera sees there [rad]; None draws as many as the options say, from which
+            a board is in the image.
+
+    Returns:
+        The truth and the reports.
+
+    Raises:
+        DataError: An arm is unknown, a camera's coefficients do not fit its model, or a robot
+            cannot reach enough poses at which it shows a board to a camera.
+    """
+    if isinstance(options, CellOptions):
+        cell = observed(_of_one(options, postures))
+        wrong = [sight.view for sight in cell.sights if sight.stop in cell.robot.wrong_stops]
+        return replace(cell, wrong_views=tuple(wrong))
+    if postures is not None:
+        raise DataError("simulation: postures are taken by a cell of one robot alone.")
+    mountings = standing.mounted(options)
+    cell = observed(_stood(options, mountings, standing.postures(options, mountings)))
+    cell = with_faults(cell)
+    last = replace(cell, mountings={name: array[-1] for name, array in _hanging(cell).items()})
+    for swept in options.sweeps:
+        cell = with_sweep(cell, swept, last)
+    return cell
+
+
+def _of_one(options: CellOptions, postures: FloatArray | None) -> Cell:
+    """A cell of one robot and one camera, before anything is seen."""
+    mountings = one_robot.mounted(options)
+    if postures is None:
+        moved = one_robot.postures(options, mountings)
+    else:
+        moved = np.array(postures, dtype=float)
+        options = replace(options, views=len(moved))
+    return _stood(options, one_robot.pushed(options, mountings), {"": moved})
+
+
+def _stood(
+    options: CellOptions | NetworkOptions,
+    mountings: Mapping[str, FloatArray],
+    moved: Mapping[str, FloatArray],
+) -> Cell:
+    """A cell whose robots moved to (s, n) joint angles each [rad], before anything is seen."""
+    layout = options.layout
+    stamps_s = np.arange(layout.stops, dtype=np.float64) * layout.pace_s
+    robots, heat = {}, {}
+    for at, robot in enumerate(layout.robots):
+        arm, q = arm_named(robot.robot), moved[robot.name]
+        true_arm = robot.built(_stream(options, Stream.ARM, at))
+        loads, approach = robot.loads(layout.stops), robot.approach(layout.stops)
+        stood = robot.flange_at(true_arm, q, loads, approach)
+        if robot.warms_up:
+            heats, hours = Heat.drawn(options.seed + at), stamps_s[-1] / 3600.0
+            warming = warm_up(heats, hours, seed=options.seed + at)
+            stood = heated_flanges(true_arm, heats, q, warming.at(stamps_s), stood)
+            heat[f"{robot.name}_heat"] = warming.recorded(temperatures=True)
+        jitter = robot.jitter(layout.stops, _stream(options, Stream.ROBOT, at))
+        rng = _stream(options, Stream.WRONG, at)
+        joints, wrong_stops = misreported(arm, q, robot.wrong_stops, rng)
+        robots[robot.name] = SimulatedRobot(
+            options=robot,
+            arm=arm,
+            true_arm=true_arm,
+            joints=joints,
+            base_from_flange=forward(arm, joints),
+            true_base_from_flange=stood @ jitter,
+            wrong_stops=wrong_stops,
+            loads=loads,
+            approach=approach,
+        )
+    return Cell(
+        options=options,
+        parents=standing.parents_of(layout),
+        mountings=mountings,
+        robots=robots,
+        stated={
+            camera.name: camera.stated(_stream(options, Stream.LENS, at))
+            for at, camera in enumerate(layout.cameras)
+        },
+        stamps_s=stamps_s if layout.pace_s else None,
+        streams=heat,
+    )
+
+
+def _stream(options: CellOptions | NetworkOptions, purpose: Stream, at: int) -> np.random.Generator:
+    """The randomness of a thing by its number; the only one of its kind has none."""
+    if isinstance(options, CellOptions):
+        return options.stream(purpose)
+    return options.stream(_OF_SEVERAL.get(purpose, purpose), at)
+
+
+def observed(cell: Cell) -> Cell:
+    """Adds what cameras and instruments see, stop by stop, and numbers the rows."""
+    layout, where = cell.layout, _places(cell)
+    poses = {
+        (camera.name, board.name): invert(where[frame_name("camera", camera.name)])
+        @ where[frame_name("target", board.name)]
+        for camera in layout.cameras
+        for board in layout.boards
+        if camera.at_stops
+    }
+    shown = {key: _shown(cell, *key, pose) for key, pose in poses.items()}
+    sights: list[Sight] = []
+    readings: list[Reading] = []
+    pose_rows: list[tuple[int, int, str]] = []
+    view = 0
+    for stop in range(layout.stops):
+        needed: dict[str, bool] = {}
+        for (camera, board), pose in poses.items():
+            if shown[camera, board][stop]:
+                sights.append(_sight(cell, view, stop, camera, board, pose[stop]))
+                _need(cell, needed, frame_name("camera", camera), frame_name("target", board))
+                view += 1
+        for reading in _read(cell, where, stop, view):
+            readings.append(reading)
+            _need(cell, needed, frame_name("point", reading.point), "")
+            view += 1
+        for robot in [name for name, is_given in needed.items() if not is_given]:
+            pose_rows.append((view, stop, robot))
+            view += 1
+    sights += _of_lenses(cell, view)
+    cell = replace(cell, readings=tuple(readings), pose_rows=tuple(pose_rows))
+    return with_detections(replace(cell, sights=tuple(sights)))
+
+
+def _sight(cell: Cell, view: int, stop: int, camera: str, board: str, pose: FloatArray) -> Sight:
+    """What a camera sees of a board, before a detector looks at it."""
+    exact = seen_in(cell.camera(camera), cell.board(board), pose, view)
+    return Sight(view, stop, camera, board, pose, exact, exact)
+
+
+def with_detections(cell: Cell) -> Cell:
+    """The cell with the corners of all its images as a detector reports them."""
+    options, found = cell.options, []
+    # One camera's noise is drawn row after row.
+    one = options.stream(Stream.PIXELS)
+    for sight in cell.sights:
+        alone = isinstance(options, CellOptions)
+        rng = one if alone else options.stream(Stream.CORNERS, sight.view)
+        corners = detected(cell.board(sight.board), sight.exact, options.pixel_sigma_px, rng)
+        found.append(replace(sight, corners=corners))
+    return replace(cell, sights=tuple(found))
+
+
+def _need(cell: Cell, needed: dict[str, bool], first: str, second: str) -> None:
+    """Notes the robots between two frames, and that the row has the pose of the first of them."""
+    carried = (cell.robot_of(frame) for frame in (first, second) if frame)
+    robots = [robot for robot in carried if robot is not None]
+    if len(set(robots)) < len(robots):
+        return
+    for place, robot in enumerate(robots):
+        needed[robot] = needed.get(robot, False) or place == 0
+
+
+def _hanging(cell: Cell) -> dict[str, FloatArray]:
+    """(s, 4, 4) where each frame hangs in its parent, stop by stop."""
+    layout = cell.layout
+    hangs = {
+        name: np.tile(mounting, (layout.stops, 1, 1)) for name, mounting in cell.mountings.items()
+    }
+    for at, moved in enumerate(layout.moved):
+        if moved.frame not in hangs:
+            raise DataError(
+                f"simulation: {moved.frame!r} cannot be pushed; there are {', '.join(hangs)}."
+            )
+        start = layout.first_pushed(moved)
+        twist = cell.options.stream(Stream.FAULTS, 10 + at).standard_normal((2, 3))
+        twist *= np.array([[moved.turn_rad], [moved.shift_m]]) / np.linalg.norm(
+            twist, axis=1, keepdims=True
+        )
+        hangs[moved.frame][start:] = hangs[moved.frame][start:] @ exp(twist.ravel())
+    return hangs
+
+
+def _places(cell: Cell) -> dict[str, FloatArray]:
+    """(s, 4, 4) where each frame really is in the cell, stop by stop."""
+    hangs = _hanging(cell)
+    flanges = {frame_name("flange", name): robot for name, robot in cell.robots.items()}
+    for (flange, robot), name in zip(flanges.items(), cell.robots, strict=True):
+        base = hangs.get(frame_name("base", name), np.eye(4))
+        hangs[flange] = base @ robot.true_base_from_flange
+    for frame, parent in cell.parents.items():
+        if parent in flanges:
+            hangs[frame] = hangs[parent] @ hangs[frame]
+    return hangs
+
+
+def _shown(cell: Cell, camera: str, board: str, pose: FloatArray) -> Mask:
+    """(s,) at which stops a camera has a board in its image, and it is recorded."""
+    layout, options = cell.layout, cell.options
+    seen = looks_at(cell.camera(camera).camera, cell.board(board), pose)
+    at_board = [board_at.name for board_at in layout.boards].index(board)
+    if isinstance(options, CellOptions):
+        # What a stop was made for is in view.
+        aimed = np.arange(layout.stops) % len(layout.boards) == at_board
+        return np.asarray(seen | aimed)
+    at_camera = [camera_at.name for camera_at in layout.cameras].index(camera)
+    share = options.stream(Stream.SHARE, at_camera, at_board).random(options.stops)
+    return np.asarray(seen & (share < options.share_seen))
+
+
+def _of_lenses(cell: Cell, first_view: int) -> list[Sight]:
+    """Images of a board that is held by hand before each camera, for its lens alone."""
+    layout = cell.layout
+    found: list[Sight] = []
+    for at, camera in enumerate(layout.cameras if layout.lens_views else ()):
+        board = layout.boards[0]
+        distance_m = filling_m(camera.camera, board)
+        drawn = Viewpoints(camera=camera.camera, board=board, distance_m=distance_m, cut_views=0.0)
+        rng, views = cell.options.stream(Stream.LENS_VIEWS, at), np.empty((0, 4, 4))
+        while len(views) < layout.lens_views:
+            views = np.concatenate([views, drawn.draw(4 * layout.lens_views, rng)])
+        for pose in views[: layout.lens_views]:
+            view = first_view + len(found)
+            found.append(_sight(cell, view, -1, camera.name, board.name, pose))
+    return found
+
+
+def _read(cell: Cell, where: Mapping[str, FloatArray], stop: int, first_view: int) -> list[Reading]:
+    """What instruments read at a stop."""
+    found: list[Reading] = []
+    for instrument in cell.layout.instruments:
+        instrument_from_cell = invert(where[frame_name("instrument", instrument.name)][stop])
+        for point in cell.layout.points:
+            view = first_view + len(found)
+            rng = cell.options.stream(Stream.READINGS, view)
+            read = instrument_from_cell @ where[frame_name("point", point.name)][stop]
+            read[:3, 3] += instrument.sigma_m * rng.standard_normal(3)
+            turn = instrument.sigma_rad * rng.standard_normal(3)
+            read[:3, :3] = read[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+            found.append(Reading(view, stop, instrument.name, point.name, read))
+    return found

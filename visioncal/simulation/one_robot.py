@@ -1,0 +1,156 @@
+"""A cell of one robot and one camera in places of chance, and the postures that it moves to."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from visioncal.core.errors import DataError
+from visioncal.core.transforms import compose, invert
+from visioncal.core.types import FloatArray, Mount
+from visioncal.session import frame_name
+from visioncal.simulation.arms import Arm, arm_named, reach_m
+from visioncal.simulation.boards import Sheet, centre_m
+from visioncal.simulation.draws import Stream
+from visioncal.simulation.layout import CellOptions, Second
+from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
+from visioncal.simulation.reach import home_posture, reached
+
+# How far aside the flange carries its second board [m].
+_ASIDE_M = 0.10
+# Bounds of the least and of the greatest distance of a camera beside the robot [m].
+_NEAR_M, _FAR_M = (0.7, 1.0), (1.0, 1.2)
+_TRIES = 50
+
+
+def mounted(options: CellOptions) -> dict[str, FloatArray]:
+    """(4, 4) where camera and boards hang, plausible for the arm's size, before any push."""
+    rng, reach = options.stream(Stream.MOUNTING), reach_m(arm_named(options.robot))
+    first, *further = options.layout.boards
+    front, spin = rng.uniform(-0.5, 0.5), rng.uniform(-0.4, 0.4)
+    skewed = Rotation.from_rotvec(rng.normal(0.0, 0.05, 3))
+    straight = _viewpoints(options, first).mean()
+    ahead = 0.6 * reach * np.array([np.cos(front), np.sin(front), 1.0])
+    if options.mount == "eye-in-hand":
+        aside = rng.uniform([0.05, -0.02, 0.03], [0.09, 0.02, 0.07])
+        cam = compose((Rotation.from_euler("z", 0.5 * np.pi) * skewed).as_matrix(), aside)
+        # The target's z points into the table.
+        turn = Rotation.from_euler("ZX", [front + spin, np.pi]).as_matrix()
+        # A table so low that the arm has the board in view from a comfortable height.
+        middle = np.array([*ahead[:2], min(0.0, 0.4 * reach - float(straight[2, 3]))])
+    else:
+        turn = (Rotation.from_euler("ZX", [spin, np.pi]) * skewed).as_matrix()
+        middle = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
+        away = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
+        distance_m = float(np.linalg.norm(straight[:3, 3]))
+        cam = looking_at(ahead, away / np.linalg.norm(away), distance_m)
+    target = compose(turn, middle - turn @ centre_m(first))
+    placed = {"cam": cam, frame_name("target", first.name): target}
+    if options.second is not None:
+        placed[frame_name("target", further[0].name)] = _second(
+            options.second, first, target, options.mount
+        )
+    return placed
+
+
+def _second(second: Second, first: Sheet, pose: FloatArray, mount: Mount) -> FloatArray:
+    """(4, 4) where a second board hangs beside the first, which hangs at a pose (4, 4)."""
+    middle = pose[:3, :3] @ centre_m(first) + pose[:3, 3]
+    around = Rotation.from_euler("z", second.turn_rad).as_matrix()
+    if mount == "eye-in-hand":
+        place = around @ middle
+        lean = np.cross([0.0, 0.0, 1.0], place / np.linalg.norm(place))
+        # The print faces the base, as the arm comes from there.
+        turn = Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ around @ pose[:3, :3]
+    else:
+        aside = around @ np.array([1.0, 0.0, 0.0])
+        place = middle + _ASIDE_M * aside
+        lean = np.cross([0.0, 0.0, 1.0], aside)
+        turn = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix() @ pose[:3, :3]
+    return compose(turn, place - turn @ centre_m(second))
+
+
+def pushed(options: CellOptions, mountings: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """The mountings once the camera was pushed, in a direction of chance."""
+    away = options.stream(Stream.BUMP).standard_normal(3)
+    away *= options.camera_moved_m / np.linalg.norm(away)
+    return {**mountings, "cam": mountings["cam"] @ compose(np.eye(3), away)}
+
+
+def postures(options: CellOptions, mountings: Mapping[str, FloatArray]) -> FloatArray:
+    """(s, n) postures of the nominal arm, which look at the boards in turn [rad].
+
+    Raises:
+        DataError: The arm cannot reach enough poses from which a board is in the image.
+    """
+    arm, boards = arm_named(options.robot), options.layout.boards
+    joints = np.zeros((options.views, arm.a.size))
+    for at, board in enumerate(boards):
+        mine = np.arange(at, options.views, len(boards))
+        target = mountings[frame_name("target", board.name)]
+        rng = options.stream(Stream.POSES, *([at] if at else []))
+        joints[mine] = _looking(options, arm, board, (mountings["cam"], target), len(mine), rng)
+    return joints
+
+
+def _looking(
+    options: CellOptions,
+    arm: Arm,
+    board: Sheet,
+    ends: tuple[FloatArray, FloatArray],
+    count: int,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """(count, n) postures of the nominal arm that bring a board into the image [rad].
+
+    The ends are where camera and board hang, (4, 4) each.
+    """
+    cam, target = ends
+    in_hand = options.mount == "eye-in-hand"
+
+    def flange(cam_from_target: FloatArray) -> FloatArray:
+        """(m, 4, 4) `base_from_flange` at which the camera sees the board so."""
+        if in_hand:
+            return target @ invert(cam_from_target) @ invert(cam)
+        return cam @ cam_from_target @ invert(target)
+
+    # Nothing of the arm may sink into the table under the board, or under the robot.
+    floor_m = min(0.0, float(target[2, 3]) if in_hand else 0.0) + 0.05
+    views = _viewpoints(options, board)
+    home = home_posture(arm, flange(views.mean()[None]), rng)
+    kept: list[FloatArray] = []
+    for _ in range(_TRIES):
+        drawn = views.draw(4 * count, rng)
+        if not len(drawn):
+            continue
+        starts = np.tile(home, (len(drawn), 1))
+        if options.branches:
+            starts = rng.uniform(-np.pi, np.pi, starts.shape)
+        joints, good = reached(arm, flange(drawn), starts, floor_m)
+        kept.extend(joints[good])
+        if len(kept) >= count:
+            return np.array(kept[:count])
+    raise DataError(
+        f"simulation: {len(kept)} of {count} views found in which the {arm.name} reaches "
+        "its pose and the camera sees the board.",
+        next_step="Take another working distance, board, tilt or robot.",
+    )
+
+
+def _viewpoints(options: CellOptions, board: Sheet) -> Viewpoints:
+    """From where the camera is to look at a board."""
+    distance_m = options.distance_m
+    if distance_m is None:
+        near, far = filling_m(options.camera, board)
+        if options.mount == "eye-to-hand":
+            near, far = min(max(near, _NEAR_M[0]), _NEAR_M[1]), min(max(far, _FAR_M[0]), _FAR_M[1])
+        distance_m = near, far
+    return Viewpoints(
+        camera=options.camera,
+        board=board,
+        distance_m=distance_m,
+        tilt_rad=options.tilt_rad,
+        roll_rad=options.roll_rad,
+        motion=options.motion,
+        cut_views=options.cut_views,
+    )

@@ -1,0 +1,43 @@
+"""Postures of simulated arms that an operator would choose."""
+
+import numpy as np
+
+from visioncal.core.errors import DataError
+from visioncal.core.types import FloatArray, Mask
+from visioncal.simulation.arms import Arm, inverse, link_frames
+
+# Postures with a smaller dexterity are so near a singularity that no operator would choose them.
+LEAST_DEXTERITY = 0.04
+
+
+def home_posture(arm: Arm, base_from_flange: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(n,) the most dexterous posture at one pose (1, 4, 4); all views start from it."""
+    starts = rng.uniform(-np.pi, np.pi, size=(64, arm.a.size))
+    reach = inverse(arm, np.tile(base_from_flange, (64, 1, 1)), starts)
+    elbow_up = link_frames(arm, reach.joints)[:, 2, 2, 3] > arm.d[0]
+    merit = np.where(reach.solved & elbow_up, reach.dexterity, 0.0)
+    if not merit.any():
+        raise DataError(
+            f"simulation: the {arm.name} cannot reach the middle of the views.",
+            next_step="Take another working distance, board or robot.",
+        )
+    best = reach.joints[np.argmax(merit)]
+    # All joints within half a turn: the middle of their range.
+    return np.asarray((best + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def reached(
+    arm: Arm, base_from_flange: FloatArray, starts: FloatArray, floor_m: float
+) -> tuple[FloatArray, Mask]:
+    """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) which an operator would choose.
+
+    They are sought from (m, n) starts [rad]; no link comes lower over the base than the floor.
+    """
+    reach = inverse(arm, base_from_flange, starts)
+    good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
+    return reach.joints, np.asarray(good & (lowest_m(arm, reach.joints) > floor_m))
+
+
+def lowest_m(arm: Arm, joints: FloatArray) -> FloatArray:
+    """(m,) height over the base of the lowest of elbow, wrists and flange [m]."""
+    return np.asarray(link_frames(arm, joints)[:, 2:, 2, 3].min(axis=1))
