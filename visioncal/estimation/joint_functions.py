@@ -231,9 +231,8 @@ class _Arm:
         torque_nm: float,
     ) -> "_Arm":
         basis = np.concatenate([*bases.values(), waves.columns], axis=2)
-        size, likelihood = basis.shape[2], nominal.beside(robot, basis)
-        mine = (nominal.members == robot).any(axis=1)
-        own, others = likelihood.jacobian[mine], nominal.jacobian[~mine]
+        size, mine = basis.shape[2], (nominal.members == robot).any(axis=1)
+        own = np.concatenate([nominal.jacobian[mine], nominal.moved(robot, basis)], axis=2)
         names = (*bases, "second", *([HARMONICS] if waves.length_rad else []))
         groups = np.repeat(np.arange(len(bases)), [base.shape[2] for base in bases.values()])
         shares = np.zeros((size, len(names)))
@@ -244,7 +243,7 @@ class _Arm:
             shares[second, -1], shares[second.stop :, -1] = waves.series[1], 1.0
             # The process's own first harmonic is among those of eccentric gears.
             shares[:, -1] += waves.series[0] * shares[:, names.index("eccentricity")]
-        known = likelihood.known
+        others, known = nominal.jacobian[~mine], nominal.known.beside(size)
         return cls(nominal, mine, own, others, known, names, shares, bases, waves, torque_nm)
 
     @property

@@ -139,8 +139,10 @@ class Problem:
         return len(self.observations)
 
     def subset(self, chosen: Mask) -> "Problem":
-        """Returns the problem with the observations of an (n,) mask."""
+        """Returns the problem with the observations of an (n,) mask; of all of them itself."""
         rows = np.flatnonzero(chosen)
+        if len(rows) == len(self):
+            return self
         return replace(
             self,
             observations=self.observations.take(rows),

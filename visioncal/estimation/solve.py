@@ -537,12 +537,8 @@ class RobotLikelihood:
             moves: (s, 6, k) by stop, how its flange moves with them.
         """
         reduced, size = self.reduced, moves.shape[2]
-        units, slots = np.nonzero(self.members == robot)
-        places = 6 * slots[:, None, None] + np.arange(6)
-        by_flange = np.take_along_axis(reduced.by_flanges[units], places, axis=2)
         jacobian = np.zeros((*reduced.errors.shape, size))
-        jacobian[units] = by_flange @ moves[self.stops[units]]
-        information, gradient = self.known.information, self.known.gradient
+        jacobian[(self.members == robot).any(axis=1)] = self.moved(robot, moves)
         return replace(
             self,
             reduced=replace(
@@ -551,9 +547,16 @@ class RobotLikelihood:
                 gradient=np.pad(reduced.gradient, (0, size)),
                 jacobian=np.concatenate([reduced.jacobian, jacobian], axis=2),
             ),
-            known=Knowledge(np.pad(information, (0, size)), np.pad(gradient, (0, size))),
+            known=self.known.beside(size),
             moving=np.pad(self.moving, (0, size), constant_values=True),
         )
+
+    def moved(self, robot: int, moves: FloatArray) -> FloatArray:
+        """(m, 6 w, k) how what a robot's m units say moves with its flange's `moves` (s, 6, k)."""
+        units, slots = np.nonzero(self.members == robot)
+        places = 6 * slots[:, None, None] + np.arange(6)
+        by_flange = np.take_along_axis(self.reduced.by_flanges[units], places, axis=2)
+        return np.asarray(by_flange @ moves[self.stops[units]])
 
     def scaled(self, robot: int, levels: FloatArray, scales: FloatArray) -> FloatArray:
         """The negative logarithm of the likelihood, up to a constant, as one robot's noise grows.

@@ -63,6 +63,10 @@ class Knowledge:
     information: FloatArray
     gradient: FloatArray
 
+    def beside(self, count: int) -> "Knowledge":
+        """The same with so many more parameters, the last ones, of which nothing is known."""
+        return Knowledge(np.pad(self.information, (0, count)), np.pad(self.gradient, (0, count)))
+
 
 @dataclass(frozen=True, eq=False)
 class Likely:
