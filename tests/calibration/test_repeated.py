@@ -149,7 +149,7 @@ def test_still_boards_seen_often_outvote_no_robot(seed, images):
     """Most rows are of still cameras and a still board, and agree best of all."""
     cell, session = of_a_cell(images, stops=True, seed=seed)
     found, once = calibrate(session), calibrate(of_a_cell(1, stops=True, seed=seed)[1])
-    assert sum(not sight.used for sight in found.cell.sights) <= 0.01 * len(found.cell.sights)
+    assert sum(not view.used for view in found.views) <= 0.01 * len(found.views)
     for name, edge in found.edges.items():
         assert edge.sigma_mm > 0.6 * once.edges[name].sigma_mm, name
         assert off(cell, found, name) < 22.5, name
