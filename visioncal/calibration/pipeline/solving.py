@@ -107,6 +107,8 @@ def solve(
 def _refuse_open_lens(looked: Observed, problem: Problem, mount: Mount) -> None:
     """Refuses a lens that corners leave open and turns about one axis do not determine either."""
     poses = problem.poses[problem.robots[0]]
+    # Images of a sweep have no pose of their own before its clock is known.
+    poses = poses[np.isfinite(poses[:, 0, 0])]
     words, _ = too_little_motion(poses, mount) if len(poses) > 1 else ("", "")
     for look in looked.cameras.values() if words else ():
         if look.lens is None or look.lens.covariance is None:
