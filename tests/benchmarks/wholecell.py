@@ -130,7 +130,7 @@ def outcome(seed: int) -> Outcome:
     )
     offsets = [_zeros(found, made.cell, robot) for robot in ("a", "b")]
     (clock,) = found.cell.details.clocks.values()
-    floor = found.cell.boards["floor"]
+    floor = found.boards["floor"]
     return Outcome(
         float(error @ np.linalg.solve(covariance, error)) / len(error),
         1e3 * float(np.sqrt(np.mean(error.reshape(-1, 6)[:, 3:] ** 2))),

@@ -720,10 +720,10 @@ def test_a_board_of_another_size_is_found_beside_arms_that_err():
     cameras = (replace(LEFT, camera=fine_camera()), RIGHT, CameraAt("hand", "b"))
     options = NetworkOptions(robots, cameras, boards, stops=2 * STOPS)
     found = aligned(simulate(options))
-    floor = found.cell.boards["floor"]
+    floor = found.boards["floor"]
     # Four of its sigmas: one run in fifteen thousand.
     assert abs(floor.shape["scale"] - 0.002) < 4 * floor.sigma["scale"] < 4e-4
-    assert set(found.cell.boards["plate_a"].sigma) == {"scale"}
+    assert set(found.boards["plate_a"].sigma) == {"scale"}
     assert not found.cell.moved
     assert {found.cell.robots[name].arm.level for name in "ab"} == {"offsets"}
 
@@ -737,7 +737,7 @@ def test_boards_of_three_sizes_are_found_beside_arms_that_err():
     found = aligned(
         simulate(NetworkOptions(tuple(robots), boards=tuple(boards), stops=STOPS, seed=5))
     )
-    shapes = {name: found.cell.boards[name].shape["scale"] for name in scales}
+    shapes = {name: found.boards[name].shape["scale"] for name in scales}
     # Against each other they are known to some hundred-thousandths.
     assert shapes["floor"] - shapes["plate_a"] == pytest.approx(0.003, abs=1e-4)
     assert shapes["floor"] - shapes["plate_b"] == pytest.approx(0.001, abs=1e-4)

@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.core.types import FloatArray, Target
 from visioncal.results import Calibration, CameraResult
 from visioncal.results.arm import ArmSections
-from visioncal.results.sections import BoardResult, ClockResult, Intervals
+from visioncal.results.sections import ClockResult, Intervals
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.frames import CELL
@@ -77,12 +77,6 @@ def calibrated_robots(calibration: Calibration) -> dict[str, Robot]:
         if arm_result is not None and arm_result.robot is not None
     }
     return {**robots(calibration), **calibrated}
-
-
-def boards(calibration: Calibration) -> Mapping[str, BoardResult]:
-    """The boards as they were found to be."""
-    cell = calibration.cell
-    return calibration.named_boards if cell is None else cell.boards
 
 
 def stated_boards(session: Session | None) -> dict[str, Target]:

@@ -1,7 +1,7 @@
 """What a result of a whole cell has by name, where one camera with one robot has one of each."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any
 
@@ -9,13 +9,7 @@ from visioncal.core.codec import KEPT
 from visioncal.core.types import Mount
 from visioncal.results.lens import CameraResult
 from visioncal.results.parts import RobotResult
-from visioncal.results.sections import (
-    BoardResult,
-    CellDetails,
-    CellJointFit,
-    CellUncertainty,
-    RigResult,
-)
+from visioncal.results.sections import CellDetails, CellJointFit, CellUncertainty
 from visioncal.session.frames import (
     CELL,
     frame_called,
@@ -71,8 +65,6 @@ class CellResult:
         untied: Frames that nothing ties to the rest.
         weakest: The weakest link, in words.
         details: Further figures.
-        boards: The boards by name, as they were found to be.
-        rigs: The rigs of points by name.
         joint_fit: The unknowns of the fit and their covariance, for a later check.
         uncertainty: How well the cell is known.
     """
@@ -87,8 +79,6 @@ class CellResult:
     untied: tuple[Untied, ...]
     weakest: str
     details: CellDetails
-    boards: Mapping[str, BoardResult] = field(default_factory=dict)
-    rigs: Mapping[str, RigResult] = field(default_factory=dict)
     joint_fit: CellJointFit | None = None
     uncertainty: CellUncertainty | None = None
 

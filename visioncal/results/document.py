@@ -23,7 +23,12 @@ from visioncal.results.parts import (
     check_schema,
 )
 from visioncal.results.ray_frame import RayFrame
-from visioncal.results.sections import CalibrationSections, CellDetails
+from visioncal.results.sections import (
+    BoardResult,
+    CalibrationSections,
+    CellDetails,
+    RigResult,
+)
 from visioncal.results.views import CellView, Rms, Validation, ViewResult, rms_of
 from visioncal.session.frames import thing_name
 
@@ -109,6 +114,8 @@ class CellForm:
         need: What the task needs, and how likely picks meet it.
         validation: Residuals of what was left out.
         frames: Tools and fixtures by the transform that places them.
+        boards: The boards by name, as they were found to be.
+        rigs: The rigs of points by name.
         further: Sections that this version does not know.
     """
 
@@ -125,6 +132,8 @@ class CellForm:
     need: NeedMet | None = None
     validation: Validation | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
+    boards: Mapping[str, BoardResult] = field(default_factory=dict)
+    rigs: Mapping[str, RigResult] = field(default_factory=dict)
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.inliers import first_inliers
-from visioncal.calibration.pipeline.reading_hints import reading_hint, readings_in_cell
+from visioncal.calibration.pipeline.reading_hints import misreadings, reading_hint
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first
 from visioncal.calibration.pipeline.steps import STAGES
@@ -141,7 +141,7 @@ def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding
     if hint is not None:
         yield hint
     if known.mount is None:
-        readings = [*readings_in_cell(known)] if error is None else []
+        readings = [*misreadings(known)] if error is None else []
         names = None if readings else exchanged_names(known)
         yield from readings if names is None else [names]
     if error is not None and cause is None:

@@ -228,7 +228,19 @@ def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
     return None
 
 
-def readings_in_cell(known: RunState) -> Iterator[Finding]:
+def misreadings(known: RunState) -> Iterator[Finding]:
+    """Says where the chain does not close as declared, and which reading explains it.
+
+    Args:
+        known: What is known once the cameras' poses are.
+    """
+    if known.mount is None:
+        yield from _readings_in_cell(known)
+    elif not _closes_as_declared(known) and (hint := reading_hint(known)) is not None:
+        yield hint
+
+
+def _readings_in_cell(known: RunState) -> Iterator[Finding]:
     """Says which robots and cameras of a whole cell only another reading of the rows explains.
 
     Each camera is looked at with one target and by way of one robot alone, those of most views
@@ -259,7 +271,7 @@ def readings_in_cell(known: RunState) -> Iterator[Finding]:
             except VisioncalError:
                 # There is too little to see.
                 continue
-            hint = None if closes_as_declared(part) else reading_hint(part)
+            hint = next(misreadings(part), None)
             if hint is None:
                 continue
             if hint.do not in (_MIRRORED, _MIRRORED_CORNERS):
@@ -300,7 +312,7 @@ def _closes(known: RunState, robot: str, pair: Pair) -> bool:
     return closes(recording)
 
 
-def closes_as_declared(seen: RunState) -> bool:
+def _closes_as_declared(seen: RunState) -> bool:
     """Whether the chain closes with the poses as they are declared: nothing else is tried.
 
     Args:

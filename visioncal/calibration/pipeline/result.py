@@ -6,7 +6,7 @@ With it goes what a later look at the same cell has to know of the joint fit.
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -30,7 +30,6 @@ from visioncal.estimation.chain import edge_names
 from visioncal.results import HELD_BACK, Calibration, SolverResult, Validation, ViewResult
 from visioncal.results.arm import ArmSections
 from visioncal.results.sections import (
-    CalibrationSections,
     FittedArm,
     InstrumentResult,
     JointFit,
@@ -61,49 +60,56 @@ def result_of(known: RunState) -> Calibration:
     if findings is None or verdict is None:
         raise RuntimeError("a step is missing")
     session, answer = known.session, known.solved
-    names = cell_edges(known) if known.mount is None else _edge_names(known)
+    cell = cell_of(known) if known.mount is None else None
+    names = _edge_names(known) if cell is None else cell_edges(known)
     size = 6 * len(names)
-    return Calibration(
+    was_left_out = np.isfinite(answer.held_out.away_m).any()
+    method = answer.held_out.method if was_left_out else ""
+    found = Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
+        mount=session.mount if cell is None else cell.mount,
         edges={name: answer.edges[frame] for frame, name in names.items()},
         joint_covariance=answer.covariance[:size, :size],
+        solvers={},
+        noise={},
+        views=answer.views,
         rms=rms_of(answer.views),
+        validation=Validation.of(method, answer.views, by_pair=True),
         verdict=verdict,
-        need=need_met(findings.need, findings.picks, whole=known.mount is None),
-        **(_of_cell(known) if known.mount is None else _of_pair(known, names)),
+        boards=boards_of(known),
+        rigs=rigs_of(known),
+        cell=cell,
+        need=need_met(findings.need, findings.picks, whole=cell is not None),
     )
+    return found if cell is not None else _of_pair(found, known, names)
 
 
-def _of_cell(known: RunState) -> dict[str, Any]:
-    """What a result of a whole cell has besides."""
-    cell, answer = cell_of(known), known.solved
-    was_left_out = np.isfinite(answer.held_out.away_m).any()
-    method = answer.held_out.method if was_left_out else ""
-    return {
-        "mount": cell.mount,
-        "solvers": {},
-        "noise": {},
-        "views": answer.views,
-        "validation": Validation.of(method, answer.views, by_pair=True),
-        "cell": cell,
-    }
-
-
-def _of_pair(known: RunState, names: Mapping[str, str]) -> dict[str, Any]:
-    """What a result of one camera and one robot has besides."""
-    answer = known.solved
-    return {
-        "mount": known.session.mount,
-        "solvers": _solvers(known, names),
-        "noise": _noise(known),
-        "views": _views(known),
-        "validation": Validation.of(answer.held_out.method, answer.views),
-        "camera": next(iter(cameras_of(known).values()), None),
-        "robot": known.robot,
-        **vars(_sections(known)),
-    }
+def _of_pair(found: Calibration, known: RunState, names: Mapping[str, str]) -> Calibration:
+    """The same of one camera and one robot, which have no names."""
+    # Of one target without a name there is one section.
+    alone = not known.session.targets
+    return replace(
+        found,
+        solvers=_solvers(known, names),
+        noise=_noise(known),
+        views=_views(known),
+        validation=Validation.of(known.solved.held_out.method, known.solved.views),
+        camera=next(iter(cameras_of(known).values()), None),
+        robot=known.robot,
+        clock=next((clocked.clock.result() for clocked in known.clocks.values()), None),
+        instrument=None if known.readings is None else _instrument(known.readings),
+        points=tuple(_points(known)),
+        board=next(iter(found.boards.values()), None) if alone else None,
+        boards={} if alone else found.boards,
+        rig=next(iter(found.rigs.values()), None) if alone else None,
+        rigs={} if alone else found.rigs,
+        uncertainty=_uncertainty(known),
+        conditions=_conditions_of(known),
+        joint_fit=_joint_fit_of(known),
+        **vars(_arm(known)),
+    )
 
 
 def _edge_names(known: RunState) -> dict[str, str]:
@@ -144,26 +150,6 @@ def _reason(known: RunState, row: View) -> str:
     if row.is_of_lens:
         return _OF_LENS
     return known.reasons.get(row.number) or (HELD_BACK if row.holdout else _NO_POSE)
-
-
-def _sections(known: RunState) -> CalibrationSections:
-    """What was refined beside the edges, and where the uncertainty comes from."""
-    boards, rigs = boards_of(known), rigs_of(known)
-    # Of one target without a name there is one section.
-    alone = not known.session.targets
-    return CalibrationSections(
-        **vars(_arm(known)),
-        clock=next((clock.clock.result() for clock in known.clocks.values()), None),
-        instrument=None if known.readings is None else _instrument(known.readings),
-        points=tuple(_points(known)),
-        board=next(iter(boards.values()), None) if alone else None,
-        boards={} if alone else boards,
-        rig=next(iter(rigs.values()), None) if alone else None,
-        rigs={} if alone else rigs,
-        uncertainty=_uncertainty(known),
-        conditions=_conditions_of(known),
-        joint_fit=_joint_fit_of(known),
-    )
 
 
 def _arm(known: RunState) -> ArmSections:

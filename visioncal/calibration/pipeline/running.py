@@ -7,12 +7,7 @@ from typing import TypedDict, Unpack
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.judging import poor_motion
-from visioncal.calibration.pipeline.reading_hints import (
-    closes_as_declared,
-    is_suspect,
-    reading_hint,
-    readings_in_cell,
-)
+from visioncal.calibration.pipeline.reading_hints import is_suspect, misreadings, reading_hint
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
@@ -130,7 +125,7 @@ def run_steps(known: RunState) -> RunState:
                 if cause is not None:
                     raise because(error.with_culprits(more), cause) from error
                 if known.mount is None:
-                    hint = hint or exchanged_names(known) or next(readings_in_cell(known), None)
+                    hint = hint or exchanged_names(known) or next(misreadings(known), None)
                     if hint is None:
                         raise
                     raise because(error, hint) from error
@@ -138,10 +133,7 @@ def run_steps(known: RunState) -> RunState:
             # Joints that are misread explain themselves, and would mislead a guess about poses.
             if stage.name == "joints":
                 seen = known
-                if known.mount is None:
-                    hint = next(readings_in_cell(known), None)
-                elif not closes_as_declared(known):
-                    hint = reading_hint(known)
+                hint = next(misreadings(known), None)
                 # Of exchanged rows the others are as they should be.
                 known = replace(known, is_misread=hint is not None and not hint.views)
         return _with_other_board(_with_reading(known, seen, hint))

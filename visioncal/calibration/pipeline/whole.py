@@ -3,12 +3,7 @@
 import numpy as np
 
 from visioncal.calibration.pipeline.judging import weakest_link
-from visioncal.calibration.pipeline.lens_documents import (
-    boards_of,
-    cameras_of,
-    fit_section,
-    rigs_of,
-)
+from visioncal.calibration.pipeline.lens_documents import cameras_of, fit_section
 from visioncal.calibration.pipeline.network_ties import untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cell import robot_key
@@ -45,8 +40,6 @@ def cell_of(known: RunState) -> CellResult:
         untied=tuple(Untied(name, untied_words(cell, name)) for name in solved.untied),
         weakest=weakest_link(solved.cell, answer.last_edges),
         details=_details(known),
-        boards=boards_of(known),
-        rigs=rigs_of(known),
         joint_fit=fit_section(known),
         uncertainty=CellUncertainty(
             budget_mm={placed[frame]: mm for frame, mm in answer.budget_mm.items()},

@@ -181,7 +181,7 @@ def _figure_lines(found: Calibration, targets: Mapping[str, Target]) -> Iterator
         if known is not None:
             yield plain(" ".join(facts.summary(found, known)))
         yield from table_lines(sources)
-    for name, board in parts.boards(found).items():
+    for name, board in found.named_boards.items():
         if said := facts.board_facts(found, board, targets.get(name)):
             yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(said))
     for name, arm in parts.arms(found).items():
