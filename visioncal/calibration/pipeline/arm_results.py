@@ -190,6 +190,29 @@ def _called(arms: Mapping[str, RobotArm], robot: str) -> str:
     return "" if len(arms) == 1 else f"Robot {robot}"
 
 
+def one_by_one(
+    arms: Mapping[str, RobotArm],
+    problem: Problem,
+    fit: Solution,
+    change: Callable[[RobotArm, Problem, State], RobotArm],
+) -> dict[str, RobotArm]:
+    """Changes one arm after the other, beside the errors of the others.
+
+    Args:
+        arms: The arms.
+        problem: The observations, with the errors of all arms.
+        fit: Their fit.
+        change: Makes of an arm, of the observations with that arm as it is stated, and of where
+            their unknowns begin, the changed arm.
+    """
+    found = dict(arms)
+    for name, arm in arms.items():
+        stated = arm.without_errors(problem)
+        found[name] = change(arm, stated, State(fit.state.edges, stated.start_values))
+        problem = found[name].put_into(problem)
+    return found
+
+
 def with_drifts(
     arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, asked: str
 ) -> dict[str, RobotArm]:
@@ -199,15 +222,16 @@ def with_drifts(
         DataError: It is asked for, and no arm has what it takes.
         DegenerateError: Likewise, and all was observed about equally warm.
     """
-    found, refused = dict(arms), []
-    for name, arm in arms.items():
-        bare = arm.without_errors(problem)
-        start = State(fit.state.edges, bare.start_values)
+    refused = []
+
+    def with_drift(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
         try:
-            found[name] = arm.with_drift(bare, start, asked)
+            return arm.with_drift(stated, start, asked)
         except (DataError, DegenerateError) as error:
-            refused.append(error.within(f"robot {name}"))
-        problem = found[name].put_into(problem)
+            refused.append(error.within(f"robot {arm.robot}"))
+            return arm
+
+    found = one_by_one(arms, problem, fit, with_drift)
     if refused and len(refused) == len(found):
         raise refused[0]
     return found

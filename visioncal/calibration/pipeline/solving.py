@@ -8,6 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.arm_results import (
     arms_of,
     joint_offsets,
+    one_by_one,
     with_drifts,
     with_errors,
     with_pose_errors,
@@ -244,34 +245,32 @@ def _with_looks(
 
 
 def _levels(found: Solved) -> dict[str, RobotArm]:
-    """Chooses how far each arm is calibrated, beside the errors of the others."""
-    problem, chosen, fit = found.part, dict(found.arms), found.agreed.fit
+    """Chooses how far each arm is calibrated."""
+    fit = found.agreed.fit
     views = [found.cell.rows[index].view for index in np.flatnonzero(found.agreed.used)]
-    for name, arm in found.arms.items():
-        stated = arm.without_errors(problem)
-        start = State(fit.state.edges, stated.start_values)
-        chosen[name] = arm.with_level(stated, start, found.asked, views, fit.noise)
-        problem = chosen[name].put_into(problem)
-    return chosen
+
+    def with_level(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
+        return arm.with_level(stated, start, found.asked, views, fit.noise)
+
+    return one_by_one(found.arms, found.part, fit, with_level)
 
 
 def _with_functions(found: Solved) -> Solved:
-    """Fits with functions of the joints of each arm that has any, beside the errors of others."""
+    """Fits with functions of the joints of each arm that has any."""
     # What agrees is known by then: their many values would make each look for outliers slow. They
     # explain much of what a joint does that slipped: where that alone explains more, there are
     # none.
-    part, fit, wider = found.part, found.agreed.fit, dict(found.arms)
-    problem = part
-    for name, arm in found.arms.items():
-        stated = arm.without_errors(problem)
-        start = State(fit.state.edges, stated.start_values)
+    part, fit = found.part, found.agreed.fit
+
+    def with_functions(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
         more = arm.with_functions(stated, start, found.asked, fit.noise)
-        if more.gain_of_functions:
-            slip = slipped_joint(part, fit, joint_offsets({name: arm}))
-            if slip and log_gain(part, fit, slip.mahalanobis_sq) > more.gain_of_functions:
-                continue
-        wider[name] = more
-        problem = more.put_into(problem)
+        if not more.gain_of_functions:
+            return more
+        slip = slipped_joint(part, fit, joint_offsets({arm.robot: arm}))
+        slips = slip and log_gain(part, fit, slip.mahalanobis_sq) > more.gain_of_functions
+        return arm if slips else more
+
+    wider = one_by_one(found.arms, part, fit, with_functions)
     if all(wider[name] is arm for name, arm in found.arms.items()):
         return found
     return _at_rest(replace(found, arms=wider))
