@@ -118,3 +118,17 @@ def test_an_arm_that_cannot_tilt_is_asked_for_its_lens(tmp_path):
     stated = visioncal.calibrate(write(tmp_path / "stated", stops, STATED_LENS, measured))
     off = stated.transforms["flange_from_cam"].inv() * stops[0].flange_from_cam
     assert 1e3 * np.linalg.norm(off.translation) < 1.5
+
+
+def test_a_table_of_corners_that_was_cut_off_is_named(tmp_path):
+    stops = looks(16)
+    most = write(tmp_path / "most", stops, has_corners=lambda view: view < 10)
+    first = visioncal.calibrate(most).verdict.findings[0]
+    assert first.kind == "lost_rows"
+    assert first.views == tuple(range(10, 16))
+    assert "corners.csv, which ends with view 9, as if it was cut off" in first.words
+    assert visioncal.doctor(most).findings[0].kind == "lost_rows"
+    # A single row without corners is named, and the others are as good as they were.
+    one = visioncal.calibrate(write(tmp_path / "one", stops, has_corners=lambda view: view != 4))
+    assert one.verdict.status == "good"
+    assert one.verdict.top[0].startswith("1 of 16 rows of views.csv observe nothing: view 4;")

@@ -20,10 +20,10 @@ VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 _SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
 # Kinds of findings that are no doubts.
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
-# Images that are not there, or of another size than the camera's: no doubt about the rest, and said
-# first.
-MISSING, OTHER_SIZE = "missing_images", "image_size"
-NOT_USABLE = (MISSING, OTHER_SIZE)
+# Images that are not there, or of another size than the camera's, and a few rows without either: no
+# doubt about the rest, and said first.
+MISSING, EMPTY_ROWS, OTHER_SIZE = "missing_images", "empty_rows", "image_size"
+NOT_USABLE = (MISSING, EMPTY_ROWS, OTHER_SIZE)
 # A part of the image in which no corner was seen: a hint where the task says what it needs.
 EMPTY_IMAGE = "empty_image"
 # Rows of poses that are exchanged come first among causes that are as good as certain.

@@ -18,7 +18,7 @@ from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.loads import check_stops
 from visioncal.calibration.stages.motion import stream_of
 from visioncal.calibration.stages.observed import all_held_back
-from visioncal.calibration.stages.pictures import pairing
+from visioncal.calibration.stages.pictures import pairing, searched_images
 from visioncal.calibration.stages.readings import (
     exchanged_points,
     probe_poses,
@@ -56,7 +56,8 @@ def _read_robot(known: RunState) -> RunState:
         )
     said = map(_suspicious, session.warnings)
     known = known.noting((), (*pairing(session), *said, *_not_used(known)))
-    known = replace(known, notes=(*known.notes, *session.declaration.corrected))
+    notes = (*session.declaration.corrected, *searched_images(session))
+    known = replace(known, notes=(*known.notes, *notes))
     if len(known.held_back) == len(session.views):
         raise all_held_back(known)
     # Views that have a time alone get their poses once the camera's are known.

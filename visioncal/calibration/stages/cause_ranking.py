@@ -63,6 +63,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "moved_frame": Evidence(1e-4),
     "holdout": Evidence(1e-3),
     "lost_views": Evidence(_REMARK),
+    "lost_rows": Evidence(_FACT),
     "shared_image": Evidence(_FACT),
     "repeated_views": Evidence(_FACT),
     "other_board": Evidence(_FACT),

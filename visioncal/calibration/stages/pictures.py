@@ -9,11 +9,13 @@ import numpy as np
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
-from visioncal.core.limits import MAX_BLUR_PX
+from visioncal.core.limits import MAX_BLUR_PX, CalibrationLimits
 from visioncal.core.types import Image, Target
-from visioncal.core.verdict import LEAST_NEED_MM, MISSING, Finding, Step
+from visioncal.core.verdict import EMPTY_ROWS, LEAST_NEED_MM, MISSING, Finding, Step
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
+from visioncal.session.kinds import is_read, is_seen
+from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.finders.identify import Identity, identify
 from visioncal.vision.finders.identify_text import describe
 from visioncal.vision.finders.imaging import blur_of_edges, decode_image, why_hard_to_see
@@ -37,9 +39,20 @@ _SAME_SIZE = 0.01
 
 
 def pairing(session: Session) -> Iterator[Finding]:
-    """Says which rows have no image, and which share one."""
+    """Says which rows have no image or show nothing at all, and which share an image."""
     yield from _missing(session)
+    yield from _empty_rows(session)
     yield from _shared(session)
+
+
+def searched_images(session: Session) -> Iterator[str]:
+    """Says whose images are searched, where corners.csv has rows of other views alone."""
+    searched = [view.number for view in session.views if view.image and not view.has_corners]
+    if searched and any(view.has_corners for view in session.views):
+        yield (
+            f"corners.csv has no rows of view {some_of([*map(str, searched)], _LISTED)}: their "
+            "images were searched."
+        )
 
 
 def unnamed_images(session: Session) -> Iterator[Finding]:
@@ -76,6 +89,28 @@ def _missing(session: Session) -> Iterator[Finding]:
         )
     views = tuple(view.number for view in missing)
     yield Finding(MISSING, words, step, views, until_mm=0.0)
+
+
+def _empty_rows(session: Session) -> Iterator[Finding]:
+    """Says which rows of one camera and one robot observe nothing, where others do."""
+    # In a whole cell, a row may state where a robot was, and no more.
+    shown = [is_seen(view) or is_read(view) for view in session.views]
+    if is_whole_cell(session) or all(shown) or not any(shown):
+        return
+    empty = [view for view, is_shown in zip(session.views, shown, strict=True) if not is_shown]
+    views, last = tuple(view.number for view in empty), len(shown) - len(empty) - 1
+    named, these = some_of([*map(str, views)], _LISTED), "these rows" if views[1:] else "this row"
+    words = f"{len(views)} of {len(shown)} rows of views.csv observe nothing: view {named}"
+    step = Step(f"In views.csv, fill in column image of {these}, or delete {these}.")
+    if any(view.has_corners for view in session.views):
+        words = f"{words}; without an image, a view needs rows in corners.csv"
+        if all(shown[: last + 1]):
+            words = (
+                f"{words}, which ends with view {session.views[last].number}, as if it was cut off"
+            )
+        step = Step(f"Write corners.csv again, as a whole; or in views.csv, delete {these}.")
+    many = len(views) > CalibrationLimits().lost_share[0] * len(shown)
+    yield Finding("lost_rows" if many else EMPTY_ROWS, f"{words}.", step, views, until_mm=0.0)
 
 
 def _renamed(session: Session, names: Sequence[str]) -> tuple[str, str]:
