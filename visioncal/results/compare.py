@@ -13,6 +13,7 @@ from visioncal.core.transforms import inverse_right_jacobian, invert, log, pose_
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult, Edge, VerdictStatus
+from visioncal.results.edge import PoseSigmas
 from visioncal.session.choosing import ANY, Choice
 from visioncal.vision.camera import intrinsics
 
@@ -43,7 +44,7 @@ class Significance:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeChange:
+class EdgeChange(PoseSigmas):
     """How one transform differs between two calibrations.
 
     Attributes:
@@ -65,16 +66,6 @@ class EdgeChange:
     moved_deg: float
     translation: Significance
     rotation: Significance
-
-    @property
-    def sigma_mm(self) -> float:
-        """Root of the trace of the translation's covariance [mm]."""
-        return float(1e3 * np.sqrt(np.trace(self.covariance[3:, 3:])))
-
-    @property
-    def sigma_deg(self) -> float:
-        """Root of the trace of the rotation's covariance [deg]."""
-        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
     @property
     def is_change(self) -> bool:

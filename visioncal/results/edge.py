@@ -19,8 +19,24 @@ _SAME = 5e-6
 _ROUNDING = 1e-3
 
 
+class PoseSigmas:
+    """What has the covariance of a pose, of its (rotation [rad], translation [m])."""
+
+    covariance: FloatArray
+
+    @property
+    def sigma_mm(self) -> float:
+        """Root of the trace of the translation's covariance [mm]."""
+        return float(1e3 * np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+    @property
+    def sigma_deg(self) -> float:
+        """Root of the trace of the rotation's covariance [deg]."""
+        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[:3, :3]))))
+
+
 @dataclass(frozen=True, eq=False)
-class Edge:
+class Edge(PoseSigmas):
     """An edge of the tree of frames that was estimated.
 
     Attributes:
@@ -40,16 +56,6 @@ class Edge:
     def oriented(self) -> bool:
         """Whether its rotation was measured; else it is chosen, and has no covariance."""
         return bool(self.covariance[:3, :3].any())
-
-    @property
-    def sigma_mm(self) -> float:
-        """Root of the trace of the translation's covariance [mm]."""
-        return float(1e3 * np.sqrt(np.trace(self.covariance[3:, 3:])))
-
-    @property
-    def sigma_deg(self) -> float:
-        """Root of the trace of the rotation's covariance [deg]."""
-        return float(np.rad2deg(np.sqrt(np.trace(self.covariance[:3, :3]))))
 
     @property
     def sigma_words(self) -> str:

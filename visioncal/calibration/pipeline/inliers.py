@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.starting import Start, sensors_of, started, with_poses
+from visioncal.calibration.pipeline.starting import Start, sensors_of, started
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -37,7 +37,7 @@ def first_inliers(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, Agr
     Raises:
         DegenerateError: The motion is too poor for any answer, by its geometry alone.
     """
-    start = started(with_poses(cell, looked), looked)
+    start = started(cell, looked)
     check_observability(start.problem, start.state, starting_noise(start.problem), mount)
     return start.cell, find_inliers(start)[0]
 

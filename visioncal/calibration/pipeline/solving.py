@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.arm_results import (
 )
 from visioncal.calibration.pipeline.inliers import find_inliers, levelled, settled, with_repeats
 from visioncal.calibration.pipeline.solved import Solved
-from visioncal.calibration.pipeline.starting import started, with_poses
+from visioncal.calibration.pipeline.starting import started
 from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clocks import clock_effects
@@ -65,7 +65,6 @@ def solve(
         DegenerateError: A robot is tied to nothing, a frame may be in two places, or the
             motion of one robot leaves a direction, or the lens, open.
     """
-    cell = with_poses(cell, looked)
     arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
     check_arms(arms, asked)
     if cell.mount is not None:

@@ -42,12 +42,8 @@ class Start:
     untied: tuple[str, ...]
 
 
-def with_poses(cell: Cell, looked: Observed) -> Cell:
-    """The cell without the observations that gave no pose.
-
-    Raises:
-        DataError: None is left.
-    """
+def _with_poses(cell: Cell, looked: Observed) -> Cell:
+    """The cell without the observations that gave no pose."""
     missing = {
         row.view: cell.reasons.get(row.view, "nothing was found in its image")
         for row in cell.rows
@@ -63,13 +59,14 @@ def started(cell: Cell, looked: Observed) -> Start:
     """Finds a start, and gives each view its one pose by it.
 
     Args:
-        cell: The cell; each of its rows has a pose.
+        cell: The cell.
         looked: What was observed in it.
 
     Raises:
+        DataError: No observation gave a pose.
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.
     """
-    cell, lost = _tied_part(cell)
+    cell, lost = _tied_part(_with_poses(cell, looked))
     views = [looked.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
     if cell.mount is not None:
@@ -97,7 +94,7 @@ def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
         DataError: Nothing was seen.
         DegenerateError: A robot is tied to nothing, or a frame may be in two places.
     """
-    start = started(with_poses(cell, looked), looked)
+    start = started(cell, looked)
     between = invert(start.problem.predicted(start.state)) @ start.problem.observations.measured
     away = np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * rotation_angle(between)
     near = (away < AGREE_M).tolist()
