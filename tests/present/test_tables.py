@@ -61,7 +61,8 @@ def test_page_and_recording_have_the_same_figures():
 def test_one_camera_has_one_of_each_without_a_name():
     calibration = made_up().calibration
     assert parts.cameras(calibration) == {"": calibration.camera}
-    assert parts.arms(calibration) == {"": calibration}
+    (robot,) = calibration.by_name.robots.values()
+    assert (robot.model, robot.arm) == (calibration.robot, calibration.arm)
     assert [view.view for view in calibration.views] == [view.view for view in calibration.views]
     frames = parts.frames(calibration)
     assert frames.parents == {

@@ -177,7 +177,7 @@ def source_table(calibration: Calibration) -> Table | None:
     Returns:
         The table; None where that is unknown.
     """
-    cell, known = calibration.cell, calibration.budget
+    known, named = calibration.budget, calibration.by_name.uncertainty
     if known is not None:
         found = [
             (SOURCES.get(name, name), significant(value), known.percent(name))
@@ -185,9 +185,9 @@ def source_table(calibration: Calibration) -> Table | None:
         ]
         total = ("total", significant(known.total_mm), "")
         return Table.of(("source", "sigma, mm", "of the variance"), [*found, total])
-    if cell is None or cell.uncertainty is None or not cell.uncertainty.budget_mm:
+    budgets = {} if named is None else named.budget_mm
+    if not budgets:
         return None
-    budgets = cell.uncertainty.budget_mm
     names = dict.fromkeys(name for budget in budgets.values() for name in budget)
     shown = [
         name

@@ -11,8 +11,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, Target
 from visioncal.results import Calibration, CameraResult
-from visioncal.results.arm import ArmSections
-from visioncal.results.sections import ClockResult, Intervals
+from visioncal.results.sections import Intervals
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.frames import CELL
@@ -54,27 +53,18 @@ def image_width(calibration: Calibration) -> int | None:
     return max(widths, default=None)
 
 
-def arms(calibration: Calibration) -> Mapping[str, ArmSections]:
-    """What was found of the arms."""
-    return {"": calibration} if calibration.cell is None else calibration.cell.robots
-
-
 def robots(calibration: Calibration) -> dict[str, Robot]:
     """The nominal models of the robots, as far as they are known."""
-    cell = calibration.cell
-    models = {"": calibration.robot}
-    if cell is not None:
-        models = {name: robot.model for name, robot in cell.robots.items()}
-    return {name: model for name, model in models.items() if model is not None}
+    found = calibration.by_name.robots.items()
+    return {name: robot.model for name, robot in found if robot.model is not None}
 
 
 def calibrated_robots(calibration: Calibration) -> dict[str, Robot]:
     """The robots as they were calibrated, or else their nominal models."""
-    found = ((name, arm.arm) for name, arm in arms(calibration).items())
     calibrated = {
-        name: arm_result.robot
-        for name, arm_result in found
-        if arm_result is not None and arm_result.robot is not None
+        name: robot.arm.robot
+        for name, robot in calibration.by_name.robots.items()
+        if robot.arm is not None and robot.arm.robot is not None
     }
     return {**robots(calibration), **calibrated}
 
@@ -87,23 +77,14 @@ def stated_boards(session: Session | None) -> dict[str, Target]:
     return {"target": found[""], **found} if "" in found else found
 
 
-def clocks(calibration: Calibration) -> Mapping[str, ClockResult]:
-    """The cameras' clocks, by whose they are."""
-    if calibration.cell is not None:
-        return calibration.cell.details.clocks
-    return {} if calibration.clock is None else {"": calibration.clock}
-
-
 def noise(calibration: Calibration) -> dict[str, Levels]:
     """The levels of noise of each sensor and each robot."""
-    cell, known = calibration.cell, calibration.uncertainty
-    if cell is None:
-        return {"": Levels(calibration.noise, {} if known is None else known.noise_95)}
-    intervals = {} if cell.uncertainty is None else cell.uncertainty.noise_95
-    robots = cell.flanges.values()
+    named = calibration.by_name
+    intervals = {} if named.uncertainty is None else named.uncertainty.noise_95
+    robots = named.flanges.values()
     return {
         f"robot {name}" if name in robots else name: Levels(levels, intervals.get(name, {}))
-        for name, levels in cell.noise.items()
+        for name, levels in named.noise.items()
     }
 
 

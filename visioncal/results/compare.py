@@ -227,11 +227,9 @@ def _mount(calibration: Calibration) -> str:
 
 def _levels(calibration: Calibration) -> Mapping[str, float]:
     """The noise by name; of a whole cell, with what it is of before it."""
-    if calibration.cell is None:
-        return calibration.noise
     return {
-        f"{of} {name}": level
-        for of, levels in calibration.cell.noise.items()
+        f"{of} {name}".strip(): level
+        for of, levels in calibration.by_name.noise.items()
         for name, level in levels.items()
     }
 

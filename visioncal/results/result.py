@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.arguments import typed
 from visioncal.core.choices import DYNAMICS_FILE
-from visioncal.core.codec import reading
+from visioncal.core.codec import entries, reading
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
@@ -24,15 +24,15 @@ from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Step, Verdict
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.intervals import freedom_of
-from visioncal.results.arm import NOMINAL, ArmResult
+from visioncal.results.arm import NOMINAL, ArmResult, ArmSections
 from visioncal.results.cell import CellResult
 from visioncal.results.document import ALIGNMENT, fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult
-from visioncal.results.parts import NeedMet, SolverResult
+from visioncal.results.parts import NeedMet, RobotResult, SolverResult
 from visioncal.results.ray_frame import RayFrame, ray_frame
-from visioncal.results.sections import CalibrationSections
+from visioncal.results.sections import CalibrationSections, CellDetails, CellUncertainty
 from visioncal.results.selecting import selected_fields
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, ViewResult
@@ -104,16 +104,42 @@ class Calibration(CalibrationSections):
         return ray_frame(edge, self.edges[edge], self.camera)
 
     @cached_property
+    def by_name(self) -> CellResult:
+        """What it has by name; one camera, one robot and their targets have empty ones."""
+        if self.cell is not None:
+            return self.cell
+        ends, known = (name.partition("_from_") for name in self.edges), self.uncertainty
+        placed = {child: parent for parent, _, child in ends}
+        arm = {section.name: getattr(self, section.name) for section in entries(ArmSections)}
+        return CellResult(
+            reference="base",
+            tree={"base": CELL, "flange": "base", **placed},
+            cameras={} if self.camera is None else {"": self.camera},
+            robots={"": RobotResult(self.robot, **arm)},
+            targets={},
+            noise={"": self.noise},
+            moved=(),
+            untied=(),
+            weakest="",
+            details=CellDetails({} if self.clock is None else {"": self.clock}),
+            uncertainty=None
+            if known is None
+            else CellUncertainty(budget_mm={}, noise_95={"": known.noise_95}),
+        )
+
+    @cached_property
     def tree(self) -> FrameTree:
         """Its frames: what hangs on what, and how."""
-        known, cell = (self.edges, self.joint_covariance, self.frames), self.cell
-        if cell is not None:
-            former = frozenset(move.before for move in cell.moved)
-            return FrameTree(cell.reference, cell.tree, cell.flanges, *known, former)
-        ends = (name.partition("_from_") for name in self.edges)
-        placed = {child: parent for parent, _, child in ends}
-        parents = {"base": CELL, "flange": "base", **placed}
-        return FrameTree("base", parents, {"flange": "robot"}, *known)
+        cell = self.by_name
+        return FrameTree(
+            cell.reference,
+            cell.tree,
+            cell.flanges,
+            self.edges,
+            self.joint_covariance,
+            self.frames,
+            frozenset(move.before for move in cell.moved),
+        )
 
     @typed
     def between(

@@ -11,7 +11,7 @@ import rerun as rr
 from visioncal.core.number_format import significant
 from visioncal.core.types import Target
 from visioncal.core.verdict import Verdict
-from visioncal.present import advice, arms, facts, parts
+from visioncal.present import advice, arms, facts
 from visioncal.present.details import frame_facts, observation_table
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.markdown import fact_lines, markdown, plain, table_lines
@@ -184,7 +184,7 @@ def _figure_lines(found: Calibration, targets: Mapping[str, Target]) -> Iterator
     for name, board in found.named_boards.items():
         if said := facts.board_facts(found, board, targets.get(name)):
             yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(said))
-    for name, arm in parts.arms(found).items():
+    for name, arm in found.by_name.robots.items():
         of = plain(facts.of(name))
         if arm.arm_errors is not None:
             yield from ("", f"# Arm{of}", "", *fact_lines(arms.error_facts(arm.arm_errors)))
@@ -256,7 +256,7 @@ def arms_markdown(calibration: Calibration) -> str:
     """What is known of each arm of which levels were tried, and of its drift."""
     return "\n".join(
         chain.from_iterable(
-            _arm(facts.of(name), arm) for name, arm in parts.arms(calibration).items()
+            _arm(facts.of(name), arm) for name, arm in calibration.by_name.robots.items()
         )
     )
 

@@ -129,7 +129,7 @@ def _log_views(
     sights = {rows[view.view]: view for view in calibration.views if view.view in rows}
     unposed = {row: scene.unposed(view.number) for row, view in views.items()}
     notes.log_views(stream, sights, views, unposed)
-    for name, arm in parts.arms(calibration).items():
+    for name, arm in calibration.by_name.robots.items():
         drifts = () if arm.thermal is None else arm.thermal.views
         for plot, attribute in ((paths.DRIFT_MM, "drift_mm"), (paths.RISE_K, "rise_k")):
             values = {rows[drift.view]: float(getattr(drift, attribute)) for drift in drifts

@@ -77,7 +77,7 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
     facts = [*need_facts(calibration.need, calibration.verdict)]
     sigmas = _camera_sigmas if calibration.cell is None else _cell_sigmas
     facts += sigmas(calibration)
-    for name, arm in parts.arms(calibration).items():
+    for name, arm in calibration.by_name.robots.items():
         if arm.arm is not None and arm.arm.workspace_sigma_mm is not None:
             sigma = f"{significant(arm.arm.workspace_sigma_mm.median)} mm"
             facts.append(Fact(f"all over the workspace{of(name)}, sigma", sigma))
@@ -165,7 +165,7 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
         read = f"it read {calibration.instrument.reads}"
         facts.append(Fact("instrument", calibration.instrument.words, read))
         facts += [_point_fact(point) for point in calibration.points]
-    for name, clock in parts.clocks(calibration).items():
+    for name, clock in calibration.by_name.details.clocks.items():
         facts += _clock_facts(clock, f"clock{of(name)}" if name else "camera's clock")
     return tuple(facts)
 
@@ -232,10 +232,7 @@ def view_table(calibration: Calibration, outlying: Collection[int]) -> Table:
         figures = (view.rms_px, view.residual_mm, view.residual_deg)
         corners = significant(None) if view.corners is None else str(view.corners)
         mark = "look" if view.used and view.view in outlying else mark_of(view)
-        cells = (str(view.view), corners, *map(significant, figures), words[mark])
-        names = (view.seer, view.seen) if view.seer else ()
-        rows.append(Row((cells[0], *names, *cells[1:]), mark, f"view-{view.view}"))
-    titles = ("view", "corners", "px", "mm", "deg", "used")
-    if calibration.cell is None:
-        return Table.of(titles, rows, (5,))
-    return Table.of((titles[0], "who", "saw", *titles[1:]), rows, (1, 2, 7))
+        names = (str(view.view), view.seer, view.seen)
+        cells = (*names, corners, *map(significant, figures), words[mark])
+        rows.append(Row(cells, mark, f"view-{view.view}"))
+    return Table.of(("view", "who", "saw", "corners", "px", "mm", "deg", "used"), rows, (1, 2, 7))

@@ -94,12 +94,11 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     rows = boxes(figure, len(shown), 1, Margins(0.75, 0.75, top=0.1 + named), (0.0, 0.15 + named))
     for (box,), (seer, mine, measure) in zip(rows, shown, strict=True):
         last = box is rows[-1][0]
-        rms = calibration.rms if calibration.cell is None else rms_of(mine)
         marked = [Bar(str(view.view), measure.value_of(view), view.used, _colour(view, outlying))
                   for view in mine]  # fmt: skip
         # Views of several cameras are other ones in each panel.
         labelled = last or calibration.cell is not None
-        bars.draw(figure, box, marked, measure.rms_of(rms), limit=measure.limit,
+        bars.draw(figure, box, marked, measure.rms_of(rms_of(mine)), limit=measure.limit,
                   labelled=labelled, titles=("view" if last else "", measure.label))  # fmt: skip
         figure.text(box.left, box.top - 5.0, seer)
     return figure.inline("Bars: residuals of each view")

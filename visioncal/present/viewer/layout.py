@@ -184,7 +184,7 @@ def _explained() -> rrb.Container:
 
 def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.Container]:
     """The calibrated arms: one with its workspace, several in words; and their drift."""
-    arms = parts.arms(calibration).values()
+    arms = calibration.by_name.robots.values()
     found = [arm.arm for arm in arms if arm.arm is not None and arm.arm.is_calibrated]
     tabs: list[rrb.Container] = []
     if found and calibration.cell is None:
