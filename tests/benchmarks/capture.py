@@ -18,15 +18,15 @@ from support.killed import kill_and_resume
 from support.planned import true_cell
 
 from visioncal.core.errors import VisioncalError
-from visioncal.live.capture.core import Step, Watcher
-from visioncal.live.capture.facts import Facts
+from visioncal.live.capture.core import CaptureEvent, Watcher
+from visioncal.live.capture.facts import CaptureFacts
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.record import record
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.read_back import PlanFile, Stop
 from visioncal.live.rehearsal.camera import RehearsalCamera
@@ -56,9 +56,9 @@ class Compared:
     truth: TruthClient
     off_m: list[float] = field(default_factory=list)
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Compares one."""
-        if isinstance(step.found, Taken):
+        if isinstance(step.found, TakenView):
             there = self.truth.state([step.found.frame.stamp_s]).base_from_flange[0]
             off = there[:3, 3] - step.found.state.base_from_flange[:3, 3]
             self.off_m.append(float(np.linalg.norm(off)))
@@ -73,7 +73,7 @@ class Faulty:
     camera: RehearsalCamera
     began_s: float = 0.0
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Sets the fault's clock."""
         if step.place == 1:
             threading.Timer(ON_THE_WAY_S, self._happen).start()
@@ -99,17 +99,17 @@ def planned(stops: int) -> PlanFile:
     """A plan of the cell, as it would be read back."""
     cell = replace(true_cell(CELL), sigma_rad=0.01, sigma_m=0.005)
     start_q = np.array(CONTROLLER.q)
-    request = Request(purpose_of("hand-eye"), stops, start_q=start_q, candidates=200)
+    request = PlanRequest(purpose_of("hand-eye"), stops, start_q=start_q, candidates=200)
     found = tuple(
         Stop(stop.view, stop.q, stop.via, stop.words) for stop in make_plan(cell, request).stops
     )
     return PlanFile(cell, request.purpose, found, start_q, "0" * 64)
 
 
-def recorded(live: LiveCell, plan: PlanFile, folder: Path, watcher: Watcher) -> list[Step]:
+def recorded(live: LiveCell, plan: PlanFile, folder: Path, watcher: Watcher) -> list[CaptureEvent]:
     """Records a plan into a folder."""
     camera, cell = live.camera, plan.cell
-    facts = Facts(
+    facts = CaptureFacts(
         "live",
         cell.mount,
         cell.target,

@@ -22,7 +22,7 @@ import visioncal
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.estimation.workspace import postures
 from visioncal.robot.inverse import Inverse
-from visioncal.simulation import Cell, forward, simulate
+from visioncal.simulation import SimulatedCell, forward, simulate
 
 WORLDS = 5
 TARGETS = few(500, 20)
@@ -35,7 +35,7 @@ def rms_mm(away: np.ndarray) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
 
 
-def world(options) -> tuple[Cell, visioncal.Calibration, tuple[float, float, float]]:
+def world(options) -> tuple[SimulatedCell, visioncal.Calibration, tuple[float, float, float]]:
     """A calibrated cell, and what its camera misses: nominal, corrected [mm], share reached."""
     cell = simulate(options)
     result, told = result_of(calibrated(cell)), result_of(calibrated(cell, joints=False))

@@ -26,7 +26,7 @@ from visioncal.calibration.stages.detect import image_of, look_for
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.session import MemoryImages
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.vision.finders.board import find_board
 from visioncal.vision.finders.template import refine
 
@@ -153,7 +153,7 @@ def corners_by_kind(session) -> dict[str, dict[int, Corners]]:
 
 
 def errors_mm(
-    cell: Cell, kinds: dict[str, dict[int, Corners]]
+    cell: SimulatedCell, kinds: dict[str, dict[int, Corners]]
 ) -> Iterator[tuple[str, float, float]]:
     """X's distance from the truth, by kind of corners and by the robot's noise."""
     for noise in NOISES_MM:

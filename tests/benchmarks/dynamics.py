@@ -26,8 +26,8 @@ from visioncal.dynamics.identify import SLOW_RAD_S, Identification, Options, ide
 from visioncal.dynamics.limits import Share, allowed_motion
 from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.motion import Measured, Motion
-from visioncal.dynamics.reading import Recorded
+from visioncal.dynamics.motion import JointMotion, Measured
+from visioncal.dynamics.reading import RecordedSamples
 from visioncal.dynamics.validate import friction_of_known, predict, validate
 from visioncal.robot import load_robot, small_urdf
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
@@ -168,7 +168,7 @@ def panda_text() -> str:
         np.loadtxt(PANDA / f"{name}.txt").reshape(-1, 7)
         for name in ("positions", "velocity", "torques")
     )
-    whole = Recorded("panda", np.loadtxt(PANDA / "time.txt"), q, dq, torques)
+    whole = RecordedSamples("panda", np.loadtxt(PANDA / "time.txt"), q, dq, torques)
     train, test = (condition(whole.part(*pair), 8.0) for pair in ((0.0, 0.7), (0.7, 1.0)))
     found = identify(load_robot("panda"), [train])
     result = validate(found.identified, predict(found.identified, test, friction_of_known(found)))
@@ -234,7 +234,7 @@ def exact_motion() -> Measured:
     built = replace(built, gears=replace(built.gears, motor_inertia=np.zeros(6)))
     torques = drive_torques(built, done.q, done.dq, done.ddq)
     noise = 0.03 * np.sqrt(np.mean(torques**2, axis=0)) * rng.standard_normal(torques.shape)
-    return Measured(Motion(done.times_s, done.q, done.dq, done.ddq), torques + noise)
+    return Measured(JointMotion(done.times_s, done.q, done.dq, done.ddq), torques + noise)
 
 
 def timed(run) -> tuple[float, Identification]:

@@ -14,8 +14,8 @@ from visioncal.dynamics import (
     DynamicModel,
     FrictionTerms,
     Identified,
+    JointMotion,
     Measured,
-    Motion,
     drive_gains,
     estimate_payload,
     external_torques,
@@ -24,7 +24,7 @@ from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, identify
 from visioncal.dynamics.reading import read_recorded
 from visioncal.robot import Inertias, load_robot
-from visioncal.simulation.dynamics import Body, DynamicArm, drive_torques, real_dynamics
+from visioncal.simulation.dynamics import DynamicArm, LinkBody, drive_torques, real_dynamics
 from visioncal.simulation.exercise import Exercise, Senses, multi_sine, record
 
 WORLDS, ROBOT = 20, "ur10e"
@@ -36,9 +36,9 @@ GAINS = (20.0, 21.0, 16.0, 9.0, 9.5, 8.7)
 PUSH_N, GAIN_PER_S = 10.0, 25.0
 
 
-def body(kg: float) -> Body:
+def body(kg: float) -> LinkBody:
     """A payload of a density."""
-    return Body(kg, CENTRE_M, kg * INERTIA)
+    return LinkBody(kg, CENTRE_M, kg * INERTIA)
 
 
 def conditioned(built: DynamicArm, done: Exercise, rng, gains=()):
@@ -94,7 +94,7 @@ def felt(found: Identified, built: DynamicArm, done: Exercise, rng) -> np.ndarra
     torques = drive_torques(built, done.q, done.dq, done.ddq)
     noise = 0.03 * np.sqrt(np.mean(torques**2, axis=0)) * rng.standard_normal(torques.shape)
     given = torques + noise - external
-    measured = Measured(Motion(done.times_s, done.q, done.dq, done.ddq), given)
+    measured = Measured(JointMotion(done.times_s, done.q, done.dq, done.ddq), given)
     residual = np.abs(external_torques(arm, measured, GAIN_PER_S))
     quiet = done.times_s < half
     limits = np.quantile(residual[quiet], 0.999, axis=0)

@@ -33,7 +33,14 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
-from visioncal.simulation import Cell, CellOptions, forward, measured_poses, simulate, write_session
+from visioncal.simulation import (
+    CellOptions,
+    SimulatedCell,
+    forward,
+    measured_poses,
+    simulate,
+    write_session,
+)
 
 WORLDS, REPEATS = 10, few(3, 1)
 # The arm's true departures, of which the ways that are `told` know.
@@ -60,7 +67,7 @@ class World:
         poses: (m, 4, 4) `cam_from_target` as measured.
     """
 
-    cell: Cell
+    cell: SimulatedCell
     poses: FloatArray
 
     @property

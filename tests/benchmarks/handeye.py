@@ -24,7 +24,7 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.session import Session
-from visioncal.simulation import Cell, CellOptions, fine_camera, simulate, wide_camera
+from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate, wide_camera
 from visioncal.simulation.boards import Sheet, corners_m
 
 SEEDS, FEW = 1000, 50
@@ -70,7 +70,7 @@ WORLDS = (
 ROBUST = (WORLDS[0], WORLDS[4])
 
 
-def opencv_poses(cell: Cell) -> FloatArray:
+def opencv_poses(cell: SimulatedCell) -> FloatArray:
     """(m, 4, 4) `cam_from_target` by OpenCV: calibrateCamera or solvePnP."""
     options = cell.options
     points = corners_m(Sheet(target=options.target))
@@ -90,7 +90,7 @@ def opencv_poses(cell: Cell) -> FloatArray:
     return poses
 
 
-def opencv_errors(cell: Cell) -> FloatArray:
+def opencv_errors(cell: SimulatedCell) -> FloatArray:
     """(methods, 2) rotation [rad] and translation [m] errors of X by each of OpenCV's solvers."""
     x, z = cell.transforms.values()
     robot = cell.robot.base_from_flange
@@ -117,7 +117,7 @@ def mahalanobis_sq(error: FloatArray, covariance: FloatArray) -> float:
     return float(error @ np.linalg.solve(covariance, error)) / len(error)
 
 
-def edge_bound(cell: Cell) -> FloatArray:
+def edge_bound(cell: SimulatedCell) -> FloatArray:
     """Least covariance (12, 12) of x and z of a cell whose board is as stated."""
     return network_bound(cell, "base", sizes=False).covariance
 

@@ -22,7 +22,7 @@ from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.solve import solve_problem
-from visioncal.simulation import BOARDS, Cell, CellOptions, fine_camera, simulate
+from visioncal.simulation import BOARDS, CellOptions, SimulatedCell, fine_camera, simulate
 from visioncal.vision.targets import corner_positions
 
 need("pyceres", "pyceres")
@@ -32,7 +32,7 @@ PIXEL_PX, NOISE = 0.1, Noise.of_robot(5e-5, 3e-5)
 REPEATS = few(15, 1)
 
 
-def cell_of(seed: int) -> Cell:
+def cell_of(seed: int) -> SimulatedCell:
     target = replace(BOARDS["charuco"], columns=11, rows=9, square_m=0.025, marker_m=0.018)
     return simulate(
         CellOptions(
@@ -49,7 +49,9 @@ def cell_of(seed: int) -> Cell:
 class ViewCost(pyceres.CostFunction):
     """One view's corners: 2 n residuals by x, z and the flange's error, all as right steps."""
 
-    def __init__(self, stack: CornerStack, cell: Cell, robot: FloatArray, start: State) -> None:
+    def __init__(
+        self, stack: CornerStack, cell: SimulatedCell, robot: FloatArray, start: State
+    ) -> None:
         pyceres.CostFunction.__init__(self)
         self.stack, self.camera, self.robot, self.start = stack, cell.options.camera, robot, start
         self.set_num_residuals(2 * len(stack.px))
@@ -77,7 +79,7 @@ class ViewCost(pyceres.CostFunction):
         return True
 
 
-def by_pyceres(cell: Cell, stacks: list[CornerStack], start: State) -> State:
+def by_pyceres(cell: SimulatedCell, stacks: list[CornerStack], start: State) -> State:
     problem = pyceres.Problem()
     x, z = np.zeros(6), np.zeros(6)
     flanges = [np.zeros(6) for _ in stacks]
@@ -94,7 +96,7 @@ def by_pyceres(cell: Cell, stacks: list[CornerStack], start: State) -> State:
     return start.moved(np.concatenate([x, z]))
 
 
-def by_visioncal(cell: Cell, stack: CornerStack, start: State) -> State:
+def by_visioncal(cell: SimulatedCell, stack: CornerStack, start: State) -> State:
     with one_blas_thread():
         x, z = start.edges
         predicted = invert(cell.robot.base_from_flange @ x) @ z

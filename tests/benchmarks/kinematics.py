@@ -25,7 +25,7 @@ from visioncal.calibration.stages import kinematics as levels
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
 WORLDS = 20
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -80,7 +80,7 @@ def dirty(options: CellOptions) -> tuple[float, ...]:
     return tuple(1e3 * error for error in errors)
 
 
-def without_blocks(cell: Cell, **changes: object) -> RunState:
+def without_blocks(cell: SimulatedCell, **changes: object) -> RunState:
     """The same way with a flat board, the lens as stated and no eccentricity."""
     told = known_of(cell).session
     camera = told.document["camera"] | {"intrinsics": "hold"}

@@ -32,7 +32,7 @@ from visioncal.frames.camera_chain import Eye
 from visioncal.frames.target_in_image import see
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
-from visioncal.simulation import BOARDS, Cell, CellOptions, simulate
+from visioncal.simulation import BOARDS, CellOptions, SimulatedCell, simulate
 from visioncal.vision.targets import corner_positions
 
 CELLS, PICKS, BINS = 1000, 20, 10
@@ -90,7 +90,7 @@ def some_need(picks: Picks, rng: np.random.Generator) -> Need:
     return Need(mm, float(np.rad2deg(turned * rng.uniform(0.7, 1.8))) if both else None)
 
 
-def of_poses(cell: Cell) -> RunState:
+def of_poses(cell: SimulatedCell) -> RunState:
     """What is known at the end of the way from measured poses, which are exact."""
     rows = [
         [str(at), *numbers(robot), *numbers(camera)]
@@ -113,7 +113,7 @@ def numbers(matrix: FloatArray) -> list[str]:
 
 
 def lands(
-    cell: Cell, known: RunState, eye: Eye | None, need: Need, rng: np.random.Generator
+    cell: SimulatedCell, known: RunState, eye: Eye | None, need: Need, rng: np.random.Generator
 ) -> bool:
     """Looks at a thing and goes there; whether that is near enough."""
     at, middle = int(rng.integers(len(cell.cam_from_target))), np.array([0.0, 0.0, 0.0, 1.0])
@@ -135,7 +135,9 @@ def lands(
     return bool(near and (need.deg is None or np.rad2deg(turned[0]) <= need.deg))
 
 
-def seen_by(cell: Cell, eye: Eye, in_camera: FloatArray, rng: np.random.Generator) -> FloatArray:
+def seen_by(
+    cell: SimulatedCell, eye: Eye, in_camera: FloatArray, rng: np.random.Generator
+) -> FloatArray:
     """(4, 4) where the calibrated camera has a thing that stands somewhere, by exact corners."""
     exact = replace(cell, options=replace(cell.options, pixel_sigma_px=0.0))
     corners = seen_corners(exact, in_camera, BOARD, rng)

@@ -19,7 +19,7 @@ from visioncal.calibration.pipeline import align
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.results import Calibration
-from visioncal.simulation import Cell, simulate
+from visioncal.simulation import SimulatedCell, simulate
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
 from visioncal.simulation.records import cell_session
 
@@ -41,14 +41,14 @@ def drawn(options: NetworkOptions, seed: int) -> NetworkOptions:
     return replace(options, boards=boards, seed=seed)
 
 
-def aligned(cell: Cell) -> Calibration:
+def aligned(cell: SimulatedCell) -> Calibration:
     session = cell_session(cell, "network", seen="names")
     return align(
         session, corners={view_corners.view: view_corners for view_corners in cell.corners}
     )
 
 
-def away(cell: Cell, found: Calibration, frames: Sequence[str]) -> FloatArray:
+def away(cell: SimulatedCell, found: Calibration, frames: Sequence[str]) -> FloatArray:
     """(6 f,) by which frames are off, on their right."""
     parts = []
     for name in frames:
@@ -134,7 +134,7 @@ def _tells(found: Calibration, push: Moved) -> bool:
     )
 
 
-def _mm(cell: Cell, found: Calibration) -> float:
+def _mm(cell: SimulatedCell, found: Calibration) -> float:
     return 1e3 * float(np.linalg.norm(away(cell, found, ["base_b"])[3:]))
 
 

@@ -28,7 +28,7 @@ from visioncal.live.planning.information import World, worlds_of
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.recorded import Begun, begin
 from visioncal.live.planning.selection import CRITERIA
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
 WORLDS = 20
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -68,13 +68,13 @@ def expected_mm(truth: World, rows: FloatArray) -> float:
     return 1e3 * float(np.sqrt(np.trace(truth.place @ truth.covariance(rows))))
 
 
-def arm_error(cell: Cell, known: RunState) -> FloatArray:
+def arm_error(cell: SimulatedCell, known: RunState) -> FloatArray:
     """Error all over the workspace [mm]."""
     model = known.robot_arm.model
     return 1e3 * np.array([error_m(cell, known, known.robot if model is None else model.robot)])
 
 
-def edge_error(cell: Cell, known: RunState) -> FloatArray:
+def edge_error(cell: SimulatedCell, known: RunState) -> FloatArray:
     """Errors of x: offset [mm] and rotation [deg]."""
     away = error_of(cell, known)
     return np.array([1e3 * np.linalg.norm(away[3:6]), np.rad2deg(np.linalg.norm(away[:3]))])

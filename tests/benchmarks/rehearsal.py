@@ -20,15 +20,15 @@ import numpy as np
 from results import WORDS, few, first, need, write_section
 from support.killed import kill_and_resume
 
-from visioncal.cli.recorded_cell import Scene, facts_of, scene_of
+from visioncal.cli.recorded_cell import RecordedSetup, facts_of, scene_of
 from visioncal.cli.rehearsed import TAKING, planned, recorded
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError
-from visioncal.live.capture.core import Step
+from visioncal.live.capture.core import CaptureEvent
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.record import record
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.oak_hosted import HostedOak
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.bench import Bench
@@ -76,7 +76,7 @@ class Knocks:
                     self.count += 1
 
 
-def stage(folder: Path, stops: int) -> tuple[RehearsedCell, Scene, Bench]:
+def stage(folder: Path, stops: int) -> tuple[RehearsedCell, RecordedSetup, Bench]:
     """A planned cell whose arm stands at the first stop."""
     options = RehearsalOptions(stops=stops, seed=SEED)
     cell = rehearsed_cell(options)
@@ -116,7 +116,10 @@ def faults(folder: Path) -> str:
         _, scene, bench = stage(place, FAULT_STOPS)
         with closing(bench):
             taken = recorded(bench, scene, place / "session", [], fault, view=False)
-        suffered, views = taken.fault, sum(isinstance(step.found, Taken) for step in taken.steps)
+        suffered, views = (
+            taken.fault,
+            sum(isinstance(step.found, TakenView) for step in taken.steps),
+        )
         stood = "" if suffered.stood_after_s is None else f"{suffered.stood_after_s:.2f}"
         message = suffered.message.replace(str(place), "...")
         lines.append(
@@ -176,7 +179,7 @@ class _Filling:
     def __init__(self, ballast: Path) -> None:
         self.ballast, self.filled_s = ballast, 0.0
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Fills it."""
         if step.place == FAULT_STOPS // 2:
             with suppress(OSError), self.ballast.open("wb", buffering=0) as file:
@@ -221,8 +224,8 @@ def kills(folder: Path) -> str:
 
 
 class _Acknowledged:
-    def stepped(self, step: Step) -> None:
-        if isinstance(step.found, Taken):
+    def stepped(self, step: CaptureEvent) -> None:
+        if isinstance(step.found, TakenView):
             print(step.view, flush=True)
 
 

@@ -17,7 +17,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import clock
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
-from visioncal.simulation import Cell, CellOptions, SweepOptions, sweep
+from visioncal.simulation import CellOptions, SimulatedCell, SweepOptions, sweep
 
 SWEEPS = 20
 # So many of them are calibrated without a look at the rows, too: that takes much longer.
@@ -89,7 +89,7 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
     )
 
 
-def x_error(moved: Cell, known: RunState) -> FloatArray:
+def x_error(moved: SimulatedCell, known: RunState) -> FloatArray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
     return log(invert(next(iter(moved.transforms.values()))) @ known.solved.state.edges[0])
 

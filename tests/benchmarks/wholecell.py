@@ -22,7 +22,7 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners, FloatArray
 from visioncal.results import Calibration
 from visioncal.session import Session
-from visioncal.simulation import Cell, simulate
+from visioncal.simulation import SimulatedCell, simulate
 from visioncal.simulation.layout import BoardAt, CameraAt, NetworkOptions, RobotAt, Swept
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import BOARDS
@@ -65,7 +65,7 @@ class World:
         corners: What is detected, by view.
     """
 
-    cell: Cell
+    cell: SimulatedCell
     session: Session
     corners: Mapping[int, Corners]
 
@@ -143,7 +143,7 @@ def outcome(seed: int) -> Outcome:
     )
 
 
-def _zeros(found: Calibration, cell: Cell, robot: str) -> FloatArray:
+def _zeros(found: Calibration, cell: SimulatedCell, robot: str) -> FloatArray:
     """(k,) errors over their sigmas of the joints' zeros."""
     rows = found.cell.robots[robot].arm.parameters
     zeros = [row for row in rows if row.name == "theta_rad"]
@@ -151,7 +151,7 @@ def _zeros(found: Calibration, cell: Cell, robot: str) -> FloatArray:
     return np.asarray(away / [zero.sigma for zero in zeros])
 
 
-def _true(cell: Cell, name: str, reference: str) -> FloatArray:
+def _true(cell: SimulatedCell, name: str, reference: str) -> FloatArray:
     """(4, 4) where a frame is on its flange, or in the cell."""
     at = cell.mountings[name]
     return invert(cell.mountings[reference]) @ at if cell.parents[name] == "cell" else at

@@ -26,7 +26,7 @@ from support.slips import (
 )
 
 from visioncal.core.types import MOUNTS
-from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate
 
 SESSIONS = 20
 ROBOTS = ("ur3e", "ur5e", "ur10e")
@@ -46,7 +46,7 @@ OF_POSES += ("poses of the arm as built",)
 Key = tuple[str, str, bool]
 
 
-def cell(arm: str, seed: int) -> Cell:
+def cell(arm: str, seed: int) -> SimulatedCell:
     """A cell of any kind."""
     length, angle = ARMS[arm]
     rng = np.random.default_rng([57, seed])

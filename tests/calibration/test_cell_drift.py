@@ -9,7 +9,7 @@ from visioncal.calibration.pipeline import align
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration
-from visioncal.simulation import Cell, simulate
+from visioncal.simulation import SimulatedCell, simulate
 from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.optics import fine_camera
@@ -20,7 +20,7 @@ OF_SIX, OF_TWELVE = 22.5, 32.9
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
+def cell() -> SimulatedCell:
     """Two robots before two cameras; one of them is cold at the first of 40 stops."""
     return simulate(
         NetworkOptions(

@@ -14,7 +14,7 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.clocks import set_clocks
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import LARGEST_SIGMA_S, Clock
+from visioncal.calibration.stages.offset import LARGEST_SIGMA_S, ClockOffset
 from visioncal.calibration.stages.pnp import given_poses
 from visioncal.calibration.verification import verify
 from visioncal.core.errors import DataError, DegenerateError
@@ -26,8 +26,8 @@ from visioncal.robot import load_robot
 from visioncal.session import MemoryImages, Session, Stream, View
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 from visioncal.simulation import (
-    Cell,
     CellOptions,
+    SimulatedCell,
     SweepOptions,
     cell_session,
     forward,
@@ -49,12 +49,12 @@ def clocked_of(session):
     return clocked
 
 
-def swept(seed=0, mount="eye-in-hand", how=SHORT, **options) -> Cell:
+def swept(seed=0, mount="eye-in-hand", how=SHORT, **options) -> SimulatedCell:
     return sweep(CellOptions(seed=seed, mount=mount, pixel_sigma_px=0.1, **options), how)
 
 
 @pytest.fixture(scope="module")
-def moved() -> Cell:
+def moved() -> SimulatedCell:
     return swept()
 
 
@@ -470,7 +470,7 @@ def test_what_is_open_about_the_clocks_counts(session):
 
 
 def test_frames_that_are_in_the_fit_tell_the_offset_once():
-    clock = Clock(0.02, 1e-4, "motion", None, 100, 0.9, dict.fromkeys(range(75), np.ones(6)))
+    clock = ClockOffset(0.02, 1e-4, "motion", None, 100, 0.9, dict.fromkeys(range(75), np.ones(6)))
     # A quarter of the frames tells half as well.
     assert clock.known_s() == pytest.approx(2e-4)
     assert replace(clock, frames=75).known_s() == LARGEST_SIGMA_S

@@ -19,7 +19,7 @@ from visioncal.live.planning.recorded import SoFar, begin
 from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session, View
-from visioncal.simulation import Cell, CellOptions, Second, simulate
+from visioncal.simulation import CellOptions, Second, SimulatedCell, simulate
 from visioncal.simulation.records import cell_session
 
 SIGMA_M = 5e-4
@@ -55,7 +55,7 @@ def away(found: Calibration) -> np.ndarray:
     return log(invert(X) @ found.transforms["flange_from_cam"].as_matrix())
 
 
-def run(cell: Cell, prior: dict[str, dict[str, float]]) -> RunState:
+def run(cell: SimulatedCell, prior: dict[str, dict[str, float]]) -> RunState:
     """Calibrates a cell whose session knows something beforehand."""
     known = known_of(cell, level="hand-eye")
     document = {**known.session.document, "prior": prior}

@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.judge import judge
-from visioncal.calibration.stages.judged import Place
+from visioncal.calibration.stages.judged import PointAccuracy
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
@@ -245,7 +245,7 @@ def test_the_verdict_is_about_the_need(sigma_mm: float, status: str) -> None:
 
 @pytest.mark.parametrize(("sigma_mm", "status"), [(0.2, "good"), (0.7, "check")])
 def test_what_a_camera_sees_counts_where_its_frame_is_known_less_well(sigma_mm, status) -> None:
-    place = Place("Where the views look, a point", {"intrinsics": 1.7, "total": 1.7}, 3.0)
+    place = PointAccuracy("Where the views look, a point", {"intrinsics": 1.7, "total": 1.7}, 3.0)
     verdict = judge(replace(SOUND, places=(place,), picks=(of_size(sigma_mm),)))
     assert verdict.status == status
     assert ("place" in {finding.kind for finding in verdict.findings}) == (status == "check")

@@ -19,7 +19,7 @@ from visioncal.calibration.stages.cause_ranking import (
 )
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
-from visioncal.calibration.stages.judged import Place
+from visioncal.calibration.stages.judged import PointAccuracy
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.codec import read, write
 from visioncal.core.transforms import exp, invert, pose_difference
@@ -30,7 +30,7 @@ from visioncal.core.verdict import (
     PLAN,
     READ_AGAIN,
     Finding,
-    Step,
+    Remedy,
     Verdict,
     with_paths,
 )
@@ -38,12 +38,12 @@ from visioncal.estimation.joint import MeasuredScale
 from visioncal.results import Rms
 from visioncal.results.parts import VerdictForm
 from visioncal.session import Session
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
 EXCHANGED = Finding(
     "exchanged_views",
     "Views 3 and 4 are exchanged: the image of each fits the pose in the other's row.",
-    Step("Exchange them.", CALIBRATE),
+    Remedy("Exchange them.", CALIBRATE),
     (3, 4),
 )
 POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanobis_sq=45.0)
@@ -173,9 +173,9 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     assert known.causes[1].do.command == PLAN
     # No view tells how large a board is that limits the rest.
     budget = {"pixels": 0.05, "board": 0.02, "held values": 0.1, "total": 0.12}
-    of_board = replace(found, places=(Place("A point", budget, 0.2),))
+    of_board = replace(found, places=(PointAccuracy("A point", budget, 0.2),))
     assert judge(of_board).causes[1].do is MEASURE_BOARD
-    of_lens = replace(of_board, places=(Place("A point", {**budget, "lens": 0.05}, 0.2),))
+    of_lens = replace(of_board, places=(PointAccuracy("A point", {**budget, "lens": 0.05}, 0.2),))
     assert "Add views" in judge(of_lens).causes[1].do.words
     # What can be had without them is no cause of a doubt about something else.
     met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
@@ -194,7 +194,7 @@ def test_poses_that_are_misread_explain_the_rest() -> None:
 
 
 def test_joints_that_are_there_but_misread_come_before_the_errors_they_would_explain() -> None:
-    step = Step('Write model = "ur5e".')
+    step = Remedy('Write model = "ur5e".')
     misread = Finding("misread_joints", "With the arm a ur5e and not a ur3e, they fit.", step)
     warnings = (replace(POSTURE, do=NO_JOINTS), misread)
     verdict = judge(changed(SOUND, warnings=warnings))
@@ -206,12 +206,12 @@ def test_joints_that_are_there_but_misread_come_before_the_errors_they_would_exp
 
 def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
     found = (
-        Finding("place", "A point is placed to 4 mm.", Step("Add views."), is_fatal=True),
+        Finding("place", "A point is placed to 4 mm.", Remedy("Add views."), is_fatal=True),
         Finding("something_odd", "It is odd."),
-        Finding("lens", "The lens is another.", Step("Leave it out."), probability=0.2),
+        Finding("lens", "The lens is another.", Remedy("Leave it out."), probability=0.2),
         DRIFT,
         replace(EXCHANGED, probability=0.7, without_it="Without them all is well."),
-        Finding("holdout", "Held back.", Step("Add views."), probability=0.01),
+        Finding("holdout", "Held back.", Remedy("Add views."), probability=0.01),
     )
     verdict = Verdict("bad", found)
     assert verdict.top == (
@@ -220,7 +220,7 @@ def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
         "Possibly (20 %): The lens is another.",
     )
     assert verdict.rest == ("It is odd.", DRIFT.words, "Held back.")
-    assert verdict.next_steps == (EXCHANGED.do, Step("Add views."), Step("Leave it out."))
+    assert verdict.next_steps == (EXCHANGED.do, Remedy("Add views."), Remedy("Leave it out."))
     assert Verdict.of("good", "Fine.").top == ("Fine.",)
 
 
@@ -258,7 +258,7 @@ def test_verdicts_of_earlier_files_say_the_same() -> None:
         "Much comes from it.",
         "Views disagree.",
     )
-    assert old.next_steps == (Step("Measure it."),)
+    assert old.next_steps == (Remedy("Measure it."),)
 
 
 def _scattered() -> Verdict:
@@ -269,7 +269,7 @@ def test_scatter_without_any_finding_is_unexplained() -> None:
     assert ids(_scattered()) == ["unexplained"]
 
 
-def session_of(cell: Cell, base_from_flange: np.ndarray) -> Session:
+def session_of(cell: SimulatedCell, base_from_flange: np.ndarray) -> Session:
     """A cell's corners with other reported poses."""
     return Session.from_corners(
         [(view_corners.ids, view_corners.px) for view_corners in cell.corners],

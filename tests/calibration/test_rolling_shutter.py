@@ -23,7 +23,14 @@ from visioncal.estimation.effects.delays import (
 from visioncal.present.recording import write_recording
 from visioncal.present.report.content import method_facts
 from visioncal.session import Session
-from visioncal.simulation import Cell, CellOptions, SweepOptions, cell_session, sweep, write_session
+from visioncal.simulation import (
+    CellOptions,
+    SimulatedCell,
+    SweepOptions,
+    cell_session,
+    sweep,
+    write_session,
+)
 from visioncal.simulation.layout import NetworkOptions
 from visioncal.vision.targets import numbered_positions
 
@@ -33,11 +40,11 @@ HURRIED = SweepOptions(stops=8, camera_minus_robot_s=0.037, readout_s=READOUT_S)
 MOUNTED = pytest.mark.parametrize("mount", MOUNTS)
 
 
-def swept(seed: int, how: SweepOptions = HURRIED, **options) -> Cell:
+def swept(seed: int, how: SweepOptions = HURRIED, **options) -> SimulatedCell:
     return sweep(CellOptions(seed=seed, pixel_sigma_px=0.1, **options), how)
 
 
-def x_error(moved: Cell, known: RunState) -> np.ndarray:
+def x_error(moved: SimulatedCell, known: RunState) -> np.ndarray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
     return log(invert(next(iter(moved.transforms.values()))) @ known.solved.state.edges[0])
 

@@ -10,13 +10,13 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.pipeline.view_evidence import view_evidence
-from visioncal.simulation import Cell, CellOptions, fine_camera, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, fine_camera, simulate
 
 HELD = (3, 8, 21, 30)
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
+def cell() -> SimulatedCell:
     return simulate(
         CellOptions(
             camera=fine_camera(),
@@ -31,7 +31,7 @@ def cell() -> Cell:
 
 
 @pytest.fixture(scope="module")
-def known(cell: Cell) -> RunState:
+def known(cell: SimulatedCell) -> RunState:
     """A session with a bad arm, four of whose views are held back."""
     known = known_of(cell)
     views = tuple(

@@ -7,7 +7,7 @@ import pytest
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import (
-    Table,
+    DocumentTable,
     check_free,
     decode_text,
     did_you_mean,
@@ -137,7 +137,7 @@ def test_a_number_that_does_not_serve_is_refused_by_name(
     content: dict[str, object], words: str
 ) -> None:
     with pytest.raises(DataError, match=words) as caught:
-        Table(content, "robot x").number("a", positive=True)
+        DocumentTable(content, "robot x").number("a", positive=True)
     assert caught.value.culprits == ("robot x: a",)
 
 

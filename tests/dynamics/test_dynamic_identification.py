@@ -11,12 +11,12 @@ from support.moved_arms import changed, recorded, robot_with_bodies, true_base
 from visioncal.core.errors import DegenerateError
 from visioncal.dynamics.base import BaseModel, null_space
 from visioncal.dynamics.conditioning import condition
-from visioncal.dynamics.identified import Identified, Validation
+from visioncal.dynamics.identified import Identified, TorqueValidation
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.limits import Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.reading import Recorded, read_recorded
+from visioncal.dynamics.reading import RecordedSamples, read_recorded
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
 from visioncal.dynamics.validate import friction_of_known, predict, validate
 from visioncal.robot import load_robot
@@ -236,7 +236,7 @@ def test_what_is_predicted_far_worse_than_fitted_is_doubted_where_it_matters(
     result = worlds[0][1].identified
     # Ten times the noise in either case, but of quieter drives where it is a hundredth in all.
     range_nm = 10.0 * result.fitted_rms_nm / share
-    seen = Validation("fresh", share * range_nm, range_nm, result.streams[0].noise_nm)
+    seen = TorqueValidation("fresh", share * range_nm, range_nm, result.streams[0].noise_nm)
     judged = judge(replace(result, validation=seen))
     assert any("worse than they were fitted" in reason for reason in judged.reasons) is doubted
 
@@ -257,7 +257,7 @@ def panda():
     q, dq, torques = (
         load(PANDA / f"{name}.txt").reshape(-1, 7) for name in ("positions", "velocity", "torques")
     )
-    return Recorded("streams/panda.csv", load(PANDA / "time.txt"), q, dq, torques)
+    return RecordedSamples("streams/panda.csv", load(PANDA / "time.txt"), q, dq, torques)
 
 
 def test_a_real_panda_is_predicted(panda):

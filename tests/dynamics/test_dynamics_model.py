@@ -15,9 +15,9 @@ from visioncal.dynamics import (
     DynamicModel,
     Friction,
     FrictionTerms,
+    JointMotion,
     Measured,
     MomentumObserver,
-    Motion,
     external_torques,
     sign,
 )
@@ -51,7 +51,7 @@ def states(robot, count=20, seed=0):
 
 
 def motion_of(robot, count=20, seed=0):
-    return Motion(np.arange(count) * 0.01, *states(robot, count, seed))
+    return JointMotion(np.arange(count) * 0.01, *states(robot, count, seed))
 
 
 def eccentric(name):
@@ -228,7 +228,7 @@ def pushed(gain, push):
     q, dq = 0.5 * waves, 0.5 * jacobian
     ddq = np.gradient(dq, times, axis=0, edge_order=2)
     external = np.where(times[:, None] >= 1.0, push, 0.0)
-    measured = Measured(Motion(times, q, dq, ddq), arm.torques(q, dq, ddq) - external)
+    measured = Measured(JointMotion(times, q, dq, ddq), arm.torques(q, dq, ddq) - external)
     return arm, measured, external_torques(arm, measured, gain)
 
 

@@ -15,8 +15,8 @@ from visioncal.dynamics import (
     DynamicModel,
     FrictionTerms,
     Identified,
+    JointMotion,
     Measured,
-    Motion,
     drive_gains,
     estimate_payload,
     external_torques,
@@ -26,12 +26,12 @@ from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.document import stribeck_rows
 from visioncal.dynamics.identify import Options
 from visioncal.dynamics.reading import read_recorded
-from visioncal.dynamics.run import Request, conditioned_streams, identify_session
+from visioncal.dynamics.run import IdentificationRequest, conditioned_streams, identify_session
 from visioncal.interchange.outputs import write_dynamics
 from visioncal.present.recording.paths import MOTION_TIMELINE
 from visioncal.robot import Inertias, Loads, Robot, load_robot, small_urdf
 from visioncal.session import Session
-from visioncal.simulation.dynamics import Body, drive_torques, real_dynamics
+from visioncal.simulation.dynamics import LinkBody, drive_torques, real_dynamics
 from visioncal.simulation.exercise import (
     Senses,
     exercise_session,
@@ -42,7 +42,7 @@ from visioncal.simulation.exercise import (
 
 # The rotors of the simulated arm are not among what the maker tells.
 TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=3e-4)
-LOAD = Body(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
+LOAD = LinkBody(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
 
 
 class World:
@@ -68,7 +68,9 @@ def world():
 
 @pytest.fixture(scope="module")
 def run(world):
-    request = Request(validate_on="check", options=Options(terms=TERMS, checked=False))
+    request = IdentificationRequest(
+        validate_on="check", options=Options(terms=TERMS, checked=False)
+    )
     return identify_session(world.empty, request)
 
 
@@ -78,7 +80,7 @@ def body_of(load):
 
 
 def loaded_streams(identified, session):
-    return conditioned_streams(session, identified, Request())
+    return conditioned_streams(session, identified, IdentificationRequest())
 
 
 def test_the_simulations_torques_are_the_models(world):
@@ -127,7 +129,7 @@ def test_a_collision_is_felt(world, run):
     jacobian = robot.axis_jacobian(done.q)[:, 3:]
     external = np.einsum("mij,mi->mj", jacobian, local) * (done.times_s > 3.0)[:, None]
     given = drive_torques(world.built, done.q, done.dq, done.ddq) - external
-    measured = Measured(Motion(done.times_s, done.q, done.dq, done.ddq), given)
+    measured = Measured(JointMotion(done.times_s, done.q, done.dq, done.ddq), given)
     found = external_torques(ArmDynamics.of(run.identified), measured, 50.0)
     quiet, leaning = done.times_s < 2.99, done.times_s > 3.2
     # Behind the filter of 20 ms; joints turn over within 3 mrad/s, where friction leaps by 20 N m.
@@ -140,7 +142,7 @@ def test_a_collision_is_felt(world, run):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_payload_is_weighed(seed):
     world = World(seed)
-    request = Request(options=Options(terms=TERMS, stribeck=False, checked=False))
+    request = IdentificationRequest(options=Options(terms=TERMS, stribeck=False, checked=False))
     identified = identify_session(world.empty, request).identified
     found = estimate_payload(identified, loaded_streams(identified, world.full))
     assert found.mass_kg == pytest.approx(2.8, abs=0.05)
@@ -198,7 +200,7 @@ def test_no_payload_is_none(world, run):
 
 def test_a_known_payload_tells_the_drives_gains():
     gains = np.array([20.0, 21.0, 16.0, 9.0, 9.5, 8.7])
-    load = Body(8.0, np.array([0.08, -0.03, 0.08]), LOAD.inertia_kg_m2)
+    load = LinkBody(8.0, np.array([0.08, -0.03, 0.08]), LOAD.inertia_kg_m2)
     world = World(4, load, Senses(gains_nm_a=tuple(gains)))
     base = BaseModel.reduce(DynamicModel(load_robot("ur10e"), TERMS))
 
@@ -299,7 +301,7 @@ def test_the_command_weighs(written, world, tmp_path):
 
 def test_the_command_finds_gains(tmp_path):
     gains = (20.0, 21.0, 16.0, 9.0, 9.5, 8.7)
-    load = Body(8.0, np.array([0.08, -0.03, 0.08]), LOAD.inertia_kg_m2)
+    load = LinkBody(8.0, np.array([0.08, -0.03, 0.08]), LOAD.inertia_kg_m2)
     world = World(4, load, Senses(gains_nm_a=gains))
     world.empty.save(tmp_path / "empty")
     world.full.save(tmp_path / "loaded")
@@ -355,7 +357,7 @@ def test_base_parameters_are_read_as_they_were_kept(run, tmp_path):
 )
 def test_a_real_load_lies_within_its_sigma_by_either_list_of_gains(real_data, gains):
     """A UR10e with 2.805 kg, by its motors' currents."""
-    request, sessions = Request(gains_nm_a=gains), real_data / "sessions"
+    request, sessions = IdentificationRequest(gains_nm_a=gains), real_data / "sessions"
     run = identify_session(Session.load(sessions / "ur10e_torques_free"), request)
     loaded = Session.load(sessions / "ur10e_torques_loaded")
     found = estimate_payload(run.identified, conditioned_streams(loaded, run.identified, request))

@@ -18,7 +18,7 @@ from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import Missing, Share, allowed_motion, kept_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.objective import Objective
 from visioncal.robot import Robot, joint_torques, load_robot
 from visioncal.robot.bodies import Body
@@ -195,7 +195,7 @@ def test_a_slow_computer_finds_the_same_motion_unless_a_limit_of_time_is_wished(
     assert excite(allowed, replace(wished, seconds=60.0)).starts == 1
 
 
-def breaking(kind: str) -> Motion:
+def breaking(kind: str) -> JointMotion:
     """A motion of the small arm that breaks one limit alone."""
     times = np.linspace(0.0, 1.0, 201)
     still = np.zeros((len(times), 3))
@@ -211,7 +211,7 @@ def breaking(kind: str) -> Motion:
         q[70, 1], ddq[70, 1] = 0.0, 7.0
     elif kind == "floor":
         q[30] = [0.0, -1.2, 0.0]
-    return Motion(times, q, dq, ddq)
+    return JointMotion(times, q, dq, ddq)
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.dynamics.regression import Block, regress
+from visioncal.dynamics.regression import NoiseBlock, regress
 
 TRUE = np.array([2.0, -1.0, 0.5])
 SIGMAS = np.array([0.1, 1.0])
 NONE = np.zeros(0)
 
 
-def block(seed: int, count: int = 400, taps=(1.0,)) -> Block:
+def block(seed: int, count: int = 400, taps=(1.0,)) -> NoiseBlock:
     """Slow columns, which correlated noise hurts, for two joints of different noise."""
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
@@ -21,7 +21,7 @@ def block(seed: int, count: int = 400, taps=(1.0,)) -> Block:
     weights = np.array(taps) / np.linalg.norm(taps)
     white = rng.standard_normal((count + len(taps) - 1, 2))
     noise = np.apply_along_axis(np.convolve, 0, white, weights, "valid")
-    return Block(x, x @ TRUE + SIGMAS * noise, np.ones((count, 2), dtype=bool), NONE)
+    return NoiseBlock(x, x @ TRUE + SIGMAS * noise, np.ones((count, 2), dtype=bool), NONE)
 
 
 def chi2(fit) -> float:
@@ -71,7 +71,7 @@ def test_unused_rows_count_for_nothing():
     used[200:] = False
     y = whole.y.copy()
     y[200:] = 1e6
-    half = regress([Block(whole.x[:200], whole.y[:200], whole.used[:200], NONE)])
+    half = regress([NoiseBlock(whole.x[:200], whole.y[:200], whole.used[:200], NONE)])
     fit = regress([replace(whole, y=y, used=used)])
     assert fit.values == pytest.approx(half.values, rel=1e-12)
     assert np.diag(fit.covariance) == pytest.approx(np.diag(half.covariance), rel=1e-9)

@@ -26,7 +26,7 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.estimation.parts import Noise
 from visioncal.estimation.pivot import fit_pivot
 from visioncal.estimation.readings import readings_that_close
-from visioncal.estimation.touching import Placed, Touches, TouchProblem
+from visioncal.estimation.touching import Touches, TouchProblem, TouchUnknowns
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 ROBOT = Noise.of_robot(5e-5, 3e-5)
@@ -74,7 +74,7 @@ def test_derivatives_are_those_of_the_residuals(oriented):
     # Where the touches close: elsewhere the derivatives leave out what noise would add.
     made = touched(Job(tips=3, points=2, axes=2, contact_m=0.0), 2)
     problem = TouchProblem(made.touches, ROBOT, oriented)
-    state = Placed(compose(TURN.as_matrix(), TIP), POINTS[:2])
+    state = TouchUnknowns(compose(TURN.as_matrix(), TIP), POINTS[:2])
     jacobian = problem.linearise(state).jacobian
     for at, step in enumerate(1e-6 * np.eye(jacobian.shape[2])):
         ahead, behind = (
@@ -88,7 +88,7 @@ def test_the_gradient_is_exact_far_from_closing_too():
     made = touched(Job(tips=3, points=2, axes=2), 2)
     problem = TouchProblem(made.touches, EXACT, oriented=True)
     twist = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.01])
-    state = Placed(compose(TURN.as_matrix(), TIP) @ exp(twist), POINTS[:2] + 0.01)
+    state = TouchUnknowns(compose(TURN.as_matrix(), TIP) @ exp(twist), POINTS[:2] + 0.01)
 
     def cost(step):
         return np.sum(problem.linearise(problem.move(state, step)).residuals ** 2) / 2
@@ -104,7 +104,7 @@ def test_the_robots_noise_is_carried_to_the_touched_point():
     made = touched(Job(tips=1, axes=1), 3)
     problem = TouchProblem(made.touches, Noise.of_robot(1e-3, 2e-3), oriented=True)
     tool, point = compose(TURN.as_matrix(), TIP), np.array([*POINTS[0], 1.0])
-    known = problem.linearise(Placed(tool, POINTS[:1])).known
+    known = problem.linearise(TouchUnknowns(tool, POINTS[:1])).known
     for at, flange in enumerate(made.touches.base_from_flange):
         jacobian = [
             (invert(flange @ exp(step) @ tool) - invert(flange @ exp(-step) @ tool)) @ point / 2e-5

@@ -21,7 +21,7 @@ from support.parts import (
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.estimation.groups import fit_groups
-from visioncal.estimation.pointfit import Placed, PointProblem, fit_points
+from visioncal.estimation.pointfit import FixturePlacement, PointProblem, fit_points
 from visioncal.estimation.procrustes import align
 
 NOISE_M = 1e-4
@@ -52,7 +52,7 @@ def test_exact_points_give_the_exact_frame(count):
 def test_derivatives_are_those_of_the_residuals(scaled):
     rng = np.random.default_rng(2)
     problem = PointProblem(pairs_of(some_drawing(rng, 5), rng.normal(size=(5, 3))), scaled)
-    state = Placed(some_frame(rng), 1.3 if scaled else 1.0)
+    state = FixturePlacement(some_frame(rng), 1.3 if scaled else 1.0)
     found = jacobian(
         lambda step: problem.linearise(problem.move(state, step)).residuals, 7 if scaled else 6
     )

@@ -6,7 +6,7 @@ import pytest
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.clock import clock_problem
-from visioncal.estimation.clock_correlation import Frames, turning_matches
+from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
 from visioncal.estimation.parts import State
 from visioncal.estimation.trajectory import Samples, Trajectory
 
@@ -77,7 +77,7 @@ def test_the_offset_moves_the_chain_as_its_column_says(mount) -> None:
     x, z = exp(rng.normal(size=(2, 6)))
     moved, at_s = sampled(500), np.linspace(0.5, 9.5, 40)
     robot = swung(at_s) if mount == "eye-in-hand" else invert(swung(at_s))
-    frames = Frames(mount, at_s, invert(robot @ x) @ z @ exp(1e-3 * rng.normal(size=(40, 6))))
+    frames = ImageTimes(mount, at_s, invert(robot @ x) @ z @ exp(1e-3 * rng.normal(size=(40, 6))))
     state, step_s = State(np.stack([x, z]), np.zeros(1)), 1e-4
     residuals = [
         clock_problem(moved, frames, value).linear(state).residuals for value in (-step_s, step_s)
@@ -94,7 +94,7 @@ def test_stamps_since_1970_are_matched_as_those_near_zero(rate_hz) -> None:
     times_s = np.arange(0.0, 9.95, 1.0 / rate_hz)
     robot = Trajectory(begin_s + times_s, swung(times_s))
     at_s = np.arange(0.5, 9.0, 1.0 / 30.0)
-    frames = Frames("eye-in-hand", begin_s + at_s + 0.03, invert(swung(at_s)))
+    frames = ImageTimes("eye-in-hand", begin_s + at_s + 0.03, invert(swung(at_s)))
     best = turning_matches(robot, frames)[0]
     # Half a step of the search; a robot of 10 Hz is interpolated over 0.1 s.
     assert best.offset_s == pytest.approx(0.03, abs=0.006)

@@ -16,7 +16,7 @@ from visioncal.live.capture.drive import travel_s
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.capture.record import Ways, departure
+from visioncal.live.capture.record import CheckedPaths, departure
 from visioncal.live.capture.still import image_motion_px
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.read_back import PlanFile
@@ -247,7 +247,7 @@ def test_an_arm_that_hangs_or_ends_elsewhere_is_told(plan, tmp_path):
 
 
 def test_ways_from_elsewhere_are_looked_at(plan):
-    ways = Ways(plan)
+    ways = CheckedPaths(plan)
     first, second = plan.stops[:2]
     assert len(ways.to(first, first.q)) == 1
     assert np.array_equal(ways.to(second, first.q)[-1], second.q)
@@ -257,7 +257,7 @@ def test_ways_from_elsewhere_are_looked_at(plan):
     box = Box("post", compose(np.eye(3), flange[:3, 3]), np.full(3, 0.02))
     walled = replace(plan, cell=replace(plan.cell, boxes=(box,)))
     with pytest.raises(DataError, match=r"no clear way leads there .*post"):
-        Ways(walled).to(far, first.q + 0.1)
+        CheckedPaths(walled).to(far, first.q + 0.1)
 
 
 def test_a_plan_for_another_arm_is_not_driven(plan):

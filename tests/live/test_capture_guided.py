@@ -8,12 +8,12 @@ from support.recorded import QUICK, REPEATABILITY_M, errors_m, facts_of
 from visioncal.calibration.stages.detect import look_for
 from visioncal.core.types import Corners
 from visioncal.live.capture.coach import Coach
-from visioncal.live.capture.core import Capture, Step
+from visioncal.live.capture.core import Capture, CaptureEvent
 from visioncal.live.capture.follow import ask_and_take, follow
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.read_back import PlanFile
 from visioncal.session import Session
 
@@ -48,7 +48,7 @@ class Hand:
     def __init__(self, arm: FakeArm, places: list[np.ndarray]) -> None:
         self.arm, self.places = arm, iter(places)
 
-    def stepped(self, _: Step) -> None:
+    def stepped(self, _: CaptureEvent) -> None:
         """Leads it on."""
         place = next(self.places, None)
         if place is None:
@@ -118,7 +118,7 @@ def test_typed_poses_make_a_session(plan, tmp_path):
         return answer
 
     steps = ask_and_take(capture, arm, 0, ask)
-    assert all(isinstance(step.found, Taken) for step in steps)
+    assert all(isinstance(step.found, TakenView) for step in steps)
     assert "View 1 (another place" in asked[0]
     assert len(Session.load(tmp_path / "live").views) == 3
 

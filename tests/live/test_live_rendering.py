@@ -7,7 +7,7 @@ import pytest
 
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.drivers.protocols import CameraDevice
-from visioncal.live.rehearsal.camera import Clock, Pace, RehearsalCamera
+from visioncal.live.rehearsal.camera import Pace, RehearsalCamera, RehearsalClock
 from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
 from visioncal.simulation.live import LiveView
 from visioncal.vision.finders.charuco import find_charuco
@@ -96,7 +96,9 @@ def a_camera(true_joints=None, **options):
         time.at += seconds
 
     told = true_joints or (lambda moments: np.tile(cell.robot.joints[0], (len(moments), 1)))
-    camera = RehearsalCamera(cell, told, pace=Pace(10.0, 0.02), clock=Clock(lambda: time.at, sleep))
+    camera = RehearsalCamera(
+        cell, told, pace=Pace(10.0, 0.02), clock=RehearsalClock(lambda: time.at, sleep)
+    )
     return cell, time, camera
 
 

@@ -17,9 +17,9 @@ from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.design import chosen, shortfall
 from visioncal.live.planning.information import stop_factors, worlds_of
-from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
-from visioncal.live.planning.recorded import Guess, begin
+from visioncal.live.planning.recorded import RoughEdges, begin
 from visioncal.live.planning.selection import CRITERIA
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, Second, fine_camera, simulate
@@ -256,7 +256,7 @@ def test_open_edges_are_those_nearest_to_what_is_known(mount):
     begun = begin(found)
     # Mounted within decimetres of the flange, along the axis that is open.
     assert np.linalg.norm(begun.cell.x[:3, 3] - x[:3, 3]) < 0.1
-    guessed = begin(found, guess=Guess(x, z, 0.02, 0.005))
+    guessed = begin(found, guess=RoughEdges(x, z, 0.02, 0.005))
     # The guess was the truth: what is left is the noise of the views.
     assert np.linalg.norm(guessed.cell.x[:3, 3] - x[:3, 3]) < 1e-3
     # What is open moves both edges together: drawn cells see the recorded views alike.
@@ -283,7 +283,7 @@ def test_the_few_stops_that_a_recorded_cell_allows_are_added():
     """As before a fixed camera: of a guessed cell so few say that it is guessed wrong."""
     begun = begin(so_far_of(simulate(CellOptions(mount="eye-to-hand", seed=4))))
     cell = replace(begun.cell, limits=replace(begun.cell.limits, edge_px=330.0))
-    request = Request(HAND_EYE, count=5)
+    request = PlanRequest(HAND_EYE, count=5)
     plan = make_plan(cell, request, begun=replace(begun, cell=cell))
     assert len(plan.stops) == 5
     # A tenth of the wish is what a guessed cell has to have.
@@ -372,7 +372,7 @@ def test_two_stops_need_a_guess():
     with pytest.raises(DataError, match="not even roughly"):
         begin(found)
     x, z = cell.transforms.values()
-    begun = begin(found, guess=Guess(x, z, 0.1, 0.03))
+    begun = begin(found, guess=RoughEdges(x, z, 0.1, 0.03))
     assert len(begun.recorded.problem) == 2
 
 

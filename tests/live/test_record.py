@@ -24,7 +24,7 @@ from visioncal.cli import recorded
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import devices
 from visioncal.live.capture.live import HostClock
-from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.read_back import PlanFile, read_plan
 from visioncal.live.planning.written import plan_document
@@ -41,7 +41,7 @@ QUICK = ("--frames", 1, "--settle-s", 0.03)
 def planned(tmp_path_factory):
     """A plan's file, and what is read back of it."""
     found = fake_plan(3)
-    request = Request(purpose_of("hand-eye"), 4, candidates=30, start_q=found.start_q)
+    request = PlanRequest(purpose_of("hand-eye"), 4, candidates=30, start_q=found.start_q)
     plan = make_plan(found.cell, request)
     folder = tmp_path_factory.mktemp("plans") / "plan"
     folder.mkdir()

@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline.result import result_of
 from visioncal.cli import rehearse as command
 from visioncal.core.errors import DriverError
 from visioncal.core.transforms import exp, pose_difference
-from visioncal.live.capture.core import Step, Times
+from visioncal.live.capture.core import CaptureEvent, Times
 from visioncal.live.capture.drive import travel_s
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import Missed
@@ -120,7 +120,7 @@ def test_what_a_recording_adds_is_told_from_motion_driving_and_settling():
     taking = CaptureOptions(speed=1.0, acceleration=1.0)
     ways = [0.0, travel_s(q[0], q[1], 1.0, 1.0) + travel_s(q[1], q[2], 1.0, 1.0)]
     times = [Times(ways[0] + 0.1, 0.5, 0.2), Times(ways[1] + 0.3, 0.7, 0.4)]
-    steps = [Step(1, 1, 2, Missed("none"), "", None, "", time) for time in times]
+    steps = [CaptureEvent(1, 1, 2, Missed("none"), "", None, "", time) for time in times]
     pace = pace_of(steps, plan, q[0], taking)
     assert pace.views == 2
     assert pace.motion_s == pytest.approx(sum(ways) / 2)

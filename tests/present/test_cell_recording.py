@@ -17,7 +17,7 @@ from visioncal.interchange.result_files import load_exportable
 from visioncal.present.recording import paths, read_calibration, read_evidence, read_session
 from visioncal.present.recording.frames import scan
 from visioncal.present.recording.reader import chunks
-from visioncal.present.recording.scene import Scene
+from visioncal.present.recording.scene import SceneDrawing
 from visioncal.results import Calibration, Edge, ViewResult, to_document
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import (
@@ -72,7 +72,7 @@ def true_result(cell, session) -> Calibration:
 
 
 def test_frames_are_drawn_where_they_were(cell, session):
-    scene = Scene.of(session, true_result(cell, session), {})
+    scene = SceneDrawing.of(session, true_result(cell, session), {})
     for observation in session.observations:
         seer = scene.in_cell(observation.seer, observation.view.number)
         seen = scene.in_cell(observation.seen, observation.view.number)

@@ -15,7 +15,7 @@ from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import RecordingWriter, paths, read_calibration, read_session
-from visioncal.present.recording.frames import Frame, scan
+from visioncal.present.recording.frames import MessageFrame, scan
 from visioncal.present.recording.reader import chunks
 from visioncal.present.viewer import blueprint
 from visioncal.session import MemoryImages, Session
@@ -53,7 +53,7 @@ def recorded(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Record
     return Recorded(path, path.read_bytes(), sizes[0], tuple(sizes[1:]), results)
 
 
-def placed(recorded: Recorded, entity: str) -> list[Frame]:
+def placed(recorded: Recorded, entity: str) -> list[MessageFrame]:
     return [frame for frame, _, _ in chunks(scan(recorded.path), (entity,), [])]
 
 

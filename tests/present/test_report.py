@@ -33,8 +33,8 @@ from visioncal.results import (
     Calibration,
     CameraResult,
     Finding,
+    Remedy,
     Rms,
-    Step,
     Verdict,
     VerdictStatus,
 )
@@ -93,12 +93,12 @@ def with_outliers(sample: Sample, status: VerdictStatus) -> Calibration:
         replace(view, residual_mm=9.5) if view.view in (1, 4) else view
         for view in sample.calibration.views
     )
-    tilted = Step("Add views tilted by 20 degrees.", "visioncal plan SESSION --add 5")
+    tilted = Remedy("Add views tilted by 20 degrees.", "visioncal plan SESSION --add 5")
     found = (
         Finding("weak_motion", "Its z is weakly determined.", tilted),
         Finding("place", "Its y is weakly determined.", tilted),
-        Finding("wrong_views", "View 1 is wrong.", Step("Look at it."), (1,), 0.9),
-        Finding("lens", "The lens is another.", Step("Measure it."), probability=0.3),
+        Finding("wrong_views", "View 1 is wrong.", Remedy("Look at it."), (1,), 0.9),
+        Finding("lens", "The lens is another.", Remedy("Measure it."), probability=0.3),
         Finding("note", "It was cold."),
     )
     return replace(sample.calibration, views=views, verdict=Verdict(status, found))

@@ -12,7 +12,7 @@ from visioncal.present import facts, parts
 from visioncal.present.recording.markdown import table_lines
 from visioncal.present.recording.notes import figures_markdown, verdict_markdown
 from visioncal.present.report.page import render
-from visioncal.present.tables import Row, Table
+from visioncal.present.tables import Table, TableRow
 from visioncal.results import Moved, ViewResult
 
 CELL = made_up_cell(3)
@@ -20,7 +20,7 @@ CELL = made_up_cell(3)
 
 def test_columns_in_which_nothing_is_known_are_left_out():
     unknown = significant(None)
-    rows = [("a", unknown, "1", ""), Row(("a heading",)), ("b", unknown, "2", "")]
+    rows = [("a", unknown, "1", ""), TableRow(("a heading",)), ("b", unknown, "2", "")]
     table = Table.of(("what", "deg", "mm", "note"), rows, (0, 3))
     assert table.titles == ("what", "mm")
     assert table.words == (0,)
@@ -35,7 +35,7 @@ def test_tables_side_by_side_have_all_rows_in_their_order():
 
 
 def test_cells_of_a_table_are_text_in_markdown():
-    table = Table.of(("a|b", "mm"), [Row(("[x](y)", "1"), "taken"), Row(("joint_1",))])
+    table = Table.of(("a|b", "mm"), [TableRow(("[x](y)", "1"), "taken"), TableRow(("joint_1",))])
     assert list(table_lines(table)) == [
         "",
         r"| a\|b | mm |",

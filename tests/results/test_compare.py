@@ -22,14 +22,14 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Camera, Mount
 from visioncal.results import Calibration, CameraResult, Edge, ViewResult
 from visioncal.results.compare import FALSE_ALARMS, compare, to_document
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
 PAIRS = 8
 SHIFT = np.array([0.0, 0.0, 0.0, 0.6, -0.64, 0.48])
 
 
 @cache
-def cells(mount: Mount, seed: int) -> tuple[Cell, Cell]:
+def cells(mount: Mount, seed: int) -> tuple[SimulatedCell, SimulatedCell]:
     """Two cells of one truth, with a lens that is to be estimated."""
     options = CellOptions(mount=mount, views=40, seed=seed, state_intrinsics=False)
     return halves(simulate(options))

@@ -7,7 +7,7 @@ from support.moved_arms import robot_with_bodies
 from visioncal.core.errors import DataError
 from visioncal.robot import body_regressor, joint_torques
 from visioncal.simulation.dynamics import (
-    Body,
+    LinkBody,
     drive_torques,
     nominal_dynamics,
     real_dynamics,
@@ -30,7 +30,7 @@ def test_two_recursions_agree(name):
 
 def test_a_load_adds_what_a_body_on_the_flange_does():
     built = nominal_dynamics("ur10e")
-    load = Body(2.8, np.array([0.02, -0.01, 0.09]), np.diag([0.01, 0.012, 0.006]))
+    load = LinkBody(2.8, np.array([0.02, -0.01, 0.09]), np.diag([0.01, 0.012, 0.006]))
     robot = robot_with_bodies(built)
     kg, (x, y, z) = load.kg, load.centre_m
     about = load.inertia_kg_m2 + kg * (load.centre_m @ load.centre_m * np.eye(3))

@@ -13,8 +13,8 @@ from visioncal.core.types import Camera, Target
 from visioncal.session import Session
 from visioncal.simulation import (
     BOARDS,
-    Cell,
     CellOptions,
+    SimulatedCell,
     fine_camera,
     fisheye_camera,
     forward,
@@ -40,14 +40,14 @@ RATIONAL = dataclasses.replace(
 )
 
 
-def base_from_target_chain(cell: Cell, base_from_flange: np.ndarray) -> np.ndarray:
+def base_from_target_chain(cell: SimulatedCell, base_from_flange: np.ndarray) -> np.ndarray:
     """(m, 4, 4) the board's pose through the arm and the camera, or on its way through the arm."""
     if cell.options.mount == "eye-in-hand":
         return base_from_flange @ cell.transforms["flange_from_cam"] @ cell.cam_from_target
     return base_from_flange @ cell.transforms["flange_from_target"]
 
 
-def base_from_target(cell: Cell) -> np.ndarray:
+def base_from_target(cell: SimulatedCell) -> np.ndarray:
     """The same without the arm."""
     if cell.options.mount == "eye-in-hand":
         return cell.transforms["base_from_target"]
@@ -176,7 +176,7 @@ def test_views_show_the_board_from_the_front_and_mostly_whole():
     assert corners.min() >= 24
 
 
-def rotation_angle_of_normal(cell: Cell) -> np.ndarray:
+def rotation_angle_of_normal(cell: SimulatedCell) -> np.ndarray:
     """(m,) angle between the optical axis and the board's normal [rad]."""
     return np.arccos(cell.cam_from_target[:, 2, 2])
 

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from visioncal.simulation.arms import Arm, link_frames
+from visioncal.simulation.arms import DhArm, link_frames
 
 # The UR5e's links as tubes: how thick they are, and how far beside the joints' axes they run [m].
 UR5E_RADIUS_M = (0.07, 0.06, 0.055, 0.05, 0.05, 0.05)
@@ -13,7 +13,7 @@ UR5E_ASIDE_M = (0.0, 0.138, 0.007, 0.0, 0.0, 0.0)
 UR5E_PAIRS = ((0, 2), (0, 3), (0, 4), (0, 5), (1, 3), (1, 4), (1, 5))
 
 
-def tubes(arm: Arm, joints: np.ndarray) -> list[np.ndarray]:
+def tubes(arm: DhArm, joints: np.ndarray) -> list[np.ndarray]:
     """For each link the (m, 4, 3) knots of its tube in the base frame, at (m, n) joints [m]."""
     frames = link_frames(arm, joints)
     found = []
@@ -85,7 +85,7 @@ def corners(base_from_box: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 
 def clearances(
-    arm: Arm,
+    arm: DhArm,
     joints: np.ndarray,
     floor_m: float | None,
     boxes: list[tuple[np.ndarray, np.ndarray]],

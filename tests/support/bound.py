@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import Camera, FloatArray, IntArray
-from visioncal.simulation import Cell, forward
+from visioncal.simulation import SimulatedCell, forward
 from visioncal.simulation.boards import Sheet, centre_m, corners_m
 from visioncal.simulation.optics import project
 from visioncal.simulation.sag import giving_of, load_torques, sagging
@@ -33,7 +33,7 @@ def _jacobian(function: Callable[[FloatArray], FloatArray], size: int) -> FloatA
     return np.stack([(function(step) - function(-step)) / (2 * _STEP) for step in steps], axis=1)
 
 
-def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
+def workspace_bound_m(cell: SimulatedCell, q: FloatArray) -> float:
     """Least root mean square error of what the arm carries, seen from what stands still [m].
 
     That is the camera's place seen from the target, or the target's middle seen from the camera.
@@ -53,7 +53,7 @@ def workspace_bound_m(cell: Cell, q: FloatArray) -> float:
     return float(np.sqrt(np.mean([np.trace(value @ covariance @ value.T) for value in jacobian])))
 
 
-def compliance_bound(cell: Cell) -> FloatArray:
+def compliance_bound(cell: SimulatedCell) -> FloatArray:
     """Least standard deviations (n,) of what the joints yield to a torque [rad/(N m)].
 
     Beside all that `workspace_bound_m` has unknown. Of the springs no more is known beforehand than
@@ -62,7 +62,7 @@ def compliance_bound(cell: Cell) -> FloatArray:
     return np.sqrt(np.diag(_arm_bound(cell))[-cell.robot.arm.a.size :]) / _TORQUE_NM
 
 
-def _arm_bound(cell: Cell) -> FloatArray:
+def _arm_bound(cell: SimulatedCell) -> FloatArray:
     """Least covariance of x, z and the arm's parameters, those of its springs last."""
     arm, look = _arm_sigmas(cell), _look_sigmas(cell)
     size = 12 + len(arm)
@@ -86,7 +86,7 @@ def _arm_bound(cell: Cell) -> FloatArray:
     return np.asarray(covariance[:size, :size])
 
 
-def _slack(cell: Cell, held: "_Held") -> FloatArray:
+def _slack(cell: SimulatedCell, held: "_Held") -> FloatArray:
     """Covariance (6, 6) of the flange's error at a stop: what it does not repeat, and ripple."""
     options, arm, q = cell.options, cell.robot.true_arm, held.standing
     covariance = np.diag(np.repeat([options.robot_sigma_rad, options.robot_sigma_m], 3) ** 2)
@@ -95,7 +95,7 @@ def _slack(cell: Cell, held: "_Held") -> FloatArray:
     return np.asarray(covariance + options.ripple_sigma_rad**2 * turned @ turned.T)
 
 
-def _look_sigmas(cell: Cell) -> FloatArray:
+def _look_sigmas(cell: SimulatedCell) -> FloatArray:
     """Standard deviations of lens and board; empty where they are as stated.
 
     The board is known as any printed one is: its size as stated, its sides to 0.1 %, and its bend
@@ -121,7 +121,7 @@ class _Held:
     torques: FloatArray
 
 
-def _held(cell: Cell, q: FloatArray, view: int | None = None) -> _Held:
+def _held(cell: SimulatedCell, q: FloatArray, view: int | None = None) -> _Held:
     """The joints (n,) at a stop, with what it carried at a view."""
     options, arm = cell.options, cell.robot.true_arm
     if not options.compliance_rad_per_nm:
@@ -132,14 +132,14 @@ def _held(cell: Cell, q: FloatArray, view: int | None = None) -> _Held:
     return _Held(standing[0], load_torques(arm, giving, standing, load)[0])
 
 
-def _carried(cell: Cell, held: _Held) -> FloatArray:
+def _carried(cell: SimulatedCell, held: _Held) -> FloatArray:
     """(6, 6) from motions of the target seen from the camera to those of what the arm carries."""
     if cell.options.mount == "eye-to-hand":
         return np.eye(6)
     return adjoint(_pose(cell, held, np.zeros(12 + len(_arm_sigmas(cell)))))
 
 
-def _arm_sigmas(cell: Cell) -> FloatArray:
+def _arm_sigmas(cell: SimulatedCell) -> FloatArray:
     """Standard deviations of a, d, alpha, beta, the joints' offsets, waves and springs, (n,) each.
 
     A spring's is how far it bends under `_TORQUE_NM`. Waves are those of eccentric joints.
@@ -154,14 +154,14 @@ def _arm_sigmas(cell: Cell) -> FloatArray:
     return np.repeat(each, count)
 
 
-def _pose_jacobian(cell: Cell, held: _Held, *, slack: bool = False) -> FloatArray:
+def _pose_jacobian(cell: SimulatedCell, held: _Held, *, slack: bool = False) -> FloatArray:
     """How `cam_from_target` (6) moves with x, z and the arm, and with the flange's error."""
     size = 12 + len(_arm_sigmas(cell)) + (6 if slack else 0)
     middle = invert(_pose(cell, held, np.zeros(size)))
     return _jacobian(lambda array: log(middle @ _pose(cell, held, array)), size)
 
 
-def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:
+def _pose(cell: SimulatedCell, held: _Held, change: FloatArray) -> FloatArray:
     arm, count = cell.robot.true_arm, cell.robot.arm.a.size
     a, d, alpha, beta, offset = change[12 : 12 + 5 * count].reshape(5, count)
     moved = replace(
@@ -184,7 +184,9 @@ def _pose(cell: Cell, held: _Held, change: FloatArray) -> FloatArray:
     return invert(robot @ x @ exp(change[:6])) @ z @ exp(change[6:12])
 
 
-def _seen(cell: Cell, pose: FloatArray, ids: IntArray, look: Sequence[float] = ()) -> FloatArray:
+def _seen(
+    cell: SimulatedCell, pose: FloatArray, ids: IntArray, look: Sequence[float] = ()
+) -> FloatArray:
     """Flat pixels of some corners, where lens and board (`_look_sigmas`) change."""
     camera = cell.options.camera
     points = corners_m(Sheet(target=cell.options.target))[ids]

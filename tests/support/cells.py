@@ -15,11 +15,11 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
-from visioncal.simulation import Cell, CellOptions, cell_session
+from visioncal.simulation import CellOptions, SimulatedCell, cell_session
 from visioncal.simulation.rows import POSE
 
 
-def session_of(cell: Cell) -> Session:
+def session_of(cell: SimulatedCell) -> Session:
     """The session of a cell as it stands in memory, its images not rendered, without joints."""
     session = cell_session(cell, "cell", seen="names")
     document = {name: value for name, value in session.document.items() if name != "robot"}
@@ -42,7 +42,9 @@ def arm_found(known: RunState) -> ArmFound:
     return next(iter(known.solved.arms.values()))
 
 
-def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **changes) -> RunState:
+def known_of(
+    cell: SimulatedCell, *, joints: bool = True, robot: Robot | None = None, **changes
+) -> RunState:
     """What is known after detection; without `joints`, poses are all that is said of the robot."""
     model = load_robot(cell.options.robot) if robot is None else robot
     known = joints or robot is not None
@@ -56,7 +58,7 @@ def known_of(cell: Cell, *, joints: bool = True, robot: Robot | None = None, **c
     return detect_targets(known, {view_corners.view: view_corners for view_corners in cell.corners})
 
 
-def calibrated(cell: Cell, **changes) -> RunState:
+def calibrated(cell: SimulatedCell, **changes) -> RunState:
     """What is known at the end of the way."""
     known = known_of(cell, **changes)
     for stage in STAGES:
@@ -65,7 +67,7 @@ def calibrated(cell: Cell, **changes) -> RunState:
     return known
 
 
-def calibrated_sweep(moved: Cell) -> RunState:
+def calibrated_sweep(moved: SimulatedCell) -> RunState:
     """What is known at the end of the way, from the corners of a sweep's frames."""
     known = replace(known_of(moved, joints=False), robots={})
     views = [
@@ -80,24 +82,24 @@ def calibrated_sweep(moved: Cell) -> RunState:
     return known
 
 
-def reporting(cell: Cell, **changes) -> Cell:
+def reporting(cell: SimulatedCell, **changes) -> SimulatedCell:
     """A cell whose only robot reports otherwise."""
     return replace(cell, robots={"": replace(cell.robot, **changes)})
 
 
-def showing(cell: Cell, corners: Iterable[Corners]) -> Cell:
+def showing(cell: SimulatedCell, corners: Iterable[Corners]) -> SimulatedCell:
     """A cell in whose images other corners are found."""
     sights = zip(cell.sights, corners, strict=True)
     return replace(cell, sights=tuple(replace(sight, corners=item) for sight, item in sights))
 
 
-def board_numbers(cell: Cell) -> np.ndarray:
+def board_numbers(cell: SimulatedCell) -> np.ndarray:
     """(m,) which of the boards each image shows."""
     names = [board.name for board in cell.layout.boards]
     return np.array([names.index(sight.board) for sight in cell.sights])
 
 
-def error_of(cell: Cell, known: RunState) -> np.ndarray:
+def error_of(cell: SimulatedCell, known: RunState) -> np.ndarray:
     """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
     true = np.array(list(cell.transforms.values()))
     return log(invert(true) @ known.solved.state.edges).ravel()

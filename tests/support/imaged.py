@@ -11,7 +11,7 @@ from support.picks import calibration_of
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import Calibration
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation import Cell, CellOptions, prepare_scene, render, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, prepare_scene, render, simulate
 from visioncal.simulation.render import encode
 from visioncal.vision.targets import target_document
 
@@ -27,7 +27,7 @@ class Shot:
 
 
 @lru_cache
-def calibrated_cell(mount: Mount, views: int = 14) -> tuple[Cell, Calibration]:
+def calibrated_cell(mount: Mount, views: int = 14) -> tuple[SimulatedCell, Calibration]:
     """A good cell, and what its corners give: no image is rendered for that."""
     cell = simulate(CellOptions(mount=mount, views=views, seed=21, pixel_sigma_px=0.05))
     return cell, calibration_of(cell)
@@ -44,12 +44,12 @@ def _scene(mount: Mount):
     return prepare_scene(calibrated_cell(mount)[0])
 
 
-def shots(cell: Cell, count: int) -> list[Shot]:
+def shots(cell: SimulatedCell, count: int) -> list[Shot]:
     """The cell's first views as they were taken."""
     return [Shot(at, cell.robot.base_from_flange[at]) for at in range(count)]
 
 
-def session_of(cell: Cell, rows: Sequence[Shot], **more: Sequence[str]) -> Session:
+def session_of(cell: SimulatedCell, rows: Sequence[Shot], **more: Sequence[str]) -> Session:
     """A session of such shots, numbered from 30; `more` are further columns by their names."""
     mount, target, camera = cell.options.mount, cell.options.target, cell.options.camera
     document = {

@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import exp
 from visioncal.core.types import Corners, FloatArray, Mount
 from visioncal.results import Calibration
-from visioncal.simulation import Cell, CellOptions, project, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, project, simulate
 from visioncal.simulation.boards import corners_m
 
 # Arms that are off by 0.5 mm and 1 mrad in every parameter, moved through all of their branches.
@@ -35,7 +35,7 @@ class Change:
 class Lot:
     """A cell of many views, the first of which its calibration rests on."""
 
-    cell: Cell
+    cell: SimulatedCell
     calibration: Calibration
 
 
@@ -52,8 +52,8 @@ def lot(options: CellOptions = ANYHOW, further: int = 60) -> Lot:
 
 
 def again(
-    cell: Cell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
-) -> Cell:
+    cell: SimulatedCell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
+) -> SimulatedCell:
     """Fresh stops of a cell at postures that its calibration has not seen, with noise of their own.
 
     Args:
@@ -80,7 +80,7 @@ def again(
 
 
 def _detected(
-    cell: Cell, view: int, pose: FloatArray, rng: np.random.Generator, scale: float
+    cell: SimulatedCell, view: int, pose: FloatArray, rng: np.random.Generator, scale: float
 ) -> Corners:
     """The board as it was printed, as a detector reports it."""
     camera = cell.options.camera
@@ -91,7 +91,7 @@ def _detected(
 
 
 def known_again(
-    cell: Cell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
+    cell: SimulatedCell, rng: np.random.Generator, change: Change | None = None, stops: int = 5
 ) -> RunState:
     """What is known of such stops after detection."""
     return known_of(again(cell, rng, change, stops))

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 
-from visioncal.core.codec import INLINE, REST, Array, Written, entries
+from visioncal.core.codec import INLINE, REST, Array, WrittenForm, entries
 from visioncal.results.document import CalibrationForm, CellForm
 from visioncal.results.sections import CalibrationSections
 
@@ -95,7 +95,7 @@ class _Schemas:
             if isinstance(mark, Array):
                 (kind,) = get_args(get_args(inner)[1])
                 return _array("boolean" if kind is np.bool_ else "number", mark.shape)
-            if isinstance(mark, Written):
+            if isinstance(mark, WrittenForm):
                 return {"type": "object"} if mark.form is None else self.of(mark.form)
         return self.of(inner)
 

@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount
-from visioncal.simulation import Cell
+from visioncal.simulation import SimulatedCell
 
 OTHER: Mapping[Mount, Mount] = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
 HALF_TURNS = [np.diag([*pair, 1.0]) for pair in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
@@ -61,7 +61,7 @@ def sound(robot: FloatArray, camera: FloatArray, mount: Mount, **more) -> Poses:
     return Poses(numbers(robot), numbers(camera), mount, robot, mount, **more)
 
 
-def measured(cell: Cell) -> RunState:
+def measured(cell: SimulatedCell) -> RunState:
     """What is known of a cell once the target's poses are."""
     known = known_of(cell)
     for stage in STAGES:
@@ -70,7 +70,7 @@ def measured(cell: Cell) -> RunState:
     return known
 
 
-def seen_in(cell: Cell) -> Poses:
+def seen_in(cell: SimulatedCell) -> Poses:
     """The poses of a simulated cell: the camera's are measured from corners, lens included."""
     known = measured(cell)
     views = sorted(known.poses)

@@ -14,7 +14,7 @@ import numpy as np
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import frame_name
-from visioncal.simulation import Cell, Sight
+from visioncal.simulation import SimulatedCell, SimulatedSight
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.optics import project
 
@@ -42,7 +42,7 @@ class Bound:
         return self.covariance[at : at + 6, at : at + 6]
 
 
-def network_bound(cell: Cell, reference: str = "base_a", *, sizes: bool = True) -> Bound:
+def network_bound(cell: SimulatedCell, reference: str = "base_a", *, sizes: bool = True) -> Bound:
     """Computes the bound; `reference` stands for the cell.
 
     Args:
@@ -84,7 +84,11 @@ def network_bound(cell: Cell, reference: str = "base_a", *, sizes: bool = True) 
 
 
 def _jacobian(
-    cell: Cell, sight: Sight, places: Mapping[str, slice], robots: list[str], size: int
+    cell: SimulatedCell,
+    sight: SimulatedSight,
+    places: Mapping[str, slice],
+    robots: list[str],
+    size: int,
 ) -> tuple[FloatArray, FloatArray]:
     """How one sight's pixels move with the unknowns and the flanges, in units of their noise."""
     camera, board = frame_name("camera", sight.camera), frame_name("target", sight.board)
@@ -113,7 +117,7 @@ def _jacobian(
     return every[:, :size], every[:, size:]
 
 
-def _differences(cell: Cell, sight: Sight, key: str, width: int) -> FloatArray:
+def _differences(cell: SimulatedCell, sight: SimulatedSight, key: str, width: int) -> FloatArray:
     steps = _STEP * np.eye(width)
     return np.stack(
         [
@@ -124,7 +128,7 @@ def _differences(cell: Cell, sight: Sight, key: str, width: int) -> FloatArray:
     )
 
 
-def _pixels(cell: Cell, sight: Sight, key: str, change: FloatArray) -> FloatArray:
+def _pixels(cell: SimulatedCell, sight: SimulatedSight, key: str, change: FloatArray) -> FloatArray:
     """Flat pixels of a sight when one thing changes."""
     camera = cell.camera(sight.camera).camera
     sheet = cell.board(sight.board)
@@ -144,7 +148,7 @@ def _pixels(cell: Cell, sight: Sight, key: str, change: FloatArray) -> FloatArra
     return project(camera, points @ pose[:3, :3].T + pose[:3, 3]).ravel()
 
 
-def _place(cell: Cell, stop: int, frame: str, key: str, change: FloatArray) -> FloatArray:
+def _place(cell: SimulatedCell, stop: int, frame: str, key: str, change: FloatArray) -> FloatArray:
     """(4, 4) `cell_from_frame` when one thing changes."""
     place = cell.mountings[frame] @ (exp(change) if key == frame else np.eye(4))
     robot = cell.robot_of(frame)

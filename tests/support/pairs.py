@@ -9,16 +9,16 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import exp, invert
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, Edge, Rms, Validation, Verdict, ViewResult
-from visioncal.simulation import Cell
+from visioncal.simulation import SimulatedCell
 
 
-def halves(cell: Cell) -> tuple[Cell, Cell]:
+def halves(cell: SimulatedCell) -> tuple[SimulatedCell, SimulatedCell]:
     """Two cells with the same mountings: the first half of the views, and the second."""
     middle = len(cell.corners) // 2
     return cell.only(range(middle)), cell.only(range(middle, 2 * middle))
 
 
-def with_moved_camera(cell: Cell, twist: np.ndarray) -> Cell:
+def with_moved_camera(cell: SimulatedCell, twist: np.ndarray) -> SimulatedCell:
     """The cell with its camera's edge moved on the right, its images as they were.
 
     The robot stands where the moved camera sees what the camera saw before.
@@ -32,7 +32,7 @@ def with_moved_camera(cell: Cell, twist: np.ndarray) -> Cell:
     return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": moved, "target": z})
 
 
-def with_moved_board(cell: Cell, twist: np.ndarray) -> Cell:
+def with_moved_board(cell: SimulatedCell, twist: np.ndarray) -> SimulatedCell:
     """The cell with its target's edge moved on the right, its images as they were."""
     x, z = cell.transforms.values()
     moved = z @ exp(twist)
@@ -43,7 +43,9 @@ def with_moved_board(cell: Cell, twist: np.ndarray) -> Cell:
     return replace(reporting(cell, base_from_flange=flanges), mountings={"cam": x, "target": moved})
 
 
-def with_moved_result(calibration: Calibration, cell: Cell, twist: np.ndarray) -> Calibration:
+def with_moved_result(
+    calibration: Calibration, cell: SimulatedCell, twist: np.ndarray
+) -> Calibration:
     """What calibrating `with_moved_camera(cell, twist)` gives, without calibrating again.
 
     The chain closes with the moved camera at the moved stops exactly as it did before: each
@@ -91,6 +93,6 @@ def calibration_of(known: RunState, name: str = "cell") -> Calibration:
     )
 
 
-def calibrated_cell(cell: Cell) -> Calibration:
+def calibrated_cell(cell: SimulatedCell) -> Calibration:
     """The calibration of a cell."""
     return calibration_of(calibrated(cell))

@@ -17,7 +17,7 @@ from visioncal.frames.locate import locate, locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.plane import Plane
 from visioncal.results import Calibration
-from visioncal.simulation import Cell, project, rays
+from visioncal.simulation import SimulatedCell, project, rays
 from visioncal.simulation.boards import Sheet, corners_m
 from visioncal.vision.targets import corner_positions
 
@@ -39,12 +39,12 @@ class Pick:
     taken_s: float
 
 
-def calibration_of(cell: Cell, **changes) -> Calibration:
+def calibration_of(cell: SimulatedCell, **changes) -> Calibration:
     """The result that the session of a simulated cell gives."""
     return result_of(calibrated(cell, **changes))
 
 
-def pick_by_plane(cell: Cell, calibration: Calibration, rng: np.random.Generator) -> Pick:
+def pick_by_plane(cell: SimulatedCell, calibration: Calibration, rng: np.random.Generator) -> Pick:
     """A point of a plane that is declared, in half of the cases to 0.2 mm only."""
     at = stand(cell, rng)
     place, px = seen_point(cell, at, rng)
@@ -58,7 +58,7 @@ def pick_by_plane(cell: Cell, calibration: Calibration, rng: np.random.Generator
 
 
 def pick_by_target(
-    cell: Cell, calibration: Calibration, target: Target, rng: np.random.Generator
+    cell: SimulatedCell, calibration: Calibration, target: Target, rng: np.random.Generator
 ) -> Pick:
     """A point beside a target's middle, by the target's corners."""
     at = stand(cell, rng)
@@ -74,7 +74,7 @@ def pick_by_target(
     return Pick(base_from_target[:3, :3] @ point + base_from_target[:3, 3], found, taken)
 
 
-def stand(cell: Cell, rng: np.random.Generator) -> Stand:
+def stand(cell: SimulatedCell, rng: np.random.Generator) -> Stand:
     """A new stop near one of the calibration's own."""
     edge = next(iter(cell.transforms.values()))
     if cell.options.mount == "eye-to-hand":
@@ -84,13 +84,15 @@ def stand(cell: Cell, rng: np.random.Generator) -> Stand:
     return Stand(reported, really(cell, reported, rng) @ edge)
 
 
-def really(cell: Cell, reported: FloatArray, rng: np.random.Generator) -> FloatArray:
+def really(cell: SimulatedCell, reported: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Where the flange really stands, (4, 4), when it reports a pose."""
     sigma = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3)
     return reported @ exp(sigma * rng.standard_normal(6))
 
 
-def seen_point(cell: Cell, at: Stand, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def seen_point(
+    cell: SimulatedCell, at: Stand, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
     """A point at a working distance: (3,) in the base, and (1, 2) where it is seen."""
     camera = cell.options.camera
     aim = np.array(camera.resolution) * rng.uniform(0.2, 0.8, 2)
@@ -100,7 +102,7 @@ def seen_point(cell: Cell, at: Stand, rng: np.random.Generator) -> tuple[FloatAr
     return place, project(camera, point_cam[None]) + noise
 
 
-def before_camera(cell: Cell, target: Target, rng: np.random.Generator) -> FloatArray:
+def before_camera(cell: SimulatedCell, target: Target, rng: np.random.Generator) -> FloatArray:
     """A target well tilted, near the image's middle: (4, 4) `cam_from_target`."""
     camera, middle = cell.options.camera, corner_positions(target).mean(axis=0)
     direction = rng.standard_normal(2)
@@ -112,7 +114,7 @@ def before_camera(cell: Cell, target: Target, rng: np.random.Generator) -> Float
 
 
 def seen_corners(
-    cell: Cell,
+    cell: SimulatedCell,
     cam_from_target: FloatArray,
     target: Target,
     rng: np.random.Generator,
@@ -131,12 +133,16 @@ def seen_corners(
 
 
 def corners_at(
-    cell: Cell, at: Stand, base_from_target: FloatArray, target: Target, rng: np.random.Generator
+    cell: SimulatedCell,
+    at: Stand,
+    base_from_target: FloatArray,
+    target: Target,
+    rng: np.random.Generator,
 ) -> Corners:
     """The noisy corners of a target that stands in the base."""
     return seen_corners(cell, invert(at.base_from_cam) @ base_from_target, target, rng)
 
 
-def _distances(cell: Cell) -> tuple[float, float]:
+def _distances(cell: SimulatedCell) -> tuple[float, float]:
     distance = np.linalg.norm(cell.cam_from_target[:, :3, 3], axis=1)
     return float(distance.min()), float(distance.max())

@@ -18,7 +18,7 @@ from visioncal.live.planning.information import WORLDS, worlds_of
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun, SoFar
 from visioncal.robot import load_robot
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.simulation.arms import forward, ur_arm
 from visioncal.simulation.boards import Sheet, outline_m
 from visioncal.simulation.optics import sees
@@ -75,7 +75,7 @@ def next_best(
     return Additions(design, tuple(said))
 
 
-def so_far_of(cell: Cell, **changes) -> SoFar:
+def so_far_of(cell: SimulatedCell, **changes) -> SoFar:
     """What is known of a cell's views, as far as they tell it."""
     known = known_of(cell, level="hand-eye", **changes)
     for stage in STAGES:

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
-from visioncal.live.capture.core import Step, Watcher
-from visioncal.live.capture.facts import Facts
+from visioncal.live.capture.core import CaptureEvent, Watcher
+from visioncal.live.capture.facts import CaptureFacts
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.record import record
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.read_back import PlanFile
 from visioncal.session import Session
 
@@ -22,9 +22,9 @@ REPEATABILITY_M = 5e-5
 QUICK = CaptureOptions(frames=1, still=Stillness(quiet_s=0.03))
 
 
-def facts_of(plan: PlanFile, arm: FakeArm, camera: FakeCamera, name: str = "live") -> Facts:
+def facts_of(plan: PlanFile, arm: FakeArm, camera: FakeCamera, name: str = "live") -> CaptureFacts:
     """What is written of a fake cell."""
-    return Facts(
+    return CaptureFacts(
         name,
         plan.cell.mount,
         plan.cell.target,
@@ -47,7 +47,7 @@ def recorded(
     watchers: tuple[Watcher, ...] = (),
     *,
     resume: bool = False,
-) -> list[Step]:
+) -> list[CaptureEvent]:
     """Records the stops of a plan that have no view yet."""
     begin = Journal.resume if resume else Journal.begin
     facts = facts_of(plan, arm, camera)
@@ -72,9 +72,9 @@ def errors_m(session: Session, camera: FakeCamera) -> list[float]:
 class _Acknowledged:
     """Prints the number of each view that is on the disk."""
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Prints it."""
-        if isinstance(step.found, Taken):
+        if isinstance(step.found, TakenView):
             print(step.view, flush=True)
 
 

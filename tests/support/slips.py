@@ -18,7 +18,7 @@ from visioncal.core.types import FloatArray
 from visioncal.robot import load_robot, read_robot_document
 from visioncal.session import Session, View
 from visioncal.session.columns import POSE
-from visioncal.simulation import Cell
+from visioncal.simulation import SimulatedCell
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 # The generation before each arm.
@@ -37,14 +37,14 @@ class Identifiability:
         words: What has to be said about it; empty where nothing is wrong.
     """
 
-    cell: Cell
+    cell: SimulatedCell
     joints: FloatArray
     poses: FloatArray | None
     robot: Mapping[str, Any] | None
     words: str = ""
 
     @classmethod
-    def of(cls, cell: Cell, *, with_poses: bool) -> "Identifiability":
+    def of(cls, cell: SimulatedCell, *, with_poses: bool) -> "Identifiability":
         """A sound session."""
         poses = cell.robot.base_from_flange if with_poses else None
         return cls(cell, cell.robot.joints, poses, read_robot_document(cell.options.robot))

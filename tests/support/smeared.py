@@ -8,14 +8,14 @@ from support.cells import session_of
 from support.rendered import disc_kernel, line_kernel
 
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation import Cell, prepare_scene
+from visioncal.simulation import SimulatedCell, prepare_scene
 from visioncal.simulation.render import developed, encode, light_on
 
 # So fine that edges are where they are to some thousandths of a pixel.
 SAMPLES = 6
 
 
-def smeared(cell: Cell, *, disc_px: float = 0.0, motion_px: float = 0.0) -> Session:
+def smeared(cell: SimulatedCell, *, disc_px: float = 0.0, motion_px: float = 0.0) -> Session:
     """The session of a cell, its images rendered, blurred further, and read out with noise.
 
     Args:

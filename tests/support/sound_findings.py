@@ -2,7 +2,13 @@
 
 from dataclasses import replace
 
-from visioncal.calibration.stages.judged import Arm, Findings, Pair, Place, Sensor
+from visioncal.calibration.stages.judged import (
+    Findings,
+    JudgedArm,
+    JudgedPair,
+    PointAccuracy,
+    Sensor,
+)
 from visioncal.core.types import Rejection
 from visioncal.estimation.observability import Direction
 from visioncal.results import HELD_BACK, ViewResult
@@ -24,15 +30,19 @@ def views(count=20, **odd):
     return tuple(replace(view, **odd) if view.view == 7 else view for view in plain)
 
 
-PAIR = Pair(views())
+PAIR = JudgedPair(views())
 SENSOR = Sensor(20, pixel_px=0.05)
-ARM = Arm(20, 0.1, 0.0057)
+ARM = JudgedArm(20, 0.1, 0.0057)
 SOUND = Findings(
     (PAIR,),
     (SENSOR,),
     (ARM,),
     directions(1e-4, 1e-4, 1e-4, 1e-4),
-    (Place("Where the views look, a point", {"pixels": 0.05, "robot": 0.03, "total": 0.06}, 0.1),),
+    (
+        PointAccuracy(
+            "Where the views look, a point", {"pixels": 0.05, "robot": 0.03, "total": 0.06}, 0.1
+        ),
+    ),
 )
 PARTS = {"pairs": PAIR, "sensors": SENSOR, "arms": ARM}
 

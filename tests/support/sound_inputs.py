@@ -34,7 +34,7 @@ from visioncal.simulation import (
     wide_camera,
     write_session,
 )
-from visioncal.simulation.dynamics import Body, real_dynamics
+from visioncal.simulation.dynamics import LinkBody, real_dynamics
 from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record
 from visioncal.simulation.tracked import Tracked, session_of, tracked
 
@@ -47,7 +47,7 @@ PLAN = (
 )
 DRAWING_MM = np.array([[0, 0, 0], [300, 0, 0], [300, 200, 0], [0, 200, 0], [150, 60, 40]])
 PLACE_M = np.array([0.5, 0.1, 0.0])
-LOAD = Body(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
+LOAD = LinkBody(2.8, np.array([0.02, -0.03, 0.08]), np.diag([0.012, 0.01, 0.008]))
 
 
 class Inputs:
@@ -155,13 +155,16 @@ def _loaded(_: Inputs, path: Path) -> None:
     _exercised(path, {"loaded": 5.0}, LOAD)
 
 
-def _currents(load: Body | None) -> Callable[[Inputs, Path], None]:
+def _currents(load: LinkBody | None) -> Callable[[Inputs, Path], None]:
     senses = Senses(gains_nm_a=(20.0, 21.0, 16.0, 9.0, 9.5, 8.7))
     return lambda _, path: _exercised(path, {"excite": 5.0}, load, senses)
 
 
 def _exercised(
-    path: Path, motions: dict[str, float], load: Body | None = None, senses: Senses | None = None
+    path: Path,
+    motions: dict[str, float],
+    load: LinkBody | None = None,
+    senses: Senses | None = None,
 ) -> None:
     """Motions of so many seconds, by name."""
     rng = np.random.default_rng(0)

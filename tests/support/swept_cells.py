@@ -6,8 +6,8 @@ from visioncal.core.types import Corners
 from visioncal.session import Session
 from visioncal.simulation import (
     CameraAt,
-    Cell,
     NetworkOptions,
+    SimulatedCell,
     Swept,
     cell_session,
     simulate,
@@ -19,12 +19,12 @@ SIDE = CameraAt("side", place_m=(0.9, 0.1, 1.3), at_stops=False)
 HOW = Swept("side", "b", "plate_b", camera_minus_robot_s=AHEAD_S, frames_hz=30.0)
 
 
-def cell_of(options: NetworkOptions, how: Swept = HOW) -> Cell:
+def cell_of(options: NetworkOptions, how: Swept = HOW) -> SimulatedCell:
     """A cell with one more camera, at the side, which sees a board on a moving flange."""
     return simulate(replace(options, cameras=(*options.cameras, SIDE), sweeps=(how,)))
 
 
-def swept_session(cell: Cell) -> tuple[Session, dict[int, Corners]]:
+def swept_session(cell: SimulatedCell) -> tuple[Session, dict[int, Corners]]:
     """The cell's session, and what is detected in its images."""
     return cell_session(cell, "swept", seen="names"), {
         view_corners.view: view_corners for view_corners in cell.corners

@@ -12,7 +12,13 @@ from visioncal.results import Calibration
 from visioncal.robot import load_robot
 from visioncal.robot.thermal import Inputs
 from visioncal.session import Session
-from visioncal.simulation import Cell, CellOptions, WarmUpOptions, cell_session, simulate_warm_up
+from visioncal.simulation import (
+    CellOptions,
+    SimulatedCell,
+    WarmUpOptions,
+    cell_session,
+    simulate_warm_up,
+)
 from visioncal.simulation.heat import Heat, Warming, heated_poses
 from visioncal.simulation.optics import fine_camera
 
@@ -36,7 +42,7 @@ class Warmed:
         whole: What heats the arm, until the end.
     """
 
-    truth: Cell
+    truth: SimulatedCell
     heat: Heat
     warming: Warming
     session: Session

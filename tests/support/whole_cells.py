@@ -11,9 +11,9 @@ from visioncal.simulation import (
     BOARDS,
     BoardAt,
     CameraAt,
-    Cell,
     NetworkOptions,
     RobotAt,
+    SimulatedCell,
     cell_session,
     fine_camera,
     simulate,
@@ -39,7 +39,7 @@ OPTIONS = NetworkOptions(
 LATER = 20
 
 
-def recorded(cell: Cell) -> Session:
+def recorded(cell: SimulatedCell) -> Session:
     """The session of a cell, with its corners in the place of images."""
     return cell_session(cell, "two arms", seen="corners")
 
@@ -53,7 +53,7 @@ def part(session: Session, first: int, end: int) -> Session:
     return replace(session, views=views, corner_table=session.corner_table.of_views(numbers))
 
 
-def saved(folder: Path, cell: Cell) -> tuple[Path, Path]:
+def saved(folder: Path, cell: SimulatedCell) -> tuple[Path, Path]:
     """Writes what is to be calibrated, and what comes later."""
     session = recorded(cell)
     part(session, 0, LATER).save(folder / "session")
@@ -67,11 +67,11 @@ def misfit(matrix, covariance, truth):
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def simulated(seed: int = 0) -> Cell:
+def simulated(seed: int = 0) -> SimulatedCell:
     return simulate(replace(OPTIONS, seed=seed))
 
 
-def truth(cell: Cell, first: str, second: str):
+def truth(cell: SimulatedCell, first: str, second: str):
     """Where a frame is in another of the same body: one of them may be a flange or a base."""
     of_first = np.eye(4) if first.startswith("flange") else cell.mountings[first]
     return invert(of_first) @ cell.mountings[second]

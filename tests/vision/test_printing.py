@@ -15,7 +15,13 @@ from visioncal.cli.target import target_app
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.vision.finders import DetectedCorners, find_target
-from visioncal.vision.printing import Request, arrange, draw_pattern, pages_named, requested_target
+from visioncal.vision.printing import (
+    BoardRequest,
+    arrange,
+    draw_pattern,
+    pages_named,
+    requested_target,
+)
 from visioncal.vision.printing.drawing import to_pdf, to_png, to_svg
 from visioncal.vision.printing.page import EDGE_MM
 from visioncal.vision.printing.pattern import outlines
@@ -158,10 +164,10 @@ def test_drawing_twice_gives_the_same_bytes():
 @pytest.mark.parametrize(
     "request_",
     [
-        Request("charuco", 9, 6),
-        Request("charuco", 7, 10, legacy=True),
-        Request("checkerboard", 9, 6),
-        Request("marker", marker_id=3),
+        BoardRequest("charuco", 9, 6),
+        BoardRequest("charuco", 7, 10, legacy=True),
+        BoardRequest("checkerboard", 9, 6),
+        BoardRequest("marker", marker_id=3),
     ],
     ids=str,
 )
@@ -177,7 +183,7 @@ def test_a_size_left_open_is_the_largest_that_fits(request_):
 
 
 def test_many_markers_get_a_dictionary_that_has_them():
-    target = requested_target(Request("charuco", 20, 14), pages_named("A3", None))
+    target = requested_target(BoardRequest("charuco", 20, 14), pages_named("A3", None))
     assert target.dictionary == "DICT_5X5_250"
 
 

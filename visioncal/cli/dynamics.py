@@ -17,7 +17,7 @@ from visioncal.core.files import some_of
 if TYPE_CHECKING:
     from visioncal.dynamics.identified import Identified
     from visioncal.dynamics.model import FrictionTerms
-    from visioncal.dynamics.run import Request
+    from visioncal.dynamics.run import IdentificationRequest
 
 MotionsArgument: TypeAlias = Annotated[
     Path, typer.Argument(help="A session with streams of angles and torques: a folder or an .rrd.")
@@ -72,13 +72,13 @@ class StreamOptions:
     ] = None
     robot: RobotName = None
 
-    def request(self) -> "Request":
+    def request(self) -> "IdentificationRequest":
         """The same, as samples are read.
 
         Raises:
             DataError: The gains are no numbers.
         """
-        from visioncal.dynamics.run import Request
+        from visioncal.dynamics.run import IdentificationRequest
 
         try:
             gains = tuple(float(part) for part in self.gains.split(",")) if self.gains else ()
@@ -87,7 +87,7 @@ class StreamOptions:
                 f"--gains is {self.gains!r}; numbers with commas between are needed.",
                 culprits=["--gains"],
             ) from error
-        return Request(
+        return IdentificationRequest(
             tuple(self.stream or ()),
             cutoff_hz=self.cutoff_hz,
             gains_nm_a=gains,

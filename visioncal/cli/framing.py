@@ -81,7 +81,7 @@ class TouchOptions(RobotPoseOptions):
 
 
 @dataclass(frozen=True)
-class Place:
+class FrameLocation:
     """Where a frame goes.
 
     Attributes:
@@ -105,7 +105,7 @@ class Place:
         kind: FrameKind,
         choice: "Choice",
         needs: "Sequence[Part]",
-    ) -> "Place":
+    ) -> "FrameLocation":
         """Finds out what is known and where the frame will go, before anything is computed.
 
         Args:
@@ -191,7 +191,7 @@ def _folder(known: Path) -> Path:
     return folder
 
 
-def keep_and_report(place: Place, frame: "Frame", source: Path, *, as_json: bool) -> None:
+def keep_and_report(place: FrameLocation, frame: "Frame", source: Path, *, as_json: bool) -> None:
     """Writes a frame where it goes, and prints it for people, or as JSON.
 
     Args:
@@ -207,7 +207,7 @@ def keep_and_report(place: Place, frame: "Frame", source: Path, *, as_json: bool
     report(place, frame, place.keep(frame), as_json=as_json)
 
 
-def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> None:
+def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: bool) -> None:
     """Prints a frame for people, or as JSON."""
     from visioncal.cli.summary import print_verdict
     from visioncal.results.frame import frames_document
@@ -242,7 +242,7 @@ def report(place: Place, frame: "Frame", written: Written, *, as_json: bool) -> 
     report_written(written)
 
 
-def _report_before(place: Place, frame: "Frame") -> None:
+def _report_before(place: FrameLocation, frame: "Frame") -> None:
     from visioncal.core.transforms import pose_difference
 
     before = None if place.result is None else place.result.frames.get(place.name)

@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from visioncal.cli.console import answers, print_json, report_written, warn
 from visioncal.cli.options import AsJson, OutFolder
-from visioncal.cli.plan_options import CellOptions, ClearanceOptions, PlanOptions, SightOptions
+from visioncal.cli.plan_options import ClearanceOptions, PlanCellOptions, PlanOptions, SightOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
@@ -37,7 +37,7 @@ def plan_command(
         ),
     ],
     wanted: PlanOptions,
-    words: CellOptions,
+    words: PlanCellOptions,
     kept: ClearanceOptions,
     sight: SightOptions,
     out: OutFolder = Path("plan"),
@@ -74,7 +74,11 @@ def plan_command(
 
 
 def _begin(
-    source: "Source", words: CellOptions, kept: "Kept", wanted: PlanOptions, progress: "Progress"
+    source: "Source",
+    words: PlanCellOptions,
+    kept: "Kept",
+    wanted: PlanOptions,
+    progress: "Progress",
 ) -> "tuple[PlanCell, Begun | None]":
     """The cell, and what was recorded of it where stops are added to that."""
     from visioncal.cli.planned_cell import begun_session, cell_of

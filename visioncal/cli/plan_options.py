@@ -15,7 +15,7 @@ from visioncal.live.planning.purposes import PURPOSES, purpose_of
 # Help does not wait for them.
 if TYPE_CHECKING:
     from visioncal.live.planning.cell import Box, Limits, PlanCell
-    from visioncal.live.planning.plan import Request
+    from visioncal.live.planning.plan import PlanRequest
 
 _what = partial(typer.Option, rich_help_panel="What is planned")
 _cell = partial(typer.Option, rich_help_panel="The cell, where the source does not say it")
@@ -81,7 +81,7 @@ class PlanOptions:
     ] = 1500
     seed: Annotated[int, _what(min=0, help="Other possible stops for every number.")] = 0
 
-    def request(self, cell: "PlanCell") -> "Request":
+    def request(self, cell: "PlanCell") -> "PlanRequest":
         """The same, as the planner takes it.
 
         Raises:
@@ -91,14 +91,14 @@ class PlanOptions:
 
         from visioncal.core.types import Need
         from visioncal.live.planning.accuracy import Wish
-        from visioncal.live.planning.plan import Request
+        from visioncal.live.planning.plan import PlanRequest
 
         wanted = purpose_of(self.purpose, "--for")
         form = ",".join(f"q{index + 1}" for index in range(cell.robot.joint_count))
         start = self.start_joints and numbers_in(self.start_joints, "--start-joints", form)
         unwished = self.wish_mm is None and self.wish_deg is None
         needless = self.need_mm is None and self.need_deg is None
-        return Request(
+        return PlanRequest(
             wanted,
             self.add or self.stops or (wanted.stops if needless else _MOST_FOR_NEED),
             self.criterion,
@@ -112,7 +112,7 @@ class PlanOptions:
 
 
 @dataclass(frozen=True)
-class CellOptions:
+class PlanCellOptions:
     """What the user says of the cell; None for what is not said."""
 
     robot: Annotated[str | None, _cell(help="The robot, where a session names none.")] = None

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.cli.parsing import numbers_in, refuse_given, size_in
-from visioncal.cli.plan_options import CellOptions
+from visioncal.cli.plan_options import PlanCellOptions
 from visioncal.core.errors import DataError
 from visioncal.core.files import absence, read_bytes, some_of
 from visioncal.core.transforms import compose
@@ -27,7 +27,7 @@ from visioncal.live.planning.cell import (
     PlanCell,
     cell_of_calibration,
 )
-from visioncal.live.planning.recorded import Begun, Guess, begin, so_far
+from visioncal.live.planning.recorded import Begun, RoughEdges, begin, so_far
 from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
@@ -86,7 +86,7 @@ def find_source(name: str) -> Source:
         ) from error
 
 
-def chosen_part(source: Source, words: CellOptions) -> tuple[Source, CellOptions]:
+def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCellOptions]:
     """Takes one camera, robot and target out of a source of a whole cell, as the words name them.
 
     Raises:
@@ -105,7 +105,7 @@ def chosen_part(source: Source, words: CellOptions) -> tuple[Source, CellOptions
     return replace(source, session=session, calibration=result), rest
 
 
-def begun_session(source: Source, words: CellOptions, kept: Kept, progress: Progress) -> Begun:
+def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: Progress) -> Begun:
     """The session to which stops are added.
 
     Raises:
@@ -129,7 +129,7 @@ def begun_session(source: Source, words: CellOptions, kept: Kept, progress: Prog
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 
-def cell_of(source: Source, words: CellOptions, kept: Kept) -> PlanCell:
+def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
     """The cell of a plan of its own, from a calibration or from options.
 
     Raises:
@@ -206,7 +206,7 @@ def _with_robot(session: Session, name: str) -> Session:
 
 
 def _calibrated(
-    calibration: Calibration, session: Session | None, words: CellOptions, kept: Kept
+    calibration: Calibration, session: Session | None, words: PlanCellOptions, kept: Kept
 ) -> PlanCell:
     if words.target is not None:
         target = target_named(words.target)
@@ -234,14 +234,14 @@ def _calibrated(
     )
 
 
-def _guess(words: CellOptions) -> Guess:
+def _guess(words: PlanCellOptions) -> RoughEdges:
     missing = [f"--{name}" for name in ("cam", "board") if getattr(words, name) is None]
     if missing:
         raise DataError(
             f"{missing[0]} is needed too: a guess is one of both, the camera and the board.",
             culprits=missing,
         )
-    return Guess(
+    return RoughEdges(
         pose_of(str(words.cam), "--cam"),
         pose_of(str(words.board), "--board"),
         float(np.deg2rad(words.guess_deg)),
@@ -249,7 +249,7 @@ def _guess(words: CellOptions) -> Guess:
     )
 
 
-def _with_noise(cell: PlanCell, words: CellOptions) -> PlanCell:
+def _with_noise(cell: PlanCell, words: PlanCellOptions) -> PlanCell:
     for name in ("noise_px", "noise_mm", "noise_deg"):
         value = getattr(words, name)
         option = f"--{name.replace('_', '-')}"

@@ -8,7 +8,7 @@ import typer
 
 from visioncal.cli.console import asked, say
 from visioncal.cli.options import AsJson, View
-from visioncal.cli.record_options import CellOptions, DeviceOptions, TakingOptions
+from visioncal.cli.record_options import DeviceOptions, RecordCellOptions, TakingOptions
 from visioncal.core.interrupts import ended_like_ctrl_c
 from visioncal.live.capture.options import CaptureOptions
 
@@ -39,7 +39,7 @@ def record_command(
             "camera's stream, or pictures that were taken already.",
         ),
     ],
-    described: CellOptions,
+    described: RecordCellOptions,
     takes: TakingOptions,
     device: DeviceOptions,
     plan: Annotated[

@@ -21,7 +21,7 @@ _camera = partial(typer.Option, rich_help_panel="What the camera is set to")
 
 
 @dataclass(frozen=True)
-class CellOptions:
+class RecordCellOptions:
     """The cell, where no plan says it."""
 
     target: Annotated[

@@ -10,10 +10,10 @@ import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages, print_json, say
-from visioncal.cli.recorded_cell import Scene
+from visioncal.cli.recorded_cell import RecordedSetup
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
-from visioncal.live.capture.core import Step, Watcher, line_of, missed
+from visioncal.live.capture.core import CaptureEvent, Watcher, line_of, missed
 from visioncal.live.capture.devices import ArmWish, open_arm, open_camera
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import HostClock, LiveCell
@@ -39,20 +39,20 @@ def opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iter
 class ViewLines:
     """Tells each view in a line."""
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Prints the line."""
         say(line_of(step))
 
 
 def driven(
     cell: LiveCell,
-    scene: Scene,
+    scene: RecordedSetup,
     journal: Journal,
     taking: CaptureOptions,
     watchers: Sequence[Watcher],
     *,
     asks: bool,
-) -> list[Step]:
+) -> list[CaptureEvent]:
     """Drives the plan's stops, after a word of the user."""
     leaving = departure(cell, scene.planned, [view.number for view in journal.views], taking)
     report_departure(leaving, cell, taking)
@@ -102,7 +102,7 @@ def _confirm(cell: LiveCell) -> None:
         raise DataError("record: not begun; nothing moved.", next_step="Look with --dry-run.")
 
 
-def check_all(journal: Journal, steps: Sequence[Step]) -> None:
+def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
     """Ends with status 2 where stops of the plan gave no view."""
     without = dict(missed(steps))
     if without:
@@ -115,7 +115,7 @@ def check_all(journal: Journal, steps: Sequence[Step]) -> None:
         )
 
 
-def finish(journal: Journal, steps: Sequence[Step], *, as_json: bool) -> None:
+def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
     """Says what there is now."""
     if as_json:
         print_json(_summary(journal, steps))
@@ -127,7 +127,7 @@ def finish(journal: Journal, steps: Sequence[Step], *, as_json: bool) -> None:
     )
 
 
-def _summary(journal: Journal, steps: Sequence[Step]) -> dict[str, Any]:
+def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
     known = [
         step.accuracy for step in steps if step.accuracy is not None and not step.accuracy.is_open
     ]
@@ -147,7 +147,7 @@ def _summary(journal: Journal, steps: Sequence[Step]) -> dict[str, Any]:
     return summary
 
 
-def check_driven(scene: Scene, *, drives: bool) -> None:
+def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
     """Refuses to drive without a plan, before a device is asked for."""
     if drives:
         _ = scene.planned

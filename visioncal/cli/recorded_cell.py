@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from visioncal.cli.console import say
-from visioncal.cli.record_options import CellOptions
+from visioncal.cli.record_options import RecordCellOptions
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.boards import target_named
 from visioncal.live.capture.coach import Coach
-from visioncal.live.capture.core import Capture, Step, Watcher
-from visioncal.live.capture.facts import Facts
+from visioncal.live.capture.core import Capture, CaptureEvent, Watcher
+from visioncal.live.capture.facts import CaptureFacts
 from visioncal.live.capture.follow import ask_and_take, follow
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
@@ -25,7 +25,7 @@ from visioncal.robot import Robot, load_robot
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RecordedSetup:
     """What is recorded of, as the user says it.
 
     Attributes:
@@ -77,13 +77,13 @@ class Scene:
         )
 
 
-def scene_of(plan: Path | None, described: CellOptions | None = None) -> Scene:
+def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> RecordedSetup:
     """Puts together what is recorded of.
 
     Raises:
         DataError: The plan cannot be read, says otherwise than the options, or no board is named.
     """
-    described = described or CellOptions()
+    described = described or RecordCellOptions()
     target, robot, mount = described.target, described.robot, described.mount
     if plan is not None:
         given = {"--target": target, "--robot": robot, "--mount": mount}
@@ -95,14 +95,14 @@ def scene_of(plan: Path | None, described: CellOptions | None = None) -> Scene:
                 next_step="Leave it out, or record without --plan.",
             )
         read = read_plan(plan)
-        return Scene(read.cell.mount, _findable(read.cell.target), read.cell.robot, read)
+        return RecordedSetup(read.cell.mount, _findable(read.cell.target), read.cell.robot, read)
     if target is None:
         raise DataError(
             "record: --plan or --target is needed to know what to look for.",
             culprits=["--plan", "--target"],
             next_step="Name the board, as --target charuco_9x6_30mm.",
         )
-    return Scene(
+    return RecordedSetup(
         mount or "eye-in-hand",
         _findable(target_named(target)),
         None if robot is None else load_robot(robot),
@@ -121,10 +121,10 @@ def _findable(target: Target) -> Target:
     return target
 
 
-def facts_of(scene: Scene, cell: LiveCell, name: str) -> Facts:
+def facts_of(scene: RecordedSetup, cell: LiveCell, name: str) -> CaptureFacts:
     """What is written of the cell besides its views."""
     camera = cell.camera
-    return Facts(
+    return CaptureFacts(
         name or "session",
         scene.mount,
         scene.target,
@@ -140,13 +140,13 @@ def facts_of(scene: Scene, cell: LiveCell, name: str) -> Facts:
 
 def guided(
     cell: LiveCell,
-    scene: Scene,
+    scene: RecordedSetup,
     journal: Journal,
     taking: CaptureOptions,
     watchers: Sequence[Watcher],
     views: int,
     ask: Callable[[str], str] | None,
-) -> list[Step]:
+) -> list[CaptureEvent]:
     """Records an arm that a person moves.
 
     Raises:
@@ -175,7 +175,7 @@ def guided(
 
 
 @contextmanager
-def shown_in(scene: Scene, cell: LiveCell, *, wanted: bool) -> Iterator[list[Watcher]]:
+def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[list[Watcher]]:
     """Opens the viewer where that is wanted; without a display the recording goes on unseen."""
     if not wanted:
         yield []

@@ -11,7 +11,14 @@ from typing import Any
 from rich.markup import escape
 
 from visioncal.cli.console import answers, say
-from visioncal.cli.rehearsed import TAKING, Recorded, calibrated, planned, recorded, touched
+from visioncal.cli.rehearsed import (
+    TAKING,
+    RehearsedRecording,
+    calibrated,
+    planned,
+    recorded,
+    touched,
+)
 from visioncal.cli.summary import print_summary, truth_table
 from visioncal.core.choices import Faults
 from visioncal.core.version import __version__
@@ -20,7 +27,7 @@ from visioncal.interchange.outputs import Written
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
 from visioncal.live.rehearsal.witness import (
-    Explained,
+    EdgeCheck,
     Pace,
     Witness,
     explained,
@@ -108,8 +115,8 @@ class Rehearsal:
     cell: RehearsedCell
     calibration: Calibration
     written: Written
-    error: Explained
-    taken: Recorded
+    error: EdgeCheck
+    taken: RehearsedRecording
     pace: Pace | None
     away_mm: tuple[float, ...]
     times_s: dict[str, float]

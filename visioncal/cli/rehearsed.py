@@ -13,19 +13,19 @@ from visioncal.calibration.pipeline import Run, run
 from visioncal.cli.console import report_error, report_written, say
 from visioncal.cli.progress import shown_progress
 from visioncal.cli.recorded import ViewLines, driven
-from visioncal.cli.recorded_cell import Scene, facts_of, scene_of, shown_in
+from visioncal.cli.recorded_cell import RecordedSetup, facts_of, scene_of, shown_in
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.interrupts import ended_like_ctrl_c
 from visioncal.core.types import FloatArray
 from visioncal.frames.touch_test import judged, touch_points
 from visioncal.interchange.outputs import Written, write_outputs, write_plan
-from visioncal.live.capture.core import Step, Watcher, missed
+from visioncal.live.capture.core import CaptureEvent, Watcher, missed
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.options import CaptureOptions
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.messages import summary_of
-from visioncal.live.planning.plan import Request, make_plan
+from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.written import plan_document
 from visioncal.live.rehearsal.bench import Bench
@@ -61,7 +61,7 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RehearsedRecording:
     """What was recorded.
 
     Attributes:
@@ -69,7 +69,7 @@ class Recorded:
         fault: What the fault did; None without one.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[CaptureEvent, ...]
     fault: "Suffered | None"
 
 
@@ -95,9 +95,9 @@ class Suffered:
     views_kept: int
 
 
-def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Scene:
+def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> RecordedSetup:
     """Plans stops from the rough guesses, and reads them back as a recording does."""
-    request = Request(
+    request = PlanRequest(
         purpose_of("hand-eye"), options.stops, candidates=_CANDIDATES, seed=options.seed
     )
     with shown_progress(quiet=False) as progress:
@@ -110,14 +110,14 @@ def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> Sce
 
 def recorded(
     bench: Bench,
-    scene: Scene,
+    scene: RecordedSetup,
     folder: Path,
     watchers: Sequence[Watcher],
     fault: Faults | None,
     *,
     view: bool,
     resume: bool = False,
-) -> Recorded:
+) -> RehearsedRecording:
     """Records the plan's stops; where a fault is wanted, through it and on.
 
     Raises:
@@ -126,7 +126,7 @@ def recorded(
     """
     if fault is None:
         steps = _drive(bench, scene, folder, watchers, resume=resume, view=view)
-        return Recorded(tuple(steps), None)
+        return RehearsedRecording(tuple(steps), None)
     injection = FaultInjection(bench, fault, after=max(1, len(scene.planned.stops) // 2))
     kept = _Kept()
     every = (*watchers, kept, injection)
@@ -150,7 +150,7 @@ def recorded(
     say(f"  ({fault} is mended; on with --resume)")
     injection.mend()
     rest = _drive(bench, scene, folder, watchers, resume=True, view=view)
-    return Recorded((*kept.steps, *rest), suffered)
+    return RehearsedRecording((*kept.steps, *rest), suffered)
 
 
 def calibrated(folder: Path, out: Path) -> tuple[Run, Written]:
@@ -164,13 +164,13 @@ def calibrated(folder: Path, out: Path) -> tuple[Run, Written]:
 
 def _drive(
     bench: Bench,
-    scene: Scene,
+    scene: RecordedSetup,
     folder: Path,
     watchers: Sequence[Watcher],
     *,
     resume: bool,
     view: bool,
-) -> list[Step]:
+) -> list[CaptureEvent]:
     with ExitStack() as opened, ended_like_ctrl_c():
         cell = opened.enter_context(bench.connected())
         begin = Journal.resume if resume else Journal.begin
@@ -191,18 +191,18 @@ class _Kept:
     """
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
+        self.steps: list[CaptureEvent] = []
         self.missed_s: float | None = None
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Keeps it."""
-        if isinstance(step.found, Taken):
+        if isinstance(step.found, TakenView):
             self.steps.append(step)
         elif self.missed_s is None:
             self.missed_s = time.monotonic()
 
 
-def _check_all_seen(steps: Sequence[Step]) -> None:
+def _check_all_seen(steps: Sequence[CaptureEvent]) -> None:
     """Raises what a recording ends with where stops gave no view."""
     without = list(missed(steps))
     if without:

@@ -15,7 +15,7 @@ from visioncal.core.errors import DataError
 
 # Help does not wait for them.
 if TYPE_CHECKING:
-    from visioncal.simulation import Cell, CellOptions
+    from visioncal.simulation import CellOptions, SimulatedCell
     from visioncal.simulation.tracked import Tracked
 Read: TypeAlias = Literal["point", "points", "probe"]
 
@@ -209,7 +209,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
     say(f"wrote {folder}\nwrote {truth_path(folder)}")
 
 
-def _single(options: "CellOptions", asked: SimulateOptions) -> "Cell":
+def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
     """A cell of one robot: at stops, in a sweep, or while it warms up."""
     from visioncal.simulation import (
         Round,
@@ -232,7 +232,7 @@ def _single(options: "CellOptions", asked: SimulateOptions) -> "Cell":
     return simulate(options)
 
 
-def _write(cell: "Cell", asked: SimulateOptions) -> None:
+def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
     """Writes a cell, and what its robots touched."""
     from visioncal.simulation import touch, write_session
 

@@ -11,17 +11,17 @@ from visioncal.core.errors import DataError
 from visioncal.session import frame_name
 from visioncal.simulation import (
     CameraAt,
-    Cell,
     CellOptions,
     InstrumentAt,
     Moved,
     NetworkOptions,
     PointAt,
     RobotAt,
+    SimulatedCell,
     read_cell,
     simulate,
 )
-from visioncal.simulation.dynamics import Body
+from visioncal.simulation.dynamics import LinkBody
 from visioncal.simulation.exercise import (
     ExerciseOptions,
     Senses,
@@ -52,7 +52,7 @@ _GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 
 def whole_cell(
     name: str, options: CellOptions, given: frozenset[str], instrument: Read | None
-) -> Cell:
+) -> SimulatedCell:
     """Simulates a whole cell; what the user gives comes before what is described."""
     cell = simulate(_described(name, options, given, instrument))
     if not (cell.sights or cell.readings):
@@ -64,7 +64,7 @@ def whole_cell(
     return cell
 
 
-def exercised(cell: Cell, asked: SimulateOptions) -> Cell:
+def exercised(cell: SimulatedCell, asked: SimulateOptions) -> SimulatedCell:
     """The cell with streams of torques of all its robots."""
     done = {
         robot.name: exercise(exercise_options(asked, robot.robot, seed_of(cell.options.seed, at)))
@@ -140,6 +140,6 @@ def exercise_options(asked: SimulateOptions, robot: str, seed: int) -> ExerciseO
             next_step="Make a session of each load, with the same --seed.",
         )
     inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
-    load = Body(loads[0], np.array(CENTRE_M), inertia) if loads[0] else None
+    load = LinkBody(loads[0], np.array(CENTRE_M), inertia) if loads[0] else None
     senses = Senses(gains_nm_a=_GAINS_NM_A if asked.currents else ())
     return ExerciseOptions(robot, load, senses, seed=seed)

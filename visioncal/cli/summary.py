@@ -11,7 +11,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray
 from visioncal.present.advice import left_out
 from visioncal.present.facts import solver_table
-from visioncal.results import Calibration, CellResult, Step, Verdict, ViewResult
+from visioncal.results import Calibration, CellResult, Remedy, Verdict, ViewResult
 from visioncal.results.compare import edge_errors
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
@@ -34,7 +34,7 @@ def print_verdict(verdict: Verdict, name: str) -> None:
         console.print(f"  - {escape(line)}")
 
 
-def print_steps(steps: Sequence[Step]) -> None:
+def print_steps(steps: Sequence[Remedy]) -> None:
     """Prints what to do next, each command on a line of its own."""
     console = answers()
     if steps:

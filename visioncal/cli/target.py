@@ -16,7 +16,7 @@ from visioncal.core.files import check_free, write_atomically
 # Help does not wait for them.
 if TYPE_CHECKING:
     from visioncal.core.types import Target
-    from visioncal.vision.printing import Page, Request
+    from visioncal.vision.printing import BoardRequest, Page
 
 target_app = typer.Typer(
     help="Print a board at its exact size, or name the one in a photograph.",
@@ -86,9 +86,9 @@ class BoardOptions:
         names = {"marker_id": "id"}
         return [f"--{names.get(name, name).replace('_', '-')}" for name in chosen if name != "kind"]
 
-    def request(self, kind: _Described) -> "Request":
+    def request(self, kind: _Described) -> "BoardRequest":
         """The same as the printer takes it."""
-        from visioncal.vision.printing import Request
+        from visioncal.vision.printing import BoardRequest
 
         mine = {
             field.name: getattr(self, field.name)
@@ -97,7 +97,7 @@ class BoardOptions:
         }
         if self.size_mm is not None:
             mine["square_mm"] = self.size_mm
-        return Request(**mine | {"kind": kind})
+        return BoardRequest(**mine | {"kind": kind})
 
 
 @target_app.command("make", cls=PlainCommand)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from visioncal.cli.framing import FrameOptions, Place, TouchOptions, keep_and_report
+from visioncal.cli.framing import FrameLocation, FrameOptions, TouchOptions, keep_and_report
 from visioncal.cli.options import PartOptions
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
@@ -79,10 +79,10 @@ def place_frame(
         own = "the tool's point" if kind == "tool" else "the fixture's origin"
         refuse_given({"--point-mm": asked.point_mm}, f"touches say where {own} is")
         refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
-        place = Place.of(asked.goes, kind, Choice(robot=part.robot), ARM)
+        place = FrameLocation.of(asked.goes, kind, Choice(robot=part.robot), ARM)
         frame = by_touches(place.calibration)
     else:
-        place = Place.of(asked.goes, kind, replace(part.choice, target=None), EYE)
+        place = FrameLocation.of(asked.goes, kind, replace(part.choice, target=None), EYE)
         if place.calibration is None:
             raise DataError(
                 f"session {session.name!r} has images, and the camera's calibration (-c) is needed "

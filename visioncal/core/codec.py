@@ -66,7 +66,7 @@ class Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Written:
+class WrittenForm:
     """How a value is written that is no dataclass of ours, or has another form on disk.
 
     Attributes:
@@ -113,7 +113,7 @@ class Entry:
     def keys(self) -> set[str]:
         """The keys that it has."""
         if INLINE in self.marks:
-            forms = [mark.form for mark in self.marks if isinstance(mark, Written)]
+            forms = [mark.form for mark in self.marks if isinstance(mark, WrittenForm)]
             (inner,) = _alternatives(get_args(self.kind)[0])
             return set().union(*(entry.keys for entry in entries(forms[0] if forms else inner)))
         return set() if REST in self.marks else {self.key}
@@ -169,7 +169,7 @@ def _written(kind: Any, value: Any) -> Any:  # noqa: ANN401 - what JSON may hold
     if get_origin(kind) is Annotated:
         inner, *marks = get_args(kind)
         for mark in marks:
-            if isinstance(mark, Written):
+            if isinstance(mark, WrittenForm):
                 return (
                     mark.write(value) if mark.form is None else write(mark.form, mark.write(value))
                 )
@@ -253,7 +253,7 @@ def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: 
     for mark in marks:
         if isinstance(mark, Array):
             return _array(inner, mark, value, path)
-        if isinstance(mark, Written):
+        if isinstance(mark, WrittenForm):
             known = value if mark.form is None else read(mark.form, value, path)
             try:
                 return mark.read(known, path)

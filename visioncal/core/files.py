@@ -380,7 +380,7 @@ def find_described(
 
 
 @dataclass(frozen=True)
-class Table:
+class DocumentTable:
     """Typed access to one table of a TOML or JSON document.
 
     Every method raises DataError, naming the field, where the value is absent without a default,
@@ -427,7 +427,7 @@ class Table:
         values = self._value(key, None, needed)
         if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
             raise self.refuse(key, values, needed)
-        return [Table({key: value}, self.label).number(key) for value in values]
+        return [DocumentTable({key: value}, self.label).number(key) for value in values]
 
     def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
         """Reads a whole number from `low` to `high`."""

@@ -53,7 +53,7 @@ _PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
 
 
 @dataclass(frozen=True)
-class Step:
+class Remedy:
     """What to do about a finding.
 
     Attributes:
@@ -82,7 +82,7 @@ def exchanging(first: int, second: int) -> str:
     return f"visioncal convert SESSION FIXED --exchange {first},{second} && {fixed}"
 
 
-READ_AGAIN = Step(
+READ_AGAIN = Remedy(
     "Write a copy of the session that is read so, and calibrate it.", GUESS_AND_CALIBRATE
 )
 
@@ -109,7 +109,7 @@ class Finding:
 
     kind: str
     words: str
-    do: Step | None = None
+    do: Remedy | None = None
     views: tuple[int, ...] = ()
     probability: Annotated[float, DROPPED] = 0.0
     without_it: Annotated[str, DROPPED] = ""
@@ -224,10 +224,10 @@ class Verdict:
         return f"{begin}{finding.words} {finding.without_it}".strip()
 
     @property
-    def next_steps(self) -> tuple[Step, ...]:
+    def next_steps(self) -> tuple[Remedy, ...]:
         """What to do about the findings, in their order; each once."""
         unlikely = [cause for cause in self.causes[1:] if cause.probability < _LIKELY]
-        steps: dict[str, Step] = {}
+        steps: dict[str, Remedy] = {}
         for finding in self.ranked:
             if finding.do is not None and finding not in unlikely:
                 steps.setdefault(finding.do.command or finding.do.words, finding.do)

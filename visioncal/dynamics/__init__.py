@@ -8,7 +8,7 @@ from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.limits import Missing, Share, allowed_motion
 from visioncal.dynamics.model import DynamicModel, Friction, FrictionTerms, sign
-from visioncal.dynamics.motion import Measured, Motion
+from visioncal.dynamics.motion import JointMotion, Measured
 from visioncal.dynamics.observer import MomentumObserver, external_torques
 from visioncal.dynamics.payload import Gains, Payload, drive_gains, estimate_payload
 from visioncal.dynamics.run import Run
@@ -25,10 +25,10 @@ __all__ = [
     "FrictionTerms",
     "Gains",
     "Identified",
+    "JointMotion",
     "Measured",
     "Missing",
     "MomentumObserver",
-    "Motion",
     "Payload",
     "Prediction",
     "Run",

@@ -21,8 +21,8 @@ from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.regression import Block
+from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.regression import NoiseBlock
 
 # States that stand for all, and their greatest speeds [rad/s] and accelerations [rad/s^2]; at these
 # gravity, speed and acceleration have like shares in the torques.
@@ -125,7 +125,7 @@ class BaseModel:
             for row, own in zip(self.dependence, self.independent, strict=True)
         )
 
-    def regressor(self, motion: Motion) -> FloatArray:
+    def regressor(self, motion: JointMotion) -> FloatArray:
         """Derivatives (m, n, b) of the torques by the base parameters."""
         return self.model.regressor(motion, self.independent)
 
@@ -139,11 +139,11 @@ def _columns(model: DynamicModel, rng: np.random.Generator) -> FloatArray:
     return model.regressor(random_motion(model, rng)).reshape(-1, len(model.names))
 
 
-def random_motion(model: DynamicModel, rng: np.random.Generator) -> Motion:
+def random_motion(model: DynamicModel, rng: np.random.Generator) -> JointMotion:
     """States all around, at random."""
     shape = (_STATES, model.robot.joint_count)
     q, dq, ddq = (rng.uniform(-value, value, shape) for value in (np.pi, _FASTEST, _HARDEST))
-    return Motion(np.arange(float(_STATES)), q, dq, ddq)
+    return JointMotion(np.arange(float(_STATES)), q, dq, ddq)
 
 
 def _sum_text(names: tuple[str, ...], row: FloatArray, own: int) -> str:
@@ -175,7 +175,7 @@ class Condition:
     raw: float
 
 
-def condition_of(base: BaseModel, motion: Motion, weights: FloatArray) -> Condition:
+def condition_of(base: BaseModel, motion: JointMotion, weights: FloatArray) -> Condition:
     """Computes the condition numbers of a motion.
 
     Args:
@@ -251,7 +251,7 @@ def _joint_of(name: str) -> int:
     return int(name[len(name.rstrip("0123456789")) :])
 
 
-def check_identifiable(base: BaseModel, blocks: Sequence[Block]) -> None:
+def check_identifiable(base: BaseModel, blocks: Sequence[NoiseBlock]) -> None:
     """Refuses motions that leave a combination of base parameters open.
 
     Raises:
@@ -268,7 +268,7 @@ def check_identifiable(base: BaseModel, blocks: Sequence[Block]) -> None:
         )
 
 
-def null_space(base: BaseModel, blocks: Sequence[Block]) -> list[int]:
+def null_space(base: BaseModel, blocks: Sequence[NoiseBlock]) -> list[int]:
     """The base parameters in directions about which a motion says nothing."""
     information = np.zeros((base.rank, base.rank))
     rows = 0

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.dynamics.reading import Recorded
+from visioncal.dynamics.reading import RecordedSamples
 
 # Steps that differ by more than this share of the usual are resampled. Where they are whole
 # multiples of it but for the second share, others are missing between them; on a clock that is more
@@ -23,7 +23,7 @@ _JUMP = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Clock:
+class StampClock:
     """The steps of a stream's stamps.
 
     Attributes:
@@ -64,7 +64,7 @@ class Even:
         there: (m,) where torques were recorded.
     """
 
-    recorded: Recorded
+    recorded: RecordedSamples
     bad: Mask
     there: Mask
 
@@ -78,7 +78,9 @@ class Even:
         return (len(times_s) - 1) / float(times_s[-1] - times_s[0])
 
 
-def even_parts(recorded: Recorded, bad: Mask, clock: Clock, widest_s: float) -> list[Even]:
+def even_parts(
+    recorded: RecordedSamples, bad: Mask, clock: StampClock, widest_s: float
+) -> list[Even]:
     """The parts between gaps, each on an even clock.
 
     Args:
@@ -95,12 +97,12 @@ def even_parts(recorded: Recorded, bad: Mask, clock: Clock, widest_s: float) -> 
     ]
 
 
-def _gaps_of(clock: Clock, widest_s: float) -> IntArray:
+def _gaps_of(clock: StampClock, widest_s: float) -> IntArray:
     """The samples behind which others are missing for longer than that [s]."""
     return np.flatnonzero((clock.counts > 1) & ((clock.counts - 1) * clock.usual_s > widest_s))
 
 
-def clock_notes(recorded: Recorded, clock: Clock, widest_s: float) -> list[str]:
+def clock_notes(recorded: RecordedSamples, clock: StampClock, widest_s: float) -> list[str]:
     """What is wrong with a stream's clock, and what was done about it, in words."""
     steps, notes = np.diff(recorded.times_s), []
     gaps = _gaps_of(clock, widest_s)
@@ -132,7 +134,7 @@ def _jitter(steps: FloatArray, counts: FloatArray, usual: float) -> float:
     return float(np.std((steps - counts * usual)[near])) / usual
 
 
-def _even(recorded: Recorded, bad: Mask, clock: Clock, rows: slice) -> Even:
+def _even(recorded: RecordedSamples, bad: Mask, clock: StampClock, rows: slice) -> Even:
     """A part with a sample at every usual step."""
     times_s, counts = recorded.times_s[rows], clock.counts[rows.start : rows.stop - 1]
     places = np.concatenate([[0], np.cumsum(counts)])
@@ -167,7 +169,7 @@ def _bridged(times_s: FloatArray, values: FloatArray, seen: Mask) -> FloatArray:
     return bridged
 
 
-def without_frozen(recorded: Recorded, notes: list[str]) -> Recorded:
+def without_frozen(recorded: RecordedSamples, notes: list[str]) -> RecordedSamples:
     """The stream without the rows in which angles of a joint repeat while it moves.
 
     A joint that stops, and one that sets off, has short steps just before and after; one whose

@@ -10,10 +10,10 @@ from scipy.ndimage import binary_opening, median_filter, uniform_filter1d
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, Mask
-from visioncal.dynamics.clock import Clock, clock_notes, even_parts, without_frozen
+from visioncal.dynamics.clock import StampClock, clock_notes, even_parts, without_frozen
 from visioncal.dynamics.lowpass import WIDER, LowPass, band_of, smoothed_motion, window_of
-from visioncal.dynamics.motion import Measured, Motion
-from visioncal.dynamics.reading import Recorded
+from visioncal.dynamics.motion import JointMotion, Measured
+from visioncal.dynamics.reading import RecordedSamples
 
 # Torques of a rigid arm have all but their friction's corners within so many times the band of its
 # motion; below so many a second there is little to estimate noise from, and beyond the other gears
@@ -66,7 +66,7 @@ class Piece:
         """(k, n) filtered torques [N m]."""
         return self.lowpass(self.measured.torques_nm, self.there)
 
-    def filtered(self, columns: Callable[[Motion], FloatArray]) -> FloatArray:
+    def filtered(self, columns: Callable[[JointMotion], FloatArray]) -> FloatArray:
         """Filters what is computed of a motion (m, ...), a part of it at a time: (k, ...)."""
         step, width = self.lowpass.step, len(self.lowpass.taps)
         total, parts = self.lowpass.count(len(self.measured)), []
@@ -151,7 +151,7 @@ class Conditioned:
         """What the filter leaves of white noise from one sample to the next, and so on."""
         return self.pieces[0].lowpass.correlation
 
-    def filtered(self, columns: Callable[[Motion], FloatArray]) -> FloatArray:
+    def filtered(self, columns: Callable[[JointMotion], FloatArray]) -> FloatArray:
         """Filters what is computed of the motion, as the torques are: (k, ...)."""
         parts = [piece.filtered(columns) for piece in self.pieces]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
@@ -162,7 +162,7 @@ class Conditioned:
 
 
 def condition(
-    recorded: Recorded, cutoff_hz: float | None = None, limits_nm: FloatArray | None = None
+    recorded: RecordedSamples, cutoff_hz: float | None = None, limits_nm: FloatArray | None = None
 ) -> Conditioned:
     """Resamples, differentiates and filters a stream.
 
@@ -182,7 +182,7 @@ def condition(
     recorded = without_frozen(recorded, notes)
     torques, bad = _cleaned(recorded, limits_nm, notes)
     recorded = replace(recorded, torques_nm=torques)
-    clock = Clock.of(recorded.times_s)
+    clock = StampClock.of(recorded.times_s)
     # Of how slow a motion may be, until its band is known.
     slowest = min(_LEAST_HZ if cutoff_hz is None else cutoff_hz, 0.25 / clock.usual_s)
     widest_s = _widest(slowest, 1.0 / clock.usual_s, clock.usual_s)
@@ -235,7 +235,7 @@ def condition(
     )
 
 
-def _resting(motion: Motion, rate_hz: float) -> Mask:
+def _resting(motion: JointMotion, rate_hz: float) -> Mask:
     """(m, n) where a joint stands: there friction holds it by any torque up to its bound."""
     samples = max(round(_REST_S * rate_hz), 1)
     slow = np.abs(uniform_filter1d(motion.dq, samples, axis=0)) < _REST_RAD_S
@@ -248,7 +248,7 @@ def _widest(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:
 
 
 def _cleaned(
-    recorded: Recorded, limits_nm: FloatArray | None, notes: list[str]
+    recorded: RecordedSamples, limits_nm: FloatArray | None, notes: list[str]
 ) -> tuple[FloatArray, Mask]:
     """Torques with single slips taken out, and which of them are none."""
     torques = recorded.torques_nm.copy()

@@ -63,7 +63,9 @@ def fit_consistent(
     names = base.model.names[10 * joints :]
     held = np.zeros(len(names), dtype=bool)
     positive = np.array([name.startswith(_POSITIVE) for name in names], dtype=bool)
-    problem = _Problem(base, values, _Whitened.of(covariance), LogCholesky.around(known), held)
+    problem = _ConsistentFit(
+        base, values, _Whitened.of(covariance), LogCholesky.around(known), held
+    )
     for _ in range(len(names) + 1):
         state, _ = levenberg_marquardt(problem.start(), problem.linearised, _SETTLED)
         wrong = positive & (state.own < 0.0) & ~problem.held
@@ -96,7 +98,7 @@ class _Whitened:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
+class _LinkState:
     """Coordinates (n, 10) of the links, and the parameters that joints have of their own."""
 
     links: FloatArray
@@ -104,7 +106,7 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _ConsistentFit:
     """The fit, with its unknowns in units of the prior where they have one."""
 
     base: BaseModel
@@ -113,7 +115,7 @@ class _Problem:
     coordinates: LogCholesky
     held: Mask
 
-    def start(self) -> _State:
+    def start(self) -> _LinkState:
         """The known links, with the joints' own parameters that go best with them."""
         joints = len(self.coordinates.maps)
         links = np.zeros((joints, 10))
@@ -121,12 +123,12 @@ class _Problem:
         own = self.whitened.of_vector(self.base.dependence[:, len(known) :] * ~self.held)
         rest = self.values - self.base.dependence[:, : len(known)] @ known
         found = np.linalg.lstsq(own, self.whitened.of_vector(rest), rcond=None)[0]
-        return _State(links, np.where(self.held, 0.0, found))
+        return _LinkState(links, np.where(self.held, 0.0, found))
 
-    def standard(self, state: _State) -> FloatArray:
+    def standard(self, state: _LinkState) -> FloatArray:
         return np.concatenate([self.coordinates.values(state.links).ravel(), state.own])
 
-    def jacobian(self, state: _State) -> FloatArray:
+    def jacobian(self, state: _LinkState) -> FloatArray:
         """(p, p) derivatives of the standard parameters by the unknowns."""
         count, own = state.links.size, state.own.size
         jacobian = np.zeros((count + own, count + own))
@@ -136,7 +138,7 @@ class _Problem:
         jacobian[range(count, count + own), range(count, count + own)] = ~self.held
         return jacobian
 
-    def normal(self, state: _State) -> tuple[FloatArray, FloatArray, float]:
+    def normal(self, state: _LinkState) -> tuple[FloatArray, FloatArray, float]:
         """Information, gradient and cost by the unknowns."""
         prior = np.zeros(state.links.size + state.own.size)
         prior[: state.links.size] = state.links.ravel() / PRIOR_SIGMA
@@ -149,13 +151,13 @@ class _Problem:
         gradient = jacobian.T @ residual + prior
         return information, gradient, float(residual @ residual + prior @ prior)
 
-    def linearised(self, state: _State) -> Linearised[_State]:
+    def linearised(self, state: _LinkState) -> Linearised[_LinkState]:
         information, gradient, cost = self.normal(state)
 
-        def step(damping: float) -> _State:
+        def step(damping: float) -> _LinkState:
             by = damped_step(information, gradient, damping)
             links = PRIOR_SIGMA * by[: state.links.size].reshape(state.links.shape)
             own = by[state.links.size :]
-            return _State(state.links + links, state.own + np.where(self.held, 0.0, own))
+            return _LinkState(state.links + links, state.own + np.where(self.held, 0.0, own))
 
         return Linearised(state, cost, step)

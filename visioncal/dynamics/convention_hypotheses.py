@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import sign
-from visioncal.dynamics.motion import Measured, Motion
+from visioncal.dynamics.motion import JointMotion, Measured
 from visioncal.robot import Inertias, Robot, joint_torques
 
 # So many samples are enough for a test; fewer, as of sweeps of single joints, are not.
@@ -40,7 +40,7 @@ _HIGH, _LOW, _SHARE = 5.0, 0.2, 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class _Guess:
+class _Hypothesis:
     """A recording as it would be without some mistake.
 
     Attributes:
@@ -71,7 +71,7 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
         if len(measured) < _LEAST:
             continue
         joints = tuple(range(measured.torques_nm.shape[1]))
-        as_it_is = _Guess("", joints, measured, _predicted(robot, measured.motion))
+        as_it_is = _Hypothesis("", joints, measured, _predicted(robot, measured.motion))
         if robot.inertias is None:
             found = _explained_better(base, as_it_is)
         else:
@@ -93,7 +93,7 @@ def _some(stream: Conditioned) -> Measured:
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
 
 
-def _predicted_better(robot: Robot, as_it_is: _Guess) -> tuple[_Guess, str] | None:
+def _predicted_better(robot: Robot, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
     """The mistake without which by far the most is as predicted, if there is one, and why."""
     before = _left(as_it_is)
     best, gain = None, np.log(_BETTER)
@@ -112,7 +112,7 @@ def _predicted_better(robot: Robot, as_it_is: _Guess) -> tuple[_Guess, str] | No
     )
 
 
-def _fitted_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | None:
+def _fitted_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
     """Two exchanged joints, if a fit finds such a pair, and why."""
     # Where friction is most of their torques, predictions hardly show it; but no inertias at all
     # can explain the others' torques.
@@ -131,7 +131,7 @@ def _fitted_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | No
     return best, f"so taken, the best fit leaves {times:.2g} times less of the torques' power"
 
 
-def _explained_better(base: BaseModel, as_it_is: _Guess) -> tuple[_Guess, str] | None:
+def _explained_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
     """The mistake without which a fit of any inertias leaves by far less, if there is one, and why.
 
     Slow sweeps tell the torques of two joints hardly from their angles: both are named.
@@ -163,7 +163,7 @@ def _unfitted(base: BaseModel, measured: Measured) -> FloatArray:
     return np.asarray(np.maximum(left, 1e-12))
 
 
-def _guesses(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
+def _guesses(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
     """The recording without one mistake or another."""
     yield from _swapped_columns(robot, as_it_is)
     yield from _swapped_joints(robot, as_it_is)
@@ -178,7 +178,7 @@ def _guesses(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
     yield _moved(robot, _scaled(motion, np.pi / 180.0), torques, "angles are in degrees", every)
 
 
-def _swapped_columns(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
+def _swapped_columns(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
     """The recording without the torques, or the angles, of two joints swapped."""
     measured = as_it_is.measured
     for pair, order in _pairs(as_it_is):
@@ -189,7 +189,7 @@ def _swapped_columns(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
         yield _moved(robot, turned, measured.torques_nm, f"the angles {words}", pair)
 
 
-def _swapped_joints(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
+def _swapped_joints(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
     """The recording without two joints taken for each other."""
     measured = as_it_is.measured
     for pair, order in _pairs(as_it_is):
@@ -198,14 +198,14 @@ def _swapped_joints(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
         yield _moved(robot, turned, measured.torques_nm[:, order], words, pair)
 
 
-def _pairs(as_it_is: _Guess) -> Iterator[tuple[tuple[int, int], IntArray]]:
+def _pairs(as_it_is: _Hypothesis) -> Iterator[tuple[tuple[int, int], IntArray]]:
     for one, other in combinations(as_it_is.joints, 2):
         order = np.array(as_it_is.joints)
         order[[one, other]] = other, one
         yield (one, other), order
 
 
-def _flipped(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
+def _flipped(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
     """The recording without the other sign of a joint's torque or angle."""
     measured = as_it_is.measured
     for joint in as_it_is.joints:
@@ -219,31 +219,31 @@ def _flipped(robot: Robot, as_it_is: _Guess) -> Iterator[_Guess]:
 
 
 def _moved(
-    robot: Robot, motion: Motion, torques: FloatArray, words: str, joints: tuple[int, ...]
-) -> _Guess:
-    return _Guess(words, joints, Measured(motion, torques), _predicted(robot, motion))
+    robot: Robot, motion: JointMotion, torques: FloatArray, words: str, joints: tuple[int, ...]
+) -> _Hypothesis:
+    return _Hypothesis(words, joints, Measured(motion, torques), _predicted(robot, motion))
 
 
-def _predicted(robot: Robot, motion: Motion) -> FloatArray:
+def _predicted(robot: Robot, motion: JointMotion) -> FloatArray:
     inertias = robot.inertias or Inertias(np.zeros((robot.joint_count, 10)))
     return joint_torques(robot, inertias, motion.q, motion.dq, motion.ddq)
 
 
-def _reordered(motion: Motion, order: Sequence[int] | IntArray) -> Motion:
+def _reordered(motion: JointMotion, order: Sequence[int] | IntArray) -> JointMotion:
     parts = (array[:, list(order)] for array in (motion.q, motion.dq, motion.ddq))
-    return Motion(motion.times_s, *parts)
+    return JointMotion(motion.times_s, *parts)
 
 
-def _scaled(motion: Motion, by: FloatArray | float) -> Motion:
-    return Motion(motion.times_s, by * motion.q, by * motion.dq, by * motion.ddq)
+def _scaled(motion: JointMotion, by: FloatArray | float) -> JointMotion:
+    return JointMotion(motion.times_s, by * motion.q, by * motion.dq, by * motion.ddq)
 
 
-def _left(guess: _Guess) -> FloatArray:
+def _left(guess: _Hypothesis) -> FloatArray:
     """(n,) share of the power of each joint's torques that nothing explains."""
     return np.array([_fitted(guess, index)[1] for index in range(guess.predicted.shape[1])])
 
 
-def _fitted(guess: _Guess, joint: int) -> tuple[FloatArray, float]:
+def _fitted(guess: _Hypothesis, joint: int) -> tuple[FloatArray, float]:
     """A joint's torques by multiples of what is predicted and of friction, none below zero."""
     dq, torques = guess.measured.motion.dq[:, joint], guess.measured.torques_nm[:, joint]
     columns = np.column_stack([guess.predicted[:, joint], sign(dq), dq])
@@ -260,7 +260,7 @@ def _named(joints: tuple[int, ...]) -> str:
     )
 
 
-def _check_units(label: str, robot: Robot, guess: _Guess) -> None:
+def _check_units(label: str, robot: Robot, guess: _Hypothesis) -> None:
     """Refuses torques that are multiples of what they should be."""
     scales = np.full(len(guess.joints), np.nan)
     for joint in guess.joints:

@@ -12,7 +12,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
-from visioncal.dynamics.identified import Identified, Lag, StreamFacts, Validation
+from visioncal.dynamics.identified import Identified, Lag, StreamFacts, TorqueValidation
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.stribeck import Stribeck
@@ -48,7 +48,7 @@ def to_document(identified: Identified) -> dict[str, Any]:
         document["lag"] = write(Lag, identified.lag)
     if identified.validation is not None:
         shares = {"share": identified.validation.shares.tolist()}
-        document["validation"] = write(Validation, identified.validation) | shares
+        document["validation"] = write(TorqueValidation, identified.validation) | shares
     verdict = judge(identified)
     return document | {"verdict": {"status": verdict.status, "reasons": list(verdict.reasons)}}
 
@@ -139,7 +139,7 @@ class _Figures:
     """What is read as it was written."""
 
     streams: tuple[StreamFacts, ...]
-    validation: Validation | None = None
+    validation: TorqueValidation | None = None
     lag: Lag | None = None
 
 

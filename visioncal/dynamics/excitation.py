@@ -135,10 +135,10 @@ def excite(
         DegenerateError: No motion was found that does.
     """
     with one_blas_thread():
-        return _Search(allowed, request, progress).run()
+        return _ExcitationSearch(allowed, request, progress).run()
 
 
-class _Search:
+class _ExcitationSearch:
     """Descents from random motions, and the best of their ends."""
 
     def __init__(

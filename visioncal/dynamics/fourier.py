@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from visioncal.core.types import FloatArray
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ class Series:
         mean, _, cosines = self.coefficients
         return np.asarray(mean + cosines.sum(axis=1))
 
-    def motion(self, times_s: FloatArray) -> Motion:
+    def motion(self, times_s: FloatArray) -> JointMotion:
         """Where the joints are at (m,) times [s], and how they move."""
         q, dq, ddq = (array @ self.free.T for array in self.harmonics.basis(times_s))
-        return Motion(np.asarray(times_s, dtype=float), q, dq, ddq)
+        return JointMotion(np.asarray(times_s, dtype=float), q, dq, ddq)
 
-    def sampled(self, rate_hz: float) -> Motion:
+    def sampled(self, rate_hz: float) -> JointMotion:
         """The motion from its beginning to its end, evenly sampled."""
         return self.motion(even_times(self.harmonics.period_s, rate_hz))
 

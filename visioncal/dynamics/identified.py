@@ -17,7 +17,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Inertias, Robot
 
@@ -56,7 +56,7 @@ class StreamFacts:
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
+class TorqueValidation:
     """How torques are predicted that were not fitted.
 
     Attributes:
@@ -133,7 +133,7 @@ class Identified:
     stribeck: Stribeck
     consistent: Consistent | None
     streams: tuple[StreamFacts, ...]
-    validation: Validation | None = None
+    validation: TorqueValidation | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     lag: Lag | None = None
 
@@ -193,11 +193,11 @@ class Identified:
         """Of the links, as bodies; None where the robot's were not known before."""
         return None if self.consistent is None else self.consistent.inertias(self.robot.joint_count)
 
-    def torques(self, motion: Motion) -> FloatArray:
+    def torques(self, motion: JointMotion) -> FloatArray:
         """(m, n) what the drives have to give, by the base parameters [N m]."""
         return np.asarray(self.base.regressor(motion) @ self.values + self.stribeck.torques(motion))
 
-    def consistent_torques(self, motion: Motion) -> FloatArray:
+    def consistent_torques(self, motion: JointMotion) -> FloatArray:
         """(m, n) the same by the standard parameters of bodies [N m].
 
         Raises:

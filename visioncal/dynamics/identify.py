@@ -12,7 +12,7 @@ from visioncal.dynamics.consistent import fit_consistent
 from visioncal.dynamics.convention_hypotheses import check_mistakes
 from visioncal.dynamics.identified import Identified, StreamFacts
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.regression import Block, Regression, regress, rms_of, spread_of
+from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of, spread_of
 from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
 from visioncal.robot import Robot
 
@@ -92,10 +92,10 @@ def identify(
     return Identification(identified, tuple(streams), fit)
 
 
-def block_of(base: BaseModel, stream: Conditioned) -> Block:
+def block_of(base: BaseModel, stream: Conditioned) -> NoiseBlock:
     """The filtered regressor and torques of a stream."""
     x = stream.filtered(base.regressor)
-    return Block(x, stream.torques_nm, stream.used, stream.correlation)
+    return NoiseBlock(x, stream.torques_nm, stream.used, stream.correlation)
 
 
 def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts, ...]:

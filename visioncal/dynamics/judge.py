@@ -9,9 +9,9 @@ from visioncal.core.files import some_of
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
-from visioncal.core.verdict import NOTE, Finding, Step, Verdict, VerdictStatus
+from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, VerdictStatus
 from visioncal.dynamics.base import random_motion
-from visioncal.dynamics.identified import UNKNOWN, Identified, Validation
+from visioncal.dynamics.identified import UNKNOWN, Identified, TorqueValidation
 from visioncal.robot.files import robot_names
 
 _LIMITS = DynamicsLimits()
@@ -19,15 +19,15 @@ _Judged: TypeAlias = tuple[VerdictStatus, Finding]
 _MOTION = "Record, and fit with this one, a motion"
 
 
-def _check(kind: str, words: str, do: Step | None = None) -> _Judged:
+def _check(kind: str, words: str, do: Remedy | None = None) -> _Judged:
     return "check", Finding(kind, words, do)
 
 
-def _plan(identified: Identified, words: str) -> Step:
+def _plan(identified: Identified, words: str) -> Remedy:
     """Advice to record a planned motion; an arm that has a name can be planned for."""
     name = identified.robot.name
     command = f"visioncal dynamics plan {name} -o motions" if name in robot_names() else ""
-    return Step(f"{words}; visioncal dynamics plan writes some.", command)
+    return Remedy(f"{words}; visioncal dynamics plan writes some.", command)
 
 
 def judge(identified: Identified) -> Verdict:
@@ -54,7 +54,7 @@ def _of_lag(identified: Identified) -> Iterator[_Judged]:
     if lag.share < _LIMITS.lag_share:
         yield "good", Finding(NOTE, words)
         return
-    step = Step(
+    step = Remedy(
         "Record angles and torques by one clock, and filter neither of them, or both alike: a lag "
         "that changes is undone in the mean alone."
     )
@@ -98,7 +98,7 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
     yield from _of_known(identified, validation)
 
 
-def _of_known(identified: Identified, validation: Validation) -> Iterator[_Judged]:
+def _of_known(identified: Identified, validation: TorqueValidation) -> Iterator[_Judged]:
     known, bodies = validation.known_rms_nm, validation.consistent_rms_nm
     if known is not None:
         lost = validation.rms_nm > known
@@ -126,7 +126,7 @@ def _of_known(identified: Identified, validation: Validation) -> Iterator[_Judge
                 f"{_joints(strange)}: by the inertias that {identified.robot.name} comes with, "
                 f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the "
                 "torques' range stays unexplained.",
-                Step(
+                Remedy(
                     "Check whether it is the robot that was recorded, whether it stands "
                     "upright ([robot] gravity_m_s2), and what is on its flange."
                 ),

@@ -17,7 +17,7 @@ from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.identified import Lag
 from visioncal.dynamics.identify import block_of
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.regression import Block, Regression, regress, rms_of, spread_of
+from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of, spread_of
 from visioncal.robot import Robot
 
 _LIMITS = DynamicsLimits()
@@ -55,7 +55,7 @@ def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms)
         return None
 
 
-def _found(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> Lag | None:
+def _found(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> Lag | None:
     lag_s = _nearest(streams, blocks)
     if lag_s is None:
         return None
@@ -75,7 +75,7 @@ def _found(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> Lag | Non
     return found if clear and np.median(left) < _LEFT else None
 
 
-def _nearest(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> float | None:
+def _nearest(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> float | None:
     """The lag on a grid by which the best fit leaves least [s]; None where samples are too few."""
     step_s = 1.0 / (_PER_PERIOD * max(stream.cutoff_hz for stream in streams))
     many = int(_LARGEST_S / step_s)
@@ -102,7 +102,7 @@ def _nearest(streams: Sequence[Conditioned], blocks: Sequence[Block]) -> float |
     return float(lags[np.argmin(cost)])
 
 
-def _lagged(stream: Conditioned, block: Block, lag_s: float) -> Block:
+def _lagged(stream: Conditioned, block: NoiseBlock, lag_s: float) -> NoiseBlock:
     """The block with its torques taken so much later, and their derivative as one more column."""
     step_s = 1.0 / stream.rate_hz
     y, before, after = (
@@ -110,7 +110,9 @@ def _lagged(stream: Conditioned, block: Block, lag_s: float) -> Block:
     )
     slope = (after - before) / (2.0 * step_s)
     used = block.used & _inside(stream, abs(lag_s) + step_s)[:, None]
-    return Block(np.concatenate([block.x, slope[:, :, None]], axis=2), y, used, block.correlation)
+    return NoiseBlock(
+        np.concatenate([block.x, slope[:, :, None]], axis=2), y, used, block.correlation
+    )
 
 
 def _torques(stream: Conditioned, lag_s: float) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 from visioncal.robot import Inertias, Robot, joint_torques, moving
 from visioncal.robot.bodies import Body, arm_bodies
 from visioncal.robot.collision import Collisions
@@ -126,7 +126,7 @@ class Allowed:
             return (f"torques: no greatest torque is stated of {some_of(unknown)}",)
         return ()
 
-    def torques(self, motion: Motion) -> FloatArray | None:
+    def torques(self, motion: JointMotion) -> FloatArray | None:
         """Torques (m, n) of the nominal arm [N m]; None where its inertias are not known."""
         if self.inertias is None:
             return None
@@ -296,7 +296,7 @@ class Kept:
         return tuple(found)
 
 
-def kept_limits(allowed: Allowed, motion: Motion) -> Kept:
+def kept_limits(allowed: Allowed, motion: JointMotion) -> Kept:
     """Looks for the extremes of a motion at all its samples.
 
     Args:

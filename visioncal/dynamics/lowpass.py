@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 
 # Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
 _BETA, _SPAN = 5.65, 1.81
@@ -138,7 +138,7 @@ def window_of(band_hz: float, rate_hz: float, longest: int) -> int:
 
 def smoothed_motion(
     times_s: FloatArray, q: FloatArray, dq: FloatArray | None, window: int
-) -> tuple[Motion, bool]:
+) -> tuple[JointMotion, bool]:
     """Smooths and differentiates evenly sampled angles (Savitzky and Golay 1964).
 
     Accelerations come from reported speeds where that is less noisy.
@@ -162,7 +162,7 @@ def smoothed_motion(
         return np.asarray(savgol_filter(values, window, _ORDER, order, step, axis=0))
 
     smooth, speeds = fitted(q, 0), fitted(q, 1)
-    derived = Motion(times_s, smooth, speeds, fitted(q, 2))
+    derived = JointMotion(times_s, smooth, speeds, fitted(q, 2))
     if dq is None:
         return derived, True
     reported = fitted(dq, 0)
@@ -173,7 +173,7 @@ def smoothed_motion(
     noise = [_noise(q - smooth, window, 2, step), _noise(dq - reported, window, 1, step)]
     if noise[0] <= noise[1]:
         return derived, True
-    return Motion(times_s, smooth, reported, fitted(dq, 1)), True
+    return JointMotion(times_s, smooth, reported, fitted(dq, 1)), True
 
 
 def _noise(residual: FloatArray, window: int, order: int, step: float) -> float:

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 from visioncal.robot import PARAMETER_NAMES, Robot, torque_regressor
 
 # Below this speed a joint may stick, and its friction has no sign of its own [rad/s].
@@ -65,7 +65,7 @@ class FrictionTerms:
             f"{symbol}{joint}" for joint in range(1, joints + 1) for symbol in self.symbols
         )
 
-    def values(self, motion: Motion) -> FloatArray:
+    def values(self, motion: JointMotion) -> FloatArray:
         """Derivatives (m, n, k) of each joint's torque by its own k parameters."""
         parts = {
             "Fc": sign(motion.dq, self.slow_rad_s),
@@ -76,7 +76,7 @@ class FrictionTerms:
         columns = [parts[symbol] for symbol in self.symbols]
         return np.stack(columns, axis=-1) if columns else np.empty((*motion.dq.shape, 0))
 
-    def columns(self, motion: Motion) -> FloatArray:
+    def columns(self, motion: JointMotion) -> FloatArray:
         """Derivatives (m, n, k n) of the joints' torques by `names`: zero for other joints'."""
         own = self.values(motion)
         count, joints, kinds = own.shape
@@ -146,7 +146,7 @@ class DynamicModel:
         links = tuple(name.format(joint) for joint in joints for name in PARAMETER_NAMES)
         return links + self.terms.names(self.robot.joint_count)
 
-    def regressor(self, motion: Motion, columns: IntArray | None = None) -> FloatArray:
+    def regressor(self, motion: JointMotion, columns: IntArray | None = None) -> FloatArray:
         """Derivatives of the torques by the parameters.
 
         Args:

@@ -6,7 +6,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class JointMotion:
     """Where n joints were at m times, and how they moved.
 
     Attributes:
@@ -24,9 +24,9 @@ class Motion:
     def __len__(self) -> int:
         return len(self.times_s)
 
-    def chosen(self, rows: slice | IntArray | Mask) -> "Motion":
+    def chosen(self, rows: slice | IntArray | Mask) -> "JointMotion":
         """Some of the samples."""
-        return Motion(self.times_s[rows], self.q[rows], self.dq[rows], self.ddq[rows])
+        return JointMotion(self.times_s[rows], self.q[rows], self.dq[rows], self.ddq[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Measured:
         torques_nm: (m, n) of its joints [N m].
     """
 
-    motion: Motion
+    motion: JointMotion
     torques_nm: FloatArray
 
     def __len__(self) -> int:

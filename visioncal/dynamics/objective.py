@@ -9,7 +9,7 @@ from visioncal.dynamics.base import BaseModel, smooth_condition
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import Allowed
 from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 
 # Samples for each of the highest harmonic's periods: torques hold products of few of them. Limits
 # and distances are looked at more often.
@@ -105,7 +105,7 @@ class Objective:
             for joint in range(joints):
                 values[1 + kind * joints + joint, :, joint] += _STEP
         times = np.tile(self._times, 3 * joints + 1)
-        motion = Motion(times, *(array.reshape(-1, joints) for array in stepped))
+        motion = JointMotion(times, *(array.reshape(-1, joints) for array in stepped))
         rows = self._base.regressor(motion).reshape(3 * joints + 1, count, joints, -1)
         return rows[0], (rows[1:] - rows[0]) / _STEP
 

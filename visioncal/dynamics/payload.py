@@ -21,8 +21,8 @@ from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import FrictionTerms
-from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.regression import Block, Regression, regress, rms_of
+from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of
 from visioncal.robot import Inertias, body_regressor, entries
 
 # A mass that is known no better than to this share of itself is none [-].
@@ -165,16 +165,16 @@ def estimate_payload(
     return found
 
 
-def _block(identified: Identified, terms: FrictionTerms, stream: Conditioned) -> Block:
+def _block(identified: Identified, terms: FrictionTerms, stream: Conditioned) -> NoiseBlock:
     """What the drives gave beyond what the arm alone takes, and its derivatives."""
     robot = identified.robot
 
-    def columns(motion: Motion) -> FloatArray:
+    def columns(motion: JointMotion) -> FloatArray:
         body = body_regressor(robot, motion.q, motion.dq, motion.ddq)
         return np.concatenate([body, terms.columns(motion)], axis=2)
 
     more = stream.torques_nm - stream.filtered(identified.torques)
-    return Block(stream.filtered(columns), more, stream.used, stream.correlation)
+    return NoiseBlock(stream.filtered(columns), more, stream.used, stream.correlation)
 
 
 def _of_arm(identified: Identified, loaded: Sequence[Conditioned], fit: Regression) -> FloatArray:
@@ -251,7 +251,7 @@ def drive_gains(
     """
     robot = base.model.robot
 
-    def load(motion: Motion) -> FloatArray:
+    def load(motion: JointMotion) -> FloatArray:
         return np.asarray(body_regressor(robot, motion.q, motion.dq, motion.ddq) @ body)
 
     streams = (*empty, *loaded)

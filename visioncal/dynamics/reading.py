@@ -22,7 +22,7 @@ _HOW = (
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RecordedSamples:
     """The samples of a stream in which all that counts is filled.
 
     Attributes:
@@ -44,11 +44,11 @@ class Recorded:
     def __len__(self) -> int:
         return len(self.times_s)
 
-    def part(self, begin: float, end: float) -> "Recorded":
+    def part(self, begin: float, end: float) -> "RecordedSamples":
         """The samples between two shares of the whole, 0 to 1."""
         return self.among(slice(round(begin * len(self)), round(end * len(self))))
 
-    def among(self, rows: slice | Mask) -> "Recorded":
+    def among(self, rows: slice | Mask) -> "RecordedSamples":
         """Some of the samples."""
         return replace(
             self,
@@ -61,7 +61,7 @@ class Recorded:
 
 def read_recorded(
     stream: Stream, label: str, count: int, gains_nm_a: Sequence[float] = ()
-) -> Recorded:
+) -> RecordedSamples:
     """Takes out of a stream what identification needs.
 
     Args:
@@ -107,7 +107,7 @@ def read_recorded(
     if usual_s > _SLOWEST_S:
         raise too_far_apart(label, usual_s, _SLOWEST_S)
     q, torques, dq = (values[:, at * count : (at + 1) * count] for at in range(3))
-    return Recorded(label, times_s, q, dq if with_dq else None, gains * torques, of_currents)
+    return RecordedSamples(label, times_s, q, dq if with_dq else None, gains * torques, of_currents)
 
 
 def _names(kind: str, count: int) -> list[str]:

@@ -28,7 +28,7 @@ _LEAST_POWER = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class NoiseBlock:
     """Samples whose joints have each one level of noise.
 
     Attributes:
@@ -54,7 +54,7 @@ class Block:
         joints = range(self.y.shape[1])
         return np.stack([self.x[:, joint] @ values for joint in joints], axis=1)
 
-    def within(self, values: FloatArray, sigma: FloatArray) -> "Block":
+    def within(self, values: FloatArray, sigma: FloatArray) -> "NoiseBlock":
         """The same without torques that are farther from a fit than chance takes them."""
         count = max(int(self.used.sum()), 1)
         limit = float(np.sqrt(chi2_limit(_OUTLIER_CHANCE / count, 1.0)))
@@ -76,7 +76,7 @@ class Regression:
     values: FloatArray
     covariance: FloatArray
     sigmas: tuple[FloatArray, ...]
-    blocks: tuple[Block, ...]
+    blocks: tuple[NoiseBlock, ...]
 
     @property
     def residuals(self) -> tuple[FloatArray, ...]:
@@ -104,7 +104,7 @@ class _Joint:
         return float(left @ left)
 
 
-def regress(blocks: Sequence[Block]) -> Regression:
+def regress(blocks: Sequence[NoiseBlock]) -> Regression:
     """Fits parameters, the joints' noise, and finds outliers.
 
     Raises:
@@ -138,7 +138,7 @@ def spread_of(values: FloatArray, used: Mask) -> FloatArray:
 
 
 def _weighted(
-    blocks: Sequence[Block],
+    blocks: Sequence[NoiseBlock],
 ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray]:
     """Parameters, noise of the joints by block, and a root (p, p) of the white covariance."""
     # Each joint's rows are decomposed once; changing weights costs triangles alone.
@@ -160,7 +160,7 @@ def _weighted(
     return values, tuple(sigmas), root
 
 
-def _decomposed(block: Block) -> list[_Joint]:
+def _decomposed(block: NoiseBlock) -> list[_Joint]:
     """The triangles of a block's joints, chunk by chunk (Golub and Van Loan 2013, 5.3.5)."""
     found = []
     for joint in range(block.y.shape[1]):

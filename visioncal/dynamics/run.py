@@ -14,7 +14,7 @@ from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.identified import Identified, Lag
 from visioncal.dynamics.identify import Identification, Options, identify
 from visioncal.dynamics.lag import find_lag
-from visioncal.dynamics.reading import Recorded, read_recorded
+from visioncal.dynamics.reading import RecordedSamples, read_recorded
 from visioncal.dynamics.validate import Prediction, friction_of_known, predict, validate
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
@@ -28,7 +28,7 @@ _ROTORS = 0.75
 
 
 @dataclass(frozen=True)
-class Request:
+class IdentificationRequest:
     """What is asked for.
 
     Attributes:
@@ -87,7 +87,7 @@ class Run:
 
 
 @on_one_blas_thread
-def identify_session(session: Session, request: Request | None = None) -> Run:
+def identify_session(session: Session, request: IdentificationRequest | None = None) -> Run:
     """Identifies the dynamics of a session's arm.
 
     Args:
@@ -98,7 +98,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
         DataError: The session has no robot or no such stream, or a stream is wrong.
         DegenerateError: The motion does not determine all base parameters.
     """
-    request = Request() if request is None else request
+    request = IdentificationRequest() if request is None else request
     session = of_one_arm(session, request.robot)
     robot = robot_of(session)
     names = [
@@ -147,7 +147,7 @@ def identify_session(session: Session, request: Request | None = None) -> Run:
 
 
 def validate_session(
-    session: Session, identified: Identified, request: Request
+    session: Session, identified: Identified, request: IdentificationRequest
 ) -> list[Prediction]:
     """Predicts the torques of a session's streams by dynamics that were identified before.
 
@@ -161,7 +161,7 @@ def validate_session(
 
 @on_one_blas_thread
 def conditioned_streams(
-    session: Session, identified: Identified, request: Request
+    session: Session, identified: Identified, request: IdentificationRequest
 ) -> list[Conditioned]:
     """Reads a session's streams, filtered as those from which an arm was identified.
 
@@ -199,7 +199,7 @@ def current_streams(
     Raises:
         DataError: There is no stream of currents, or one is wrong.
     """
-    request = Request(cutoff_hz=cutoff_hz, gains_nm_a=(1.0,) * robot.joint_count)
+    request = IdentificationRequest(cutoff_hz=cutoff_hz, gains_nm_a=(1.0,) * robot.joint_count)
     recorded = [_read(session, robot, stream, request) for stream in _torque_streams(session)]
     recorded = [item for item in recorded if item.of_currents]
     if not recorded:
@@ -265,19 +265,23 @@ def _torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
     return found
 
 
-def _read(session: Session, robot: Robot, name: str, request: Request) -> Recorded:
+def _read(
+    session: Session, robot: Robot, name: str, request: IdentificationRequest
+) -> RecordedSamples:
     (name,) = _torque_streams(session, [name])
     label = f"{STREAMS}/{name}.csv"
     return read_recorded(session.streams[name], label, robot.joint_count, request.gains_nm_a)
 
 
-def _conditioned(robot: Robot, recorded: Recorded, request: Request) -> Conditioned:
+def _conditioned(
+    robot: Robot, recorded: RecordedSamples, request: IdentificationRequest
+) -> Conditioned:
     found = condition(recorded, request.cutoff_hz, robot.torque_nm)
     return found.advanced(request.lag_s) if request.lag_s else found
 
 
 def _lagging(
-    robot: Robot, streams: list[Conditioned], request: Request
+    robot: Robot, streams: list[Conditioned], request: IdentificationRequest
 ) -> tuple[list[Conditioned], Lag | None]:
     """The streams with their torques at the angles' times, and by how much they were later."""
     lag = None
@@ -287,7 +291,10 @@ def _lagging(
 
 
 def _split(
-    robot: Robot, recorded: Sequence[Recorded], streams: Sequence[Conditioned], request: Request
+    robot: Robot,
+    recorded: Sequence[RecordedSamples],
+    streams: Sequence[Conditioned],
+    request: IdentificationRequest,
 ) -> _Split | None:
     """Leaves the end of the fastest motion out; None where the rest determines too little."""
     # Sweeps move one joint after the other: no part of them stands for the others.
@@ -305,7 +312,7 @@ def _split(
     return split
 
 
-def _with_rotors(robot: Robot, split: _Split | None, request: Request) -> Options:
+def _with_rotors(robot: Robot, split: _Split | None, request: IdentificationRequest) -> Options:
     """The options with rotors, where these are asked for, or predict by far better."""
     options, rotors = request.options, request.rotors
     if rotors is None and split is not None:

@@ -15,8 +15,8 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import sign
-from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.regression import Block, Regression, regress
+from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.regression import NoiseBlock, Regression, regress
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step, gram
 
@@ -48,18 +48,18 @@ class Stribeck:
         """No joint has one."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), 0.0)
 
-    def shapes(self, motion: Motion) -> FloatArray:
+    def shapes(self, motion: JointMotion) -> FloatArray:
         """(m, a) torques of a hump of 1 N m."""
         dq = motion.dq[:, self.joints]
         return np.asarray(sign(dq, self.slow_rad_s) * np.exp(-((dq / self.speed_rad_s) ** 2)))
 
-    def torques(self, motion: Motion) -> FloatArray:
+    def torques(self, motion: JointMotion) -> FloatArray:
         """(m, n) what the humps add to the joints' friction [N m]."""
         torques = np.zeros_like(motion.dq)
         torques[:, self.joints] = self.hump_nm * self.shapes(motion)
         return torques
 
-    def jacobian(self, motion: Motion) -> FloatArray:
+    def jacobian(self, motion: JointMotion) -> FloatArray:
         """(m, 2 a) derivatives by the hump, and by the logarithm of its speed."""
         shapes = self.shapes(motion)
         squares = (motion.dq[:, self.joints] / self.speed_rad_s) ** 2
@@ -68,7 +68,7 @@ class Stribeck:
 
 def fit_stribeck(
     streams: Sequence[Conditioned],
-    blocks: Sequence[Block],
+    blocks: Sequence[NoiseBlock],
     plain: Regression,
     slow_rad_s: float,
     sliding: IntArray,
@@ -101,7 +101,7 @@ def fit_stribeck(
 
 
 def _polished(
-    streams: Sequence[Conditioned], blocks: Sequence[Block], found: Stribeck
+    streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock], found: Stribeck
 ) -> tuple[Stribeck, Regression]:
     """Descends again under the noise that is left with humps, until that stays the same."""
     fit = regress(_with_humps(streams, blocks, found))
@@ -125,7 +125,7 @@ def _shown(found: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> FloatArr
     return np.asarray((np.abs(found.hump_nm) > limit * sigma) & inside & resists)
 
 
-def _descended(whole: "_Weighted", start: Stribeck) -> "_Look":
+def _descended(whole: "_Weighted", start: Stribeck) -> "_HumpFit":
     """The humps that a descent from some speeds finds."""
 
     def linearise(logs: FloatArray) -> Linearised[FloatArray]:
@@ -142,7 +142,7 @@ def _descended(whole: "_Weighted", start: Stribeck) -> "_Look":
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _HumpFit:
     """Humps of given speeds at their best.
 
     Attributes:
@@ -172,7 +172,7 @@ class _Weighted:
     """
 
     streams: Sequence[Conditioned]
-    blocks: tuple[Block, ...]
+    blocks: tuple[NoiseBlock, ...]
     weights: tuple[FloatArray, ...]
     information: FloatArray
     right: FloatArray
@@ -180,7 +180,10 @@ class _Weighted:
 
     @classmethod
     def of(
-        cls, streams: Sequence[Conditioned], blocks: Sequence[Block], sigmas: Sequence[FloatArray]
+        cls,
+        streams: Sequence[Conditioned],
+        blocks: Sequence[NoiseBlock],
+        sigmas: Sequence[FloatArray],
     ) -> Self:
         """Weighs blocks by the noise of their joints."""
         weights = tuple(block.used / sigma for block, sigma in zip(blocks, sigmas, strict=True))
@@ -197,7 +200,7 @@ class _Weighted:
             float(sum(np.sum(block.y**2) for block in weighted)),
         )
 
-    def look(self, at: Stribeck) -> _Look:
+    def look(self, at: Stribeck) -> _HumpFit:
         """Solves for all that is linear at given speeds."""
         count, size = len(at.joints), len(self.right)
         a, b = self._normal(replace(at, hump_nm=np.ones(count)))
@@ -206,7 +209,7 @@ class _Weighted:
         best = covariance @ b[linear]
         humps = best[size:]
         cross = humps[:, None] * a[speeds, linear]
-        return _Look(
+        return _HumpFit(
             replace(at, hump_nm=humps),
             self.total - float(best @ b[linear]),
             np.outer(humps, humps) * a[speeds, speeds] - cross @ covariance @ cross.T,
@@ -231,8 +234,8 @@ class _Weighted:
 
 
 def _with_humps(
-    streams: Sequence[Conditioned], blocks: Sequence[Block], humps: Stribeck
-) -> list[Block]:
+    streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock], humps: Stribeck
+) -> list[NoiseBlock]:
     """Blocks with the columns of humps and of their speeds added."""
     count = len(humps.joints)
     added = []

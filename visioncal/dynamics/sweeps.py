@@ -14,7 +14,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.fourier import even_times
 from visioncal.dynamics.limits import Allowed, Kept, kept_limits
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 
 # Ramps last at least, and constant speed is held at least [s].
 _SHORTEST_RAMP_S, _SHORTEST_HOLD_S = 0.15, 0.4
@@ -126,7 +126,7 @@ class Sweeps:
         """(k + 1,) when each stroke begins, and when all is done [s]."""
         return _begins(self.strokes)
 
-    def sampled(self, rate_hz: float) -> Motion:
+    def sampled(self, rate_hz: float) -> JointMotion:
         """The motion from its beginning to its end, evenly sampled."""
         return _sampled(self.home, self.strokes, rate_hz)
 
@@ -253,7 +253,7 @@ def _begins(strokes: tuple[Stroke, ...]) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(lengths)])
 
 
-def _sampled(home: FloatArray, strokes: tuple[Stroke, ...], rate_hz: float) -> Motion:
+def _sampled(home: FloatArray, strokes: tuple[Stroke, ...], rate_hz: float) -> JointMotion:
     begins = _begins(strokes)
     times = even_times(float(begins[-1]), rate_hz)
     q = np.repeat(np.asarray(home)[None], len(times), axis=0)
@@ -264,4 +264,4 @@ def _sampled(home: FloatArray, strokes: tuple[Stroke, ...], rate_hz: float) -> M
         own = slice(rows[place], rows[place + 1] if place + 1 < len(strokes) else None)
         at = stroke.at(times[own] - begins[place])
         q[own, stroke.joint], dq[own, stroke.joint], ddq[own, stroke.joint] = at
-    return Motion(times, q, dq, ddq)
+    return JointMotion(times, q, dq, ddq)

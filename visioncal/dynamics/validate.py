@@ -8,11 +8,11 @@ import numpy as np
 from visioncal.core.errors import DegenerateError
 from visioncal.core.types import FloatArray, Mask
 from visioncal.dynamics.conditioning import Conditioned
-from visioncal.dynamics.identified import Identified, Validation
+from visioncal.dynamics.identified import Identified, TorqueValidation
 from visioncal.dynamics.identify import Identification
 from visioncal.dynamics.model import DynamicModel
-from visioncal.dynamics.motion import Motion
-from visioncal.dynamics.regression import Block, regress, rms_of, spread_of
+from visioncal.dynamics.motion import JointMotion
+from visioncal.dynamics.regression import NoiseBlock, regress, rms_of, spread_of
 from visioncal.robot import joint_torques
 
 
@@ -84,10 +84,10 @@ def predict(
     )
 
 
-def validate(identified: Identified, prediction: Prediction) -> Validation:
+def validate(identified: Identified, prediction: Prediction) -> TorqueValidation:
     """Compares predicted with measured torques."""
     consistent, known = prediction.consistent_nm, prediction.known_nm
-    return Validation(
+    return TorqueValidation(
         prediction.label,
         prediction.rms_nm(prediction.predicted_nm),
         prediction.torque_nm,
@@ -112,21 +112,21 @@ def friction_of_known(identification: Identification) -> FloatArray | None:
     for stream, block in zip(identification.streams, identification.fit.blocks, strict=True):
         links = stream.filtered(partial(_link_torques, model))
         x = stream.filtered(model.terms.columns)
-        blocks.append(Block(x, block.y - links, block.used, block.correlation))
+        blocks.append(NoiseBlock(x, block.y - links, block.used, block.correlation))
     try:
         return regress(blocks).values
     except np.linalg.LinAlgError as error:
         raise DegenerateError("dynamics: the motion does not determine friction.") from error
 
 
-def _link_torques(model: DynamicModel, motion: Motion) -> FloatArray:
+def _link_torques(model: DynamicModel, motion: JointMotion) -> FloatArray:
     robot = model.robot
     if robot.inertias is None:
         return np.zeros_like(motion.q)
     return joint_torques(robot, robot.inertias, motion.q, motion.dq, motion.ddq)
 
 
-def _known_torques(identified: Identified, friction: FloatArray, motion: Motion) -> FloatArray:
+def _known_torques(identified: Identified, friction: FloatArray, motion: JointMotion) -> FloatArray:
     model = identified.base.model
     return np.asarray(_link_torques(model, motion) + model.terms.columns(motion) @ friction)
 
@@ -137,7 +137,7 @@ def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:
     values = np.zeros(len(model.names))
     values[identified.base.independent] = identified.values
     still = np.zeros_like(dq)
-    motion = Motion(np.zeros(len(dq)), still, dq, still)
+    motion = JointMotion(np.zeros(len(dq)), still, dq, still)
     own = model.terms.columns(motion) @ values[10 * model.robot.joint_count :]
     return np.asarray(own + identified.stribeck.torques(motion))
 

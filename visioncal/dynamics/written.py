@@ -15,7 +15,7 @@ from visioncal.dynamics.base import Condition
 from visioncal.dynamics.excitation import Excitation
 from visioncal.dynamics.fourier import Series
 from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.sweeps import REST_S, Stroke, Sweeps
 from visioncal.robot import Robot, has_ur_axes
 
@@ -57,7 +57,7 @@ def motion_files(plan: MotionPlan, rate_hz: float) -> dict[str, str]:
     return found
 
 
-def _motion_table(motion: Motion) -> str:
+def _motion_table(motion: JointMotion) -> str:
     """Writes a motion as a table with the columns of a session's stream."""
     joints = range(1, motion.q.shape[1] + 1)
     columns = [

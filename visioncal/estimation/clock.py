@@ -13,7 +13,7 @@ from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.chain import chain
-from visioncal.estimation.clock_correlation import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, Frames
+from visioncal.estimation.clock_correlation import NEAR_S, WIDEST_OFFSET_S, WINDOW_S, ImageTimes
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
@@ -118,7 +118,7 @@ class _Late:
     times_s: FloatArray
 
     def problem(
-        self, robot: Trajectory, frames: Frames, offset_s: float, state: State
+        self, robot: Trajectory, frames: ImageTimes, offset_s: float, state: State
     ) -> tuple[Problem, FloatArray]:
         """The problem of some frames, with changes of the offset and of the times [s]."""
         # With it, (m, k) half the gradient of each frame's corners by the times, its pose being
@@ -148,7 +148,9 @@ class _Late:
         return problem, weight * seen.shared_pulls
 
 
-def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tuple[ClockFit, ...]:
+def fit_offset(
+    robot: Trajectory, frames: ImageTimes, starts: Sequence[float]
+) -> tuple[ClockFit, ...]:
     """Fits the offset and both edges together, from several starts.
 
     Args:
@@ -178,7 +180,7 @@ def fit_offset(robot: Trajectory, frames: Frames, starts: Sequence[float]) -> tu
 
 
 def fit_delays(
-    robot: Trajectory, frames: Frames, camera: Camera, start: ClockFit, delays: Sequence[Delay]
+    robot: Trajectory, frames: ImageTimes, camera: Camera, start: ClockFit, delays: Sequence[Delay]
 ) -> DelayedFit | None:
     """Fits times within images, the offset and both edges together.
 
@@ -200,7 +202,7 @@ def fit_delays(
         return _fitted(robot, some, start.offset_s, start.fit.state, late)
 
 
-def clock_change(robot: Trajectory, frames: Frames, fit: ClockFit) -> ClockChange | None:
+def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockChange | None:
     """Looks for a step of the offset at any frame, and for a steady drift.
 
     Each frame is asked for the offset at which it is where the fit has it. Means of these over
@@ -246,7 +248,7 @@ def clock_change(robot: Trajectory, frames: Frames, fit: ClockFit) -> ClockChang
 
 
 def refined_change(
-    robot: Trajectory, frames: Frames, fit: ClockFit, stamped: Frames, change: ClockChange
+    robot: Trajectory, frames: ImageTimes, fit: ClockFit, stamped: ImageTimes, change: ClockChange
 ) -> ClockChange:
     """The change with what frames ask for that are corrected by it.
 
@@ -268,7 +270,7 @@ def refined_change(
 
 
 def _asked_offsets(
-    robot: Trajectory, frames: Frames, fit: ClockFit
+    robot: Trajectory, frames: ImageTimes, fit: ClockFit
 ) -> tuple[FloatArray, FloatArray]:
     """(m,) by how much the offset is to change for each frame [s], and the information on it."""
     # What no offset explains has none.
@@ -334,7 +336,7 @@ def _evenly(count: int, most: int) -> IntArray:
 
 
 def _fitted(
-    robot: Trajectory, frames: Frames, offset_s: float, start: State | None, late: _Late
+    robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, late: _Late
 ) -> DelayedFit | None:
     """Fits from one start, and once more without the frames that contradict the others."""
     found = _settled(robot, frames, offset_s, start, late)
@@ -349,7 +351,7 @@ def _fitted(
 
 
 def _settled(
-    robot: Trajectory, frames: Frames, offset_s: float, start: State | None, late: _Late
+    robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, late: _Late
 ) -> DelayedFit | None:
     """Moves times, offset and both edges until they rest; None where too few frames are covered."""
     for _ in range(_ROUNDS):
@@ -375,12 +377,12 @@ def _settled(
     return DelayedFit(clock, late.delays, late.times_s, sigmas_s[1:], freedom)
 
 
-def _covered(robot: Trajectory, frames: Frames, offset_s: float) -> Frames:
+def _covered(robot: Trajectory, frames: ImageTimes, offset_s: float) -> ImageTimes:
     margin_s = 0.5 * robot.speed_window_s
     return frames.only(robot.covers(frames.stamps_s - offset_s, margin_s))
 
 
-def clock_problem(robot: Trajectory, frames: Frames, offset_s: float) -> Problem:
+def clock_problem(robot: Trajectory, frames: ImageTimes, offset_s: float) -> Problem:
     """The problem of some frames at an offset, with the offset's change [s] as an effect."""
     at_s = frames.stamps_s - offset_s
     return chain(

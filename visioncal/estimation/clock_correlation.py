@@ -26,7 +26,7 @@ _FEWEST_PAIRS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class ImageTimes:
     """What a camera saw, by its own clock.
 
     Attributes:
@@ -51,7 +51,7 @@ class Frames:
         """Whether they show the turning itself, and not only where it led from rest to rest."""
         return len(self) > 2 and float(np.median(np.diff(self.stamps_s))) <= WINDOW_S
 
-    def only(self, chosen: Mask | IntArray) -> "Frames":
+    def only(self, chosen: Mask | IntArray) -> "ImageTimes":
         """Returns some of them, in ascending order."""
         known, stack = self.covariance, self.stack
         rows = np.arange(len(self))[chosen]
@@ -81,7 +81,9 @@ class Match:
     at_end: bool = False
 
 
-def turning_matches(robot: Trajectory, frames: Frames, about_s: float = 0.0) -> tuple[Match, ...]:
+def turning_matches(
+    robot: Trajectory, frames: ImageTimes, about_s: float = 0.0
+) -> tuple[Match, ...]:
     """Finds the offsets at which camera and robot turn alike, the best first.
 
     Angles are compared between each frame and the first one some time behind it, by their
@@ -137,7 +139,9 @@ class _Turning:
     per_window: float
 
     @classmethod
-    def of(cls, robot: Trajectory, frames: Frames, first: IntArray, second: IntArray) -> "_Turning":
+    def of(
+        cls, robot: Trajectory, frames: ImageTimes, first: IntArray, second: IntArray
+    ) -> "_Turning":
         """Compares some frames with others behind them."""
         seen = frames.cam_from_target
         begin_s, end_s = robot.stamps_s[[0, -1]]
@@ -200,7 +204,7 @@ def _steps(stamps_s: FloatArray) -> IntArray:
     return np.asarray(steps[steps < places[-1]])
 
 
-def _common_s(robot: Trajectory, frames: Frames) -> float:
+def _common_s(robot: Trajectory, frames: ImageTimes) -> float:
     """How much time the streams have in common, as stamped [s]."""
     start = max(robot.stamps_s[0], frames.stamps_s[0])
     return max(float(min(robot.stamps_s[-1], frames.stamps_s[-1]) - start), 0.0)

@@ -73,7 +73,7 @@ def agreeing_groups(
     fit, doubtful = everything, np.zeros(count, dtype=bool)
     if everything.freedom > 1:
         first = _core(problem, count) if start is None else fit_groups(problem, *start)
-        fit = settled(_Search(problem), first.used, first, fewest=1, suspect=0.0)[1]
+        fit = settled(_GroupSearch(problem), first.used, first, fewest=1, suspect=0.0)[1]
         if fit.used.sum() < max(_LEAST_SHARE * count, 1) or fit.freedom < 1:
             fit = everything
         doubtful = _doubtful(fit)
@@ -88,7 +88,7 @@ def agreeing_groups(
 
 
 @dataclass(frozen=True, eq=False)
-class _Search(Generic[State]):
+class _GroupSearch(Generic[State]):
     """The search among the groups of a problem."""
 
     problem: GroupProblem[State]
@@ -139,7 +139,7 @@ def _core(problem: GroupProblem[State], count: int) -> GroupFit[State]:
 
     mask, state = trimmed_start(problem.guesses(), away, solve, half_of(count))
     fit = fit_groups(problem, mask, state)
-    return widened(_Search(problem), mask, fit, np.ones(count, dtype=bool))[1]
+    return widened(_GroupSearch(problem), mask, fit, np.ones(count, dtype=bool))[1]
 
 
 def _doubtful(fit: GroupFit[State]) -> Mask:

@@ -73,7 +73,7 @@ class Side(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class ConvergedFit:
     """The fit at rest: the linearisation, the problem of all frames, and what came out."""
 
     seen: LinearisedCorners
@@ -125,7 +125,7 @@ def settle(
     moving: IntArray,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None = None,
-) -> Fitted:
+) -> ConvergedFit:
     """Linearises and fits in turn, until the values stay where they are.
 
     Args:
@@ -153,13 +153,13 @@ def settle(
 
 
 def again(
-    fitted: Fitted, side: Side, moving: IntArray, looks: CameraParameters | None = None
-) -> Fitted:
+    fitted: ConvergedFit, side: Side, moving: IntArray, looks: CameraParameters | None = None
+) -> ConvergedFit:
     """Settles once more from an answer, with other values free, or by other priors."""
     return settle(looks or fitted.looks, side, moving, fitted.frames, fitted.others)
 
 
-def _settled(side: Side, fitted: Fitted) -> Fitted:
+def _settled(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     for _ in range(_ROUNDS):
         sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
         if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
@@ -174,7 +174,7 @@ def _settled(side: Side, fitted: Fitted) -> Fitted:
     return fitted
 
 
-def _stepped(fitted: Fitted) -> LinearisedCorners:
+def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     """Linearises where the fit came to rest, or on the way there as far as the corners follow."""
     # Far from the answer, as where a lens was stated for images of another size, the whole step
     # leads to lenses that see nothing.
@@ -190,13 +190,13 @@ def _stepped(fitted: Fitted) -> LinearisedCorners:
 
 def _fitted(
     side: Side, seen: LinearisedCorners, frames: Mapping[str, FloatArray], others: FloatArray | None
-) -> Fitted:
+) -> ConvergedFit:
     problem = side.problem(seen)
     start = problem.start(frames)
     if others is not None:
         first = len(start.values) - len(others)
         start = State(start.edges, np.concatenate([start.values[:first], others]))
-    return Fitted(seen, problem, fit_problem(problem, start, side.noise))
+    return ConvergedFit(seen, problem, fit_problem(problem, start, side.noise))
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(side: Side, fitted: Fitted, board: int = 0) -> MeasuredScale:
+def measured_scale(side: Side, fitted: ConvergedFit, board: int = 0) -> MeasuredScale:
     """Measures a board's size by the robots' motion; its sigma is infinite where that cannot."""
     looks = fitted.seen.looks
     (place,) = looks.scale_of(board)
@@ -248,7 +248,7 @@ def measured_scale(side: Side, fitted: Fitted, board: int = 0) -> MeasuredScale:
     )
 
 
-def measured_rig(side: Side, fitted: Fitted, frame: str, rig: int) -> MeasuredScale:
+def measured_rig(side: Side, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
     """Measures the size of a rig of points by the robots' motion; its table is taken for exact.
 
     A larger rig farther away looks the same: its views alone say nothing of that.
@@ -269,7 +269,7 @@ def measured_rig(side: Side, fitted: Fitted, frame: str, rig: int) -> MeasuredSc
 
 
 def rig_by_stated_arms(
-    fitted: Fitted, stated: Problem, frame: str, rig: int
+    fitted: ConvergedFit, stated: Problem, frame: str, rig: int
 ) -> MeasuredScale | None:
     """Measures the size of a rig by arms as they are stated; see `measured_rig`.
 
@@ -314,7 +314,7 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
     return Effect.free("sizes of targets", known, by_size)
 
 
-def moved_mahalanobis_sq(fitted: Fitted, places: IntArray) -> float:
+def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
     """Squared distance of some values from the stated ones, in units of their covariance.
 
     Args:
@@ -326,7 +326,7 @@ def moved_mahalanobis_sq(fitted: Fitted, places: IntArray) -> float:
     return float(away @ np.linalg.solve(fitted.covariance()[np.ix_(at, at)], away))
 
 
-def contradicted_lens(fitted: Fitted, camera: str) -> bool:
+def contradicted_lens(fitted: ConvergedFit, camera: str) -> bool:
     """Whether given intrinsics are farther off than what they are known to explains."""
     looks = fitted.looks
     away = (looks.values - looks.stated)[looks.lenses[camera]]
@@ -362,7 +362,7 @@ class Scores:
     places: IntArray
 
     @classmethod
-    def of(cls, side: Side, fitted: Fitted, asked: IntArray) -> "Scores":
+    def of(cls, side: Side, fitted: ConvergedFit, asked: IntArray) -> "Scores":
         """The scores of some values, at a fit."""
         seen = fitted.seen.freed(np.union1d(fitted.moving, asked))
         problem, there = _at(side, fitted, seen)
@@ -386,7 +386,7 @@ class Scores:
         return -covariance[at] @ self.gradient, covariance[np.ix_(at, at)]
 
 
-def _at(side: Side, fitted: Fitted, seen: LinearisedCorners) -> tuple[Problem, State]:
+def _at(side: Side, fitted: ConvergedFit, seen: LinearisedCorners) -> tuple[Problem, State]:
     """The problem with other values free, and a fit's state in it."""
     values = fitted.fit.state.values[len(fitted.seen.free) :]
     values = np.concatenate([fitted.looks.values[seen.free], values])

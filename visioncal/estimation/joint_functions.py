@@ -123,13 +123,13 @@ def find_joint_functions(
         The functions with all other errors of the arm; None where these explain about as much.
     """
     nominal, place = robot_likelihood(problem, state, noise), problem.robots.index(robot)
-    plain = _Arm.of(nominal, place, bases, _Waves.of(harmonics), torque_nm)
+    plain = _ArmLikelihood.of(nominal, place, bases, _Waves.of(harmonics), torque_nm)
     without = plain.most_likely(plain.start())
     if without is None:
         return None
     chosen, best, worse = None, without, 0
     for length in _LENGTHS_RAD:
-        arm = _Arm.of(nominal, place, bases, _Waves.of(harmonics, length), torque_nm)
+        arm = _ArmLikelihood.of(nominal, place, bases, _Waves.of(harmonics, length), torque_nm)
         # Of what seems not to gain enough, the rest of the way does not matter.
         found = arm.most_likely(
             np.append(best.logs[: len(without.logs)], np.log(_START_RAD)),
@@ -146,7 +146,7 @@ def find_joint_functions(
     # Springs that would yield against their load are none.
     while (against := chosen.springs_of(best) < 0.0).any():
         bases = {**bases, COMPLIANCE: bases[COMPLIANCE] * ~against}
-        stiffer = _Arm.of(nominal, place, bases, chosen.waves, torque_nm)
+        stiffer = _ArmLikelihood.of(nominal, place, bases, chosen.waves, torque_nm)
         found = stiffer.most_likely(best.logs)
         if found is None:
             break
@@ -194,7 +194,7 @@ class _Waves:
 
 
 @dataclass(frozen=True, eq=False)
-class _Arm:
+class _ArmLikelihood:
     """An arm with groups of errors whose sizes are sought.
 
     Attributes:
@@ -229,7 +229,7 @@ class _Arm:
         bases: Mapping[str, FloatArray],
         waves: _Waves,
         torque_nm: float,
-    ) -> "_Arm":
+    ) -> "_ArmLikelihood":
         basis = np.concatenate([*bases.values(), waves.columns], axis=2)
         size, mine = basis.shape[2], (nominal.members == robot).any(axis=1)
         own = np.concatenate([nominal.jacobian[mine], nominal.moved(robot, basis)], axis=2)
@@ -251,7 +251,7 @@ class _Arm:
         """The places of the arm's errors among the unknowns."""
         return slice(self.others.shape[2], None)
 
-    def springs_of(self, step: "_Step") -> FloatArray:
+    def springs_of(self, step: "_SizesAt") -> FloatArray:
         """(n,) the compliances at some step; none without any."""
         at = 0
         for name, base in self.bases.items():
@@ -272,7 +272,7 @@ class _Arm:
         factor = {COMPLIANCE: self.torque_nm / _TORQUE_NM}
         return np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.names])
 
-    def most_likely(self, start: FloatArray, enough: float = np.inf) -> "_Step | None":
+    def most_likely(self, start: FloatArray, enough: float = np.inf) -> "_SizesAt | None":
         """Finds the most likely levels and sizes; None where there are none to start from."""
         low, high = (np.full(len(start), np.log(value)) for value in (LEAST_SIGMA, MOST_SIGMA))
         try:
@@ -280,7 +280,7 @@ class _Arm:
         except LinAlgError:
             return None
 
-    def _likelihood(self, logs: FloatArray) -> "_Step":
+    def _likelihood(self, logs: FloatArray) -> "_SizesAt":
         components, known, mine = self.nominal.components, self.known, self.mine
         residuals, levels, plain = self.nominal.reduced.errors, len(components.parts), self.others
         count = plain.shape[2]
@@ -341,9 +341,9 @@ class _Arm:
             value, slope = value + 0.5 * float(offset**2), slope + offset * lean
             curvature = curvature + np.outer(lean, lean)
         # Residuals fall as errors that are left out of the prediction grow.
-        return _Step(value, slope, curvature, logs, -effects)
+        return _SizesAt(value, slope, curvature, logs, -effects)
 
-    def found(self, step: "_Step", gain: float) -> JointFunctions:
+    def found(self, step: "_SizesAt", gain: float) -> JointFunctions:
         """The errors of all blocks with the sizes at some step."""
         sizes = np.exp(step.logs[-len(self.names) :])
         variances, sigma = self.shares @ sizes**2, float(sizes[-1])
@@ -377,7 +377,7 @@ class _Arm:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step(Likely):
+class _SizesAt(Likely):
     """What is found at some logarithms of levels and sizes; its curvature is average information.
 
     Attributes:

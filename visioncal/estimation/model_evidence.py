@@ -75,7 +75,7 @@ class Cause:
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
+class CauseEvidence:
     """What the stops say under one cause.
 
     Attributes:
@@ -95,7 +95,7 @@ class Explained:
     freedom: int
 
 
-def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Explained:
+def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> CauseEvidence:
     """Says how well a cause explains what was observed at some stops.
 
     Args:
@@ -116,7 +116,7 @@ def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Exp
     # The change's size is left to the stops: what is known of it beforehand would shrink it.
     mean, covariance = _posterior(stops, widest_m * units)
     pulled = float(np.sum((mean / (widest_m * units)) ** 2))
-    return Explained(
+    return CauseEvidence(
         float(np.logaddexp.reduce(scores) - np.log(len(scores))),
         mean,
         covariance,
@@ -127,7 +127,7 @@ def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Exp
 
 
 @dataclass(frozen=True, eq=False)
-class _Stops:
+class _StopResiduals:
     """The residuals (n,) of all stops as they are linear in a cause's unknowns around some values.
 
     `residuals` are those at zero, by that linearisation; `jacobian` (n, p), `covariance` (n, n) of
@@ -150,7 +150,7 @@ def _nothing(problem: Problem) -> Cause:
 
 def _rested(
     problem: Problem, belief: Belief, cause: Cause, sigmas: FloatArray, factor: float
-) -> _Stops:
+) -> _StopResiduals:
     """Linearises at a cause's most likely values, which linearising finds."""
     stops = _at(problem, belief, cause, cause.start, factor)
     for _ in range(_ROUNDS if len(sigmas) else 0):
@@ -164,7 +164,7 @@ def _rested(
 
 def _at(
     problem: Problem, belief: Belief, cause: Cause, values: FloatArray, factor: float
-) -> _Stops:
+) -> _StopResiduals:
     """Linearises at some values (p,) of a cause."""
     without, known = undone(problem, cause, values), len(belief.covariance)
     linear = without.linear(with_change(belief.state, cause))
@@ -173,7 +173,7 @@ def _at(
     before, own = jacobian[:, :known], jacobian[:, known:]
     covariance = _spread(without, linear, noise) + before @ belief.covariance @ before.T
     covariance += _LEAST_SIGMA**2 * np.eye(len(covariance))
-    return _Stops(values, linear.residuals.reshape(-1) - own @ values, own, covariance)
+    return _StopResiduals(values, linear.residuals.reshape(-1) - own @ values, own, covariance)
 
 
 def _spread(problem: Problem, linear: Linear, noise: Noise) -> FloatArray:
@@ -224,22 +224,24 @@ def with_change(state: State, cause: Cause) -> State:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class _LinearisedMotions:
     """Motions (m, 4, 4) by some values, and how they go on with them: (m, 6, p), on the right."""
 
     moved: FloatArray
     jacobian: FloatArray
 
 
-def _stepped(jacobian: FloatArray, values: FloatArray) -> _Step:
+def _stepped(jacobian: FloatArray, values: FloatArray) -> _LinearisedMotions:
     twists = jacobian @ values
     # Beyond, the series does not converge; no cause that leads there explains anything.
     near = np.linalg.norm(twists[:, :3], axis=1) < np.pi
     onward = inverse_right_jacobian(np.where(near[:, None], twists, 0.0))
-    return _Step(exp(twists), np.asarray(np.linalg.solve(onward, jacobian), dtype=float))
+    return _LinearisedMotions(
+        exp(twists), np.asarray(np.linalg.solve(onward, jacobian), dtype=float)
+    )
 
 
-def _score(stops: _Stops, sigmas: FloatArray, freedom: float) -> float:
+def _score(stops: _StopResiduals, sigmas: FloatArray, freedom: float) -> float:
     """Logarithm of the marginal likelihood, up to what all causes have in common."""
     squares, log_det = _misfit(stops, sigmas)
     if np.isinf(freedom):
@@ -248,21 +250,21 @@ def _score(stops: _Stops, sigmas: FloatArray, freedom: float) -> float:
     return -0.5 * (log_det + (freedom + count) * float(np.log1p(squares / freedom)))
 
 
-def _misfit(stops: _Stops, sigmas: FloatArray) -> tuple[float, float]:
+def _misfit(stops: _StopResiduals, sigmas: FloatArray) -> tuple[float, float]:
     """Squared length of the residuals in units of their covariance, and its log-determinant."""
     root, lower = _root(stops, sigmas)
     squares = float(stops.residuals @ cho_solve((root, lower), stops.residuals))
     return squares, 2.0 * float(np.log(np.diag(root)).sum())
 
 
-def _posterior(stops: _Stops, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _posterior(stops: _StopResiduals, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (p,) and covariance (p, p) of a cause's values, given the residuals."""
     carried = stops.jacobian * sigmas**2
     taken = cho_solve(_root(stops, sigmas), carried)
     return -taken.T @ stops.residuals, np.diag(sigmas**2) - carried.T @ taken
 
 
-def _root(stops: _Stops, sigmas: FloatArray) -> tuple[FloatArray, bool]:
+def _root(stops: _StopResiduals, sigmas: FloatArray) -> tuple[FloatArray, bool]:
     """Cholesky's root of the residuals' covariance, for a cause of some size."""
     total = stops.covariance + (stops.jacobian * sigmas**2) @ stops.jacobian.T
     root, lower = cho_factor(total, lower=True)

@@ -237,7 +237,7 @@ def gross_move(
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class _MoveCandidate:
     """A step of a frame, from a stop on, and how many more observations it explains."""
 
     gain: int
@@ -246,9 +246,11 @@ class _Step:
     change: FloatArray
 
 
-def _steps(problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]) -> list[_Step]:
+def _steps(
+    problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
+) -> list[_MoveCandidate]:
     """The steps that explain enough, those that explain most first."""
-    found: list[_Step] = []
+    found: list[_MoveCandidate] = []
     for frame in movable:
         rows = np.flatnonzero(problem.observations.involves(frame))
         if np.sum(~agrees[rows]) >= _FEWEST:
@@ -279,13 +281,13 @@ def _followed(
     return (steps[0].gain, steps[0].frame) if steps else (0, "")
 
 
-def _move(problem: Problem, step: _Step) -> Move:
+def _move(problem: Problem, step: _MoveCandidate) -> Move:
     return Move(step.frame, _twin_name(problem, step.frame), step.stop, step.change)
 
 
 def _best_steps(
     problem: Problem, fit: Solution, agrees: Mask, frame: str, rows: IntArray
-) -> list[_Step]:
+) -> list[_MoveCandidate]:
     """The step of a frame that explains most, and the best that is another one."""
     part = problem.subset(np.isin(np.arange(len(problem)), rows))
     order = np.argsort(part.observations.stops, kind="stable")
@@ -315,7 +317,7 @@ def _best_steps(
             pulls = np.einsum("nij,nj->i", weights, apart[at, after])
             mean = np.linalg.solve(weights.sum(axis=0), pulls)
             change = asked[some[at]] @ exp(mean)
-            found.append(_Step(gain, frame, int(stops[begin]), change))
+            found.append(_MoveCandidate(gain, frame, int(stops[begin]), change))
         left &= ~alike[at][some]
         left[at] = False
     return found
@@ -370,7 +372,7 @@ def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move
     if best is None:
         return None
     frame, stop, step, square = best
-    found = _move(problem, _Step(0, frame, stop, exp(step)))
+    found = _move(problem, _MoveCandidate(0, frame, stop, exp(step)))
     return replace(found, mahalanobis_sq=square)
 
 

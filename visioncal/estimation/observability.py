@@ -118,7 +118,7 @@ def refuse_open_motion(problem: Problem, state: State, noise: Noise, mount: Moun
 
 
 @dataclass(frozen=True)
-class Scene:
+class CellWords:
     """How messages speak of a cell.
 
     Attributes:
@@ -141,7 +141,7 @@ def check_determined(
     problem: Problem,
     state: State,
     noise: Noise,
-    scene: Scene,
+    scene: CellWords,
     pixel_px: Mapping[str, float] = MappingProxyType({}),
     *,
     looks: bool = False,
@@ -195,7 +195,7 @@ def _at_typical_noise(
     return typical, Noise(robots, np.minimum(noise.sensors, 1.0))
 
 
-def _refuse_null(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
+def _refuse_null(problem: Problem, state: State, noise: Noise, scene: CellWords) -> None:
     """Refuses frames that are not determined at all."""
     counted = problem.counted
     found = spectrum(fisher_information(problem, state, noise)[np.ix_(counted, counted)])
@@ -211,7 +211,7 @@ def _refuse_null(problem: Problem, state: State, noise: Noise, scene: Scene) -> 
         )
 
 
-def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: Scene) -> None:
+def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: CellWords) -> None:
     """Refuses frames whose predicted sigmas are over the limit."""
     covariance = covariance_among(fisher_information(problem, state, noise), problem.counted)
     beyond = [
@@ -241,7 +241,7 @@ def _frame_directions(
     return found[:1] if frame in problem.points else found
 
 
-def _scene(problem: Problem, mount: Mount) -> Scene:
+def _scene(problem: Problem, mount: Mount) -> CellWords:
     """How messages speak of one camera and one robot."""
     stops = np.unique(problem.observations.stops)
     flange = problem.poses[problem.robots[0]][stops]
@@ -258,7 +258,7 @@ def _scene(problem: Problem, mount: Mount) -> Scene:
             return f"Add views of {names[frame][0][4:]}, or take it out of the session."
         return f"{_or_measured(mount, open_part)}{_advice(mount)}"
 
-    return Scene(title(mount), names, motion, advice, _UNDETERMINED[_sensor(mount)])
+    return CellWords(title(mount), names, motion, advice, _UNDETERMINED[_sensor(mount)])
 
 
 def directions(
@@ -334,7 +334,7 @@ def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
 
 
 def _null_direction(
-    null: FloatArray, problem: Problem, state: State, scene: Scene
+    null: FloatArray, problem: Problem, state: State, scene: CellWords
 ) -> tuple[str, str]:
     """The first frame that (p, k) null directions leave open, and what of it."""
     for frame, at in problem.unknown.items():

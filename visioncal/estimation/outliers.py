@@ -100,7 +100,7 @@ class Agreed:
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _ObservationSearch:
     """The search among the observations of a problem."""
 
     problem: Problem
@@ -161,7 +161,7 @@ def agree(problem: Problem, state: State | None = None, movable: Sequence[str] =
     moves: list[Move] = []
     used, fit = _widened(problem, used, fit)
     while len(moves) < _MOST_MOVES:
-        beyond = _Search(problem).distances(used, fit).beyond
+        beyond = _ObservationSearch(problem).distances(used, fit).beyond
         move = gross_move(problem, fit, beyond < 1.0, movable)
         if move is None:
             break
@@ -282,7 +282,7 @@ def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Sol
 
     starts = _starts(part, state)
     mask, start = trimmed_start(starts, lambda item: _away(part, item), solve, half_of(len(rows)))
-    search, mask = _Search(part), _of_pairs(part, mask, start)
+    search, mask = _ObservationSearch(part), _of_pairs(part, mask, start)
     every = np.ones(len(rows), dtype=bool)
     mask, fit = widened(search, mask, search.fit_from(mask, start), every)
     used = among.copy()
@@ -339,12 +339,12 @@ def _fitted(problem: Problem, state: State | None, used: Mask) -> tuple[Mask, So
 
 
 def _widened(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
-    search = _Search(problem)
+    search = _ObservationSearch(problem)
     return widened(search, used, search.fit(used, fit))
 
 
 def _settled(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
-    return settled(_Search(problem), used, fit, LEAST_VIEWS, _SUSPECT_SHARE)
+    return settled(_ObservationSearch(problem), used, fit, LEAST_VIEWS, _SUSPECT_SHARE)
 
 
 def _agreed(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> Agreed:

@@ -19,7 +19,7 @@ from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.parts import Noise
 from visioncal.estimation.placing import TOUCH_NOISE_M, counted_noise_m
-from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
+from visioncal.estimation.touching import Touches, TouchProblem, TouchUnknowns, in_tool
 from visioncal.estimation.turning import CARELESS_M, check_counts, check_turning
 
 # A touch that errs fits another point by chance in one of a thousand.
@@ -41,7 +41,7 @@ class PivotFit:
         worst: The directions that are known worst: the tip's, then the rotation's if measured.
     """
 
-    agreement: GroupInliers[Placed]
+    agreement: GroupInliers[TouchUnknowns]
     oriented: bool
     covariance: FloatArray
     points_covariance: FloatArray
@@ -127,7 +127,7 @@ def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
     return _result(problem, found, worst)
 
 
-def _check_doubt(problem: TouchProblem, found: GroupInliers[Placed]) -> None:
+def _check_doubt(problem: TouchProblem, found: GroupInliers[TouchUnknowns]) -> None:
     """Refuses touches that contradict each other grossly where it is unknown which is wrong."""
     if not found.doubtful.any() or found.fit.sigma < CARELESS_M:
         return
@@ -148,7 +148,7 @@ def _check_doubt(problem: TouchProblem, found: GroupInliers[Placed]) -> None:
     )
 
 
-def _check_sides(touches: Touches, found: GroupInliers[Placed]) -> None:
+def _check_sides(touches: Touches, found: GroupInliers[TouchUnknowns]) -> None:
     seen = in_tool(touches, found.fit.state)
     for kind, along in (("z", seen[:, 2]), ("xz", seen[:, 0])):
         these = found.agrees & np.array([name == kind for name in touches.kinds])
@@ -166,7 +166,7 @@ def _check_sides(touches: Touches, found: GroupInliers[Placed]) -> None:
 
 
 def _result(
-    problem: TouchProblem, found: GroupInliers[Placed], worst: tuple[Direction, ...]
+    problem: TouchProblem, found: GroupInliers[TouchUnknowns], worst: tuple[Direction, ...]
 ) -> PivotFit:
     fit, edge = found.fit, 6 if problem.oriented else 3
     covariance = np.zeros((6, 6))
@@ -178,7 +178,7 @@ def _result(
     return PivotFit(found, problem.oriented, covariance, blocks[at, :, at, :], belongs, worst)
 
 
-def _belonging(problem: TouchProblem, found: GroupInliers[Placed]) -> tuple[int | None, ...]:
+def _belonging(problem: TouchProblem, found: GroupInliers[TouchUnknowns]) -> tuple[int | None, ...]:
     """The other point that each disagreeing touch fits, as the touches beyond doubt have it."""
     suspects = ~found.agrees | found.doubtful
     fit = found.fit
@@ -197,7 +197,9 @@ def _belonging(problem: TouchProblem, found: GroupInliers[Placed]) -> tuple[int 
     return tuple(belongs)
 
 
-def _mahalanobis_sq_at(problem: TouchProblem, fit: GroupFit[Placed], at: int, point: int) -> float:
+def _mahalanobis_sq_at(
+    problem: TouchProblem, fit: GroupFit[TouchUnknowns], at: int, point: int
+) -> float:
     """Squared distance of one touch from where it had been if of a point, over its limit."""
     if not np.any(fit.used & (problem.touches.points == point)):
         return float("inf")

@@ -58,7 +58,7 @@ class Scale:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class FixturePlacement:
     """Where the drawing lies: (4, 4) `base_from_fixture`, behind a scale of the drawing."""
 
     base_from_fixture: FloatArray
@@ -80,7 +80,7 @@ class PointFit:
         worst: The worst known offset, amid the points, and the worst known rotation.
     """
 
-    agreement: GroupInliers[Placed]
+    agreement: GroupInliers[FixturePlacement]
     scale: Scale
     numbering: Numbering
     hand_known: bool
@@ -109,18 +109,18 @@ class PointProblem:
     pairs: PointPairs
     scaled: bool
 
-    def guesses(self) -> Iterator[Placed]:
+    def guesses(self) -> Iterator[FixturePlacement]:
         """Gives closed forms from all points, and from small sets."""
         yield self._closed_form(np.arange(len(self.pairs)))
         for rows in small_sets(len(self.pairs), FEWEST_POINTS):
             yield self._closed_form(rows)
 
-    def _closed_form(self, rows: IntArray) -> Placed:
+    def _closed_form(self, rows: IntArray) -> FixturePlacement:
         measured, nominal = self.pairs.measured[rows], self.pairs.nominal[rows]
         scale = scale_between(measured, nominal) if self.scaled else 1.0
-        return Placed(align(measured, scale * nominal), scale)
+        return FixturePlacement(align(measured, scale * nominal), scale)
 
-    def linearise(self, state: Placed) -> Groups:
+    def linearise(self, state: FixturePlacement) -> Groups:
         """Residuals (n, 3) in the base, and their derivatives by the perturbation and the scale.
 
         `R (s p + w x s p + v) + t`, so that a step (w, v) moves the residual by `R (sp x w) - R v`,
@@ -137,10 +137,10 @@ class PointProblem:
             self.pairs.known,
         )
 
-    def move(self, state: Placed, step: FloatArray) -> Placed:
+    def move(self, state: FixturePlacement, step: FloatArray) -> FixturePlacement:
         """Takes a (6,) or (7,) step on the right."""
         scale = state.scale + float(step[6]) if self.scaled else 1.0
-        return Placed(state.base_from_fixture @ exp(step[:6]), scale)
+        return FixturePlacement(state.base_from_fixture @ exp(step[:6]), scale)
 
 
 def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> PointFit:
@@ -189,7 +189,7 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
 
 def _agreeing(
     pairs: PointPairs, expected_noise_m: float | None
-) -> tuple[GroupInliers[Placed], Scale]:
+) -> tuple[GroupInliers[FixturePlacement], Scale]:
     """Finds the points that agree, without accusing those that only a scale sets apart."""
     rigid = agreeing_groups(PointProblem(pairs, scaled=False), expected_noise_m)
     if not _sound(rigid).all():
@@ -201,18 +201,20 @@ def _agreeing(
     return rigid, _scale_of(fit_groups(PointProblem(pairs, scaled=True), rigid.agrees))
 
 
-def _sound(agreement: GroupInliers[Placed]) -> Mask:
+def _sound(agreement: GroupInliers[FixturePlacement]) -> Mask:
     return agreement.agrees & ~agreement.doubtful
 
 
-def _as_scaled(scaled: GroupInliers[Placed], fit: GroupFit[Placed]) -> GroupInliers[Placed]:
+def _as_scaled(
+    scaled: GroupInliers[FixturePlacement], fit: GroupFit[FixturePlacement]
+) -> GroupInliers[FixturePlacement]:
     """What agrees behind a scale, with the fit that has none: noise does not explain that one."""
     return GroupInliers(
         fit, fit.used, scaled.mahalanobis_sq, scaled.limit, scaled.doubtful, explained=False
     )
 
 
-def _scale_of(fit: GroupFit[Placed]) -> Scale:
+def _scale_of(fit: GroupFit[FixturePlacement]) -> Scale:
     value, sigma = fit.state.scale, float(np.sqrt(fit.covariance[6, 6]))
     chance = t_chance((value - 1.0) / sigma, max(fit.freedom, 1))
     # Points through their middle are no drawing of another size: exchanged names fit like that.
@@ -237,7 +239,7 @@ def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[
     )
 
 
-def _no_fit(pairs: PointPairs, fit: GroupFit[Placed], scale: Scale) -> DataError:
+def _no_fit(pairs: PointPairs, fit: GroupFit[FixturePlacement], scale: Scale) -> DataError:
     """The points contradict the drawing by so much that no frame follows, whatever their places."""
     off = np.linalg.norm(fit.groups.residuals, axis=1)
     rms_mm, worst = 1e3 * np.sqrt(np.mean(off**2)), int(np.argmax(off))
@@ -253,7 +255,7 @@ def _no_fit(pairs: PointPairs, fit: GroupFit[Placed], scale: Scale) -> DataError
     )
 
 
-def _cause(pairs: PointPairs, fit: GroupFit[Placed]) -> str:
+def _cause(pairs: PointPairs, fit: GroupFit[FixturePlacement]) -> str:
     noise = float(np.hypot(fit.sigma, pairs.known_noise_m))
     for points, whose in ((pairs.nominal, "drawn"), (pairs.measured, "measured")):
         extents = spreads(points[fit.used])[0]

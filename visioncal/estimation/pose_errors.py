@@ -288,7 +288,7 @@ def _columns(
 
 
 @dataclass(frozen=True, eq=False)
-class _Block:
+class _StopBlock:
     """Stops whose errors are weighed together.
 
     Attributes:
@@ -315,7 +315,7 @@ class _Block:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class _LikelihoodAt:
     """The negative log-likelihood at logarithms of sizes, its slope and average information."""
 
     logs: FloatArray
@@ -334,7 +334,7 @@ class _Likelihood:
         gradient: (p,) of that.
     """
 
-    blocks: tuple[_Block, ...]
+    blocks: tuple[_StopBlock, ...]
     information: FloatArray
     gradient: FloatArray
 
@@ -372,7 +372,7 @@ class _Likelihood:
             own = np.zeros((len(rows), width, len(rows), width))
             own[np.arange(len(rows)), :, np.arange(len(rows))] = known[rows]
             blocks.append(
-                _Block(
+                _StopBlock(
                     np.searchsorted(stood, stops[rows]),
                     errors[rows].ravel(),
                     jacobian[rows].reshape(-1, jacobian.shape[2]),
@@ -411,7 +411,7 @@ class _Likelihood:
         processes = tuple(replace(process, size=size) for process, size in pairs)
         return replace(model, processes=processes, white=found[:2], value=now.value)
 
-    def _step(self, common: Sequence[FloatArray], logs: FloatArray) -> _Step | None:
+    def _step(self, common: Sequence[FloatArray], logs: FloatArray) -> _LikelihoodAt | None:
         """The likelihood there; None where levels are too far apart for it."""
         squares, count = np.exp(2.0 * logs), len(logs)
         information, gradient = self.information.copy(), self.gradient.copy()
@@ -452,7 +452,7 @@ class _Likelihood:
         lean = np.zeros(count)
         lean[:2] = np.array([-1.0, 1.0]) / RATIO_PRIOR.log_sigma
         offset = float(lean @ logs - np.log(RATIO_PRIOR.ratio) / RATIO_PRIOR.log_sigma)
-        return _Step(
+        return _LikelihoodAt(
             logs,
             0.5 * (value + offset**2),
             slope + offset * lean,

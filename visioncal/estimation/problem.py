@@ -25,7 +25,7 @@ from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, inve
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect, FramePrior, Noise, Observations, State
-from visioncal.estimation.tree import Step, Stride, Tree, Ways
+from visioncal.estimation.tree import PathStep, Stride, Tree, TreePaths
 from visioncal.estimation.variance import Knowledge
 
 # A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
@@ -39,7 +39,7 @@ class _Group:
     """The observations of one pair of frames, and the path between them."""
 
     rows: IntArray
-    path: tuple[Step, ...]
+    path: tuple[PathStep, ...]
 
 
 # Places of the c values that move a group, by (m, 6, c) how they move what was measured, and how
@@ -48,7 +48,7 @@ _MovedGroup: TypeAlias = tuple[IntArray, FloatArray, tuple[FloatArray | None, ..
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class JacobianBlock:
     """The Jacobian (m, 6, c) of m rows by the c columns that may move them: all others are zero."""
 
     rows: IntArray
@@ -71,7 +71,7 @@ class Linear:
     """
 
     residuals: FloatArray
-    blocks: tuple[Block, ...]
+    blocks: tuple[JacobianBlock, ...]
     by_errors: FloatArray
     by_flanges: FloatArray
     size: int
@@ -131,8 +131,8 @@ class Problem:
     is_combined: bool = False
     # The last of `linear`, ideal or not: a fit, its noise and its tests ask for the same one.
     _last: dict[bool, tuple[State, Linear]] = field(default_factory=dict, init=False, repr=False)
-    _last_moved: list[tuple[State, tuple[FloatArray, FloatArray, tuple[Block, ...]]]] = field(
-        default_factory=list, init=False, repr=False
+    _last_moved: list[tuple[State, tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]]] = (
+        field(default_factory=list, init=False, repr=False)
     )
 
     def __len__(self) -> int:
@@ -427,7 +427,7 @@ class Problem:
             cost += float(away @ away)
         return cost
 
-    def _edge(self, step: Step, state: State, rows: IntArray) -> FloatArray:
+    def _edge(self, step: PathStep, state: State, rows: IntArray) -> FloatArray:
         """(4, 4) or (m, 4, 4) `parent_from_frame` of a step at some observations."""
         if step.robot:
             poses = self.poses[step.robot][self.observations.stops[rows]]
@@ -438,7 +438,7 @@ class Problem:
         known = self.tree.branches[step.frame].known
         return state.edges[self.unknown[step.frame]] if known is None else known
 
-    def product(self, path: tuple[Step, ...], state: State, rows: IntArray) -> FloatArray:
+    def product(self, path: tuple[PathStep, ...], state: State, rows: IntArray) -> FloatArray:
         """(m, 4, 4) the product of some steps' edges at some observations."""
         product = np.broadcast_to(np.eye(4), (len(rows), 4, 4))
         for step in path:
@@ -478,7 +478,7 @@ class Problem:
         return before[1]
 
     @cached_property
-    def _ways(self) -> tuple[Ways, ...]:
+    def _ways(self) -> tuple[TreePaths, ...]:
         """The observations' ways through the tree, those of one kind together."""
         alike: dict[tuple[tuple[bool, ...], ...], list[int]] = {}
         for at, group in enumerate(self.groups):
@@ -489,7 +489,7 @@ class Problem:
             alike.setdefault(tuple(kind), []).append(at)
         return tuple(self._ways_of(mine) for mine in alike.values())
 
-    def _ways_of(self, mine: list[int]) -> Ways:
+    def _ways_of(self, mine: list[int]) -> TreePaths:
         """The ways of some groups whose steps are of the same kinds."""
         groups, (of, members) = [self.groups[index] for index in mine], self.units
         ends = np.cumsum([0, *(len(group.rows) for group in groups)]).tolist()
@@ -522,7 +522,7 @@ class Problem:
                 )
             )
         places = tuple((at, slice(*pair)) for at, pair in zip(mine, pairwise(ends), strict=True))
-        return Ways(rows, places, tuple(strides))
+        return TreePaths(rows, places, tuple(strides))
 
     @cached_property
     def _moved_groups(self) -> tuple[_MovedGroup, ...]:
@@ -541,7 +541,7 @@ class Problem:
             found.append((values, by_sensor[:, :, values], steps))
         return tuple(found)
 
-    def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[Block, ...]]:
+    def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]:
         """How the predicted poses move, on their right.
 
         Returns:
@@ -552,7 +552,7 @@ class Problem:
             return self._last_moved[0][1]
         change, width = state.values - self.start_values, self.units[1].shape[1]
         back, errors = np.empty((len(self), 4, 4)), np.zeros((len(self), 6, width, 6))
-        blocks: dict[int, Block] = {}
+        blocks: dict[int, JacobianBlock] = {}
         for ways in self._ways:
             inverse, moved = ways.moved(state.edges, change)
             back[ways.rows] = inverse
@@ -570,7 +570,7 @@ class Problem:
                 edges = [
                     6 * ways.strides[index].edges[place.start] + np.arange(6) for index in unknown
                 ]
-                blocks[at] = Block(
+                blocks[at] = JacobianBlock(
                     ways.rows[place],
                     np.concatenate([*edges, 6 * len(self.unknown) + values]),
                     np.concatenate([*(moved[index][place] for index in unknown), effects], axis=2),

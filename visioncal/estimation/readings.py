@@ -14,7 +14,7 @@ _MUCH_BETTER, _CLOSED_M = 20.0, 2e-3
 
 
 @dataclass(frozen=True)
-class Reading:
+class PoseReading:
     """Another way to read the poses, by which the touches close.
 
     Attributes:
@@ -31,7 +31,7 @@ class Reading:
     options: str = ""
 
 
-def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
+def readings_that_close(touches: Touches) -> tuple[PoseReading, ...]:
     """Finds other ways to read the poses by which the touches close, where as read they do not.
 
     Touches of one point close in both directions alike, with the tip and the point exchanged; of
@@ -59,7 +59,7 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
         options |= {inverse: "--robot-inverse"}
         options |= {f"{first} and {inverse}": f"{options[first]} --robot-inverse"}
     found = [
-        Reading(
+        PoseReading(
             words,
             _linear_rms(replace(there, base_from_flange=other)),
             as_read,
@@ -70,7 +70,7 @@ def readings_that_close(touches: Touches) -> tuple[Reading, ...]:
     if len(np.unique(touches.points)) == 1:
         back = replace(touches, base_from_flange=invert(touches.base_from_flange))
         sizes = (_axes_rms(back), _axes_rms(touches))
-        found.append(Reading(inverse, *sizes, "--robot-inverse"))
+        found.append(PoseReading(inverse, *sizes, "--robot-inverse"))
     closing = [
         reading
         for reading in found

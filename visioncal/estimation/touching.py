@@ -70,7 +70,7 @@ class Touches:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class TouchUnknowns:
     """The unknowns: the tool on the flange (4, 4), and the points (k, 3) in the base [m]."""
 
     flange_from_tool: FloatArray
@@ -94,13 +94,13 @@ class TouchProblem:
     noise: Noise
     oriented: bool
 
-    def guesses(self) -> Iterator[Placed]:
+    def guesses(self) -> Iterator[TouchUnknowns]:
         """Gives starts from all touches of kind `point`, and from small sets of them."""
         there = np.flatnonzero(self.touches.are("point"))
         yield self.guess(there)
         yield from (self.guess(rows) for rows in _small_sets(self.touches, there))
 
-    def guess(self, rows: IntArray) -> Placed:
+    def guess(self, rows: IntArray) -> TouchUnknowns:
         """Starts with the tip that some touches of kind `point` determine."""
         touches = self.touches
         base_from_flange = touches.base_from_flange
@@ -113,10 +113,10 @@ class TouchProblem:
                 for index in range(len(touches.names))
             ]
         )
-        state = Placed(compose(np.eye(3), tip), points)
+        state = TouchUnknowns(compose(np.eye(3), tip), points)
         return self.turned(state) if self.oriented else state
 
-    def turned(self, state: Placed) -> Placed:
+    def turned(self, state: TouchUnknowns) -> TouchUnknowns:
         """Turns the tool to where the touches of kind `z` and `xz` have its axes."""
         touches, tip = self.touches, state.flange_from_tool[:3, 3]
         away = _in_flange(touches, state.points) - tip
@@ -126,7 +126,7 @@ class TouchProblem:
         axes = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=1)
         return replace(state, flange_from_tool=compose(nearest_rotation(axes), tip))
 
-    def linearise(self, state: Placed) -> Groups:
+    def linearise(self, state: TouchUnknowns) -> Groups:
         """Gives the coordinates of each touched point in the tool that should be zero.
 
         They are taken as zero in the derivatives, where noise would pass for information about the
@@ -152,11 +152,11 @@ class TouchProblem:
             self._known(rotation, _in_flange(touches, state.points)),
         )
 
-    def move(self, state: Placed, step: FloatArray) -> Placed:
+    def move(self, state: TouchUnknowns, step: FloatArray) -> TouchUnknowns:
         """Takes a step from a state."""
         edge = 6 if self.oriented else 3
         twist = np.concatenate([np.zeros(6 - edge), step[:edge]])
-        return Placed(
+        return TouchUnknowns(
             state.flange_from_tool @ exp(twist), state.points + step[edge:].reshape(-1, 3)
         )
 
@@ -168,7 +168,7 @@ class TouchProblem:
         return np.asarray((shift_sq + LEAST_NOISE_M**2) * np.eye(3) + turned)
 
 
-def in_tool(touches: Touches, state: Placed) -> FloatArray:
+def in_tool(touches: Touches, state: TouchUnknowns) -> FloatArray:
     """Where each touch has its point in the tool's frame: (n, 3) [m]."""
     away = _in_flange(touches, state.points) - state.flange_from_tool[:3, 3]
     return np.asarray(away @ state.flange_from_tool[:3, :3])

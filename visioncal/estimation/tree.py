@@ -35,7 +35,7 @@ class Branch:
 
 
 @dataclass(frozen=True)
-class Step:
+class PathStep:
     """One edge of a way through the tree.
 
     Attributes:
@@ -114,15 +114,15 @@ class Tree:
             name for name in self.above(frame) if name == self.root or self.branches[name].robot
         )
 
-    def path(self, start: str, end: str) -> tuple[Step, ...]:
+    def path(self, start: str, end: str) -> tuple[PathStep, ...]:
         """The edges whose product is `start_from_end`, first to last."""
         up, down = list(self.above(start)), list(self.above(end))
         while up and down and up[-1] == down[-1]:
             up.pop()
             down.pop()
         return (
-            *(Step(name, self.branches[name].robot, True) for name in up),
-            *(Step(name, self.branches[name].robot, False) for name in reversed(down)),
+            *(PathStep(name, self.branches[name].robot, True) for name in up),
+            *(PathStep(name, self.branches[name].robot, False) for name in reversed(down)),
         )
 
 
@@ -157,7 +157,7 @@ class Stride:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class TreePaths:
     """Ways of m observations that are made of the same kinds of steps.
 
     Attributes:

@@ -17,7 +17,7 @@ from visioncal.estimation.observability import (
 )
 from visioncal.estimation.placing import LEAST_NOISE_M
 from visioncal.estimation.readings import readings_that_close
-from visioncal.estimation.touching import Placed, Touches, TouchProblem, in_tool
+from visioncal.estimation.touching import Touches, TouchProblem, TouchUnknowns, in_tool
 
 # Under this scaled eigenvalue ratio the touches do not determine a direction at all.
 _NULL_RATIO = 1e-8
@@ -72,7 +72,7 @@ def check_counts(touches: Touches) -> None:
         )
 
 
-def check_turning(problem: TouchProblem, fit: GroupFit[Placed]) -> tuple[Direction, ...]:
+def check_turning(problem: TouchProblem, fit: GroupFit[TouchUnknowns]) -> tuple[Direction, ...]:
     """Refuses touches that leave a direction open; otherwise returns the worst ones.
 
     Touches that disagree wildly are no fault of the motion: it is judged by a noise of at most the
@@ -104,7 +104,9 @@ def check_turning(problem: TouchProblem, fit: GroupFit[Placed]) -> tuple[Directi
     )
 
 
-def _worst(problem: TouchProblem, fit: GroupFit[Placed], level: float) -> tuple[Direction, ...]:
+def _worst(
+    problem: TouchProblem, fit: GroupFit[TouchUnknowns], level: float
+) -> tuple[Direction, ...]:
     covariance = covariance_from(fit.groups.subset(fit.used).information(level))
     first = 3 if problem.oriented else 0
     to_flange = fit.state.flange_from_tool[:3, :3]
@@ -124,7 +126,9 @@ def _direction(words: str, variance: float, limit: float, *, is_rotation: bool) 
     return Direction(words, float(np.sqrt(variance)), limit, is_rotation)
 
 
-def _cause(problem: TouchProblem, fit: GroupFit[Placed], culprit: Direction) -> tuple[str, str]:
+def _cause(
+    problem: TouchProblem, fit: GroupFit[TouchUnknowns], culprit: Direction
+) -> tuple[str, str]:
     """Why a direction is undetermined, and what to do about it."""
     used = problem.touches.subset(fit.used)
     careful = [
@@ -146,7 +150,7 @@ def _cause(problem: TouchProblem, fit: GroupFit[Placed], culprit: Direction) -> 
     return _motion(used), _ADVICE
 
 
-def _levers(used: Touches, fit: GroupFit[Placed]) -> tuple[str, str]:
+def _levers(used: Touches, fit: GroupFit[TouchUnknowns]) -> tuple[str, str]:
     """Says how far from the tip the touches of the axes have their points."""
     seen = np.abs(in_tool(used, fit.state))
     along = 1e3 * seen[used.are("z"), 2].max()

@@ -113,7 +113,7 @@ class Eye:
             raise DataError(f"locate: sigma_px is {sigma!r}; a standard deviation is needed.")
         return float(sigma)
 
-    def at(self, base_from_flange: Pose | None) -> "Stop":
+    def at(self, base_from_flange: Pose | None) -> "ChainStop":
         """The chain while the flange stands somewhere.
 
         Args:
@@ -125,7 +125,7 @@ class Eye:
                 transform in metres.
         """
         if self.mount == "eye-to-hand":
-            return Stop(self.edge, np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 0)))
+            return ChainStop(self.edge, np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 0)))
         if base_from_flange is None:
             raise DataError(
                 "locate: the camera is on the flange (eye-in-hand), and the robot's pose at the "
@@ -137,7 +137,7 @@ class Eye:
             base_from_flange = base_from_flange.as_matrix()
         base_from_flange = np.asarray(base_from_flange, dtype=float)
         checked_pose(base_from_flange, "base_from_flange")
-        return Stop(
+        return ChainStop(
             base_from_flange @ self.edge,
             adjoint(invert(self.edge)),
             self.flange_noise,
@@ -161,7 +161,7 @@ class Eye:
 
 
 @dataclass(frozen=True, eq=False)
-class Stop:
+class ChainStop:
     """The chain while the flange stands at one place.
 
     Attributes:

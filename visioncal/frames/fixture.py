@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.features import (
     FEATURE_KINDS,
     FeatureFit,
@@ -20,7 +20,7 @@ from visioncal.estimation.features import (
 )
 from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame
+from visioncal.frames.fixture_fit import FixtureFit, Setting, fixture_frame
 from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.measured import MeasuredPoints, Tool, touched_points
 from visioncal.frames.touches import TouchRows, robot_noise
@@ -132,10 +132,10 @@ def _featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: S
     )
 
 
-def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitted[FloatArray]:
+def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> FixtureFit[FloatArray]:
     matrix, amid = fit.base_from_fixture, measured.points[fit.agreement.agrees].mean(axis=0)
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
-    return Fitted(
+    return FixtureFit(
         measured,
         measured.labels,
         tuple(f"Touch {label}" for label in measured.labels),
@@ -149,7 +149,7 @@ def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fitt
 
 
 def _unchecked(
-    fitted: Fitted[FloatArray], kinds: Sequence[str], setting: Setting
+    fitted: FixtureFit[FloatArray], kinds: Sequence[str], setting: Setting
 ) -> Iterator[Finding]:
     once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
     assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
@@ -157,7 +157,7 @@ def _unchecked(
         yield Finding(
             "unchecked",
             f"Three touches leave nothing to check the fixture with.{assumed}",
-            Step("Touch each feature once more, elsewhere."),
+            Remedy("Touch each feature once more, elsewhere."),
         )
     elif once:
         verb = "was" if len(once) == 1 else "were"
@@ -165,7 +165,7 @@ def _unchecked(
             "unchecked",
             f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks."
             f"{assumed}",
-            Step("Touch again, elsewhere."),
+            Remedy("Touch again, elsewhere."),
         )
 
 

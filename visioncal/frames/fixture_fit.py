@@ -72,7 +72,7 @@ class Setting:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted(Generic[State]):
+class FixtureFit(Generic[State]):
     """A fixture's fit to n points, whatever is known of them.
 
     Attributes:
@@ -130,7 +130,7 @@ class Fitted(Generic[State]):
 
 
 def fixture_frame(
-    fitted: Fitted[State],
+    fitted: FixtureFit[State],
     kinds: Sequence[str],
     method: str,
     more: Sequence[Finding],
@@ -175,7 +175,7 @@ def fixture_frame(
     )
 
 
-def _observations(fitted: Fitted[State], kinds: Sequence[str]) -> tuple[Observation, ...]:
+def _observations(fitted: FixtureFit[State], kinds: Sequence[str]) -> tuple[Observation, ...]:
     off_m = fitted.agreement.off_m.tolist()
     rows = zip(fitted.labels, fitted.agrees.tolist(), fitted.reasons, kinds, off_m, strict=True)
     return tuple(
@@ -184,7 +184,7 @@ def _observations(fitted: Fitted[State], kinds: Sequence[str]) -> tuple[Observat
     )
 
 
-def _doubts(fitted: Fitted[State], setting: Setting) -> list[Finding]:
+def _doubts(fitted: FixtureFit[State], setting: Setting) -> list[Finding]:
     names = [
         placed_name(name, place)
         for name, place in zip(fitted.names, fitted.measured.places, strict=True)

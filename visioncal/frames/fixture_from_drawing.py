@@ -7,12 +7,12 @@ import numpy as np
 
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.placing import assumed_words, counted_noise_m
-from visioncal.estimation.pointfit import Placed, PointFit, fit_points
+from visioncal.estimation.pointfit import FixturePlacement, PointFit, fit_points
 from visioncal.estimation.pointpairs import PointPairs
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import Fitted, Setting, fixture_frame
+from visioncal.frames.fixture_fit import FixtureFit, Setting, fixture_frame
 from visioncal.frames.measured import MeasuredPoints
 from visioncal.results import Frame
 
@@ -57,10 +57,10 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Set
 
 def _fitted(
     fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting: Setting
-) -> Fitted[Placed]:
+) -> FixtureFit[FixturePlacement]:
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
     noise = np.hypot(noise_m, pairs.nominal_sigma_m)
-    return Fitted(
+    return FixtureFit(
         measured,
         _labels(measured, pairs),
         tuple(f"Point {label}" for label in pairs.labels),
@@ -94,7 +94,7 @@ def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
 
 
 def _doubts(
-    fit: PointFit, fitted: Fitted[Placed], pairs: PointPairs, setting: Setting
+    fit: PointFit, fitted: FixtureFit[FixturePlacement], pairs: PointPairs, setting: Setting
 ) -> Iterator[Finding]:
     yield from _scaled(fit, pairs)
     if not fit.hand_known:
@@ -104,7 +104,7 @@ def _doubts(
             "symmetric",
             f"The pattern of the points is symmetric: they fit the drawing in "
             f"{fit.numbering.equally_good} orders alike, and exchanged names would not be noticed.",
-            Step(
+            Remedy(
                 f"Check that {pairs.labels[0]} is where the drawing has it, or measure one more "
                 "point that breaks the symmetry."
             ),
@@ -143,7 +143,9 @@ def _scaled(fit: PointFit, pairs: PointPairs) -> Iterator[Finding]:
     )
 
 
-def _mirrored(fitted: Fitted[Placed], pairs: PointPairs, seen_from: str) -> Iterator[Finding]:
+def _mirrored(
+    fitted: FixtureFit[FixturePlacement], pairs: PointPairs, seen_from: str
+) -> Iterator[Finding]:
     """Doubts points in a plane, unless the side of the touches determines their handedness."""
     drawn = pairs.nominal[fitted.agrees]
     normal = np.linalg.svd(drawn - drawn.mean(axis=0))[2][2]
@@ -156,14 +158,16 @@ def _mirrored(fitted: Fitted[Placed], pairs: PointPairs, seen_from: str) -> Iter
             "mirrored",
             "The points lie in one plane, and the fixture's z axis points away from the side that "
             f"{seen_from}: a mirrored drawing looks like this.",
-            Step("Check that z of the drawing points into the part."),
+            Remedy("Check that z of the drawing points into the part."),
         )
         return
     yield Finding(
         "mirrored",
         "The points lie in one plane, and a mirrored drawing would fit them as well, turned to the "
         "other side.",
-        Step("Check to which side the fixture's axes point, or measure a point beside the plane."),
+        Remedy(
+            "Check to which side the fixture's axes point, or measure a point beside the plane."
+        ),
     )
 
 

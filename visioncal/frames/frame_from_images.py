@@ -51,7 +51,7 @@ _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class _PlacedTarget:
     """A target's place, with what it was made from.
 
     Attributes:
@@ -118,7 +118,7 @@ def seen_frame(
     sights = [sight for sight, view in zip(shown.sights, shown.views, strict=True) if view in views]
     seen = place_looks(eye, sights, looks, parent).at(point)
     worst = worst_of(seen.matrix, seen.covariance, kind, parent)
-    placed = _Placed(kind, shown, seen, worst, views, lost)
+    placed = _PlacedTarget(kind, shown, seen, worst, views, lost)
     _check_still(eye, placed, sights, looks)
     doubts = [
         *(
@@ -158,7 +158,7 @@ def _looks(eye: Eye, shown: Sighting) -> tuple[tuple[View, ...], list[SeenTarget
 
 
 def _check_still(
-    eye: Eye, placed: _Placed, sights: Sequence[Sight], looks: Sequence[SeenTarget]
+    eye: Eye, placed: _PlacedTarget, sights: Sequence[Sight], looks: Sequence[SeenTarget]
 ) -> None:
     """Refuses a target that moves where it should stand still, and stands still elsewhere."""
     other: FrameKind = "fixture" if placed.kind == "tool" else "tool"
@@ -205,7 +205,7 @@ def camera_details(calibration: Calibration) -> dict[str, Any]:
     return {SEEN_BY: calibration.created, "note": _COUNTED_TWICE}
 
 
-def _method(placed: _Placed, point: FloatArray) -> str:
+def _method(placed: _PlacedTarget, point: FloatArray) -> str:
     count, target = int(placed.seen.agrees.sum()), placed.shown.target
     words = {
         "charuco": "ChArUco board",
@@ -228,7 +228,7 @@ def _noise_mm(seen: TargetPose) -> float:
     return float(1e3 * np.sqrt(np.trace(seen.independent[3:, 3:]) / 3))
 
 
-def _observations(session: Session, placed: _Placed) -> Iterator[Observation]:
+def _observations(session: Session, placed: _PlacedTarget) -> Iterator[Observation]:
     places = {view.number: at for at, view in enumerate(placed.views)}
     for number in (view.number for view in session.views):
         if number not in places:
@@ -241,7 +241,7 @@ def _observations(session: Session, placed: _Placed) -> Iterator[Observation]:
         yield Observation(str(number), agrees, reason, residual_mm=away_mm)
 
 
-def _praise(placed: _Placed) -> str:
+def _praise(placed: _PlacedTarget) -> str:
     seen, worst = placed.seen, placed.worst[0]
     return (
         f"{int(seen.agrees.sum())} images agree to {figure(seen.rms_mm)} mm and "
@@ -250,7 +250,7 @@ def _praise(placed: _Placed) -> str:
     )
 
 
-def _details(placed: _Placed, point: FloatArray, calibration: Calibration) -> dict[str, Any]:
+def _details(placed: _PlacedTarget, point: FloatArray, calibration: Calibration) -> dict[str, Any]:
     seen = placed.seen
     own = {"point_target_mm": (1e3 * point).tolist()} if point.any() else {}
     return {

@@ -15,7 +15,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from, squared_lengths
 from visioncal.estimation.robust import Distances, settled
-from visioncal.frames.single_view import Place
+from visioncal.frames.single_view import TargetPlace
 
 # A sound image is lost in one set of a thousand.
 _FALSE_ALARM = 1e-3
@@ -38,12 +38,12 @@ class CandidateViews:
         freedom: Degrees of freedom of the noise's levels.
     """
 
-    views: Sequence[Sequence[Place]]
+    views: Sequence[Sequence[TargetPlace]]
     flange_noise: FloatArray
     common: FloatArray
     freedom: float
 
-    def own(self, place: Place) -> FloatArray:
+    def own(self, place: TargetPlace) -> FloatArray:
         """(6, 6) covariance of a place by what is its image's own: pixels, and robot."""
         carried = place.flange_jacobian @ self.flange_noise @ place.flange_jacobian.T
         return np.asarray(place.pixels + carried)
@@ -107,7 +107,7 @@ def agreeing(sights: CandidateViews) -> ImageInliers:
     Where no more than half agree, the right ones are unknown: all stay.
     """
     picks, agrees = _core(sights)
-    search = _Search(sights, picks)
+    search = _ImageSearch(sights, picks)
     agrees, found = settled(search, agrees, _judged(sights, picks, agrees), fewest=2, suspect=0.0)
     if 2 * int(agrees.sum()) <= len(picks):
         return _judged(sights, picks, np.ones(len(picks), dtype=bool))
@@ -115,7 +115,7 @@ def agreeing(sights: CandidateViews) -> ImageInliers:
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
+class _ImageSearch:
     """The search among images, each with one of its poses."""
 
     sights: CandidateViews
@@ -147,7 +147,7 @@ def _core(sights: CandidateViews) -> tuple[IntArray, Mask]:
     return picks, agrees
 
 
-def _nearest(sights: CandidateViews, seed: Place) -> tuple[FloatArray, IntArray]:
+def _nearest(sights: CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
     """Squared distance (m,) of each image's nearest pose from a place, and which one it is."""
     own, found = sights.own(seed), []
     for view in sights.views:
@@ -191,7 +191,7 @@ def _judged(sights: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInlie
     )
 
 
-def _mean(sights: CandidateViews, chosen: Sequence[Place], agrees: Mask) -> Mean:
+def _mean(sights: CandidateViews, chosen: Sequence[TargetPlace], agrees: Mask) -> Mean:
     """Weighs images by what is their own; what they share cannot be averaged by weights."""
     weights = np.array(
         [

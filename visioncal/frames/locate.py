@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
-from visioncal.frames.camera_chain import Eye, Pose, Stop, checked_point, point_slope
+from visioncal.frames.camera_chain import ChainStop, Eye, Pose, checked_point, point_slope
 from visioncal.frames.located import Located
 from visioncal.frames.plane import Plane
 from visioncal.frames.target_in_image import SeenTarget, see
@@ -88,7 +88,7 @@ def _rays(eye: Eye, px: FloatArray) -> FloatArray:
     return np.concatenate([plane, np.ones((len(px), 1))], axis=1)
 
 
-def _depth(stop: Stop, plane: Plane, ray: FloatArray, label: str) -> float:
+def _depth(stop: ChainStop, plane: Plane, ray: FloatArray, label: str) -> float:
     """How far along a ray of unit depth it meets the plane."""
     along = stop.base_from_cam[:3, :3] @ ray
     rise = float(plane.normal @ along)
@@ -108,7 +108,7 @@ def _depth(stop: Stop, plane: Plane, ray: FloatArray, label: str) -> float:
 
 
 def _on_plane(
-    eye: Eye, stop: Stop, plane: Plane, ray: FloatArray, px: FloatArray, noise_px: float
+    eye: Eye, stop: ChainStop, plane: Plane, ray: FloatArray, px: FloatArray, noise_px: float
 ) -> Located:
     """Cuts a pixel's ray with the plane, and carries the covariance of both to the cut."""
     label = f"pixel ({px[0]:.1f}, {px[1]:.1f})"
@@ -143,7 +143,7 @@ _LOOK_AT_PLANE = (
 
 
 def _camera_parts(
-    eye: Eye, stop: Stop, by_camera: FloatArray, by_lens: FloatArray
+    eye: Eye, stop: ChainStop, by_camera: FloatArray, by_lens: FloatArray
 ) -> dict[str, FloatArray]:
     """What the calibration and the robot add to a place, by how it moves with camera and lens."""
     flange_jacobian = by_camera @ stop.flange_jacobian

@@ -12,8 +12,8 @@ from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.image_outliers import CandidateViews, ImageInliers, agreeing
 from visioncal.frames.single_view import (
-    Place,
     Sight,
+    TargetPlace,
     all_places,
     check_labels,
     common_covariance,
@@ -64,7 +64,7 @@ class _Marker:
 
     name: str
     images: tuple[int, ...]
-    views: tuple[tuple[Place, ...], ...]
+    views: tuple[tuple[TargetPlace, ...], ...]
     looks: tuple[SeenTarget, ...]
 
 
@@ -175,8 +175,8 @@ def _warnings(
 
 
 def _shares(
-    found: ImageInliers, views: Sequence[Sequence[Place]]
-) -> list[tuple[Place, FloatArray]]:
+    found: ImageInliers, views: Sequence[Sequence[TargetPlace]]
+) -> list[tuple[TargetPlace, FloatArray]]:
     """Each image's place, and the (3, 6) slope by which it moves the mean's centre."""
     mean = np.concatenate([np.zeros((3, 3)), found.mean.matrix[:3, :3]], axis=1)
     return [

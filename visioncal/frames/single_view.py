@@ -56,7 +56,7 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class TargetPlace:
     """Where one image puts a target, for one of the poses that it allows.
 
     Attributes:
@@ -87,7 +87,7 @@ def needs_robot(eye: Eye, parent: Parent) -> bool:
 
 def all_places(
     eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
-) -> list[tuple[Place, ...]]:
+) -> list[tuple[TargetPlace, ...]]:
     """Carries what images of one target allow to the parent's frame; see `places`."""
     stops = [sight.stop_key for sight in sights]
     return [
@@ -98,7 +98,7 @@ def all_places(
 
 def places(
     eye: Eye, sight: Sight, view: SeenTarget, parent: Parent, of_stop: int = 1
-) -> tuple[Place, ...]:
+) -> tuple[TargetPlace, ...]:
     """Carries the poses that one image allows to the parent's frame.
 
     Args:
@@ -138,11 +138,11 @@ def _carried(
     flange_jacobian: FloatArray,
     base_from_flange: FloatArray,
     of_stop: int,
-) -> tuple[Place, ...]:
+) -> tuple[TargetPlace, ...]:
     arm = eye.arm_basis(base_from_flange)
     by_edge = adjoint(invert(view.cam_from_target))
     return tuple(
-        Place(
+        TargetPlace(
             parent_from_cam @ pose,
             view.covariance[at],
             np.sqrt(of_stop) * flange_jacobian[at],

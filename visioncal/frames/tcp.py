@@ -12,10 +12,10 @@ from visioncal.core.limits import ToolLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Step, Verdict
+from visioncal.core.verdict import AGAIN, AGREEMENT, Finding, Remedy, Verdict
 from visioncal.estimation.pivot import PivotFit, fit_pivot
 from visioncal.estimation.placing import assumed_words
-from visioncal.estimation.readings import Reading, readings_that_close
+from visioncal.estimation.readings import PoseReading, readings_that_close
 from visioncal.estimation.touching import Touches, TouchKind
 from visioncal.frames.touches import (
     TouchRows,
@@ -117,7 +117,7 @@ def _reading_hint(touches: Touches) -> str:
     return f"{_closing_words(found[0])}: are the columns in that order?"
 
 
-def _closing_words(best: Reading) -> str:
+def _closing_words(best: PoseReading) -> str:
     return (
         f"Read {best.words}, the touches close to {figure(1e3 * best.rms_m)} mm instead of "
         f"{figure(1e3 * best.as_read_m)} mm"
@@ -168,7 +168,7 @@ def _doubts(
 ) -> Iterator[Finding]:
     for best in readings_that_close(touches)[:1]:
         command = f"{AGAIN} {best.options}" if best.options else ""
-        step = Step("If the columns are in that order, say so.", command)
+        step = Remedy("If the columns are in that order, say so.", command)
         words = f"{_closing_words(best)}."
         yield Finding("misread_poses", words, step, probability=_MISREAD, is_fatal=True)
     rows = range(len(touches))
@@ -190,7 +190,7 @@ def _doubts(
             "inverse_poses",
             "The tip would be farther from the flange than the point from the base: poses read the "
             "other way round look like this.",
-            Step("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
+            Remedy("If the columns hold flange_from_base, say so.", f"{AGAIN} --robot-inverse"),
         )
     tip_m = float(np.linalg.norm(fit.flange_from_tool[:3, 3]))
     if tip_m < _NO_TOOL_M:
@@ -199,7 +199,7 @@ def _doubts(
             f"The tip is {figure(1e3 * tip_m)} mm from the origin of the "
             "poses' own frame: they look like those of a tool that was active in the controller, "
             "and of that tool's tip.",
-            Step("Set the controller's tool to zero, and write the poses of the flange."),
+            Remedy("Set the controller's tool to zero, and write the poses of the flange."),
         )
     yield from weak_directions(
         fit.worst,
@@ -213,7 +213,7 @@ def _doubts(
             "few_touches",
             f"Only {used} touches of a point are used: {options.touches} or more give the result "
             f"something to be checked with.{assumed}",
-            Step("Touch the point from more directions."),
+            Remedy("Touch the point from more directions."),
         )
 
 

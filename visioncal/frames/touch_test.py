@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray, Target
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.measured import Tool
@@ -140,7 +140,9 @@ def finding_of(test: TouchTest) -> Finding:
     )
     if test.passed:
         return Finding("touch_test", f"{words} The gaps are as predicted.")
-    step = Step("Measure the tool's tip anew, then look whether the camera or the robot was moved.")
+    step = Remedy(
+        "Measure the tool's tip anew, then look whether the camera or the robot was moved."
+    )
     return Finding("touch_test", f"{words} That is more than predicted.", step, is_fatal=True)
 
 

@@ -10,7 +10,7 @@ from visioncal.core.files import did_you_mean, some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.parts import Noise
 from visioncal.results import Calibration
 from visioncal.robot import Robot
@@ -160,7 +160,7 @@ def nominal_poses(rows: TouchRows, calibration: Calibration | None) -> Iterator[
             "nominal_poses",
             "The calibration is of a calibrated arm, but touches come without joint angles: their "
             "poses are the nominal arm's, off by as much as its errors.",
-            Step("Write down q1_rad ... too."),
+            Remedy("Write down q1_rad ... too."),
         )
 
 

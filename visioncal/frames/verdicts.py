@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
-from visioncal.core.verdict import AGAIN, Finding, Step
+from visioncal.core.verdict import AGAIN, Finding, Remedy
 from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
@@ -34,7 +34,7 @@ def weak_directions(
                 "weak_motion",
                 f"{direction.words[0].upper()}{direction.words[1:]} is known to "
                 f"{figure(direction.sigma * scale)} {unit} only (doubt begins at {check:g}).",
-                Step(advice),
+                Remedy(advice),
                 is_fatal=direction.sigma * scale > bad,
             )
 
@@ -53,11 +53,11 @@ def disputed(
     for at in np.flatnonzero(~found.agrees).tolist():
         end = "" if reasons[at].endswith("?") else "."
         words = f"{names[at]} was left out: {reasons[at]}{end}"
-        yield Finding("left_out", words, Step(again, AGAIN))
+        yield Finding("left_out", words, Remedy(again, AGAIN))
     if found.doubtful.any():
         some = some_of([names[at] for at in np.flatnonzero(found.doubtful).tolist()])
         words = f"{some} contradict each other, and which is wrong is not known: all are used."
-        yield Finding("contradicting", words, Step(again))
+        yield Finding("contradicting", words, Remedy(again))
 
 
 def noisy(
@@ -83,7 +83,7 @@ def noisy(
             "noise",
             f"The {things} agree to {figure(noise_mm)} mm only (per axis; doubt begins at "
             f"{check:g}).",
-            Step(cause),
+            Remedy(cause),
             is_fatal=noise_mm > bad,
         )
     elif not explained:
@@ -91,7 +91,7 @@ def noisy(
             "noise",
             f"The {things} scatter by more than they are stated to, without one that stands out: "
             f"{figure(noise_mm)} mm per axis.",
-            Step(
+            Remedy(
                 "Repeat them, or state the noise as it is.",
                 f"{AGAIN} --touch-noise-mm {noise_mm:.2g}",
             ),

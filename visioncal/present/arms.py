@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.core.number_format import decimals_for, fixed, signed, significant
 from visioncal.estimation.arm import SIGNIFICANT
 from visioncal.present.facts import PLUS_MINUS
-from visioncal.present.tables import Fact, Row, Table
+from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results.arm import (
     NOMINAL,
     ArmErrorsResult,
@@ -153,21 +153,21 @@ def level_note(observed: str) -> str:
     )
 
 
-def _level(arm_level: ArmLevel, *, taken: bool) -> Row:
+def _level(arm_level: ArmLevel, *, taken: bool) -> TableRow:
     words = level_words(arm_level.level) + (" (taken)" if taken else "")
     residuals = map(
         significant,
         (arm_level.rms_mm, arm_level.rms_deg, arm_level.held_out_mm, arm_level.held_out_deg),
     )
     ratio = significant(None) if arm_level.level == NOMINAL else f"{arm_level.likelihood_ratio:.0f}"
-    return Row((words, str(arm_level.unknowns), *residuals, ratio), "taken" if taken else "")
+    return TableRow((words, str(arm_level.unknowns), *residuals, ratio), "taken" if taken else "")
 
 
 def parameter_tables(found: ArmResult, count: int = 1) -> list[Table]:
     """The numbers of the arm's model, joint by joint, in so many tables."""
-    joints: dict[str, list[Row]] = {}
+    joints: dict[str, list[TableRow]] = {}
     for parameter in found.parameters:
-        joints.setdefault(parameter.joint, [Row((joint_words(parameter.joint),))]).append(
+        joints.setdefault(parameter.joint, [TableRow((joint_words(parameter.joint),))]).append(
             _parameter(parameter)
         )
     titles, rows = ("parameter", "nominal", "identified", "change", "sigma", "unit"), [*joints]
@@ -177,7 +177,7 @@ def parameter_tables(found: ArmResult, count: int = 1) -> list[Table]:
             for part in parts]  # fmt: skip
 
 
-def _parameter(arm_parameter: ArmParameter) -> Row:
+def _parameter(arm_parameter: ArmParameter) -> TableRow:
     """Writes a number of the arm's model with as many digits as its change is known to."""
     suffix = next((end for end in _UNITS if arm_parameter.name.endswith(end)), "")
     unit, scale = _UNITS.get(suffix, ("", 1.0))
@@ -193,7 +193,7 @@ def _parameter(arm_parameter: ArmParameter) -> Row:
         f"{PLUS_MINUS} {significant(sigma)}" if sigma else "",
         unit,
     )
-    return Row(cells, "sure" if arm_parameter.is_sure else "")
+    return TableRow(cells, "sure" if arm_parameter.is_sure else "")
 
 
 def parameter_note(found: ArmResult) -> str:

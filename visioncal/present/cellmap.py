@@ -16,7 +16,7 @@ _SEERS = ("cam", "instrument")
 
 
 @dataclass(frozen=True)
-class Pair:
+class SeenPair:
     """All that one frame saw of another.
 
     Attributes:
@@ -36,7 +36,7 @@ class Pair:
     unseen: Rms | None
 
 
-def pairs(views: Iterable[ViewResult]) -> tuple[Pair, ...]:
+def pairs(views: Iterable[ViewResult]) -> tuple[SeenPair, ...]:
     """Lists who saw whom, and how well that fits."""
     rows: dict[tuple[str, str], list[ViewResult]] = {}
     for view in views:
@@ -46,12 +46,12 @@ def pairs(views: Iterable[ViewResult]) -> tuple[Pair, ...]:
         used = sum(view.used for view in mine)
         unseen = any(view.used and view.left_out_mm is not None for view in mine)
         rms = (rms_of(mine) if used else None, left_out_rms(mine) if unseen else None)
-        listed.append(Pair(seer, seen, used, len(mine) - used, *rms))
+        listed.append(SeenPair(seer, seen, used, len(mine) - used, *rms))
     return tuple(listed)
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class RigidGroup:
     """Frames that never move before each other: those of the cell, or of one flange."""
 
     name: str
@@ -92,7 +92,7 @@ def _edged(tree: FrameTree) -> list[str]:
     return [name for name in tree.last if name not in tree.flanges]
 
 
-def bodies(tree: FrameTree) -> list[Body]:
+def bodies(tree: FrameTree) -> list[RigidGroup]:
     """The flanges with the cell in their middle; frames as they hung before are left out."""
     flanges = list(tree.flanges)
     half = (len(flanges) + 1) // 2
@@ -102,7 +102,7 @@ def bodies(tree: FrameTree) -> list[Body]:
         top = tuple(name for name in mine if name.startswith(_SEERS))
         bottom = tuple(name for name in mine if name.startswith("base"))
         middle = tuple(name for name in mine if name not in top and name not in bottom)
-        found_bodies.append(Body(name, top, middle, bottom))
+        found_bodies.append(RigidGroup(name, top, middle, bottom))
     return found_bodies
 
 

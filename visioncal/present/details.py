@@ -5,7 +5,7 @@ from typing import Any
 
 from visioncal.core.number_format import significant
 from visioncal.present.facts import readable_time
-from visioncal.present.tables import Fact, Row, Table
+from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Frame
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "_rad": "rad", "_m": "m", "_percent": "%"}
@@ -62,7 +62,7 @@ def observation_table(frame: Frame) -> Table:
         mark = "left-out" if not observation.used else "look" if observation.reason else "used"
         words = {"left-out": "left out", "look": "look", "used": "yes"}[mark]
         rows.append(
-            Row(
+            TableRow(
                 (observation.name, observation.kind, significant(observation.residual_mm), words),
                 mark,
             )

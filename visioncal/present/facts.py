@@ -10,7 +10,7 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
 from visioncal.present import parts
 from visioncal.present.cellmap import pairs
-from visioncal.present.tables import Fact, Row, Table
+from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CellResult, Edge, Rms
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
@@ -128,8 +128,10 @@ def moved_table(cell: CellResult) -> Table:
             f"Between stops {move.last_stop} and {move.first_stop}. {move.frame} is where it stood "
             f"last, {move.before} where it stood before.{rivals}"
         )
-        rows.append(Row((move.frame, how_far, words), "look"))
-    rows += [Row((untied.frame, "not tied", untied.remedy), "left-out") for untied in cell.untied]
+        rows.append(TableRow((move.frame, how_far, words), "look"))
+    rows += [
+        TableRow((untied.frame, "not tied", untied.remedy), "left-out") for untied in cell.untied
+    ]
     return Table(("", "", ""), tuple(rows), (0, 1, 2))
 
 

@@ -18,7 +18,7 @@ from visioncal.session.frames import CELL
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
+class FrameHierarchy:
     """What hangs on what.
 
     Attributes:
@@ -88,13 +88,13 @@ def noise(calibration: Calibration) -> dict[str, Levels]:
     }
 
 
-def frames(calibration: Calibration | None) -> Frames:
+def frames(calibration: Calibration | None) -> FrameHierarchy:
     """The frames of a result as they hang last, tools and fixtures among them.
 
     Without a result, base and flange of one robot.
     """
     if calibration is None:
-        return Frames({"base": CELL, "flange": "base"}, {"base": np.eye(4)}, {"flange": ""})
+        return FrameHierarchy({"base": CELL, "flange": "base"}, {"base": np.eye(4)}, {"flange": ""})
     tree = calibration.tree
     parents, matrices = tree.last, {tree.reference: np.eye(4)}
     for name, edge in calibration.placed.items():
@@ -102,4 +102,4 @@ def frames(calibration: Calibration | None) -> Frames:
         if child not in tree.former:
             parents[child], matrices[child] = parent, edge.matrix
     robots = tree.flanges if calibration.cell is not None else dict.fromkeys(tree.flanges, "")
-    return Frames(parents, matrices, robots)
+    return FrameHierarchy(parents, matrices, robots)

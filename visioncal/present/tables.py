@@ -18,7 +18,7 @@ class Fact:
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A row of a table.
 
     Attributes:
@@ -44,18 +44,18 @@ class Table:
     """
 
     titles: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     words: tuple[int, ...] = (0,)
 
     @classmethod
     def of(
         cls,
         titles: Sequence[str],
-        rows: Iterable[Sequence[str] | Row],
+        rows: Iterable[Sequence[str] | TableRow],
         words: tuple[int, ...] = (0,),
     ) -> "Table":
         """A table without the columns in which nothing is known."""
-        marked = [row if isinstance(row, Row) else Row(tuple(row)) for row in rows]
+        marked = [row if isinstance(row, TableRow) else TableRow(tuple(row)) for row in rows]
         filled = [group.cells for group in marked if len(group.cells) > 1]
         kept = [
             at

@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
-from visioncal.present.tables import Row, Table
+from visioncal.present.tables import Table, TableRow
 
 # A tenth of a second to import, which reports of calibrations need not wait for.
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def base_parameter_table(identified: "Identified") -> Table:
     ):
         unit = _unit_of(base.model.names[own])
         cells = (name, matched(value, sigma), significant(sigma), unit, share)
-        rows.append(Row(cells, _MARKS.get(share, "rejected")))
+        rows.append(TableRow(cells, _MARKS.get(share, "rejected")))
     return Table.of(("combination", "value", "sigma", "unit", "known to"), rows, (0, 3, 4))
 
 

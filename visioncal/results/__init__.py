@@ -1,6 +1,6 @@
 """The result of a calibration, its frames, and how they stand on disk."""
 
-from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
+from visioncal.core.verdict import Finding, Remedy, Verdict, VerdictStatus
 from visioncal.results.cell import CellResult, Moved, Untied
 from visioncal.results.document import to_document
 from visioncal.results.edge import Edge
@@ -28,10 +28,10 @@ __all__ = [
     "NeedMet",
     "Observation",
     "Picker",
+    "Remedy",
     "Rms",
     "RobotResult",
     "SolverResult",
-    "Step",
     "Untied",
     "Validation",
     "Verdict",

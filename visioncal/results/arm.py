@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from visioncal.core.choices import Convention
-from visioncal.core.codec import Array, Key, Matrix, Section, Written
+from visioncal.core.codec import Array, Key, Matrix, Section, WrittenForm
 from visioncal.core.number_format import figure, percent
 from visioncal.core.types import FloatArray
 from visioncal.estimation.bending import Factor
@@ -22,7 +22,7 @@ NOMINAL = "nominal"
 _SURE = 3.0
 
 StoredRobot = Annotated[
-    Robot, Written(lambda item: dict(item.document), lambda item, _: Robot.from_document(item))
+    Robot, WrittenForm(lambda item: dict(item.document), lambda item, _: Robot.from_document(item))
 ]
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.core.codec import Array, Written
+from visioncal.core.codec import Array, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
@@ -161,9 +161,10 @@ def _edge_form(edge: Edge) -> EdgeForm:
     )
 
 
-StoredPose = Annotated[FloatArray, Written(PoseForm.of, PoseForm.pose, PoseForm)]
+StoredPose = Annotated[FloatArray, WrittenForm(PoseForm.of, PoseForm.pose, PoseForm)]
 StoredEdge = Annotated[
-    Edge, Written(_edge_form, lambda item, path: Edge(item.pose(path), item.covariance), EdgeForm)
+    Edge,
+    WrittenForm(_edge_form, lambda item, path: Edge(item.pose(path), item.covariance), EdgeForm),
 ]
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from visioncal.core.codec import INLINE, Array, Matrix, Section, Vector, Written
+from visioncal.core.codec import INLINE, Array, Matrix, Section, Vector, WrittenForm
 from visioncal.core.types import Camera, CameraKind, FloatArray
 from visioncal.estimation.lens_field import LensLevels, displacements
 from visioncal.results.edge import Covariance
@@ -90,7 +90,7 @@ class CameraForm:
 _StoredCamera = Annotated[
     Camera,
     INLINE,
-    Written(
+    WrittenForm(
         lambda item: item,
         lambda item, _: Camera(item.model, item.resolution, item.matrix, item.distortion),
         CameraForm,

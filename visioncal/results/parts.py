@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from scipy.spatial.transform import RigidTransform
 
-from visioncal.core.codec import DROPPED, INLINE, REST, Written
+from visioncal.core.codec import DROPPED, INLINE, REST, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.types import Need
-from visioncal.core.verdict import Finding, Step, Verdict, VerdictStatus
+from visioncal.core.verdict import Finding, Remedy, Verdict, VerdictStatus
 from visioncal.results.arm import ArmSections
 from visioncal.results.edge import StoredPose
 from visioncal.robot import Robot
@@ -18,7 +18,7 @@ from visioncal.robot import Robot
 SCHEMA: Literal[1] = 1
 
 
-_OF_ROBOT = Written(
+_OF_ROBOT = WrittenForm(
     lambda item: dict(item.document), lambda item, _: Robot.from_document(item) if item else None
 )
 
@@ -139,7 +139,7 @@ class CauseForm:
 
     def finding(self, words: str) -> Finding:
         """Reads it, with the words of a reason that begins with its sentence."""
-        step = Step(self.do) if self.do else None
+        step = Remedy(self.do) if self.do else None
         return Finding(
             self.cause, words, step, probability=self.probability, without_it=self.without_it
         )
@@ -192,4 +192,4 @@ class VerdictForm:
         yield from (cause.finding(sentence) for sentence, cause in causes.items())
 
 
-StoredVerdict = Annotated[Verdict, Written(VerdictForm.of, VerdictForm.verdict, VerdictForm)]
+StoredVerdict = Annotated[Verdict, WrittenForm(VerdictForm.of, VerdictForm.verdict, VerdictForm)]

@@ -21,7 +21,7 @@ from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.number_format import figure
 from visioncal.core.shown import ByName, html_card, text_card
 from visioncal.core.types import FloatArray, Mount
-from visioncal.core.verdict import Step, Verdict
+from visioncal.core.verdict import Remedy, Verdict
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.intervals import freedom_of
 from visioncal.results.arm import NOMINAL, ArmResult, ArmSections
@@ -165,10 +165,10 @@ class Calibration(CalibrationSections):
         return self.tree.between(first, second, poses)
 
     @property
-    def next_steps(self) -> tuple[Step, ...]:
+    def next_steps(self) -> tuple[Remedy, ...]:
         """What to do about what was found, of tools and fixtures, too; the most pressing first."""
         doubtful = (name for name, frame in self.frames.items() if frame.verdict.status != "good")
-        frames = (Step(f"Read what was found of {name} before it is used.") for name in doubtful)
+        frames = (Remedy(f"Read what was found of {name} before it is used.") for name in doubtful)
         return (*self.verdict.next_steps, *frames)
 
     @typed

@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.tree import Branch, Step, Tree
+from visioncal.estimation.tree import Branch, PathStep, Tree
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.session.frames import CELL
@@ -113,7 +113,7 @@ class FrameTree:
         }
         return Tree(CELL, branches)
 
-    def _matrix(self, step: Step, poses: Mapping[str, FloatArray]) -> FloatArray:
+    def _matrix(self, step: PathStep, poses: Mapping[str, FloatArray]) -> FloatArray:
         if not step.robot:
             return self.edge_of(step.frame).matrix
         if step.robot not in poses:

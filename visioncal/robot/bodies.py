@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.robot.model import BODY_KEYS, Robot
@@ -128,7 +128,7 @@ def _thickness(robot: Robot, usual_m: float) -> list[tuple[float, float]]:
     found = [(usual_m, 0.0)]
     for place, name in enumerate(robot.joint_names):
         content = rows[place] if place < len(rows) else {}
-        row = Table(content, f"robot {robot.name}, joint {name}")
+        row = DocumentTable(content, f"robot {robot.name}, joint {name}")
         radius = row.number(BODY_KEYS[0], usual_m, positive=True)
         offset = row.number(BODY_KEYS[1], 0.0)
         length = float(np.abs(robot.chain.placements[:, :3, 3]).sum())

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray, Mask
 
@@ -163,7 +163,7 @@ def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
     }
 
 
-def chain_from_document(table: Table) -> Chain:
+def chain_from_document(table: DocumentTable) -> Chain:
     """Reads what `chain_document` writes.
 
     Raises:
@@ -191,7 +191,7 @@ def chain_from_document(table: Table) -> Chain:
     )
 
 
-def _harmonics(rows: Sequence[Table]) -> FloatArray | None:
+def _harmonics(rows: Sequence[DocumentTable]) -> FloatArray | None:
     """(n, k, 2) harmonics of the joints; None where no row has any."""
     given = [row.content.get("harmonics", []) for row in rows]
     if not any(given):
@@ -203,13 +203,16 @@ def _harmonics(rows: Sequence[Table]) -> FloatArray | None:
             raise row.refuse("harmonics", pairs, needed)
     return np.array(
         [
-            [number_list(Table({"harmonics": pair}, row.label), "harmonics", 2) for pair in pairs]
+            [
+                number_list(DocumentTable({"harmonics": pair}, row.label), "harmonics", 2)
+                for pair in pairs
+            ]
             for row, pairs in zip(rows, given, strict=True)
         ]
     )
 
 
-def joint_tables(table: Table) -> list[tuple[str, Table]]:
+def joint_tables(table: DocumentTable) -> list[tuple[str, DocumentTable]]:
     """The rows of a table of joints with their names.
 
     Raises:
@@ -219,18 +222,18 @@ def joint_tables(table: Table) -> list[tuple[str, Table]]:
     if not isinstance(rows, Sequence) or not rows or not all(isinstance(r, Mapping) for r in rows):
         raise table.refuse("joint", rows, "one [[joint]] table for each joint")
     names = [
-        Table(row, f"{table.label}, joint {place}").text("name", f"joint_{place}")
+        DocumentTable(row, f"{table.label}, joint {place}").text("name", f"joint_{place}")
         for place, row in enumerate(rows, start=1)
     ]
     if len(set(names)) < len(names):
         raise table.refuse("joint", names, "a name of its own for each joint")
     return [
-        (name, Table(row, f"{table.label}, joint {name}"))
+        (name, DocumentTable(row, f"{table.label}, joint {name}"))
         for name, row in zip(names, rows, strict=True)
     ]
 
 
-def subtable(table: Table, key: str) -> Table:
+def subtable(table: DocumentTable, key: str) -> DocumentTable:
     """A table inside a table; empty where it is absent.
 
     Raises:
@@ -239,10 +242,10 @@ def subtable(table: Table, key: str) -> Table:
     content = table.content.get(key, {})
     if not isinstance(content, Mapping):
         raise table.refuse(key, content, f"a [{key}] table")
-    return Table(content, f"{table.label}, {key}")
+    return DocumentTable(content, f"{table.label}, {key}")
 
 
-def joint_function(row: Table, keys: Sequence[str]) -> list[float]:
+def joint_function(row: DocumentTable, keys: Sequence[str]) -> list[float]:
     """A joint's function: offset, ratio, sine, cosine under the given keys; an empty one is left.
 
     Raises:
@@ -254,7 +257,7 @@ def joint_function(row: Table, keys: Sequence[str]) -> list[float]:
     ]
 
 
-def number_list(row: Table, key: str, size: int) -> FloatArray:
+def number_list(row: DocumentTable, key: str, size: int) -> FloatArray:
     """A list of so many finite numbers.
 
     Raises:
@@ -263,20 +266,23 @@ def number_list(row: Table, key: str, size: int) -> FloatArray:
     return np.array(row.numbers(key, size))
 
 
-def _axis(row: Table) -> FloatArray:
+def _axis(row: DocumentTable) -> FloatArray:
     axis = number_list(row, "axis", 3)
     if abs(np.linalg.norm(axis) - 1.0) > _ROTATION_TOLERANCE:
         raise row.refuse("axis", axis.tolist(), "a vector of length 1")
     return axis
 
 
-def _placement(row: Table) -> FloatArray:
+def _placement(row: DocumentTable) -> FloatArray:
     rows = row.content.get("placement")
     needed = "a list of 4 rows of 4 numbers, a rigid transform [m]"
     if not isinstance(rows, Sequence) or isinstance(rows, str) or len(rows) != 4:
         raise row.refuse("placement", rows, needed)
     matrix = np.array(
-        [number_list(Table({"placement": value}, row.label), "placement", 4) for value in rows]
+        [
+            number_list(DocumentTable({"placement": value}, row.label), "placement", 4)
+            for value in rows
+        ]
     )
     _check_rigid(matrix, row.label)
     return matrix

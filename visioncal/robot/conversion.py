@@ -38,7 +38,7 @@ _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
-class _Row:
+class _DhRow:
     """theta, d, a, alpha, beta from one axis to the next."""
 
     theta: float = 0.0
@@ -111,7 +111,7 @@ def table_of(
     """
     chain = _about_z(robot.chain.with_offsets_placed())
     like = None if like is None else convert_table(like, convention)
-    hints = [_Row()] * len(chain) if like is None else _rows(like)
+    hints = [_DhRow()] * len(chain) if like is None else _rows(like)
     first = np.eye(4) if like is None else like.along_x[0]
     base = _base(chain.placements[0], np.eye(4) if like is None else like.base, first)
     rows, flats = [], []
@@ -216,13 +216,13 @@ def has_ur_axes(robot: Robot) -> bool:
     return np.array_equal(parallel_axes(robot), [False, True, True, False, False])
 
 
-def _rows(table: DHTable) -> list[_Row]:
+def _rows(table: DHTable) -> list[_DhRow]:
     """The table as Z_i X_i, whatever its convention."""
     columns = (table.theta_rad, table.d_m, table.a_m[1:], table.alpha_rad[1:], table.beta_rad[1:])
-    return [_Row(*map(float, numbers)) for numbers in zip(*columns, strict=True)]
+    return [_DhRow(*map(float, numbers)) for numbers in zip(*columns, strict=True)]
 
 
-def _with_rows(table: DHTable, rows: list[_Row]) -> DHTable:
+def _with_rows(table: DHTable, rows: list[_DhRow]) -> DHTable:
     """A table with other Z_i X_i; X_0 stays."""
     return replace(
         table,
@@ -258,13 +258,13 @@ def _off_parallel(directions: FloatArray) -> FloatArray:
     return np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), np.abs(directions[..., 2]))
 
 
-def _left_over(link: FloatArray, row: _Row) -> FloatArray:
+def _left_over(link: FloatArray, row: _DhRow) -> FloatArray:
     """Turn about [rad] and way along [m] the next axis that a row leaves to it."""
     rest = invert(row.transform) @ link
     return np.array([np.arctan2(rest[1, 0], rest[0, 0]), rest[2, 3]])
 
 
-def _between(link: FloatArray, hint: _Row, *, flat: bool) -> _Row:
+def _between(link: FloatArray, hint: _DhRow, *, flat: bool) -> _DhRow:
     """The row from an axis to the next.
 
     Args:
@@ -290,10 +290,10 @@ def _between(link: FloatArray, hint: _Row, *, flat: bool) -> _Row:
     if parallel:
         across[:] = 0.0
     alpha = _near(float(np.arctan2(-across[1], direction[2])), hint.alpha)
-    return _Row(theta, d, sign * a, alpha, float(np.arcsin(across[0])))
+    return _DhRow(theta, d, sign * a, alpha, float(np.arcsin(across[0])))
 
 
-def _common_normal(direction: FloatArray, position: FloatArray, hint: _Row) -> _Row:
+def _common_normal(direction: FloatArray, position: FloatArray, hint: _DhRow) -> _DhRow:
     """The row with x along the common normal of z and another axis (Denavit, Hartenberg 1955)."""
     sine = np.hypot(direction[0], direction[1])
     normal = np.array([-direction[1], direction[0]]) / sine
@@ -302,7 +302,7 @@ def _common_normal(direction: FloatArray, position: FloatArray, hint: _Row) -> _
     forward = a > 0.0 or abs(a) < EXACTLY
     theta, sign = _nearer(float(np.arctan2(normal[1], normal[0])), hint.theta, forward=forward)
     d = float(position[2] - along * direction[2])
-    return _Row(theta, d, sign * a, _near(sign * alpha, hint.alpha))
+    return _DhRow(theta, d, sign * a, _near(sign * alpha, hint.alpha))
 
 
 def _near(angle: float, to: float) -> float:
@@ -335,7 +335,7 @@ def _base(placement: FloatArray, nominal: FloatArray, first: FloatArray) -> Floa
     return np.asarray(nominal @ first @ tilt @ invert(first))
 
 
-def _last_row(link: FloatArray, hint: _Row, like: DHTable | None) -> tuple[_Row, FloatArray]:
+def _last_row(link: FloatArray, hint: _DhRow, like: DHTable | None) -> tuple[_DhRow, FloatArray]:
     """The last row, and the flange behind it."""
     if like is None and _off_parallel(link[:3, 2]) >= PARALLEL_RAD:
         row = _between(link, hint, flat=False)

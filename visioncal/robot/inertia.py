@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import number_list
@@ -138,7 +138,7 @@ def moving(link_from_body: FloatArray) -> FloatArray:
     return np.asarray(parameters_of(link_from_body @ units @ link_from_body.T).T)
 
 
-def inertias_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Inertias | None:
+def inertias_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) -> Inertias | None:
     """Reads `mass_kg`, `com_m` and `inertia_kg_m2` of a table of joints.
 
     Args:

@@ -43,7 +43,7 @@ def table_moves(
     count, chain = len(table), robot.chain
     twists = _seen_about_z(chain, placements, functions)
     moves = np.zeros((len(placements), count, 5))
-    frames = _Frames(table, chain)
+    frames = _LinkFrames(table, chain)
     # What a row hands on: a turn about the next axis and a way along it, (p, 2).
     screw = (twists[:, 0] @ adjoint(frames.rest[0]).T)[:, _Z]
     for row in range(count - 1):
@@ -82,7 +82,7 @@ def number_jacobian(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArr
     return np.einsum("mirj,rjk->mirk", moved, ends), functions
 
 
-class _Frames:
+class _LinkFrames:
     """A table's links as its robot has them, in frames with z along the axes.
 
     Attributes:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table, did_you_mean
+from visioncal.core.files import DocumentTable, did_you_mean
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
 from visioncal.robot.inertia import Inertias
@@ -186,7 +186,7 @@ class UrdfArm(NamedTuple):
     rates: Rates
 
 
-def arm_of_urdf(table: Table) -> UrdfArm:
+def arm_of_urdf(table: DocumentTable) -> UrdfArm:
     """Reads the arm from a URDF's root to the tip.
 
     Raises:
@@ -274,7 +274,7 @@ def _chain_of_model(model: "pin.Model", tip: str) -> Chain:
     )
 
 
-def _find_tip(table: Table, frames: list[str]) -> str:
+def _find_tip(table: DocumentTable, frames: list[str]) -> str:
     """Finds the tip among a URDF's frames; one that is not named is the usual one."""
     tip = table.text("tip", "")
     usual = [name for name in _USUAL_TIPS if name in frames]

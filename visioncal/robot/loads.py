@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.robot.chain import number_list
 
@@ -124,7 +124,7 @@ class Loads:
         return bool((self.side > 0.0).any() and (self.side < 0.0).any())
 
 
-def masses_of_rows(rows: Sequence[Table], joint_from_row: FloatArray) -> Masses | None:
+def masses_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) -> Masses | None:
     """Reads `mass_kg` and `com_m` of a table of joints.
 
     Args:
@@ -159,7 +159,7 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
     """
     if "gravity_m_s2" not in document:
         return np.array(STANDARD_GRAVITY)
-    row = Table(document, label)
+    row = DocumentTable(document, label)
     gravity = number_list(row, "gravity_m_s2", 3)
     if not 9.5 < float(np.linalg.norm(gravity)) < 10.1:
         raise row.refuse(

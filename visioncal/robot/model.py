@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
@@ -92,8 +92,8 @@ class Robot:
             DataError: A field is missing or out of range, the URDF cannot be parsed, or it lacks
                 the tip.
         """
-        name = Table(document, "robot").text("name")
-        table = Table(document, f"robot {name}")
+        name = DocumentTable(document, "robot").text("name")
+        table = DocumentTable(document, f"robot {name}")
         tip = table.text("tip", "flange")
         table.integer("schema", 1, 1)
         if "urdf" in document:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray
 
 # What a joint's table says of its drive.
@@ -30,7 +30,7 @@ class Rates:
     torque: FloatArray
 
     @classmethod
-    def of_rows(cls, rows: Sequence[Table]) -> "Rates":
+    def of_rows(cls, rows: Sequence[DocumentTable]) -> "Rates":
         """Reads the limits from a table of joints.
 
         Raises:

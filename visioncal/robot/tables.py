@@ -10,7 +10,7 @@ import numpy as np
 from visioncal.core.choices import CONVENTIONS, Convention
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain, joint_function, joint_tables, number_list, subtable
@@ -150,8 +150,8 @@ def table_from_document(document: Mapping[str, Any]) -> DHTable:
     Raises:
         DataError: A field is missing, unknown or out of range.
     """
-    name = Table(document, "robot").text("name")
-    table = Table(document, f"robot {name}")
+    name = DocumentTable(document, "robot").text("name")
+    table = DocumentTable(document, f"robot {name}")
     needed = cast(tuple[str, ...], CONVENTIONS)
     convention = cast(Convention, table.choice("convention", needed))
     rows = joint_tables(table)
@@ -229,11 +229,11 @@ def _row(table: DHTable, place: int) -> dict[str, Any]:
     return row | {key: value for key, value, none in values if key and value != none}
 
 
-def _is_prismatic(row: Table) -> bool:
+def _is_prismatic(row: DocumentTable) -> bool:
     return row.choice("type", ("revolute", "prismatic"), "revolute") == "prismatic"
 
 
-def _limits(row: Table) -> tuple[float, float]:
+def _limits(row: DocumentTable) -> tuple[float, float]:
     """The limits of q [rad or m]; an angle may be infinite, as TOML writes it."""
     if _is_prismatic(row):
         keys = ("lower_m", "upper_m")
@@ -254,7 +254,7 @@ def _limits(row: Table) -> tuple[float, float]:
     return (lower, upper) if _is_prismatic(row) else (math.radians(lower), math.radians(upper))
 
 
-def _across(row: Table, convention: Convention) -> tuple[float, float, float, float]:
+def _across(row: DocumentTable, convention: Convention) -> tuple[float, float, float, float]:
     """a, alpha, beta, and whether the row is of parallel axes."""
     parallel = "beta_rad" in row.content
     if parallel and convention != "hayati":
@@ -267,7 +267,7 @@ def _across(row: Table, convention: Convention) -> tuple[float, float, float, fl
     return row.number("a_m"), row.number("alpha_rad"), beta, float(parallel)
 
 
-def _flange(row: Table, convention: Convention) -> tuple[FloatArray, FloatArray]:
+def _flange(row: DocumentTable, convention: Convention) -> tuple[FloatArray, FloatArray]:
     """The constant behind X_n, and X_n as (1, 4) where the convention leaves it to the flange."""
     nothing = np.zeros((1, 4))
     if not row.content or any(key in row.content for key in _POSE_KEYS):
@@ -293,7 +293,7 @@ def _flange_row(table: DHTable) -> dict[str, Any]:
     return {"flange": _pose_document(table.along_x[-1] @ flange)}
 
 
-def _pose(row: Table) -> FloatArray:
+def _pose(row: DocumentTable) -> FloatArray:
     """A constant transform (4, 4) [m]; the identity where the table is empty."""
     if not row.content:
         return np.eye(4)

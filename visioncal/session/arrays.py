@@ -25,7 +25,7 @@ _KEPT_PLACE = (
 )
 
 
-class Cell(TypedDict, total=False):
+class CellArguments(TypedDict, total=False):
     """What else is known of a cell.
 
     Attributes:
@@ -43,7 +43,7 @@ class Cell(TypedDict, total=False):
     name: str
 
 
-class Facts(TypedDict):
+class AssembleArguments(TypedDict):
     """What `Session.assemble` takes."""
 
     document: Mapping[str, Any]
@@ -58,8 +58,8 @@ def of_images(
     images: Sequence[Image | Image16 | bytes],
     poses: Poses,
     board: Target | str,
-    **cell: Unpack[Cell],
-) -> Facts:
+    **cell: Unpack[CellArguments],
+) -> AssembleArguments:
     """The facts of a session of images; see `Session.from_arrays`."""
     matrices = _matrices(poses, "images", len(images))
     paths = [f"images/{at:03d}.png" for at in range(len(images))]
@@ -75,8 +75,8 @@ def of_corners(
     poses: Poses,
     board: Target | str,
     resolution: tuple[int, int],
-    **cell: Unpack[Cell],
-) -> Facts:
+    **cell: Unpack[CellArguments],
+) -> AssembleArguments:
     """The facts of a session of corners; see `Session.from_corners`."""
     matrices = _matrices(poses, "corners", len(corners))
     read = [_corners(at, *corner) for at, corner in enumerate(corners)]
@@ -159,12 +159,12 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
 def _facts(
     matrices: FloatArray,
     board: Target | str,
-    cell: Cell,
+    cell: CellArguments,
     columns: Mapping[str, Sequence[str]],
     images: MemoryImages,
     resolution: tuple[int, int] | None = None,
-) -> Facts:
-    count, known = len(matrices), [*Cell.__annotations__]
+) -> AssembleArguments:
+    count, known = len(matrices), [*CellArguments.__annotations__]
     for name in cell:
         if name not in known:
             raise DataError(

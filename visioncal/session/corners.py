@@ -15,7 +15,7 @@ from visioncal.session.boards import COLUMN
 from visioncal.session.document import Declaration
 from visioncal.session.kinds import name_of
 from visioncal.session.streams import numbered_rows
-from visioncal.session.table import Problem, View, problems_error, read_integer, read_number
+from visioncal.session.table import TableProblem, View, problems_error, read_integer, read_number
 from visioncal.vision.targets import point_numbers
 
 FILE = "corners.csv"
@@ -112,7 +112,7 @@ def parse_corners(text: str) -> CornerTable:
             culprits=[f"{FILE}: {name}" for name in (*missing, *other)],
             next_step=hints[0] if hints else f"Begin {FILE} with the line {','.join(_NEEDED)}.",
         )
-    problems: list[Problem] = []
+    problems: list[TableProblem] = []
     lines: list[_Line] = []
     for number, cells in rows:
         if len(lines) == _MOST_CORNERS:
@@ -125,7 +125,7 @@ def parse_corners(text: str) -> CornerTable:
     stated = [line.sigma_px is not None for line in lines]
     if any(stated) and not all(stated) and not problems:
         place = f"{lines[stated.index(False)].place}, column {_SIGMA}"
-        problems.append(Problem(place, "it is empty; all rows state it, or none"))
+        problems.append(TableProblem(place, "it is empty; all rows state it, or none"))
     if problems:
         raise problems_error(problems)
     sigmas = [line.sigma_px for line in lines if line.sigma_px is not None]
@@ -149,14 +149,14 @@ class _Line:
 
 
 def _line(
-    columns: Sequence[str], cells: Sequence[str], place: str, problems: list[Problem]
+    columns: Sequence[str], cells: Sequence[str], place: str, problems: list[TableProblem]
 ) -> _Line:
     """Reads one row; what is wrong with it is added to the problems."""
     row = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
     numbers: dict[str, float] = {}
     if len(cells) != len(columns):
         words = f"it has {len(cells)} fields, but the header has {len(columns)} columns"
-        problems.append(Problem(place, words))
+        problems.append(TableProblem(place, words))
         row = {}
     for name in (*_NEEDED, _SIGMA):
         cell = row.get(name, "")
@@ -165,11 +165,11 @@ def _line(
         try:
             numbers[name] = (read_integer if name in _NEEDED[:2] else read_number)(cell)
         except DataError as error:
-            problems.append(Problem(f"{place}, column {name}", error.message.rstrip(".")))
+            problems.append(TableProblem(f"{place}, column {name}", error.message.rstrip(".")))
     sigma_px = numbers.get(_SIGMA)
     if sigma_px is not None and sigma_px <= 0.0:
         words = f"{sigma_px:g} px is no standard deviation; a number above 0 is needed"
-        problems.append(Problem(f"{place}, column {_SIGMA}", words))
+        problems.append(TableProblem(f"{place}, column {_SIGMA}", words))
     view, point, u_px, v_px = (numbers.get(name, 0.0) for name in _NEEDED)
     return _Line(place, int(view), int(point), (u_px, v_px), row.get(COLUMN, ""), sigma_px)
 
@@ -270,14 +270,14 @@ def _of_rows(table: CornerTable, rows: Mapping[int, View]) -> CornerTable:
 
 def _target_problems(
     table: CornerTable, rows: Mapping[int, View], own: Sequence[str], names: Sequence[str]
-) -> Iterator[Problem]:
+) -> Iterator[TableProblem]:
     """What is wrong with the rows' views and targets."""
     first = next((target for target in table.targets if target), "")
     there = sorted(set(table.views.tolist()))
     if len(there) == len(rows) and there != sorted(rows):
         (by, *others) = {b - a for a, b in zip(there, sorted(rows), strict=True)}
         if not others:
-            yield Problem(
+            yield TableProblem(
                 f"{FILE}, column view",
                 f"it goes from {there[0]} to {there[-1]}, and that of views.csv from {min(rows)} "
                 f"to {max(rows)}: one of them is numbered otherwise",
@@ -288,26 +288,26 @@ def _target_problems(
         mine = np.flatnonzero(table.views == view)
         more = f" and {len(mine) - 1} more" if len(mine) > 1 else ""
         place = f"{table.place(int(mine[0]))}{more}, column view"
-        yield Problem(place, f"views.csv has no view {view}")
+        yield TableProblem(place, f"views.csv has no view {view}")
     for at, (view, target) in enumerate(zip(table.views.tolist(), table.targets, strict=True)):
         place = f"{FILE}, line {at + 2}"
         if view not in rows:
             continue
         if not names and target not in ("", first):
             words = f"{target!r} beside {first!r}, but session.toml declares one target"
-            yield Problem(f"{place}, column {COLUMN}", words)
+            yield TableProblem(f"{place}, column {COLUMN}", words)
         elif names and not (target or own[at]):
             words = f"it is empty, and so is view {view}'s; one of {', '.join(names)} is needed"
-            yield Problem(f"{place}, column {COLUMN}", words)
+            yield TableProblem(f"{place}, column {COLUMN}", words)
         elif names and target and target not in names:
             words = f"{target!r} is not declared; session.toml declares {', '.join(names)}"
-            yield Problem(f"{place}, column {COLUMN}", words)
+            yield TableProblem(f"{place}, column {COLUMN}", words)
         elif names and target and own[at] not in ("", target):
             words = (
                 f"{target!r}, but views.csv says that view {view} shows {own[at]!r}; a view that "
                 "shows both has a row for each there, or names none"
             )
-            yield Problem(f"{place}, column {COLUMN}", words)
+            yield TableProblem(f"{place}, column {COLUMN}", words)
 
 
 # A number that is mistyped is one, and those of another target are many.
@@ -336,18 +336,18 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
     for name, point in zip(names, table.points.tolist(), strict=True):
         by_name.setdefault(name, set()).add(point)
     _check_exchanged(by_name, {name: numbers[targets[name]] for name in by_name}, file)
-    problems: list[Problem] = []
+    problems: list[TableProblem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
         place, target = table.place(at) + (", column point" if table.is_file else ""), boards[at]
         earlier = seen.setdefault(key, at)
         if key[1] not in numbers[target]:
             words = f"target {target.name} has no point {key[1]}; {_range(target)}"
-            problems.append(Problem(place, words))
+            problems.append(TableProblem(place, words))
         elif earlier != at:
             first = f"line {earlier + 2}" if table.is_file else table.place(earlier)
             words = f"point {key[1]} of view {key[0]} is there twice, first in {first}"
-            problems.append(Problem(place, words))
+            problems.append(TableProblem(place, words))
     if problems:
         raise problems_error(problems)
 

@@ -66,7 +66,7 @@ def resolve_frames(
     Raises:
         DataError: What is said contradicts itself, or something is neither said nor follows.
     """
-    return _Tree(declaration, tuple(views), tuple(robots)).resolved()
+    return _DeclaredTree(declaration, tuple(views), tuple(robots)).resolved()
 
 
 def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
@@ -77,7 +77,7 @@ def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
             has it.
     """
     if declaration.frames:
-        _ = _Tree(declaration, tuple(views), tuple(robots_of(declaration, views))).said
+        _ = _DeclaredTree(declaration, tuple(views), tuple(robots_of(declaration, views))).said
 
 
 def frames_of_kind(frames: Iterable[str], kind: str) -> tuple[str, ...]:
@@ -116,7 +116,7 @@ def _is_flange(frame: str) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Tree:
+class _DeclaredTree:
     """What a session says of its frames, and what follows from it."""
 
     declaration: Declaration
@@ -294,7 +294,7 @@ def observed(declaration: Declaration, view: View) -> tuple[str, str]:
     return "", ""
 
 
-def _carrier(parents: Mapping[str, str], frame: str, tree: _Tree) -> str | None:
+def _carrier(parents: Mapping[str, str], frame: str, tree: _DeclaredTree) -> str | None:
     """The cell, base or flange before which a frame never moves; None where it is not known."""
     on = parents.get(frame)
     while (

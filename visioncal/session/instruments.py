@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table, did_you_mean, parse_toml, read_text
+from visioncal.core.files import DocumentTable, did_you_mean, parse_toml, read_text
 from visioncal.core.types import FloatArray
 
 _FILE = Path(__file__).with_name("instruments.toml")
@@ -106,6 +106,6 @@ def stated_instrument(
 
 
 @cache
-def _shipped() -> Mapping[str, Table]:
+def _shipped() -> Mapping[str, DocumentTable]:
     rows = parse_toml(read_text(_FILE), _FILE.name)["instrument"]
-    return {row["name"]: Table(row, f"{_FILE.name}, {row['name']}") for row in rows}
+    return {row["name"]: DocumentTable(row, f"{_FILE.name}, {row['name']}") for row in rows}

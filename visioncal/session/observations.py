@@ -45,7 +45,7 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stop:
+class _StopRows:
     """The rows of one stop, and for each robot the row whose pose most of them agree with."""
 
     rows: tuple[View, ...]
@@ -145,7 +145,7 @@ def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[s
                 )
 
 
-def _stops(declaration: Declaration, views: Sequence[View]) -> list[_Stop]:
+def _stops(declaration: Declaration, views: Sequence[View]) -> list[_StopRows]:
     """Groups rows by their stop; without one, by runs in which their robot stood still."""
     groups: dict[tuple[int, int], list[View]] = {}
     rows_of: dict[str, list[View]] = {}
@@ -157,7 +157,7 @@ def _stops(declaration: Declaration, views: Sequence[View]) -> list[_Stop]:
         alone = view.stop is None or view.is_of_lens
         key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)
         groups.setdefault(key, []).append(view)
-    return [_Stop(tuple(rows), _robot_rows(declaration, rows)) for rows in groups.values()]
+    return [_StopRows(tuple(rows), _robot_rows(declaration, rows)) for rows in groups.values()]
 
 
 def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, View]:

@@ -16,7 +16,7 @@ from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.core.shown import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
 from visioncal.session import columns as known
-from visioncal.session.arrays import Cell, Poses, of_corners, of_images
+from visioncal.session.arrays import CellArguments, Poses, of_corners, of_images
 from visioncal.session.boards import COLUMN, read_targets, target_warnings
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
 from visioncal.session.choosing import Choice
@@ -46,7 +46,7 @@ from visioncal.session.streams import (
     read_streams,
     write_stream,
 )
-from visioncal.session.table import Row, View, parse_csv, read_views, write_csv
+from visioncal.session.table import TextRow, View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
 
 # The columns of a session without views.
@@ -92,7 +92,7 @@ class Session:
         path: Path | str,
         *,
         target_document: Mapping[str, Any] | None = None,
-        table: tuple[tuple[str, ...], tuple[Row, ...]] | None = None,
+        table: tuple[tuple[str, ...], tuple[TextRow, ...]] | None = None,
     ) -> "Session":
         """Loads a session's folder, or the `.rrd` recording of one.
 
@@ -142,7 +142,7 @@ class Session:
         )
         streams = read_streams(path)
         columns: tuple[str, ...] = ALONE
-        rows: tuple[Row, ...] = ()
+        rows: tuple[TextRow, ...] = ()
         # Streams alone have what an arm's drives needed.
         if table is not None:
             columns, rows = table
@@ -196,7 +196,7 @@ class Session:
         Raises:
             DataError: A field, row or column is wrong.
         """
-        rows = [Row(f"row {place}", tuple(row)) for place, row in enumerate(cells, start=1)]
+        rows = [TextRow(f"row {place}", tuple(row)) for place, row in enumerate(cells, start=1)]
         return _build(
             document,
             tuple(columns),
@@ -214,7 +214,7 @@ class Session:
         images: Sequence[Image | Image16 | bytes],
         base_from_flange: Poses,
         board: Target | str,
-        **cell: Unpack[Cell],
+        **cell: Unpack[CellArguments],
     ) -> "Session":
         """Builds a session of images in memory.
 
@@ -238,7 +238,7 @@ class Session:
         base_from_flange: Poses,
         board: Target | str,
         resolution: tuple[int, int],
-        **cell: Unpack[Cell],
+        **cell: Unpack[CellArguments],
     ) -> "Session":
         """Builds a session of corners that another detector found.
 
@@ -517,7 +517,7 @@ class Session:
 def _build(
     document: Mapping[str, Any],
     columns: tuple[str, ...],
-    rows: Sequence[Row],
+    rows: Sequence[TextRow],
     images: ImageStore,
     *,
     folder: Path | None = None,

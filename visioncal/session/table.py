@@ -132,7 +132,7 @@ def reported_matrices(views: Sequence[View]) -> dict[int, FloatArray]:
 
 
 @dataclass(frozen=True)
-class Row:
+class TextRow:
     """One row of text cells, and the words that place it in messages (`views.csv, line 3`)."""
 
     where: str
@@ -140,7 +140,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Problem:
+class TableProblem:
     """What is wrong with a table, and where."""
 
     place: str
@@ -149,7 +149,7 @@ class Problem:
     step: str = ""  # what to do about it, where the table is not what to correct
 
 
-def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
+def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[TextRow, ...]]:
     """Splits a views.csv into its column names and its rows; blank lines are skipped.
 
     Where the header has semicolons or tabs and no comma, they separate the columns, and a decimal
@@ -161,13 +161,13 @@ def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
     """
     separator = separator_of(text.lstrip().partition("\n")[0])
     reader = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator)
-    rows: list[Row] = []
+    rows: list[TextRow] = []
     line = 1
     try:
         for cells in reader:
             if any(cell.strip() for cell in cells):
                 read = tuple(cells) if separator == "," else with_points(cells)
-                rows.append(Row(f"{label}, line {line}", read))
+                rows.append(TextRow(f"{label}, line {line}", read))
                 _check_count(rows, label)
             line = reader.line_num + 1
     except csv.Error as error:
@@ -193,7 +193,7 @@ def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[Row, ...]]:
     )
 
 
-def _check_count(rows: Sequence[Row], label: str) -> None:
+def _check_count(rows: Sequence[TextRow], label: str) -> None:
     if len(rows) > _MOST_VIEWS + 1 or len(rows[0].cells) > _MOST_COLUMNS:
         raise DataError(
             f"{label} has more than {_MOST_VIEWS:,} rows or {_MOST_COLUMNS:,} columns; a row is "
@@ -217,7 +217,7 @@ def _quoted(cell: str) -> str:
 
 
 def read_views(
-    columns: Sequence[str], rows: Sequence[Row], label: str, *, with_corners: bool = False
+    columns: Sequence[str], rows: Sequence[TextRow], label: str, *, with_corners: bool = False
 ) -> tuple[View, ...]:
     """Reads and checks views.
 
@@ -233,7 +233,7 @@ def read_views(
     """
     known.check_header(columns, f"{label}, header")
     views: list[View] = []
-    problems: list[Problem] = []
+    problems: list[TableProblem] = []
     first_seen: dict[int, str] = {}
     if rows and not any(name.isdigit() for cell in rows[0].cells for name in cell):
         raise DataError(
@@ -256,7 +256,7 @@ def read_views(
     return tuple(views)
 
 
-def problems_error(problems: Sequence[Problem]) -> DataError:
+def problems_error(problems: Sequence[TableProblem]) -> DataError:
     """Words the first ten problems of a table."""
     norms = [problem.norm for problem in problems if problem.norm is not None]
     if len(norms) == len(problems) >= _FEWEST_ALIKE and max(norms) > _FAR_FROM_UNIT:
@@ -292,14 +292,14 @@ def problems_error(problems: Sequence[Problem]) -> DataError:
 class _RowReader:
     """Reads one row and collects what is wrong with it in `problems`."""
 
-    row: Row
+    row: TextRow
     columns: Sequence[str]
-    problems: list[Problem]
+    problems: list[TableProblem]
     with_corners: bool
 
     def report(self, column: str, words: str, norm: float | None = None, step: str = "") -> None:
         place = f"{self.row.where}, column {column}" if column else self.row.where
-        self.problems.append(Problem(place, words, norm, step))
+        self.problems.append(TableProblem(place, words, norm, step))
 
     def view(self) -> View | None:
         """Reads the row; None where it is so wrong that its problems are all there is."""

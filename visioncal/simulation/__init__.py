@@ -4,8 +4,13 @@ Nothing here uses the application's camera, robot, targets, solvers or estimator
 projection or a wrong chain cannot hide by being wrong in both.
 """
 
-from visioncal.simulation.arms import Arm, arm_named, forward, ur_arm
-from visioncal.simulation.cell import Cell, Reading, Sight, SimulatedRobot
+from visioncal.simulation.arms import DhArm, arm_named, forward, ur_arm
+from visioncal.simulation.cell import (
+    InstrumentReading,
+    SimulatedCell,
+    SimulatedRobot,
+    SimulatedSight,
+)
 from visioncal.simulation.described import cell_names, read_cell
 from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import (
@@ -32,7 +37,7 @@ from visioncal.simulation.optics import (
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
 from visioncal.simulation.real_arm import ArmOptions
 from visioncal.simulation.records import cell_session, measured_poses, write_session
-from visioncal.simulation.render import Scene, prepare_scene, render
+from visioncal.simulation.render import RenderScene, prepare_scene, render
 from visioncal.simulation.sag import Payload
 from visioncal.simulation.sweep import sweep
 from visioncal.simulation.touching import touch
@@ -42,26 +47,26 @@ from visioncal.simulation.warmup import Round, WarmUpOptions, simulate_warm_up
 __all__ = [
     "BOARDS",
     "CAMERAS",
-    "Arm",
     "ArmOptions",
     "BoardAt",
     "CameraAt",
     "CameraOptions",
-    "Cell",
     "CellOptions",
+    "DhArm",
     "Heat",
     "InstrumentAt",
+    "InstrumentReading",
     "Moved",
     "NetworkOptions",
     "Payload",
     "PointAt",
-    "Reading",
+    "RenderScene",
     "RobotAt",
     "Round",
-    "Scene",
     "Second",
-    "Sight",
+    "SimulatedCell",
     "SimulatedRobot",
+    "SimulatedSight",
     "SweepOptions",
     "Swept",
     "Truth",

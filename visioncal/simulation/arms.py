@@ -23,7 +23,7 @@ _NODES = 1440
 
 
 @dataclass(frozen=True, eq=False)
-class Arm:
+class DhArm:
     """A serial arm of revolute joints in standard Denavit-Hartenberg form.
 
     Link i is `Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i) Ry(beta_i)`. The last turn is
@@ -93,7 +93,7 @@ class Reach:
     dexterity: FloatArray
 
 
-def ur_arm(name: str) -> Arm:
+def ur_arm(name: str) -> DhArm:
     """Nominal arm of Universal Robots' e-Series by the values that the maker publishes.
 
     Source: Universal Robots, "DH parameters for calculations of kinematics and dynamics".
@@ -121,7 +121,7 @@ def ur_arm(name: str) -> Arm:
         )
     d1, a2, a3, d4, d5, d6 = published[name]
     quarter = 0.5 * np.pi
-    return Arm(
+    return DhArm(
         name=name,
         a=np.array([0.0, a2, a3, 0.0, 0.0, 0.0]),
         d=np.array([d1, 0.0, 0.0, d4, d5, d6]),
@@ -132,13 +132,13 @@ def ur_arm(name: str) -> Arm:
     )
 
 
-def industrial_arm() -> Arm:
+def industrial_arm() -> DhArm:
     """Nominal arm of 1.8 m reach in the proportions of a medium industrial one.
 
     No maker's: round numbers, a shoulder that is off the first axis, and a spherical wrist.
     """
     quarter = 0.5 * np.pi
-    return Arm(
+    return DhArm(
         name="generic-6r-1800",
         a=np.array([0.18, 0.8, 0.18, 0.0, 0.0, 0.0]),
         d=np.array([0.5, 0.0, 0.0, 0.8, 0.0, 0.13]),
@@ -149,7 +149,7 @@ def industrial_arm() -> Arm:
     )
 
 
-def arm_named(name: str) -> Arm:
+def arm_named(name: str) -> DhArm:
     """The nominal arm of a name: Universal Robots', or `generic-6r-1800`.
 
     Raises:
@@ -158,7 +158,7 @@ def arm_named(name: str) -> Arm:
     return industrial_arm() if name == "generic-6r-1800" else ur_arm(name)
 
 
-def disturb(arm: Arm, errors: ArmErrors, rng: np.random.Generator) -> Arm:
+def disturb(arm: DhArm, errors: ArmErrors, rng: np.random.Generator) -> DhArm:
     """Draws a real arm around a nominal one.
 
     The same generator state gives the same directions of error whatever their size.
@@ -188,12 +188,12 @@ def _functions(errors: ArmErrors, joints: int, rng: np.random.Generator) -> Floa
     return np.asarray(errors.function_sigma_rad * np.fft.irfft(power * white, _NODES, axis=0))
 
 
-def reach_m(arm: Arm) -> float:
+def reach_m(arm: DhArm) -> float:
     """Length of the stretched upper and lower arm [m]."""
     return float(np.abs(arm.a).sum())
 
 
-def link_frames(arm: Arm, joints: FloatArray) -> FloatArray:
+def link_frames(arm: DhArm, joints: FloatArray) -> FloatArray:
     """Frames of all links for a batch of postures.
 
     Args:
@@ -210,12 +210,12 @@ def link_frames(arm: Arm, joints: FloatArray) -> FloatArray:
     return frames
 
 
-def forward(arm: Arm, joints: FloatArray) -> FloatArray:
+def forward(arm: DhArm, joints: FloatArray) -> FloatArray:
     """Forward kinematics: (m, n) joint angles [rad] to (m, 4, 4) `base_from_flange`."""
     return link_frames(arm, joints)[:, -1]
 
 
-def inverse(arm: Arm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
+def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
     """Inverse kinematics by damped least squares, from one starting posture for each pose.
 
     Method: Wampler (1986); the damping follows the remaining error, so that the end of the
@@ -252,7 +252,7 @@ def inverse(arm: Arm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
     )
 
 
-def _link(arm: Arm, i: int, angle: FloatArray) -> FloatArray:
+def _link(arm: DhArm, i: int, angle: FloatArray) -> FloatArray:
     """(m, 4, 4) `link_from_next` of joint i."""
     turned = angle + arm.offset[i]
     if arm.waves[:, i].any():
@@ -279,7 +279,7 @@ def _link(arm: Arm, i: int, angle: FloatArray) -> FloatArray:
 
 
 def _linearise(
-    arm: Arm, joints: FloatArray, goal: FloatArray, scale: FloatArray
+    arm: DhArm, joints: FloatArray, goal: FloatArray, scale: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Geometric Jacobian (m, 6, n) and pose error (m, 6), both in the base frame and scaled."""
     frames = link_frames(arm, joints)

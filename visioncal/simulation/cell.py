@@ -9,7 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.session import Stream, frame_name
-from visioncal.simulation.arms import Arm
+from visioncal.simulation.arms import DhArm
 from visioncal.simulation.layout import (
     CELL,
     BoardAt,
@@ -38,8 +38,8 @@ class SimulatedRobot:
     """
 
     options: RobotAt
-    arm: Arm
-    true_arm: Arm
+    arm: DhArm
+    true_arm: DhArm
     joints: FloatArray
     base_from_flange: FloatArray
     true_base_from_flange: FloatArray
@@ -69,7 +69,7 @@ class SimulatedRobot:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class SimulatedSight:
     """A camera's image of a board at a stop.
 
     Attributes:
@@ -101,14 +101,14 @@ class Sight:
         """Whether it serves the camera's lens alone."""
         return self.stop < 0 and self.stamp_s is None
 
-    def numbered(self, view: int) -> "Sight":
+    def numbered(self, view: int) -> "SimulatedSight":
         """The same as another row."""
         exact, corners = (replace(corners, view=view) for corners in (self.exact, self.corners))
         return replace(self, view=view, exact=exact, corners=corners)
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class InstrumentReading:
     """What an instrument read of a point at a stop: (4, 4) in the instrument's frame.
 
     The rotation counts where the instrument reads any.
@@ -122,7 +122,7 @@ class Reading:
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class SimulatedCell:
     """A simulated cell of robots, cameras and boards, and what was seen in it.
 
     One robot, one camera and one board have no names, and the robot's base is what all stands on.
@@ -149,8 +149,8 @@ class Cell:
     mountings: Mapping[str, FloatArray]
     robots: Mapping[str, SimulatedRobot]
     stated: Mapping[str, Camera]
-    sights: tuple[Sight, ...] = ()
-    readings: tuple[Reading, ...] = ()
+    sights: tuple[SimulatedSight, ...] = ()
+    readings: tuple[InstrumentReading, ...] = ()
     pose_rows: tuple[tuple[int, int, str], ...] = ()
     wrong_views: tuple[int, ...] = ()
     stamps_s: FloatArray | None = None
@@ -241,7 +241,7 @@ class Cell:
 
         return before
 
-    def only(self, views: Sequence[int]) -> "Cell":
+    def only(self, views: Sequence[int]) -> "SimulatedCell":
         """The cell with some of the images and their stops, both numbered anew."""
         kept = [self.sights[view] for view in views]
         stops = list(dict.fromkeys(sight.stop for sight in kept))

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table, did_you_mean, find_described, parse_toml, read_text
+from visioncal.core.files import DocumentTable, did_you_mean, find_described, parse_toml, read_text
 from visioncal.core.types import Camera, Target
 from visioncal.session.document import NAME
 from visioncal.simulation.layout import (
@@ -93,7 +93,7 @@ def read_cell(name_or_path: str) -> NetworkOptions:
             culprits=[f"{path.name}: points"],
             next_step="Add a table [instruments.NAME], or leave the points out.",
         )
-    table = Table(document, path.name)
+    table = DocumentTable(document, path.name)
     moved = reader.listed(Moved, table, "moved")
     sweeps = reader.listed(Swept, table, "sweeps")
     return reader.read(NetworkOptions, own, "", moved=moved, sweeps=sweeps, **things)
@@ -106,7 +106,7 @@ def _shipped() -> dict[str, Path]:
 def _table(document: Mapping[str, Any], key: str, label: str) -> Mapping[str, Any]:
     content = document.get(key, {})
     if not isinstance(content, dict):
-        raise Table(document, label).refuse(key, content, f"a table [{key}.NAME] for each")
+        raise DocumentTable(document, label).refuse(key, content, f"a table [{key}.NAME] for each")
     for name in content:
         if not NAME.fullmatch(name) or name == CELL:
             raise DataError(
@@ -133,7 +133,7 @@ class _Reader:
         """One table as an object of a dataclass."""
         label = f"{self.file}, {path}" if path else self.file
         if not isinstance(row, dict):
-            raise Table({path: row}, self.file).refuse(path, row, "a table")
+            raise DocumentTable({path: row}, self.file).refuse(path, row, "a table")
         types = {name: kind for name, kind in get_type_hints(kind).items() if name not in given}
         unknown = sorted(row.keys() - types.keys())
         if unknown:
@@ -144,7 +144,7 @@ class _Reader:
                 next_step=did_you_mean(unknown[0], known),
             )
         needed = {field.name for field in fields(kind) if _has_no_default(field)}
-        table = Table(row, label)
+        table = DocumentTable(row, label)
         values: dict[str, Any] = {
             key: self._value(table, key, hint, kind, path)
             for key, hint in types.items()
@@ -152,14 +152,16 @@ class _Reader:
         }
         return kind(**values | given)
 
-    def listed(self, kind: type[_T], table: Table, key: str, path: str = "") -> tuple[_T, ...]:
+    def listed(
+        self, kind: type[_T], table: DocumentTable, key: str, path: str = ""
+    ) -> tuple[_T, ...]:
         """A list of tables as objects of a dataclass."""
         rows, path = table.content.get(key, []), f"{path}.{key}".lstrip(".")
         if not isinstance(rows, list):
             raise table.refuse(key, rows, f"a table [[{path}]] for each")
         return tuple(self.read(kind, row, f"{path} {at}") for at, row in enumerate(rows, start=1))
 
-    def _value(self, table: Table, key: str, hint: object, kind: type, path: str) -> object:
+    def _value(self, table: DocumentTable, key: str, hint: object, kind: type, path: str) -> object:
         if hint in (Camera, Target):
             named: Mapping[str, object] = CAMERAS if hint is Camera else TARGETS
             return named[table.choice(key, tuple(named))]
@@ -182,7 +184,7 @@ class _Reader:
         return tuple(table.numbers(key, 3))
 
 
-def _number(table: Table, key: str) -> float:
+def _number(table: DocumentTable, key: str) -> float:
     """A number within the range of its field."""
     value = table.number(key, positive=key in ("scale", "mass_share", "function_length_rad"))
     if key == "scale" and not 0.5 <= value <= 2.0:

@@ -6,7 +6,7 @@ from enum import IntEnum
 import numpy as np
 
 
-class Stream(IntEnum):
+class RandomStream(IntEnum):
     """What is random in a cell; the numbers from 100 on are of whole cells, by their things."""
 
     MOUNTING = 0
@@ -37,12 +37,12 @@ class Stream(IntEnum):
 
 # What another draw of the same cell draws anew, and what another recording of it does not.
 _DRAWN_ANEW = (
-    *(Stream.ARM, Stream.ROBOT, Stream.PIXELS),
-    *(Stream.ARMS, Stream.ROBOTS, Stream.CORNERS),
+    *(RandomStream.ARM, RandomStream.ROBOT, RandomStream.PIXELS),
+    *(RandomStream.ARMS, RandomStream.ROBOTS, RandomStream.CORNERS),
 )
 _KEPT = (
-    *(Stream.MOUNTING, Stream.ARM, Stream.LENS),
-    *(Stream.MOUNTINGS, Stream.ARMS, Stream.LENS_VIEWS),
+    *(RandomStream.MOUNTING, RandomStream.ARM, RandomStream.LENS),
+    *(RandomStream.MOUNTINGS, RandomStream.ARMS, RandomStream.LENS_VIEWS),
 )
 # Sets a recording's randomness apart from a draw's.
 _RECORDING = 1000
@@ -66,7 +66,7 @@ class DrawOptions:
     draw: int = 0
     recording: int = 0
 
-    def stream(self, purpose: Stream, *index: int) -> np.random.Generator:
+    def stream(self, purpose: RandomStream, *index: int) -> np.random.Generator:
         """The generator of one source of randomness; `index` is of the thing or the view."""
         again = [self.draw] if self.draw and purpose in _DRAWN_ANEW else []
         if self.recording and purpose not in _KEPT:

@@ -11,7 +11,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.simulation.arms import Arm, link_frames, ur_arm
+from visioncal.simulation.arms import DhArm, link_frames, ur_arm
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])
 # By how much masses and inertias depart from what is published (standard deviation).
@@ -42,7 +42,7 @@ _MOTOR_INERTIA = (1.1, 1.2, 0.9, 0.08, 0.08, 0.07)
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class LinkBody:
     """A rigid body.
 
     Attributes:
@@ -90,16 +90,16 @@ class Gears:
 class DynamicArm:
     """An arm with its bodies, one a link in the frame in which the link ends, and its drives."""
 
-    arm: Arm
-    bodies: tuple[Body, ...]
+    arm: DhArm
+    bodies: tuple[LinkBody, ...]
     gears: Gears
 
-    def carrying(self, load: Body) -> "DynamicArm":
+    def carrying(self, load: LinkBody) -> "DynamicArm":
         """The arm with a load on its flange, in the flange's frame."""
         return replace(self, bodies=(*self.bodies[:-1], joined(self.bodies[-1], load)))
 
 
-def joined(first: Body, second: Body) -> Body:
+def joined(first: LinkBody, second: LinkBody) -> LinkBody:
     """Two bodies of one frame as one (Huygens and Steiner)."""
     kg = first.kg + second.kg
     centre = (first.kg * first.centre_m + second.kg * second.centre_m) / kg
@@ -107,7 +107,7 @@ def joined(first: Body, second: Body) -> Body:
     for body in (first, second):
         arm = body.centre_m - centre
         inertia += body.inertia_kg_m2 + body.kg * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return Body(kg, centre, inertia)
+    return LinkBody(kg, centre, inertia)
 
 
 def nominal_dynamics(name: str) -> DynamicArm:
@@ -121,7 +121,7 @@ def nominal_dynamics(name: str) -> DynamicArm:
             f"simulation: nothing is known of the dynamics of {name!r}, only of "
             f"{', '.join(sorted(_BODIES))}."
         )
-    bodies = tuple(Body(kg, np.array(at), np.diag(main)) for kg, at, main in _BODIES[name])
+    bodies = tuple(LinkBody(kg, np.array(at), np.diag(main)) for kg, at, main in _BODIES[name])
     still = np.zeros(len(bodies))
     return DynamicArm(ur_arm(name), bodies, Gears(still, still, still, still, still + 1.0, still))
 
@@ -161,13 +161,13 @@ def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False
     )
 
 
-def _off(body: Body, share: float, rng: np.random.Generator) -> Body:
+def _off(body: LinkBody, share: float, rng: np.random.Generator) -> LinkBody:
     kg = body.kg * np.exp(share * rng.standard_normal())
     covariance = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
     stretch = np.sqrt(kg / body.kg) * (np.eye(3) + 0.5 * share * rng.standard_normal((3, 3)))
     covariance = stretch @ covariance @ stretch.T
     centre = body.centre_m + 0.01 * rng.standard_normal(3)
-    return Body(float(kg), centre, np.trace(covariance) * np.eye(3) - covariance)
+    return LinkBody(float(kg), centre, np.trace(covariance) * np.eye(3) - covariance)
 
 
 def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:

@@ -8,8 +8,8 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.session import Session, Stream
-from visioncal.simulation.cell import Cell
-from visioncal.simulation.dynamics import Body, DynamicArm, drive_torques, real_dynamics
+from visioncal.simulation.cell import SimulatedCell
+from visioncal.simulation.dynamics import DynamicArm, LinkBody, drive_torques, real_dynamics
 from visioncal.simulation.truth import write_truth
 
 _HARMONICS = 5
@@ -132,7 +132,7 @@ class ExerciseOptions:
     """
 
     robot: str = "ur10e"
-    load: Body | None = None
+    load: LinkBody | None = None
     senses: Senses = field(default_factory=Senses)
     rate_hz: float = 250.0
     seed: int = 0
@@ -174,7 +174,7 @@ def exercise(options: ExerciseOptions) -> Exercised:
     return Exercised(streams, empty)
 
 
-def with_exercises(cell: Cell, exercised: Mapping[str, Exercised]) -> Cell:
+def with_exercises(cell: SimulatedCell, exercised: Mapping[str, Exercised]) -> SimulatedCell:
     """A cell with what its robots' controllers recorded of motions: streams are `ROBOT_MOTION`."""
     streams = {
         f"{robot}_{motion}": stream

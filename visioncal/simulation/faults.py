@@ -9,13 +9,13 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray
 from visioncal.session import frame_name
-from visioncal.simulation.arms import Arm, forward, inverse
-from visioncal.simulation.cell import Cell, Sight
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.arms import DhArm, forward, inverse
+from visioncal.simulation.cell import SimulatedCell, SimulatedSight
+from visioncal.simulation.draws import RandomStream
 
 
 def misreported(
-    arm: Arm, moved: FloatArray, count: int, rng: np.random.Generator
+    arm: DhArm, moved: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, tuple[int, ...]]:
     """Joints as reported: those moved to, but for some stops whose report belongs elsewhere.
 
@@ -45,9 +45,9 @@ def misreported(
     return joints, tuple(chosen.tolist())
 
 
-def with_faults(cell: Cell) -> Cell:
+def with_faults(cell: SimulatedCell) -> SimulatedCell:
     """Exchanges images of rows, and takes some from other stops."""
-    layout, rng = cell.layout, cell.options.stream(Stream.FAULTS)
+    layout, rng = cell.layout, cell.options.stream(RandomStream.FAULTS)
     sights = list(cell.sights)
     groups: dict[tuple[str, str], list[int]] = {}
     for at, sight in enumerate(sights):
@@ -73,7 +73,7 @@ def with_faults(cell: Cell) -> Cell:
     return replace(cell, sights=tuple(sights), wrong_views=tuple(views))
 
 
-def _moves(cell: Cell, sight: Sight) -> bool:
+def _moves(cell: SimulatedCell, sight: SimulatedSight) -> bool:
     """Whether a board moves before a camera."""
     carriers = [
         cell.parents[frame_name("camera", sight.camera)],
@@ -89,6 +89,6 @@ def _pool(pools: list[list[int]], least: int) -> list[int]:
     raise DataError("simulation: there are too few rows of one camera and board for such faults.")
 
 
-def _showing(row: Sight, image: Sight) -> Sight:
+def _showing(row: SimulatedSight, image: SimulatedSight) -> SimulatedSight:
     """A row with the image of another stop."""
     return replace(image.numbered(row.view), stop=row.stop)

@@ -14,7 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.session import Stream
-from visioncal.simulation.arms import Arm, forward
+from visioncal.simulation.arms import DhArm, forward
 
 _JOINTS = 6
 # What a metre of steel and of aluminium grows by for a kelvin.
@@ -121,7 +121,7 @@ def warm_up(heat: Heat, hours: float, *, step_s: float = 10.0, seed: int = 0) ->
     return Warming(stamps, duty, measured, links, ambient)
 
 
-def heated_poses(arm: Arm, heat: Heat, q: FloatArray, links_c: FloatArray) -> FloatArray:
+def heated_poses(arm: DhArm, heat: Heat, q: FloatArray, links_c: FloatArray) -> FloatArray:
     """Where the flange stands (m, 4, 4) at (m, n) joint angles and temperatures of the links."""
     poses = []
     for row, rise in zip(q, links_c - heat.ambient_c, strict=True):
@@ -133,7 +133,7 @@ def heated_poses(arm: Arm, heat: Heat, q: FloatArray, links_c: FloatArray) -> Fl
 
 
 def heated_flanges(
-    arm: Arm, heat: Heat, q: FloatArray, links_c: FloatArray, cold: FloatArray
+    arm: DhArm, heat: Heat, q: FloatArray, links_c: FloatArray, cold: FloatArray
 ) -> FloatArray:
     """Where a flange stands (m, 4, 4) once warm that stood at `cold` (m, 4, 4), by its joints."""
     return heated_poses(arm, heat, q, links_c) @ (invert(forward(arm, q)) @ cold)

@@ -8,8 +8,8 @@ from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, Image
 from visioncal.simulation.arms import forward
 from visioncal.simulation.boards import centre_m, corners_m, outline_m
-from visioncal.simulation.cell import Cell
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.cell import SimulatedCell
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.optics import project, rays
 from visioncal.simulation.rasters import Float32Array, Patch, between, trace
 from visioncal.simulation.render import developed, light_on, prepare_scene
@@ -35,7 +35,7 @@ class LiveView:
         DataError: The cell has two boards, or OpenCV does not have the target's dictionary.
     """
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, cell: SimulatedCell) -> None:
         boards = cell.layout.boards
         if len(boards) != 1:
             raise DataError(
@@ -65,7 +65,7 @@ class LiveView:
         else:
             light = self._smeared(joints, smear_px)
         self._count += 1
-        noise = self._cell.options.stream(Stream.IMAGES, 1, self._count)
+        noise = self._cell.options.stream(RandomStream.IMAGES, 1, self._count)
         return developed(light, self._cell.camera(), noise)
 
     def cam_from_target(self, joints: FloatArray) -> FloatArray:
@@ -129,7 +129,7 @@ class LiveView:
         return np.asarray(self._cell.camera().camera.matrix[0] * (shift + turn))
 
 
-def _faces(cell: Cell, cam_from_target: FloatArray) -> bool:
+def _faces(cell: SimulatedCell, cam_from_target: FloatArray) -> bool:
     """Tells whether the board's printed side may be in the picture, at least in part."""
     board = cell.board()
     points = np.concatenate([corners_m(board), outline_m(board, margin_m(board.target))])

@@ -13,8 +13,13 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
 from visioncal.simulation import one_robot, standing
 from visioncal.simulation.arms import arm_named, forward
-from visioncal.simulation.cell import Cell, Reading, Sight, SimulatedRobot
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.cell import (
+    InstrumentReading,
+    SimulatedCell,
+    SimulatedRobot,
+    SimulatedSight,
+)
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.faults import misreported, with_faults
 from visioncal.simulation.heat import Heat, heated_flanges, warm_up
 from visioncal.simulation.imaging import detected, looks_at, seen_in
@@ -23,11 +28,13 @@ from visioncal.simulation.passage import with_sweep
 from visioncal.simulation.poses import Viewpoints, filling_m
 
 # The same sources of randomness in cells of several robots.
-_OF_SEVERAL = {Stream.ARM: Stream.ARMS, Stream.ROBOT: Stream.ROBOTS}
+_OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomStream.ROBOTS}
 
 
 @typed
-def simulate(options: CellOptions | NetworkOptions, postures: FloatArray | None = None) -> Cell:
+def simulate(
+    options: CellOptions | NetworkOptions, postures: FloatArray | None = None
+) -> SimulatedCell:
     """Builds a cell, moves its robots and looks at the boards.
 
     Args:
@@ -58,7 +65,7 @@ def simulate(options: CellOptions | NetworkOptions, postures: FloatArray | None 
     return cell
 
 
-def _of_one(options: CellOptions, postures: FloatArray | None) -> Cell:
+def _of_one(options: CellOptions, postures: FloatArray | None) -> SimulatedCell:
     """A cell of one robot and one camera, before anything is seen."""
     mountings = one_robot.mounted(options)
     if postures is None:
@@ -73,14 +80,14 @@ def _stood(
     options: CellOptions | NetworkOptions,
     mountings: Mapping[str, FloatArray],
     moved: Mapping[str, FloatArray],
-) -> Cell:
+) -> SimulatedCell:
     """A cell whose robots moved to (s, n) joint angles each [rad], before anything is seen."""
     layout = options.layout
     stamps_s = np.arange(layout.stops, dtype=np.float64) * layout.pace_s
     robots, heat = {}, {}
     for at, robot in enumerate(layout.robots):
         arm, q = arm_named(robot.robot), moved[robot.name]
-        true_arm = robot.built(_stream(options, Stream.ARM, at))
+        true_arm = robot.built(_stream(options, RandomStream.ARM, at))
         loads, approach = robot.loads(layout.stops), robot.approach(layout.stops)
         stood = robot.flange_at(true_arm, q, loads, approach)
         if robot.warms_up:
@@ -88,8 +95,8 @@ def _stood(
             warming = warm_up(heats, hours, seed=options.seed + at)
             stood = heated_flanges(true_arm, heats, q, warming.at(stamps_s), stood)
             heat[f"{robot.name}_heat"] = warming.recorded(temperatures=True)
-        jitter = robot.jitter(layout.stops, _stream(options, Stream.ROBOT, at))
-        rng = _stream(options, Stream.WRONG, at)
+        jitter = robot.jitter(layout.stops, _stream(options, RandomStream.ROBOT, at))
+        rng = _stream(options, RandomStream.WRONG, at)
         joints, wrong_stops = misreported(arm, q, robot.wrong_stops, rng)
         robots[robot.name] = SimulatedRobot(
             options=robot,
@@ -102,13 +109,13 @@ def _stood(
             loads=loads,
             approach=approach,
         )
-    return Cell(
+    return SimulatedCell(
         options=options,
         parents=standing.parents_of(layout),
         mountings=mountings,
         robots=robots,
         stated={
-            camera.name: camera.stated(_stream(options, Stream.LENS, at))
+            camera.name: camera.stated(_stream(options, RandomStream.LENS, at))
             for at, camera in enumerate(layout.cameras)
         },
         stamps_s=stamps_s if layout.pace_s else None,
@@ -116,14 +123,16 @@ def _stood(
     )
 
 
-def _stream(options: CellOptions | NetworkOptions, purpose: Stream, at: int) -> np.random.Generator:
+def _stream(
+    options: CellOptions | NetworkOptions, purpose: RandomStream, at: int
+) -> np.random.Generator:
     """The randomness of a thing by its number; the only one of its kind has none."""
     if isinstance(options, CellOptions):
         return options.stream(purpose)
     return options.stream(_OF_SEVERAL.get(purpose, purpose), at)
 
 
-def observed(cell: Cell) -> Cell:
+def observed(cell: SimulatedCell) -> SimulatedCell:
     """Adds what cameras and instruments see, stop by stop, and numbers the rows."""
     layout, where = cell.layout, _places(cell)
     poses = {
@@ -134,8 +143,8 @@ def observed(cell: Cell) -> Cell:
         if camera.at_stops
     }
     shown = {key: _shown(cell, *key, pose) for key, pose in poses.items()}
-    sights: list[Sight] = []
-    readings: list[Reading] = []
+    sights: list[SimulatedSight] = []
+    readings: list[InstrumentReading] = []
     pose_rows: list[tuple[int, int, str]] = []
     view = 0
     for stop in range(layout.stops):
@@ -157,26 +166,28 @@ def observed(cell: Cell) -> Cell:
     return with_detections(replace(cell, sights=tuple(sights)))
 
 
-def _sight(cell: Cell, view: int, stop: int, camera: str, board: str, pose: FloatArray) -> Sight:
+def _sight(
+    cell: SimulatedCell, view: int, stop: int, camera: str, board: str, pose: FloatArray
+) -> SimulatedSight:
     """What a camera sees of a board, before a detector looks at it."""
     exact = seen_in(cell.camera(camera), cell.board(board), pose, view)
-    return Sight(view, stop, camera, board, pose, exact, exact)
+    return SimulatedSight(view, stop, camera, board, pose, exact, exact)
 
 
-def with_detections(cell: Cell) -> Cell:
+def with_detections(cell: SimulatedCell) -> SimulatedCell:
     """The cell with the corners of all its images as a detector reports them."""
     options, found = cell.options, []
     # One camera's noise is drawn row after row.
-    one = options.stream(Stream.PIXELS)
+    one = options.stream(RandomStream.PIXELS)
     for sight in cell.sights:
         alone = isinstance(options, CellOptions)
-        rng = one if alone else options.stream(Stream.CORNERS, sight.view)
+        rng = one if alone else options.stream(RandomStream.CORNERS, sight.view)
         corners = detected(cell.board(sight.board), sight.exact, options.pixel_sigma_px, rng)
         found.append(replace(sight, corners=corners))
     return replace(cell, sights=tuple(found))
 
 
-def _need(cell: Cell, needed: dict[str, bool], first: str, second: str) -> None:
+def _need(cell: SimulatedCell, needed: dict[str, bool], first: str, second: str) -> None:
     """Notes the robots between two frames, and that the row has the pose of the first of them."""
     carried = (cell.robot_of(frame) for frame in (first, second) if frame)
     robots = [robot for robot in carried if robot is not None]
@@ -186,7 +197,7 @@ def _need(cell: Cell, needed: dict[str, bool], first: str, second: str) -> None:
         needed[robot] = needed.get(robot, False) or place == 0
 
 
-def _hanging(cell: Cell) -> dict[str, FloatArray]:
+def _hanging(cell: SimulatedCell) -> dict[str, FloatArray]:
     """(s, 4, 4) where each frame hangs in its parent, stop by stop."""
     layout = cell.layout
     hangs = {
@@ -198,7 +209,7 @@ def _hanging(cell: Cell) -> dict[str, FloatArray]:
                 f"simulation: {moved.frame!r} cannot be pushed; there are {', '.join(hangs)}."
             )
         start = layout.first_pushed(moved)
-        twist = cell.options.stream(Stream.FAULTS, 10 + at).standard_normal((2, 3))
+        twist = cell.options.stream(RandomStream.FAULTS, 10 + at).standard_normal((2, 3))
         twist *= np.array([[moved.turn_rad], [moved.shift_m]]) / np.linalg.norm(
             twist, axis=1, keepdims=True
         )
@@ -206,7 +217,7 @@ def _hanging(cell: Cell) -> dict[str, FloatArray]:
     return hangs
 
 
-def _places(cell: Cell) -> dict[str, FloatArray]:
+def _places(cell: SimulatedCell) -> dict[str, FloatArray]:
     """(s, 4, 4) where each frame really is in the cell, stop by stop."""
     hangs = _hanging(cell)
     flanges = {frame_name("flange", name): robot for name, robot in cell.robots.items()}
@@ -219,7 +230,7 @@ def _places(cell: Cell) -> dict[str, FloatArray]:
     return hangs
 
 
-def _shown(cell: Cell, camera: str, board: str, pose: FloatArray) -> Mask:
+def _shown(cell: SimulatedCell, camera: str, board: str, pose: FloatArray) -> Mask:
     """(s,) at which stops a camera has a board in its image, and it is recorded."""
     layout, options = cell.layout, cell.options
     seen = looks_at(cell.camera(camera).camera, cell.board(board), pose)
@@ -229,19 +240,19 @@ def _shown(cell: Cell, camera: str, board: str, pose: FloatArray) -> Mask:
         aimed = np.arange(layout.stops) % len(layout.boards) == at_board
         return np.asarray(seen | aimed)
     at_camera = [camera_at.name for camera_at in layout.cameras].index(camera)
-    share = options.stream(Stream.SHARE, at_camera, at_board).random(options.stops)
+    share = options.stream(RandomStream.SHARE, at_camera, at_board).random(options.stops)
     return np.asarray(seen & (share < options.share_seen))
 
 
-def _of_lenses(cell: Cell, first_view: int) -> list[Sight]:
+def _of_lenses(cell: SimulatedCell, first_view: int) -> list[SimulatedSight]:
     """Images of a board that is held by hand before each camera, for its lens alone."""
     layout = cell.layout
-    found: list[Sight] = []
+    found: list[SimulatedSight] = []
     for at, camera in enumerate(layout.cameras if layout.lens_views else ()):
         board = layout.boards[0]
         distance_m = filling_m(camera.camera, board)
         drawn = Viewpoints(camera=camera.camera, board=board, distance_m=distance_m, cut_views=0.0)
-        rng, views = cell.options.stream(Stream.LENS_VIEWS, at), np.empty((0, 4, 4))
+        rng, views = cell.options.stream(RandomStream.LENS_VIEWS, at), np.empty((0, 4, 4))
         while len(views) < layout.lens_views:
             views = np.concatenate([views, drawn.draw(4 * layout.lens_views, rng)])
         for pose in views[: layout.lens_views]:
@@ -250,17 +261,19 @@ def _of_lenses(cell: Cell, first_view: int) -> list[Sight]:
     return found
 
 
-def _read(cell: Cell, where: Mapping[str, FloatArray], stop: int, first_view: int) -> list[Reading]:
+def _read(
+    cell: SimulatedCell, where: Mapping[str, FloatArray], stop: int, first_view: int
+) -> list[InstrumentReading]:
     """What instruments read at a stop."""
-    found: list[Reading] = []
+    found: list[InstrumentReading] = []
     for instrument in cell.layout.instruments:
         instrument_from_cell = invert(where[frame_name("instrument", instrument.name)][stop])
         for point in cell.layout.points:
             view = first_view + len(found)
-            rng = cell.options.stream(Stream.READINGS, view)
+            rng = cell.options.stream(RandomStream.READINGS, view)
             read = instrument_from_cell @ where[frame_name("point", point.name)][stop]
             read[:3, 3] += instrument.sigma_m * rng.standard_normal(3)
             turn = instrument.sigma_rad * rng.standard_normal(3)
             read[:3, :3] = read[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
-            found.append(Reading(view, stop, instrument.name, point.name, read))
+            found.append(InstrumentReading(view, stop, instrument.name, point.name, read))
     return found

@@ -9,9 +9,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray, Mount
 from visioncal.session import frame_name
-from visioncal.simulation.arms import Arm, arm_named, reach_m
+from visioncal.simulation.arms import DhArm, arm_named, reach_m
 from visioncal.simulation.boards import Sheet, centre_m
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.layout import CellOptions, Second
 from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
 from visioncal.simulation.reach import home_posture, reached
@@ -25,7 +25,7 @@ _TRIES = 50
 
 def mounted(options: CellOptions) -> dict[str, FloatArray]:
     """(4, 4) where camera and boards hang, plausible for the arm's size, before any push."""
-    rng, reach = options.stream(Stream.MOUNTING), reach_m(arm_named(options.robot))
+    rng, reach = options.stream(RandomStream.MOUNTING), reach_m(arm_named(options.robot))
     first, *further = options.layout.boards
     front, spin = rng.uniform(-0.5, 0.5), rng.uniform(-0.4, 0.4)
     skewed = Rotation.from_rotvec(rng.normal(0.0, 0.05, 3))
@@ -72,7 +72,7 @@ def _second(second: Second, first: Sheet, pose: FloatArray, mount: Mount) -> Flo
 
 def pushed(options: CellOptions, mountings: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     """The mountings once the camera was pushed, in a direction of chance."""
-    away = options.stream(Stream.BUMP).standard_normal(3)
+    away = options.stream(RandomStream.BUMP).standard_normal(3)
     away *= options.camera_moved_m / np.linalg.norm(away)
     return {**mountings, "cam": mountings["cam"] @ compose(np.eye(3), away)}
 
@@ -88,14 +88,14 @@ def postures(options: CellOptions, mountings: Mapping[str, FloatArray]) -> Float
     for at, board in enumerate(boards):
         mine = np.arange(at, options.views, len(boards))
         target = mountings[frame_name("target", board.name)]
-        rng = options.stream(Stream.POSES, *([at] if at else []))
+        rng = options.stream(RandomStream.POSES, *([at] if at else []))
         joints[mine] = _looking(options, arm, board, (mountings["cam"], target), len(mine), rng)
     return joints
 
 
 def _looking(
     options: CellOptions,
-    arm: Arm,
+    arm: DhArm,
     board: Sheet,
     ends: tuple[FloatArray, FloatArray],
     count: int,

@@ -17,10 +17,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
-from visioncal.simulation.arms import Arm, forward
+from visioncal.simulation.arms import DhArm, forward
 from visioncal.simulation.boards import Sheet, corners_m, found_in_part
-from visioncal.simulation.cell import Cell, Sight
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.cell import SimulatedCell, SimulatedSight
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.imaging import EDGE_PX, detected
 from visioncal.simulation.layout import CELL, Swept
 from visioncal.simulation.optics import project, sees
@@ -61,7 +61,7 @@ class Passage:
             np.arange(0.5 / how.frames_hz, end_s, 1.0 / how.frames_hz),
         )
 
-    def reported(self, arm: Arm, rng: np.random.Generator) -> Recorded:
+    def reported(self, arm: DhArm, rng: np.random.Generator) -> Recorded:
         """The controller's stream, by the nominal arm and encoders with noise."""
         joints = self.way(self.robot_s)
         joints = joints + self.options.encoder_sigma_rad * rng.standard_normal(joints.shape)
@@ -112,7 +112,7 @@ def _in_turn(stops: FloatArray) -> FloatArray:
     return stops[order]
 
 
-def with_sweep(cell: Cell, swept: Swept, pushed: Cell) -> Cell:
+def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> SimulatedCell:
     """A cell with the frames of one camera while one robot goes through its stops.
 
     Args:
@@ -126,7 +126,7 @@ def with_sweep(cell: Cell, swept: Swept, pushed: Cell) -> Cell:
     _check(cell, swept)
     options, robot = cell.options, cell.robots[swept.robot]
     at = list(cell.robots).index(swept.robot)
-    rng, ticks = options.stream(Stream.SWEEPS, at), options.stream(Stream.SWEEPS, at, 1)
+    rng, ticks = options.stream(RandomStream.SWEEPS, at), options.stream(RandomStream.SWEEPS, at, 1)
     passage = Passage.through(robot.joints[: swept.stops], swept)
     recorded = passage.reported(robot.arm, rng)
     camera, board = cell.camera(swept.camera), cell.board(swept.target)
@@ -134,7 +134,7 @@ def with_sweep(cell: Cell, swept: Swept, pushed: Cell) -> Cell:
     seen_from = pushed.seen_from(swept.robot, swept.camera, swept.target)
     taken = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
     first_view = 1 + max([*taken, *(row[0] for row in cell.pose_rows)], default=-1)
-    sights: list[Sight] = []
+    sights: list[SimulatedSight] = []
 
     def before(off: FloatArray, q: FloatArray) -> FloatArray:
         return seen_from(robot.flange_at(q) @ off)
@@ -149,12 +149,14 @@ def with_sweep(cell: Cell, swept: Swept, pushed: Cell) -> Cell:
         ahead_s = swept.camera_minus_robot_s + swept.jitter_s * ticks.standard_normal()
         names = swept.camera, swept.target
         stamp_s, at_once = taken_s + ahead_s, not swept.readout_s
-        sights.append(Sight(exact.view, -1, *names, middle, exact, found, stamp_s, at_once))
+        sights.append(
+            SimulatedSight(exact.view, -1, *names, middle, exact, found, stamp_s, at_once)
+        )
     streams = {**cell.streams, swept.robot: recorded}
     return replace(cell, sights=(*cell.sights, *sights), streams=streams)
 
 
-def _check(cell: Cell, swept: Swept) -> None:
+def _check(cell: SimulatedCell, swept: Swept) -> None:
     """Refuses a sweep of what there is not, or of a camera and a target that do not move so."""
     layout = cell.layout
     for kind, name, things in (

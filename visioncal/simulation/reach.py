@@ -4,13 +4,13 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mask
-from visioncal.simulation.arms import Arm, inverse, link_frames
+from visioncal.simulation.arms import DhArm, inverse, link_frames
 
 # Postures with a smaller dexterity are so near a singularity that no operator would choose them.
 LEAST_DEXTERITY = 0.04
 
 
-def home_posture(arm: Arm, base_from_flange: FloatArray, rng: np.random.Generator) -> FloatArray:
+def home_posture(arm: DhArm, base_from_flange: FloatArray, rng: np.random.Generator) -> FloatArray:
     """(n,) the most dexterous posture at one pose (1, 4, 4); all views start from it."""
     starts = rng.uniform(-np.pi, np.pi, size=(64, arm.a.size))
     reach = inverse(arm, np.tile(base_from_flange, (64, 1, 1)), starts)
@@ -27,7 +27,7 @@ def home_posture(arm: Arm, base_from_flange: FloatArray, rng: np.random.Generato
 
 
 def reached(
-    arm: Arm, base_from_flange: FloatArray, starts: FloatArray, floor_m: float
+    arm: DhArm, base_from_flange: FloatArray, starts: FloatArray, floor_m: float
 ) -> tuple[FloatArray, Mask]:
     """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) which an operator would choose.
 
@@ -38,6 +38,6 @@ def reached(
     return reach.joints, np.asarray(good & (lowest_m(arm, reach.joints) > floor_m))
 
 
-def lowest_m(arm: Arm, joints: FloatArray) -> FloatArray:
+def lowest_m(arm: DhArm, joints: FloatArray) -> FloatArray:
     """(m,) height over the base of the lowest of elbow, wrists and flange [m]."""
     return np.asarray(link_frames(arm, joints)[:, 2:, 2, 3].min(axis=1))

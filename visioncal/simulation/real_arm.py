@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
-from visioncal.simulation.arms import Arm, ArmErrors, arm_named, disturb, forward
+from visioncal.simulation.arms import ArmErrors, DhArm, arm_named, disturb, forward
 from visioncal.simulation.sag import Payload, giving_of, sagging
 
 
@@ -48,13 +48,13 @@ class ArmOptions(ArmErrors):
         """(stops,) the sides from which stops are approached, +1 or -1; None without play."""
         return np.where(np.arange(stops) % 2, 1.0, -1.0) if self.backlash_rad else None
 
-    def built(self, rng: np.random.Generator) -> Arm:
+    def built(self, rng: np.random.Generator) -> DhArm:
         """Draws the arm as it was built."""
         return disturb(arm_named(self.robot), self, rng)
 
     def flange_at(
         self,
-        arm: Arm,
+        arm: DhArm,
         q: FloatArray,
         payloads: Sequence[Payload] = (),
         approach: FloatArray | None = None,

@@ -16,12 +16,12 @@ from visioncal.core.types import Camera, FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name, target_document
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
-from visioncal.simulation.cell import Cell, Sight
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.cell import SimulatedCell, SimulatedSight
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.layout import BoardAt, CameraAt, CellOptions
 from visioncal.simulation.optics import project
 from visioncal.simulation.options import BOARDS
-from visioncal.simulation.render import Scene, encode, prepare_scene, render
+from visioncal.simulation.render import RenderScene, encode, prepare_scene, render
 from visioncal.simulation.rows import POSE, load_row, pose_row
 from visioncal.simulation.touching import Touching, write_touches
 from visioncal.simulation.truth import truth_of, write_truth
@@ -38,7 +38,7 @@ _STEPS = exp(_STEP * np.stack([np.eye(6), -np.eye(6)]))
 
 @typed
 def write_session(
-    cell: Cell,
+    cell: SimulatedCell,
     folder: Path | str,
     progress: Callable[[float], None] | None = None,
     *,
@@ -76,12 +76,12 @@ def write_session(
 
 
 def cell_session(
-    cell: Cell, name: str, progress: Progress | None = None, *, seen: Seen = "images"
+    cell: SimulatedCell, name: str, progress: Progress | None = None, *, seen: Seen = "images"
 ) -> Session:
     """The session of a cell; see `write_session`.
 
-    With `seen="names"`, `Cell.corners` is what was detected in the images that are not there. With
-    poses of an only camera and an only board it has neither of the two.
+    With `seen="names"`, `SimulatedCell.corners` is what was detected in the images that are not
+    there. With poses of an only camera and an only board it has neither of the two.
     """
     if seen in ("images", "poses") and not all(sight.at_once for sight in cell.sights):
         raise DataError(
@@ -116,7 +116,7 @@ def cell_session(
     ).with_streams(cell.streams)
 
 
-def _rows(cell: Cell, sights: Sequence[Sight], seen: Seen) -> list[View]:
+def _rows(cell: SimulatedCell, sights: Sequence[SimulatedSight], seen: Seen) -> list[View]:
     """The rows of what cameras saw, of what instruments read, and of poses alone."""
     poses = measured_poses(cell) if seen == "poses" else [None] * len(sights)
     views = {
@@ -135,7 +135,7 @@ def _rows(cell: Cell, sights: Sequence[Sight], seen: Seen) -> list[View]:
     return [views[number] for number in sorted(views)]
 
 
-def _document(cell: Cell, name: str, seen: Seen) -> dict[str, Any]:
+def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
     """What session.toml says."""
     layout = cell.layout
     document: dict[str, Any] = {"schema": 1, "name": name}
@@ -187,7 +187,9 @@ def _target_place(board: BoardAt) -> str:
     return board.target.name if shipped else f"{frame_name('target', board.name)}.toml"
 
 
-def _row(cell: Cell, sight: Sight, seen: Seen, measured: FloatArray | None) -> View:
+def _row(
+    cell: SimulatedCell, sight: SimulatedSight, seen: Seen, measured: FloatArray | None
+) -> View:
     """The row of what a camera saw, with the board's pose where that was measured."""
     text = {"camera": sight.camera, "target": sight.board}
     numbers = {} if sight.stamp_s is None else {"stamp_s": sight.stamp_s}
@@ -205,7 +207,7 @@ def _row(cell: Cell, sight: Sight, seen: Seen, measured: FloatArray | None) -> V
 
 
 def _view(
-    cell: Cell,
+    cell: SimulatedCell,
     number: int,
     stop: int,
     robot: str | None,
@@ -234,7 +236,7 @@ def _named(text: Mapping[str, str]) -> dict[str, str]:
     return {column: name for column, name in text.items() if name}
 
 
-def _corners(sights: Sequence[Sight]) -> CornerTable:
+def _corners(sights: Sequence[SimulatedSight]) -> CornerTable:
     """The table of the corners that a detector found."""
     counts = [len(sight.corners.ids) for sight in sights]
     return CornerTable(
@@ -245,7 +247,7 @@ def _corners(sights: Sequence[Sight]) -> CornerTable:
     )
 
 
-def measured_poses(cell: Cell) -> FloatArray:
+def measured_poses(cell: SimulatedCell) -> FloatArray:
     """`cam_from_target` as a PnP on the noisy corners of each image would give it.
 
     It knows a board by its stated size: one that is larger is seen so much nearer. The error is
@@ -260,14 +262,16 @@ def measured_poses(cell: Cell) -> FloatArray:
     """
     options, sights = cell.options, [sight for sight in cell.sights if not sight.is_of_lens]
     if isinstance(options, CellOptions):
-        draws = [*options.stream(Stream.PAIRS).standard_normal((len(sights), 6))]
+        draws = [*options.stream(RandomStream.PAIRS).standard_normal((len(sights), 6))]
     else:
         numbers = [sight.view for sight in sights]
-        draws = [options.stream(Stream.MEASURED, number).standard_normal(6) for number in numbers]
+        draws = [
+            options.stream(RandomStream.MEASURED, number).standard_normal(6) for number in numbers
+        ]
     return np.array([_measured_pose(cell, *pair) for pair in zip(sights, draws, strict=True)])
 
 
-def _measured_pose(cell: Cell, sight: Sight, white: FloatArray) -> FloatArray:
+def _measured_pose(cell: SimulatedCell, sight: SimulatedSight, white: FloatArray) -> FloatArray:
     """(4, 4) `cam_from_target` as measured, by (6,) white noise."""
     ids, board = sight.exact.ids, cell.board(sight.board)
     if ids.size < 4:
@@ -290,7 +294,7 @@ def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArr
     return np.asarray((ahead - behind).T / (2.0 * _STEP))
 
 
-def _image(cell: Cell, sight: Sight) -> str:
+def _image(cell: SimulatedCell, sight: SimulatedSight) -> str:
     quality = cell.camera(sight.camera).jpeg_quality
     suffix = "png" if quality is None else "jpg"
     if not sight.camera:
@@ -299,9 +303,9 @@ def _image(cell: Cell, sight: Sight) -> str:
     return f"{folder}/{sight.view:04d}.{suffix}"
 
 
-def _rendered(cell: Cell, progress: Progress | None) -> dict[str, bytes]:
+def _rendered(cell: SimulatedCell, progress: Progress | None) -> dict[str, bytes]:
     """Takes the pictures, each of which shows one board."""
-    scenes: dict[tuple[str, str], Scene] = {}
+    scenes: dict[tuple[str, str], RenderScene] = {}
     files: dict[str, bytes] = {}
     for camera in cell.layout.cameras:
         for at, sight in enumerate(sight for sight in cell.sights if sight.camera == camera.name):

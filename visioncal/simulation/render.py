@@ -15,10 +15,10 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.session import frame_name
-from visioncal.simulation.arms import Arm, link_frames, reach_m
+from visioncal.simulation.arms import DhArm, link_frames, reach_m
 from visioncal.simulation.boards import Sheet, bow_depth_m, outline_m, unit_m
-from visioncal.simulation.cell import Cell, Sight
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.cell import SimulatedCell, SimulatedSight
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CameraOptions
 from visioncal.simulation.rasters import (
@@ -70,7 +70,7 @@ class Backdrop:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderScene:
     """What all pictures of one board by one camera share.
 
     Attributes:
@@ -89,14 +89,14 @@ class Scene:
     board: Sheet
     sheet: SheetTexture
     backdrop: Backdrop
-    sights: Sequence[Sight]
-    arm: Arm | None
+    sights: Sequence[SimulatedSight]
+    arm: DhArm | None
     joints: FloatArray
     cam_from_base: FloatArray
     noise: Callable[[int], np.random.Generator]
 
 
-def prepare_scene(cell: Cell, camera: str = "", board: str | None = None) -> Scene:
+def prepare_scene(cell: SimulatedCell, camera: str = "", board: str | None = None) -> RenderScene:
     """Draws the textures of a cell, which takes longer than one of its pictures.
 
     Args:
@@ -112,13 +112,13 @@ def prepare_scene(cell: Cell, camera: str = "", board: str | None = None) -> Sce
     sheet = cell.layout.boards[0] if board is None else cell.board(board)
     place = [camera_at.name for camera_at in cell.layout.cameras].index(camera)
     # The first draws as the only one does.
-    rng = options.stream(Stream.BACKDROP, *((place,) if place else ()))
+    rng = options.stream(RandomStream.BACKDROP, *((place,) if place else ()))
     seer, holder = frame_name("camera", camera), cell.robot_of(frame_name("target", sheet.name))
     arm, joints, cam_from_base = None, np.zeros((0, 0)), np.eye(4)
     if holder is not None and cell.robot_of(seer) is None:
         arm, joints = cell.robots[holder].arm, cell.robots[holder].joints
         cam_from_base = cell.between(seer, frame_name("base", holder))
-    return Scene(
+    return RenderScene(
         camera=optics,
         board=sheet,
         sheet=_textured(
@@ -129,7 +129,7 @@ def prepare_scene(cell: Cell, camera: str = "", board: str | None = None) -> Sce
         arm=arm,
         joints=joints,
         cam_from_base=cam_from_base,
-        noise=partial(options.stream, Stream.IMAGES),
+        noise=partial(options.stream, RandomStream.IMAGES),
     )
 
 
@@ -153,7 +153,7 @@ def _wall(rng: np.random.Generator) -> Backdrop:
     return Backdrop(draw_wall(rng, 1024), 0.004, 2.6, 2.0, False)
 
 
-def render(scene: Scene, index: int) -> Image:
+def render(scene: RenderScene, index: int) -> Image:
     """Takes the picture of one view.
 
     Returns:
@@ -173,7 +173,7 @@ def render(scene: Scene, index: int) -> Image:
 
 
 def light_on(
-    scene: Scene,
+    scene: RenderScene,
     cam_from_target: FloatArray,
     joints: FloatArray | None,
     *,
@@ -232,7 +232,7 @@ def encode(image: Image, jpeg_quality: int | None) -> bytes:
 
 
 def _behind(
-    scene: Scene, cam_from_target: FloatArray, joints: FloatArray | None
+    scene: RenderScene, cam_from_target: FloatArray, joints: FloatArray | None
 ) -> tuple[Float32Array, Raster, FloatArray]:
     """What is behind the board: its light, knots over the image, and how bright each lies."""
     camera = scene.camera.camera
@@ -273,7 +273,7 @@ def _plane_from_cam(backdrop: Backdrop, cam_from_target: FloatArray) -> FloatArr
     return lower @ invert(cam_from_target)
 
 
-def _facing(scene: Scene, cam_from_target: FloatArray) -> float:
+def _facing(scene: RenderScene, cam_from_target: FloatArray) -> float:
     """Brightness of the board: where a robot turns it, it catches more or less of the light."""
     if scene.backdrop.moves:
         return 1.0
@@ -282,7 +282,9 @@ def _facing(scene: Scene, cam_from_target: FloatArray) -> float:
     return 0.7 + 0.3 * max(float(cam_from_target[:3, 2] @ light_cam), 0.0)
 
 
-def _cover(light: Float32Array, scene: Scene, cam_from_target: FloatArray, samples: int) -> None:
+def _cover(
+    light: Float32Array, scene: RenderScene, cam_from_target: FloatArray, samples: int
+) -> None:
     """Lays the sheet over what is behind it, in place."""
     sheet, camera = scene.sheet, scene.camera.camera
     patch = _board_patch(camera, scene.board, cam_from_target)
@@ -375,7 +377,7 @@ class _Tube:
 
 
 def _draw_arm(
-    image: Image, camera: Camera, arm: Arm, joints: FloatArray, cam_from_base: FloatArray
+    image: Image, camera: Camera, arm: DhArm, joints: FloatArray, cam_from_base: FloatArray
 ) -> None:
     """Draws an arm into an image, its far parts first."""
     tubes = _tubes(arm, link_frames(arm, joints[None])[0])
@@ -389,7 +391,7 @@ def _draw_arm(
         _draw_tube(image, project(camera, ends), radii, tube.grey)
 
 
-def _tubes(arm: Arm, frames: FloatArray) -> list[_Tube]:
+def _tubes(arm: DhArm, frames: FloatArray) -> list[_Tube]:
     """Housings and links of an arm of Universal Robots' shape, sized by its reach."""
     size = reach_m(arm)
     origin, axis = frames[:, :3, 3], frames[:, :3, 2]

@@ -11,7 +11,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.simulation.arms import Arm, link_frames
+from visioncal.simulation.arms import DhArm, link_frames
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])
 # Yielding changes the levers by a hundredth, and the torques as much: enough to be exact.
@@ -85,7 +85,7 @@ class Giving:
 
 
 def sagging(
-    arm: Arm,
+    arm: DhArm,
     giving: Giving,
     joints: FloatArray,
     payloads: Sequence[Payload] = (),
@@ -115,7 +115,7 @@ def sagging(
 
 
 def giving_of(
-    arm: Arm, compliance: Sequence[float], mass_share: float, backlash: Sequence[float]
+    arm: DhArm, compliance: Sequence[float], mass_share: float, backlash: Sequence[float]
 ) -> Giving:
     """How an arm gives way; empty sequences stand for a rigid arm and for one without play.
 
@@ -134,7 +134,7 @@ def giving_of(
 
 
 def load_torques(
-    arm: Arm, giving: Giving, joints: FloatArray, payloads: Sequence[Payload]
+    arm: DhArm, giving: Giving, joints: FloatArray, payloads: Sequence[Payload]
 ) -> FloatArray:
     """(m, n) by which weight and force turn the joints [N m]: their moments about the axes."""
     frames = link_frames(arm, joints)

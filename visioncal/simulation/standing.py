@@ -10,9 +10,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.session import frame_name
-from visioncal.simulation.arms import Arm, arm_named, forward
+from visioncal.simulation.arms import DhArm, arm_named, forward
 from visioncal.simulation.boards import centre_m
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.layout import CELL, MIDDLE_M, BoardAt, CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
 from visioncal.simulation.reach import home_posture, reached
@@ -47,7 +47,7 @@ def parents_of(options: NetworkOptions) -> dict[str, str]:
 
 def mounted(options: NetworkOptions) -> dict[str, FloatArray]:
     """(4, 4) where each frame hangs in its parent, before anything is pushed."""
-    rng = options.stream(Stream.MOUNTINGS)
+    rng = options.stream(RandomStream.MOUNTINGS)
     placed = {frame_name("base", robot.name): _base(robot, rng) for robot in options.robots}
     placed |= {
         frame_name("camera", camera.name): _camera(camera, rng) for camera in options.cameras
@@ -156,7 +156,7 @@ def postures(options: NetworkOptions, placed: Mapping[str, FloatArray]) -> dict[
     flanges: dict[str, FloatArray] = {}
     for at, robot in enumerate(options.robots):
         aims = _aims(options, robot, list(found))
-        arm, rng = arm_named(robot.robot), options.stream(Stream.POSTURES, at)
+        arm, rng = arm_named(robot.robot), options.stream(RandomStream.POSTURES, at)
         if aims:
             joints = _reached(options, robot, arm, aims, placed, flanges, rng)
         else:
@@ -171,7 +171,7 @@ def postures(options: NetworkOptions, placed: Mapping[str, FloatArray]) -> dict[
 def _reached(
     options: NetworkOptions,
     robot: RobotAt,
-    arm: Arm,
+    arm: DhArm,
     aims: Sequence[_Aim],
     placed: Mapping[str, FloatArray],
     flanges: Mapping[str, FloatArray],
@@ -211,7 +211,7 @@ def _reached(
 
 def _home(
     robot: RobotAt,
-    arm: Arm,
+    arm: DhArm,
     aim: _Aim,
     placed: Mapping[str, FloatArray],
     flanges: Mapping[str, FloatArray],

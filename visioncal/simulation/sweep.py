@@ -6,8 +6,8 @@ from functools import partial
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
-from visioncal.simulation.cell import Cell, Sight
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.cell import SimulatedCell, SimulatedSight
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.layout import CellOptions
 from visioncal.simulation.observing import simulate, with_detections
 from visioncal.simulation.options import SweepOptions
@@ -17,7 +17,7 @@ from visioncal.simulation.passage import Passage
 _FEWEST_CORNERS = 8
 
 
-def sweep(options: CellOptions, how: SweepOptions | None = None) -> Cell:
+def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCell:
     """Sweeps a cell's robot through as many of its stops as are asked for.
 
     Args:
@@ -42,7 +42,7 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Cell:
     if len(seen) < 2:
         raise DataError(f"simulation: {len(seen)} frames of the sweep show the board.")
     taken_s = passage.taken_s[[frames.sights[index].stop for index in seen]]
-    rng = options.stream(Stream.SWEEP)
+    rng = options.stream(RandomStream.SWEEP)
     recorded = passage.reported(frames.robot.arm, rng)
     ahead_s = how.camera_minus_robot_s + how.jitter_s * rng.standard_normal(len(taken_s))
     kept = frames.only(seen)
@@ -56,12 +56,12 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> Cell:
     )
 
 
-def _by_rows(frames: Cell, passage: Passage) -> Cell:
+def _by_rows(frames: SimulatedCell, passage: Passage) -> SimulatedCell:
     """The frames with every corner where it was when its row was taken."""
     robot = frames.robot
     jitter = invert(robot.flange_at(robot.joints)) @ robot.true_base_from_flange
 
-    def taken(sight: Sight) -> Sight:
+    def taken(sight: SimulatedSight) -> SimulatedSight:
         seen_from = frames.seen_from("", sight.camera, sight.board)
 
         def before(off: FloatArray, q: FloatArray) -> FloatArray:

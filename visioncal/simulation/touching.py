@@ -15,8 +15,8 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
 from visioncal.simulation.arms import forward, inverse, reach_m
-from visioncal.simulation.cell import Cell, SimulatedRobot
-from visioncal.simulation.draws import Stream
+from visioncal.simulation.cell import SimulatedCell, SimulatedRobot
+from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.reach import LEAST_DEXTERITY, home_posture, lowest_m
 from visioncal.simulation.rows import pose_row
 
@@ -91,7 +91,7 @@ class Touching:
         ]
 
 
-def touch(cell: Cell) -> dict[str, Touching]:
+def touch(cell: SimulatedCell) -> dict[str, Touching]:
     """What each robot of a cell touches: with a tool of its own, a fixture before it.
 
     A point by the tool's tip, axis and plane, and then the fixture by the tip. The arm touches
@@ -103,7 +103,7 @@ def touch(cell: Cell) -> dict[str, Touching]:
     found = {}
     for at, (name, robot) in enumerate(cell.robots.items()):
         # The first draws as the only one does.
-        rng = cell.options.stream(Stream.TOUCHES, *((at,) if at else ()))
+        rng = cell.options.stream(RandomStream.TOUCHES, *((at,) if at else ()))
         found[name] = _touching(robot, rng)
     return found
 

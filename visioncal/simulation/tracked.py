@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation.arms import Arm, arm_named, forward
+from visioncal.simulation.arms import DhArm, arm_named, forward
 from visioncal.simulation.real_arm import ArmOptions
 from visioncal.simulation.rows import POSE, load_row, pose_row
 from visioncal.simulation.truth import write_truth
@@ -54,8 +54,8 @@ class Shop:
     """
 
     options: Tracked
-    arm: Arm
-    true_arm: Arm
+    arm: DhArm
+    true_arm: DhArm
     base_from_instrument: FloatArray
     flange_from_probe: FloatArray
     joints: FloatArray
@@ -86,7 +86,7 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     return Shop(options, arm, true_arm, x, z, joints, tuple(rows))
 
 
-def above(arm: Arm, stops: int, rng: np.random.Generator) -> FloatArray:
+def above(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatArray:
     """Postures all over the workspace, above the table [rad]."""
     kept: list[FloatArray] = []
     while len(kept) < stops:

@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import decode_text, read_bytes, write_atomically
 from visioncal.core.types import Camera, FloatArray
-from visioncal.simulation.cell import Cell
+from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.layout import CellOptions
 
 
@@ -82,13 +82,13 @@ def read_truth(path: Path | str) -> Truth:
         ) from error
 
 
-def truth_of(cell: Cell) -> dict[str, Any]:
+def truth_of(cell: SimulatedCell) -> dict[str, Any]:
     """What a truth's file says of a cell."""
     of_cell = _of_one if isinstance(cell.options, CellOptions) else _of_several
     return {"schema": 1} | of_cell(cell) | dict(cell.facts)
 
 
-def _of_one(cell: Cell) -> dict[str, Any]:
+def _of_one(cell: SimulatedCell) -> dict[str, Any]:
     """Of a cell of one robot and one camera, view by view."""
     options, arm = asdict(cell.options), asdict(cell.robot.true_arm)
     camera = options.pop("camera")
@@ -104,7 +104,7 @@ def _of_one(cell: Cell) -> dict[str, Any]:
     }
 
 
-def _of_several(cell: Cell) -> dict[str, Any]:
+def _of_several(cell: SimulatedCell) -> dict[str, Any]:
     """Of a cell whose things have names, stop by stop."""
     layout, robots = cell.layout, cell.robots
     return {

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.simulation.cell import Cell
+from visioncal.simulation.cell import SimulatedCell
 from visioncal.simulation.heat import Heat, Warming, heated_flanges, warm_up
 from visioncal.simulation.layout import CellOptions
 from visioncal.simulation.observing import observed, simulate
@@ -69,7 +69,7 @@ class WarmUpOptions:
         return warm_up(self.heats, self.hours, seed=self.cell.seed)
 
 
-def simulate_warm_up(options: WarmUpOptions) -> Cell:
+def simulate_warm_up(options: WarmUpOptions) -> SimulatedCell:
     """Looks at a cell's board while its arm warms up.
 
     Returns:

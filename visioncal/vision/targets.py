@@ -19,7 +19,7 @@ from visioncal.core import transforms
 from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable, read_table
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table, did_you_mean, find_described, is_inside, read_toml
+from visioncal.core.files import DocumentTable, did_you_mean, find_described, is_inside, read_toml
 from visioncal.core.types import FloatArray, IntArray, Mask, Target, TargetKind
 
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
@@ -178,13 +178,13 @@ def target_from_document(document: Mapping[str, Any], name: str) -> Target:
         DataError: A field is missing, of another type, or out of range.
     """
     try:
-        return _described(Table(document, f"target {name}"), name)
+        return _described(DocumentTable(document, f"target {name}"), name)
     except DataError as error:
         hint = error.next_step or " ".join(misspelt_keys(document))
         raise type(error)(error.message, culprits=error.culprits, next_step=hint) from error
 
 
-def _described(table: Table, name: str) -> Target:
+def _described(table: DocumentTable, name: str) -> Target:
     kind = table.choice("kind", get_args(TargetKind))
     if kind == "marker":
         return _marker(table, name)
@@ -218,7 +218,7 @@ def _described(table: Table, name: str) -> Target:
     return Target(name, "charuco", columns, rows, square_m, sigma_m, marker_m, dictionary, legacy)
 
 
-def _size(table: Table, key: str) -> float:
+def _size(table: DocumentTable, key: str) -> float:
     size_m = table.number(key, positive=True)
     if size_m > _LARGEST_IN_CM:
         raise table.refuse(
@@ -230,7 +230,7 @@ def _size(table: Table, key: str) -> float:
     return size_m
 
 
-def _check_one_unit(table: Table) -> None:
+def _check_one_unit(table: DocumentTable) -> None:
     """Refuses sides of squares and markers of which one is in another unit, as their ratio says."""
     square, marker = (table.number(name, positive=True) for name in ("square_m", "marker_m"))
     if _UNREADABLE * square < marker < square:
@@ -252,7 +252,7 @@ def _check_one_unit(table: Table) -> None:
                 )
 
 
-def _sigma(table: Table, size_m: float) -> float:
+def _sigma(table: DocumentTable, size_m: float) -> float:
     sigma_m = table.number("square_sigma_m", DEFAULT_RELATIVE_SIGMA * size_m, positive=True)
     if not LEAST_SIGMA_M <= sigma_m <= size_m:
         needed = f"a standard deviation from {LEAST_SIGMA_M:g} m to the square's own {size_m:g} m"
@@ -260,7 +260,7 @@ def _sigma(table: Table, size_m: float) -> float:
     return sigma_m
 
 
-def _marker(table: Table, name: str) -> Target:
+def _marker(table: DocumentTable, name: str) -> Target:
     size_m = _size(table, "size_m")
     sigma_m = _sigma(table, size_m)
     dictionary = table.text("dictionary")
@@ -268,7 +268,7 @@ def _marker(table: Table, name: str) -> Target:
     return Target(name, "marker", 1, 1, size_m, sigma_m, dictionary=dictionary, marker_id=marker_id)
 
 
-def _aprilgrid(table: Table, name: str) -> Target:
+def _aprilgrid(table: DocumentTable, name: str) -> Target:
     columns = table.integer("columns", _MIN_TAGS, _MAX_SQUARES)
     rows = table.integer("rows", _MIN_TAGS, _MAX_SQUARES)
     size_m = _size(table, "size_m")
@@ -300,7 +300,7 @@ def _aprilgrid(table: Table, name: str) -> Target:
     )
 
 
-def _circles(table: Table, name: str) -> Target:
+def _circles(table: DocumentTable, name: str) -> Target:
     columns = table.integer("columns", _MIN_SQUARES, _MAX_SQUARES)
     rows = table.integer("rows", _MIN_SQUARES, _MAX_SQUARES)
     square_m = _size(table, "square_m")
@@ -323,7 +323,7 @@ def _circles(table: Table, name: str) -> Target:
     )
 
 
-def _rig(table: Table, name: str) -> Target:
+def _rig(table: DocumentTable, name: str) -> Target:
     columns = table.content.get("points")
     if not isinstance(columns, Mapping) or not all(column in columns for column in RIG_COLUMNS[:4]):
         raise table.refuse("points", columns, 'the path of a table (points = "rig.csv")')
@@ -363,7 +363,7 @@ def _rig(table: Table, name: str) -> Target:
     )
 
 
-def _tags_of_rig(table: Table, columns: Mapping[str, Any]) -> dict[str, Any]:
+def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, Any]:
     """Which corners of which tags a rig's points are, and the tags' dictionary."""
     given = [name for name in ("tag", "corner") if name in columns]
     if not given:
@@ -388,7 +388,7 @@ def _tags_of_rig(table: Table, columns: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _dictionary_size(table: Table, name: str) -> int:
+def _dictionary_size(table: DocumentTable, name: str) -> int:
     """Counts the markers of one of OpenCV's dictionaries."""
     known = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
     if name not in known:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.guess.fit import Fit, no_fit, robust_fit
-from visioncal.calibration.guess.hypothesis import Hypothesis, Taken, differences, strangeness
+from visioncal.calibration.guess.hypothesis import Hypothesis, SideReading, differences, strangeness
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.types import IntArray, Mount
 
@@ -52,8 +52,8 @@ class Recording:
     def declared(self) -> Hypothesis:
         """What was declared."""
         return Hypothesis(
-            Taken.as_declared(self.robot.reading),
-            Taken.as_declared(self.camera.reading),
+            SideReading.as_declared(self.robot.reading),
+            SideReading.as_declared(self.camera.reading),
             self.mount,
         )
 

@@ -64,7 +64,7 @@ class Turns:
 
 
 @dataclass(frozen=True)
-class Taken:
+class SideReading:
     """How one side's numbers, the robot's or the camera's, are taken.
 
     Attributes:
@@ -87,7 +87,7 @@ class Taken:
     scale: float = 1.0
 
     @classmethod
-    def as_declared(cls, reading: Reading) -> "Taken":
+    def as_declared(cls, reading: Reading) -> "SideReading":
         """What a reading says."""
         return cls(Turns(reading.rotation), reading.unit, reading.inverse)
 
@@ -145,8 +145,8 @@ class Hypothesis:
         swap: Two of the robot's rows that are exchanged; empty for none.
     """
 
-    robot: Taken
-    camera: Taken
+    robot: SideReading
+    camera: SideReading
     mount: Mount
     shift: int = 0
     swap: tuple[int, ...] = ()
@@ -219,7 +219,7 @@ def _differences(
         yield f"the robot's poses of {first} and {second} exchanged"
 
 
-def _of_side(whose: str, tried: Taken, declared: Taken) -> Iterator[str]:
+def _of_side(whose: str, tried: SideReading, declared: SideReading) -> Iterator[str]:
     if tried.unit != declared.unit:
         yield f"{whose} positions in {tried.unit}"
     if tried.turns != declared.turns:

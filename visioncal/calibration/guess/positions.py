@@ -30,7 +30,7 @@ _SMALLEST, _LARGEST, _FEWEST_SIZED = np.log(1.5), np.log(20.0), 5
 
 
 @dataclass(frozen=True, eq=False)
-class Turned:
+class TurnedPairing:
     """A pairing with the unknown rotation solved for.
 
     `robot` and `camera` are (n, 3, 3) rotations of the chain's parts, `transposed` is whether
@@ -74,7 +74,7 @@ def solve_turn(
     transposed: tuple[bool, bool],
     rows: IntArray,
     sides: tuple[FloatArray, FloatArray],
-) -> Turned:
+) -> TurnedPairing:
     """Solves for X's rotation by the views that agree best."""
     robot, camera = (
         np.swapaxes(side, 1, 2) if flip else side
@@ -90,10 +90,10 @@ def solve_turn(
         angles = rotation_angle(nearest_rotation(placed[kept].mean(axis=0)).T @ placed)
         kept = np.sort(np.argsort(angles)[:count])
     score = float(np.sqrt(np.mean(angles[kept] ** 2)))
-    return Turned(pairing, transposed, rows, robot, camera, x, kept, score)
+    return TurnedPairing(pairing, transposed, rows, robot, camera, x, kept, score)
 
 
-def score_variants(recording: Recording, turned: Turned) -> Iterator[tuple[float, Variant]]:
+def score_variants(recording: Recording, turned: TurnedPairing) -> Iterator[tuple[float, Variant]]:
     """Scores all ways to take the positions, at once: they share the equations' left sides.
 
     `R_i t_X - t_Z = -(p_i + R_i R_X c_i)` for all views; t_Z goes with the means.
@@ -113,7 +113,7 @@ def score_variants(recording: Recording, turned: Turned) -> Iterator[tuple[float
 
 
 def _of_another_size(
-    recording: Recording, turned: Turned, variants: Sequence[Variant], matrix: FloatArray
+    recording: Recording, turned: TurnedPairing, variants: Sequence[Variant], matrix: FloatArray
 ) -> Iterator[tuple[float, Variant]]:
     """Scores the positions as they are, or of the inverse, with the size of the target unknown."""
     # `R_i t_X + r p_i - t_Z = -R_i R_X c_i`, whose r is the ratio over the scale. Sizes near the
@@ -152,7 +152,7 @@ def _ratio(robot_unit: str, camera_unit: str) -> float:
 
 
 def _steps(
-    recording: Recording, turned: Turned, variants: Sequence[Variant]
+    recording: Recording, turned: TurnedPairing, variants: Sequence[Variant]
 ) -> tuple[FloatArray, float]:
     """(n, 3, v) what must be made constant, and the lever, in the unit of the camera's numbers."""
     p = recording.robot.positions[turned.rows + turned.pairing.shift]

@@ -28,10 +28,10 @@ from visioncal.calibration.guess.given import (
     is_likely_unit,
     likeness,
 )
-from visioncal.calibration.guess.hypothesis import Hypothesis, Taken, strangeness
+from visioncal.calibration.guess.hypothesis import Hypothesis, SideReading, strangeness
 from visioncal.calibration.guess.positions import (
     UNIT_PAIRS,
-    Turned,
+    TurnedPairing,
     Variant,
     score_variants,
     solve_turn,
@@ -85,7 +85,7 @@ def _with_neighbours(rows: IntArray, count: int) -> IntArray:
 
 
 def _closing(
-    recording: Recording, robot: Forms, camera: Forms, turned: Sequence[Turned]
+    recording: Recording, robot: Forms, camera: Forms, turned: Sequence[TurnedPairing]
 ) -> tuple[list[Hypothesis], list[list[Hypothesis]]]:
     """The declared reading's class, and the others to be fitted, as their simplest readings."""
     scored = [
@@ -116,7 +116,7 @@ def _priced(score: float, cost: float) -> float:
     return (score + SCORE_FLOOR) * (1.0 + _PRICE * cost)
 
 
-def _cheap_cost(robot: Forms, camera: Forms, turned: Turned, variant: Variant) -> float:
+def _cheap_cost(robot: Forms, camera: Forms, turned: TurnedPairing, variant: Variant) -> float:
     """About `Recording.cost` of the simplest reading of a class, without building it."""
     transposed = (turned.transposed[0] != variant.carried) + turned.transposed[1]
     return _pairing_cost(robot, camera, turned.pairing) + variant.changes + transposed
@@ -130,7 +130,7 @@ def _pairing_cost(robot: Forms, camera: Forms, pairing: Pairing) -> float:
 
 
 def _labels(
-    recording: Recording, robot: Forms, camera: Forms, turned: Turned, variant: Variant
+    recording: Recording, robot: Forms, camera: Forms, turned: TurnedPairing, variant: Variant
 ) -> Iterator[Hypothesis]:
     """All readings that give the same chain."""
     # An inverse of the robot's poses, one of the camera's and another mount are the same change;
@@ -148,14 +148,14 @@ def _labels(
     inverses = (False,) if recording.is_measured else (False, True)
     for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
         yield Hypothesis(
-            Taken(
+            SideReading(
                 robot.turns[pairing.robot],
                 unit,
                 variant.carried != ((mount == "eye-to-hand") != inverse),
                 transposed[0],
                 variant.signs,
             ),
-            Taken(
+            SideReading(
                 camera.turns[pairing.camera],
                 camera_unit,
                 inverse,
@@ -220,7 +220,7 @@ def _turned(
     camera: Forms,
     pairings: Sequence[Pairing],
     rows: IntArray,
-) -> list[Turned]:
+) -> list[TurnedPairing]:
     """Solves for the rotations of each pairing, with each side as given and transposed."""
     solved = []
     cameras = (False,) if recording.is_measured else (False, True)

@@ -27,11 +27,11 @@ from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.starting import sensors_of
 from visioncal.calibration.stages.arms import ArmFound
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.clock import Pair
+from visioncal.calibration.stages.clock import ClockPair
 from visioncal.calibration.stages.diagnose import ResidualTest, misfits
 from visioncal.calibration.stages.image_delays import FoundDelay
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import Clock
+from visioncal.calibration.stages.offset import ClockOffset
 from visioncal.calibration.stages.validate import HeldOut
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
@@ -114,13 +114,13 @@ class Answer:
             if version.name == version.frame
         }
 
-    def clocks(self, looked: Observed) -> dict[Pair, Clock]:
+    def clocks(self, looked: Observed) -> dict[ClockPair, ClockOffset]:
         """The clocks as the fit has them, where it estimates them."""
         return {
             pair: self._fitted_clock(pair, clock.clock) for pair, clock in looked.clocks.items()
         }
 
-    def _fitted_clock(self, pair: Pair, clock: Clock) -> Clock:
+    def _fitted_clock(self, pair: ClockPair, clock: ClockOffset) -> ClockOffset:
         found = self._fitted_time(pair.effect)
         if found is None:
             return clock
@@ -132,7 +132,7 @@ class Answer:
             delays=tuple(self._fitted_delay(pair, delay) for delay in clock.delays),
         )
 
-    def _fitted_delay(self, pair: Pair, delay: FoundDelay) -> FoundDelay:
+    def _fitted_delay(self, pair: ClockPair, delay: FoundDelay) -> FoundDelay:
         found = self._fitted_time(pair.delay(delay.of))
         if found is None:
             return delay

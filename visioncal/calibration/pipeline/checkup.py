@@ -25,7 +25,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.shown import html_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mount, Progress
-from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Step, with_paths
+from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Remedy, with_paths
 from visioncal.session import Session
 from visioncal.vision.finders.board import hidden_corners
 
@@ -116,7 +116,7 @@ def _of(found: Finding, session: Path | str) -> Finding:
     if found.do is None:
         return found
     words, command = (with_paths(name, session) for name in (found.do.words, found.do.command))
-    return replace(found, do=Step(words, command))
+    return replace(found, do=Remedy(words, command))
 
 
 def _looked(known: RunState) -> tuple[RunState, VisioncalError | None]:
@@ -161,12 +161,12 @@ def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding
 
 
 def _refused(kind: str, error: VisioncalError) -> Finding:
-    return Finding(kind, error.message, Step(error.next_step) if error.next_step else None)
+    return Finding(kind, error.message, Remedy(error.next_step) if error.next_step else None)
 
 
 def _lenses(known: RunState) -> Iterator[Finding]:
     """Lenses that are stated and not those of the images."""
-    step = Step("In session.toml, delete matrix and distortion, so that they are estimated.")
+    step = Remedy("In session.toml, delete matrix and distortion, so that they are estimated.")
     for frame, look in known.cameras.items():
         stated = look.table.stated
         if stated is None:
@@ -191,7 +191,7 @@ def _lenses(known: RunState) -> Iterator[Finding]:
             yield Finding("lens", words, mend).of(frame if len(known.cameras) > 1 else "")
 
 
-def _resized(known: RunState, look: CameraLook, stated: Camera) -> tuple[str, Step] | None:
+def _resized(known: RunState, look: CameraLook, stated: Camera) -> tuple[str, Remedy] | None:
     """How much larger the images of a stated matrix are, by a lens of these images."""
     targets, model = tuple(known.session.boards.values()), look.table.model
     try:
@@ -199,7 +199,7 @@ def _resized(known: RunState, look: CameraLook, stated: Camera) -> tuple[str, St
     except VisioncalError:
         return None
     words, do = other_images(stated, found.camera.matrix)
-    return (words, Step(do)) if words else None
+    return (words, Remedy(do)) if words else None
 
 
 def _measured_px(look: CameraLook) -> float:
@@ -224,7 +224,7 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
             f"{'View' if one else 'Views'} {some_of([*map(str, out)])} "
             f"{'disagrees' if one else 'disagree'} with the others: {'its' if one else 'their'} "
             "pose or image is wrong, or something moved.",
-            Step(
+            Remedy(
                 f"Look at {'its image and pose' if one else 'their images and poses'}: repeat "
                 f"{'it' if one else 'them'}, or in views.csv, delete the row{'' if one else 's'} "
                 f"of view {rows}."
@@ -237,7 +237,7 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
             "few_stops",
             f"Only {used} views can be used; {enough} or more give a result something to be "
             "checked with.",
-            Step(
+            Remedy(
                 f"Add {enough - used} views or more, tilted by 20 to 40 degrees about different "
                 "axes."
             ),
@@ -249,7 +249,7 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
             f"The views disagree by {figure(1e3 * metres)} mm and {figure(np.rad2deg(rad))} deg "
             "from stop to stop, and arms repeat to 0.1 mm: the board is of another size than "
             "stated, the lens is not this camera's, or the poses are not of these images.",
-            Step("Calibrate: the verdict weighs the causes.", CALIBRATE),
+            Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
 
 
@@ -268,7 +268,7 @@ def _lost(known: RunState) -> Iterator[Finding]:
         (of_images, "Look at the image, and repeat the view or take it out of views.csv."),
     ):
         for words in by_reason(some):
-            yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", Step(do))
+            yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", Remedy(do))
 
 
 def _coverage(known: RunState) -> Iterator[Finding]:
@@ -285,7 +285,7 @@ def _coverage(known: RunState) -> Iterator[Finding]:
                 f"lens, which session.toml does not state, needs it all over the image: "
                 f"{_LEAST_PARTS} parts and more."
             )
-            step = Step("Add views with the board near the image's edges and corners, or nearer.")
+            step = Remedy("Add views with the board near the image's edges and corners, or nearer.")
             yield Finding("coverage", words, step).of(frame if len(known.cameras) > 1 else "")
 
 

@@ -9,7 +9,7 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.pnp import given_poses
 from visioncal.core.errors import VisioncalError
-from visioncal.core.verdict import CALIBRATE, Finding, Step
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.session import Session, View, frame_name
 from visioncal.session.document import Kind
 from visioncal.session.kinds import name_of
@@ -72,7 +72,7 @@ def _finding(kind: Kind, pair: tuple[str, str], counts: tuple[int, int, int]) ->
         "exchanged_names",
         f"The {what} of {whose} are exchanged: with them exchanged, {after} of {total} views "
         f"agree, as recorded {before}.",
-        Step(
+        Remedy(
             f"In the column {kind} of views.csv, write {second} for {first} and {first} for "
             f"{second} in all rows, and calibrate again.",
             CALIBRATE,

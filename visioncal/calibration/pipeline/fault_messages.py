@@ -9,13 +9,13 @@ import numpy as np
 
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
-from visioncal.calibration.stages.turned_images import Turned
+from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import apart
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Step, exchanging, look_at
+from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Remedy, exchanging, look_at
 from visioncal.results import Moved
 
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
@@ -28,7 +28,7 @@ _FEWEST = 2
 
 # So many views of a fault are named, and so many stops that an observation fits.
 _LISTED, _NAMED = 8, 3
-_EXCHANGE = Step("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
+_EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def moved_found(moved: Moved) -> Finding:
         f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
         f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}. The result has "
         f"{moved.frame} where it stood last, and as {moved.before} where it stood before.",
-        Step(f"Fasten {moved.frame}, and record again."),
+        Remedy(f"Fasten {moved.frame}, and record again."),
     )
 
 
@@ -157,7 +157,7 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
 def _turned_images(solved: Solved) -> list[PoseFault]:
     """Images that agree with the others once they are turned back, by how they were turned."""
     rows, found = solved.cell.rows, []
-    alike: dict[Turned, list[int]] = defaultdict(list)
+    alike: dict[ImageTurn, list[int]] = defaultdict(list)
     for at, row in enumerate(rows):
         if row.view in solved.turned and not solved.agreed.used[at]:
             alike[solved.turned[row.view]].append(at)
@@ -169,11 +169,11 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
         them = "it agrees" if len(views) == 1 else "they agree"
         left_out = "It was" if len(views) == 1 else "They were"
         words = f"{subject} {how.words}: turned back, {them} with the others. {left_out} left out."
-        step = Step("Turn these corners back in corners.csv, and calibrate again.", CALIBRATE)
+        step = Remedy("Turn these corners back in corners.csv, and calibrate again.", CALIBRATE)
         if all(images[view] for view in views):
             files = " ".join(f"SESSION/{shlex.quote(images[view])}" for view in views)
             turn = f"mogrify {how.option} {files}"
-            step = Step("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
+            step = Remedy("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
         fault = Finding("turned_images", words, step, views)
         found.append(PoseFault(fault, tuple(mine), f"its image is {how.words}"))
     return found
@@ -209,7 +209,7 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     views = _numbers(solved, out.tolist())
     thing = frame.partition("_")[0].replace("cam", "camera")
     moved = f"the {thing} stood {figure(shift_mm)} mm and {figure(turn_deg)} deg elsewhere"
-    step = Step("Fasten what moved, and calibrate the views before and after it apart.")
+    step = Remedy("Fasten what moved, and calibrate the views before and after it apart.")
     parent = problem.tree.branches.get(problem.tree.branches[frame].parent)
     on_flange = parent is not None and bool(parent.robot)
     if on_flange or len(problem.robots) == 1:
@@ -219,7 +219,7 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
             f", or the controller reported another {which} frame, {figure(other_mm)} mm and "
             f"{figure(other_deg)} deg from that of the other views"
         )
-        step = Step(
+        step = Remedy(
             f"Look which {which} frame was active in the controller, and set the same one for all "
             "views; or fasten what moved, and calibrate the views before and after it apart."
         )
@@ -238,7 +238,7 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
                 "each fits the pose in the other's row. They were left out."
             )
             views = (rows[first].view, rows[second].view)
-            step = Step(
+            step = Remedy(
                 "Write a copy of the session in which their images are exchanged, and calibrate "
                 "it.",
                 exchanging(*views),
@@ -276,7 +276,7 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
             f"{base} is where it stood before."
         )
         views = _numbers(solved, after.tolist())
-        step = Step("Fasten it, and align the stops from there on alone.", look_at(views[0]))
+        step = Remedy("Fasten it, and align the stops from there on alone.", look_at(views[0]))
         pushed = Finding("something_moved", words, step, views)
         found.append(PoseFault(pushed, tuple(after.tolist())))
     return found
@@ -313,7 +313,7 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
                 )
                 views = _numbers(solved, rows.tolist())
                 fix = "Correct its pose there in views.csv, or leave the stop out."
-                found = Finding("wrong_pose", words, Step(fix, look_at(views[0])), views)
+                found = Finding("wrong_pose", words, Remedy(fix, look_at(views[0])), views)
                 short = f"the pose of robot {robot} at stop {solved.cell.stops[stop]} is wrong"
                 yield PoseFault(found, tuple(rows.tolist()), short)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.starting import problem_of, targets_of
-from visioncal.calibration.stages.cell import Row
+from visioncal.calibration.stages.cell import ObservationRow
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
@@ -33,7 +33,7 @@ class Held:
         problem: What they measured, with the unknowns of the fit.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[ObservationRow, ...]
     views: tuple[ViewPoses, ...]
     problem: Problem
 

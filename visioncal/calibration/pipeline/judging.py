@@ -16,22 +16,28 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cause_ranking import NO_JOINTS
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.distance_scale import distance_scale
-from visioncal.calibration.stages.judged import Arm, Findings, Pair, Place, Sensor
+from visioncal.calibration.stages.judged import (
+    Findings,
+    JudgedArm,
+    JudgedPair,
+    PointAccuracy,
+    Sensor,
+)
 from visioncal.calibration.stages.measured_turns import measured_turns
-from visioncal.calibration.stages.need import Fitted, picks_of
+from visioncal.calibration.stages.need import PickInputs, picks_of
 from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
-from visioncal.core.verdict import NOTE, Finding, Step
+from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
 from visioncal.estimation.intervals import freedom_of
 from visioncal.estimation.observability import (
+    CellWords,
     Direction,
-    Scene,
     check_determined,
     check_observability,
     directions,
@@ -89,11 +95,11 @@ def findings_of(known: RunState) -> Findings:
     )
 
 
-def _pickable(known: RunState) -> Fitted:
+def _pickable(known: RunState) -> PickInputs:
     """What picks are predicted from."""
     answer, solved = known.solved, known.fitted
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
-    return Fitted(
+    return PickInputs(
         answer.problem,
         answer.fit,
         answer.covariance,
@@ -114,18 +120,18 @@ def _untied(known: RunState) -> Iterator[Finding]:
             words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
             yield Finding("unseen_target", words)
         else:
-            step = Step(untied_words(known.cell, frame))
+            step = Remedy(untied_words(known.cell, frame))
             yield Finding("untied", f"{frame} is tied to nothing.", step)
 
 
-_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[Place], Sequence[Finding]]
+_Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence[Finding]]
 
 
 def _of_pair(known: RunState) -> _Parts:
     """The worst directions and the place of work of one camera and one robot."""
     answer, work = known.solved, known.work
     budget = {name.replace("_", " "): mm for name, mm in work.budget_mm.items()}
-    place = Place("Where the views look, a point", budget, work.radius95_mm)
+    place = PointAccuracy("Where the views look, a point", budget, work.radius95_mm)
     mount = known.session.mount
     found = [*_of_measured(known)]
     return directions(answer.problem, answer.state, answer.covariance, mount), [place], found
@@ -168,7 +174,7 @@ def _of_cell(known: RunState) -> _Parts:
     return (
         sorted(worst, key=lambda value: (value.is_rotation, -value.sigma)),
         [
-            Place(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
+            PointAccuracy(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
         [moved_found(move) for move in answer.moved],
@@ -193,13 +199,13 @@ def _clock_words(known: RunState) -> Iterator[str]:
 
 def _pairs(
     sights: Sequence[ViewResult], explained: Collection[int], answer: Answer, *, alone: bool
-) -> list[Pair]:
+) -> list[JudgedPair]:
     """What each camera saw of each target; of one camera and one robot, all that there is."""
     rows: dict[tuple[str, str], list[ViewResult]] = {}
     for sight in sights:
         rows.setdefault(("", "") if alone else (sight.seer, sight.seen), []).append(sight)
     return [
-        Pair(
+        JudgedPair(
             mine,
             [
                 Rejection(view.view, view.reason)
@@ -279,7 +285,7 @@ def _sensors(
     return found
 
 
-def _arms(answer: Answer) -> list[Arm]:
+def _arms(answer: Answer) -> list[JudgedArm]:
     problem, solved = answer.problem, answer.solved
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     found = []
@@ -288,7 +294,7 @@ def _arms(answer: Answer) -> list[Arm]:
         known = not problem.is_combined
         surely = (1e3 * float(intervals[1, 0]), float(np.rad2deg(intervals[0, 0])))
         found.append(
-            Arm(
+            JudgedArm(
                 len(stops_of(problem, robot)),
                 noise["translation_mm"] if known else None,
                 noise["rotation_deg"] if known else None,
@@ -314,7 +320,7 @@ def poor_motion(known: RunState) -> Finding | None:
         return None
     poses = np.array([*known.base_from_flange.values()])
     words, advice = too_little_motion(poses, known.mount)
-    return Finding("weak_motion", words, Step(advice)) if words else None
+    return Finding("weak_motion", words, Remedy(advice)) if words else None
 
 
 def check_answer(known: RunState) -> None:
@@ -351,7 +357,7 @@ def check_answer(known: RunState) -> None:
             "belong together."
         )
 
-    scene = Scene("cell", names, motion, advice)
+    scene = CellWords("cell", names, motion, advice)
     check_determined(part, fit.state, fit.noise, scene, pixel_px, looks=looks)
 
 

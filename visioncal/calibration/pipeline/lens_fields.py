@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray, IntArray
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
@@ -163,7 +163,7 @@ def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
                 "lens_field",
                 f"{of} departs from its model: corners of one part of the image are off alike, by "
                 f"{figure(lens.field_px)} px. The result counts it, and belongs to this lens.",
-                Step(
+                Remedy(
                     "Give matrix and distortion of a model that fits the lens, or keep the work in "
                     "the middle of the image."
                 ),
@@ -180,7 +180,7 @@ def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
             yield Finding(
                 "focus",
                 f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
-                Step("Fix the focus (no autofocus), or work at one distance."),
+                Remedy("Fix the focus (no autofocus), or work at one distance."),
                 mahalanobis_sq=max(breathing, jitter),
                 up_to_mm=10.0
                 * share

@@ -23,13 +23,13 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cameras import COUNTED_BACKWARDS
 from visioncal.calibration.stages.doubts import is_scattered
 from visioncal.calibration.stages.joints import match_joints
-from visioncal.calibration.stages.robots import Pair, pairs_of
+from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
 from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import VisioncalError
 from visioncal.core.number_format import percent
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, GUESS_AND_CALIBRATE, READ_AGAIN, Finding, Step
+from visioncal.core.verdict import CALIBRATE, GUESS_AND_CALIBRATE, READ_AGAIN, Finding, Remedy
 from visioncal.estimation.chain import robot_part
 from visioncal.robot import Robot
 from visioncal.session import Session
@@ -48,26 +48,26 @@ _ALIKE_DEG = 3.0
 _SHUFFLES, _CHANCE, _FEWEST_SHUFFLED, _MOST_BY_CHANCE = 200, 0.05, 8, 0.3
 
 # No copy mirrors sound poses unasked: another sign of y would look as good.
-_MIRRORED = Step(
+_MIRRORED = Remedy(
     "Look at an image first: where it is mirrored (a flip in the camera's driver, a mirror before "
     "the lens), turn the images back (and find the corners anew), and calibrate anew. Only where "
     "the robot's frame is left-handed, convert with --guess --mirror-poses."
 )
-_MIRRORED_CORNERS = Step(
+_MIRRORED_CORNERS = Remedy(
     f"{COUNTED_BACKWARDS} As they are, the board would be seen from behind. Write a copy of the "
     "session whose u_px are mirrored back, and calibrate it.",
     GUESS_AND_CALIBRATE,
 )
-_UNRECORDED = Step(
+_UNRECORDED = Remedy(
     "Look how the poses were recorded: a logger that repeats one pose, or that writes positions as "
     "0, 0, 0 or rotations as 0, 0, 0, 1, gives no calibration. Record them again, at the same time "
     "as the images."
 )
-_UNPAIRED = Step(
+_UNPAIRED = Remedy(
     "Look how rows and images were paired: files sorted by name (10 before 2), rows sorted anew, "
     "views.csv of another run. Write into column image which file belongs to each row."
 )
-_BESIDE_JOINTS = Step(
+_BESIDE_JOINTS = Remedy(
     "Look for exchanged columns and shifted rows among x_m to qw in views.csv; or delete these "
     "columns, and the poses are those of the joint angles.",
     CALIBRATE,
@@ -279,24 +279,24 @@ def _readings_in_cell(known: RunState) -> Iterator[Finding]:
                     f"Correct the rows of robot {robot} in views.csv (base_from_flange in metres, "
                     "quaternion x, y, z, w), and calibrate again."
                 )
-                yield replace(hint, words=f"Robot {robot}: {hint.words}", do=Step(step))
+                yield replace(hint, words=f"Robot {robot}: {hint.words}", do=Remedy(step))
                 # All cameras would say so.
                 break
             mirrored.add(pair.camera)
             named = replace(hint, words=f"Camera {pair.camera}: {hint.words}")
             if hint.do is _MIRRORED_CORNERS:
                 # A copy is written of one camera and one robot alone.
-                yield replace(named, do=Step(COUNTED_BACKWARDS))
+                yield replace(named, do=Remedy(COUNTED_BACKWARDS))
                 continue
             step = (
                 f"Look at an image of {pair.camera} first: where it is mirrored (a flip in the "
                 "camera's driver, a mirror before the lens), turn its images back, and calibrate "
                 "anew."
             )
-            yield replace(named, do=Step(step))
+            yield replace(named, do=Remedy(step))
 
 
-def _closes(known: RunState, robot: str, pair: Pair) -> bool:
+def _closes(known: RunState, robot: str, pair: CameraTargetPair) -> bool:
     """Whether the chain of a pair closes as declared."""
     reported = known.robots[robot].base_from_flange
     views = [pose for pose in pair.poses if pose in reported]

@@ -7,16 +7,16 @@ from typing import Self
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.cell import Cell, Row
+from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.fit_messages import found_of_looks
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.side import FramesSide
-from visioncal.calibration.stages.turned_images import Turned
+from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
-from visioncal.estimation.joint import Fitted
+from visioncal.estimation.joint import ConvergedFit
 from visioncal.estimation.outliers import Agreed
 from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.problem import Problem
@@ -47,7 +47,7 @@ class Solved:
     arms: Mapping[str, RobotArm]
     asked: str
     late: tuple[Effect, ...]
-    turned: Mapping[int, Turned] = field(default_factory=dict)
+    turned: Mapping[int, ImageTurn] = field(default_factory=dict)
     solver: str = "joint"
 
     @property
@@ -74,7 +74,7 @@ class Solved:
         problem = replace(problem, poses={**problem.poses, **poses})
         return replace(self, agreed=replace(self.agreed, problem=problem))
 
-    def settled(self, side: FramesSide, fitted: Fitted) -> Self:
+    def settled(self, side: FramesSide, fitted: ConvergedFit) -> Self:
         """The same as lenses, boards and frames were fitted with a side."""
         agreed = replace(self.agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
         return replace(self, agreed=agreed, seen=fitted.seen, arms=side.arms)
@@ -82,7 +82,7 @@ class Solved:
     def found_of_looks(self, covariance: FloatArray) -> Iterator[Finding]:
         """Says what was found of lenses and boards; see `stages.fit_messages`."""
         if self.seen is not None:
-            fitted = Fitted(self.seen, self.part, self.agreed.fit)
+            fitted = ConvergedFit(self.seen, self.part, self.agreed.fit)
             arms, stated = self.arms.values(), None
             if any(arm.model is not None for arm in arms):
                 stated = self.part
@@ -130,7 +130,11 @@ class Solved:
         return self.pixels(mine, [self.poses[index] for index in rows], poses, state)
 
     def pixels(
-        self, rows: Sequence[Row], views: Sequence[ViewPoses], poses: FloatArray, state: State
+        self,
+        rows: Sequence[ObservationRow],
+        views: Sequence[ViewPoses],
+        poses: FloatArray,
+        state: State,
     ) -> FloatArray:
         """Reprojection errors (m,) [px] of views whose targets are at (m, 4, 4) poses."""
         looks = self.looks_at(state)

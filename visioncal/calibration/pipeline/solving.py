@@ -24,7 +24,7 @@ from visioncal.calibration.stages.kinematics import check_asked
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import lens_levels, refined
-from visioncal.calibration.stages.turned_images import Turned, turned_how
+from visioncal.calibration.stages.turned_images import ImageTurn, turned_how
 from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, DegenerateError
@@ -191,7 +191,7 @@ def _agreeing_looks(start: Solved, looked: Observed, sizes: Mapping[str, float])
     return found
 
 
-def _turned_images(fit: Solved) -> dict[int, Turned]:
+def _turned_images(fit: Solved) -> dict[int, ImageTurn]:
     """How images of views that disagree were turned or mirrored, by view."""
     agreed = fit.agreed
     looks, state, problem = fit.looks, agreed.fit.state, agreed.problem

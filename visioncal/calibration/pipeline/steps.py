@@ -28,7 +28,7 @@ from visioncal.calibration.stages.readings import (
 from visioncal.calibration.stages.robots import check_joints, check_read_joints, read_robots
 from visioncal.core.errors import DataError
 from visioncal.core.types import Rejection
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import STREAMS, Session
 
 
@@ -92,7 +92,7 @@ def _suspicious(warning: str) -> Finding:
     """What is suspicious about a session; a robot that nobody knows costs its joint angles."""
     if not warning.startswith(_OF_MODEL):
         return Finding("remark", warning)
-    return Finding("misread_joints", warning, Step("Correct [robot] model in session.toml."))
+    return Finding("misread_joints", warning, Remedy("Correct [robot] model in session.toml."))
 
 
 def _without_times(session: Session) -> str:

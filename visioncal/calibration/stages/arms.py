@@ -25,7 +25,7 @@ from visioncal.calibration.stages.thermal import (
     find_drift,
     heating,
 )
-from visioncal.calibration.stages.thermal_fit import Stops, ThermalFit
+from visioncal.calibration.stages.thermal_fit import ThermalFit, ThermalStops
 from visioncal.core.choices import Convention
 from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
@@ -210,13 +210,13 @@ class RobotArm:
         return None if self.thermal is None or not thermal.is_found(self.thermal) else self.thermal
 
     @property
-    def warming(self) -> Stops:
+    def warming(self) -> ThermalStops:
         """Where it stood, and when; a stop without a time counts as at the start."""
         if self.joints_rad is None or self.heat is None or self.thermal is None:
             raise RuntimeError("an arm drifts by its joints and what heats them")
         start_s = self.thermal.inputs.stamps_s[0]
         stamps_s = np.nan_to_num(self.heat.stamps_s, nan=start_s)
-        return Stops(self.robot, np.flatnonzero(self.stood), self.joints_rad, stamps_s)
+        return ThermalStops(self.robot, np.flatnonzero(self.stood), self.joints_rad, stamps_s)
 
     def erring(self, errors: ArmErrors | None) -> Self:
         """The arm with errors that were found at some of its stops, none of them estimated yet."""
@@ -275,7 +275,7 @@ class RobotArm:
         if inputs is None or seen.heat is None or seen.joints_rad is None or self.matched is None:
             return self
         places = stops_of(problem, self.robot)
-        stops = Stops(self.robot, places, seen.joints_rad, seen.heat.stamps_s)
+        stops = ThermalStops(self.robot, places, seen.joints_rad, seen.heat.stamps_s)
         found = find_drift(problem, start, stops, inputs, self.matched.arm)
         return replace(self, thermal=found)
 

@@ -19,7 +19,7 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, Corners
-from visioncal.core.verdict import LEAST_NEED_MM, OTHER_SIZE, Finding, Step
+from visioncal.core.verdict import LEAST_NEED_MM, OTHER_SIZE, Finding, Remedy
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
@@ -184,13 +184,13 @@ def _other_lens(
         f"by {figure(poses.sigma_px)} px. The estimated one was taken: fx, fy, cx, cy = "
         f"{', '.join(f'{value:.1f}' for value in lens.camera.matrix)} px."
     )
-    step = Step(
+    step = Remedy(
         "In session.toml, delete matrix and distortion, or give those of this camera: matrix is "
         "fx, fy, cx, cy in pixels."
     )
     resized, do = other_images(stated, lens.camera.matrix)
     if resized:
-        words, step = f"{resized} The lens was estimated of these images.", Step(do)
+        words, step = f"{resized} The lens was estimated of these images.", Remedy(do)
     found = Finding("other_lens", words, step)
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
     several = len(seen.session.cameras) > 1
@@ -297,7 +297,7 @@ def _of_other_size(session: Session, found: Detections) -> Iterator[Finding]:
     rows = f"the row{'' if one else 's'} of view{'' if one else 's'} {_listed(views)}"
     these = names[views[0]] if one else "these images"
     mend = f"Turn {these} back" if is_turned else f"Take {these} again at the camera's full size"
-    step = Step(f"{mend}; or in views.csv, delete {rows}.")
+    step = Remedy(f"{mend}; or in views.csv, delete {rows}.")
     yield Finding(OTHER_SIZE, words, step, views, until_mm=0.0)
 
 
@@ -312,7 +312,7 @@ def _said_of(again: Mapping[int, int]) -> Iterator[Finding]:
         "repeated_views",
         f"{views} {_listed(copies)} {repeat} {_listed(originals)}: poses and corners are the same "
         "to the last digit. They count once.",
-        Step(f"In views.csv, delete the {rows} of {views.lower()} {_listed(copies)}."),
+        Remedy(f"In views.csv, delete the {rows} of {views.lower()} {_listed(copies)}."),
         tuple(copies),
         until_mm=LEAST_NEED_MM,
     )

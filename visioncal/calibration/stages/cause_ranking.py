@@ -29,7 +29,7 @@ from visioncal.core.verdict import (
     REVIEW,
     SOURCES,
     Finding,
-    Step,
+    Remedy,
     Verdict,
 )
 from visioncal.results import NeedMet
@@ -106,25 +106,25 @@ _BY_THE_CHAIN = (
     "prior",
     *MOVED_AT_ONCE,
 )
-LOOK = Step(
+LOOK = Remedy(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )
 
 # What helps where the size of a board limits a result.
-TILTED = Step("Add views tilted by 30 to 45 degrees.")
-MEASURE_BOARD = Step(
+TILTED = Remedy("Add views tilted by 30 to 45 degrees.")
+MEASURE_BOARD = Remedy(
     "Measure the board with a caliper over its whole width, and state square_m, the side of one "
     "square, and square_sigma_m, how well it is known, of the target: more views tell neither."
 )
 
 # What helps where an arm errs whose joints are not known.
-NO_JOINTS = Step(
+NO_JOINTS = Remedy(
     "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
     "calibrate then estimates the arm, too."
 )
 
 
-def adding(words: str, *, modelled: bool, purpose: str = "") -> Step:
+def adding(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
     """Advice to add views, with the command that proposes them where the arm's model is known.
 
     Args:
@@ -133,9 +133,9 @@ def adding(words: str, *, modelled: bool, purpose: str = "") -> Step:
         purpose: Options of the command.
     """
     if modelled:
-        return Step(words, f"{PLAN}{purpose}")
+        return Remedy(words, f"{PLAN}{purpose}")
     model = "With [robot] model in session.toml, visioncal plan proposes them."
-    return Step(f"{words} {model}")
+    return Remedy(f"{words} {model}")
 
 
 def with_misread(verdict: Verdict, found: Finding) -> Verdict:
@@ -180,7 +180,7 @@ def ranked(
     picks: Sequence[Picks],
     met: NeedMet | None,
     *,
-    more: Step | None = None,
+    more: Remedy | None = None,
     left_out_mm: float = 0.0,
 ) -> tuple[Finding, ...]:
     """Doubts with how likely each is the cause, and the sources of errors that are too large.
@@ -209,7 +209,7 @@ def ranked(
     return tuple(_with_weak_motion(_with_joints_at_hand(found), more))
 
 
-def _with_weak_motion(found: Sequence[Finding], more: Step | None) -> Sequence[Finding]:
+def _with_weak_motion(found: Sequence[Finding], more: Remedy | None) -> Sequence[Finding]:
     """The same where the motion is why the calibration is uncertain: one cause, and one advice."""
     weak = next((finding for finding in found if finding.kind == "weak_motion"), None)
     source = next((finding for finding in found if finding.kind == "calibration"), None)
@@ -329,7 +329,7 @@ def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
 
 
 # What picks are limited by: as a kind, in words, and what helps.
-_SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
+_SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
     "calibration": (
         "calibration",
         "the calibration itself",
@@ -338,7 +338,7 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "board": (
         "unmeasured_board",
         "the board, whose size is not known better",
-        Step(
+        Remedy(
             "Measure the board over many squares, and state square_m and square_sigma_m in its "
             ".toml."
         ),
@@ -346,12 +346,12 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
     "look": (
         "robot_noise",
         "the robot's own noise where it looks, which more views do not change",
-        Step("Look several times from different stops, and take the mean."),
+        Remedy("Look several times from different stops, and take the mean."),
     ),
     "pick": (
         "robot_noise_of_pick",
         "the robot's own noise where it picks, which no calibration changes",
-        Step("Take a robot that repeats better, or a gripper that forgives."),
+        Remedy("Take a robot that repeats better, or a gripper that forgives."),
     ),
     "arm": (
         "arm_errors",
@@ -366,7 +366,7 @@ _SOURCES: Mapping[str, tuple[str, str, Step | None]] = {
 }
 
 
-def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Step | None) -> list[Finding]:
+def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -> list[Finding]:
     """What makes errors as large as they are, by the worst camera and robot."""
     if met is None:
         worst = max(picks, key=lambda pick: pick.good_for_mm)

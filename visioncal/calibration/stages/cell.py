@@ -25,7 +25,7 @@ _CELL = "cell"
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class ObservationRow:
     """An observation that can be used, of a place alone or of a pose."""
 
     view: int
@@ -55,11 +55,11 @@ class Cell:
     tree: Tree
     reference: str
     poses: Mapping[str, FloatArray]
-    rows: tuple[Row, ...]
+    rows: tuple[ObservationRow, ...]
     reasons: Mapping[int, str] = field(default_factory=dict)
     stops: tuple[int, ...] = ()
     priors: tuple[FramePrior, ...] = ()
-    held: tuple[Row, ...] = ()
+    held: tuple[ObservationRow, ...] = ()
 
     def from_when(self, station: int) -> str:
         """From when on, in the session's own numbers."""
@@ -130,7 +130,7 @@ def read_cell(seen: Observed) -> Cell:
             next_step="Give rows images and cameras, or poses in cft_ columns.",
         )
     rows = [
-        Row(
+        ObservationRow(
             observation.view.number,
             observation.station,
             observation.seer,

@@ -11,12 +11,12 @@ import numpy as np
 
 from visioncal.calibration.guess.joints import JointReading, declared_reading, unit_readings
 from visioncal.calibration.stages.image_delays import find_delays, straighten
-from visioncal.calibration.stages.motion import Motion, at_rest, is_open, slow_and_new
+from visioncal.calibration.stages.motion import RobotMotion, at_rest, is_open, slow_and_new
 from visioncal.calibration.stages.offset import (
     FEWEST_VIEWS,
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
-    Clock,
+    ClockOffset,
     change_doubt,
     clock_words,
     no_offset,
@@ -41,7 +41,7 @@ from visioncal.estimation.clock import (
     left_by,
     refined_change,
 )
-from visioncal.estimation.clock_correlation import Frames, Match, turning_matches
+from visioncal.estimation.clock_correlation import ImageTimes, Match, turning_matches
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.effects.delays import Delay
 from visioncal.estimation.trajectory import Trajectory
@@ -65,7 +65,7 @@ _SURELY_ALIKE = 0.9
 
 
 @dataclass(frozen=True)
-class Pair:
+class ClockPair:
     """A camera's frame and the name of a robot that parts it from what it sees."""
 
     camera: str
@@ -100,7 +100,7 @@ class Clocked:
         notes: What is good to know.
     """
 
-    clock: Clock
+    clock: ClockOffset
     views: tuple[View, ...]
     rejections: tuple[Rejection, ...]
     spared: Mapping[int, str]
@@ -110,7 +110,7 @@ class Clocked:
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class CameraSweep:
     """What one camera saw while one robot moved.
 
     Attributes:
@@ -122,14 +122,14 @@ class Sweep:
         positions: (c, 3) corners of all boards, numbered through [m].
     """
 
-    motion: Motion
+    motion: RobotMotion
     mount: Mount
     views: tuple[View, ...]
     stated_s: float | None
     camera: Camera | None = None
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
-    def frames(self, seen: Sequence[tuple[View, ViewPoses]]) -> Frames:
+    def frames(self, seen: Sequence[tuple[View, ViewPoses]]) -> ImageTimes:
         """What the camera saw over time, each view by its best pose."""
         known = [view.corners for _, view in seen]
         corners = {
@@ -137,7 +137,7 @@ class Sweep:
         }
         measured = bool(seen) and len(corners) == len(seen)
         stacked = measured and self.camera is not None
-        return Frames(
+        return ImageTimes(
             "eye-in-hand" if self.mount == "eye-in-hand" else "eye-to-hand",
             np.array([view.stamp_s for view, _ in seen], dtype=float),
             np.array([view.cam_from_target[0] for _, view in seen]).reshape(-1, 4, 4),
@@ -146,7 +146,7 @@ class Sweep:
         )
 
 
-def set_clock(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> Clocked:
+def set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> Clocked:
     """Gives views the robot's poses at their time.
 
     Args:
@@ -182,14 +182,14 @@ class _Matched:
     """
 
     views: Sequence[View]
-    frames: Frames
+    frames: ImageTimes
     matches: Sequence[Match]
     sound: Sequence[Match]
     fits: Sequence[ClockFit]
     fit: ClockFit | None
 
 
-def _match(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> _Matched:
+def _match(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> _Matched:
     flange, stated_s = sweep.motion.flange, sweep.stated_s
     views = [view for view in sweep.views if is_open(view) and view.number in poses]
     views.sort(key=lambda view: view.stamp_s or 0.0)
@@ -205,7 +205,7 @@ def _match(sweep: Sweep, poses: Mapping[int, ViewPoses]) -> _Matched:
     return _Matched(views, frames, matches, sound, fits, clear_fit(fits, stated_s))
 
 
-def _placed_by(sweep: Sweep, found: _Matched, poses: Mapping[int, ViewPoses]) -> Clocked:
+def _placed_by(sweep: CameraSweep, found: _Matched, poses: Mapping[int, ViewPoses]) -> Clocked:
     """Gives views their poses by the best that the motion says."""
     fit, sound = found.fit, found.sound
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
@@ -220,7 +220,7 @@ def _placed_by(sweep: Sweep, found: _Matched, poses: Mapping[int, ViewPoses]) ->
     return _undetermined(sweep, found.views, (found.fits, found.matches))
 
 
-def _change(sweep: Sweep, frames: Frames, fit: ClockFit) -> ClockChange | None:
+def _change(sweep: CameraSweep, frames: ImageTimes, fit: ClockFit) -> ClockChange | None:
     """How the offset changes over the frames; None where it does not, or that explains little."""
     # A fit to both sides of a jump misleads about its size, which is found in a few rounds.
     flange, change = sweep.motion.flange, clock_change(sweep.motion.flange, frames, fit)
@@ -248,7 +248,9 @@ def _corrected(view: View, change: ClockChange) -> View:
     return replace(view, numbers={**view.numbers, "stamp_s": stamp_s})
 
 
-def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses]) -> Frames:
+def _frames(
+    sweep: CameraSweep, views: Sequence[View], poses: Mapping[int, ViewPoses]
+) -> ImageTimes:
     """What the camera saw over time: of several boards one, and where it can be of clear poses."""
     seen = [(view, poses[view.number]) for view in views]
     boards = [view.board for _, view in seen]
@@ -258,7 +260,9 @@ def _frames(sweep: Sweep, views: Sequence[View], poses: Mapping[int, ViewPoses])
     return sweep.frames(clear if 2 * len(clear) > len(seen) else seen)
 
 
-def misread_joints(sweep: Sweep, poses: Mapping[int, ViewPoses], robot: Robot) -> DataError | None:
+def misread_joints(
+    sweep: CameraSweep, poses: Mapping[int, ViewPoses], robot: Robot
+) -> DataError | None:
     """The error of a stream of joint angles alone that turn as the camera sees in another unit.
 
     Args:
@@ -294,16 +298,16 @@ def misread_joints(sweep: Sweep, poses: Mapping[int, ViewPoses], robot: Robot) -
 
 
 def _by_motion(
-    sweep: Sweep,
+    sweep: CameraSweep,
     views: Sequence[View],
     found: tuple[ClockFit, Match],
-    frames: Frames,
+    frames: ImageTimes,
     poses: Mapping[int, ViewPoses],
 ) -> Clocked:
     fit, match = found
     late, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
     fit = fit if late is None else late.clock
-    clock = Clock(
+    clock = ClockOffset(
         fit.offset_s,
         fit.sigma_s,
         "motion",
@@ -320,7 +324,7 @@ def _by_motion(
 
 
 def _straightened(
-    sweep: Sweep,
+    sweep: CameraSweep,
     placed: Clocked,
     views: Sequence[View],
     poses: Mapping[int, ViewPoses],
@@ -352,9 +356,9 @@ def _straightened(
     return replace(placed, clock=replace(clock, delays=delays), poses=found.poses)
 
 
-def _by_turning(sweep: Sweep, views: Sequence[View], match: Match) -> Clocked:
+def _by_turning(sweep: CameraSweep, views: Sequence[View], match: Match) -> Clocked:
     """Takes the offset at which both turn alike, where the chain as it is read does not close."""
-    clock = Clock(
+    clock = ClockOffset(
         match.offset_s, match.sigma_s, "turning", sweep.stated_s, 0, match.correlation, speeds={}
     )
     warnings = [turning_doubt(match), *stated_doubts(clock, views)]
@@ -362,7 +366,7 @@ def _by_turning(sweep: Sweep, views: Sequence[View], match: Match) -> Clocked:
 
 
 def _undetermined(
-    sweep: Sweep,
+    sweep: CameraSweep,
     views: Sequence[View],
     tried: tuple[Sequence[ClockFit], Sequence[Match]],
 ) -> Clocked:
@@ -373,7 +377,7 @@ def _undetermined(
     correlation = max((match.correlation for match in tried[1]), default=None)
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
     resting = at_rest(sweep.motion.flange, stamps_s - offset_s)
-    clock = Clock(offset_s, 0.0, "rest", stated_s, 0, correlation, speeds={})
+    clock = ClockOffset(offset_s, 0.0, "rest", stated_s, 0, correlation, speeds={})
     if resting.all() and len(views):
         note = (
             f"The clocks of camera and robot are taken to be {1e3 * offset_s:+.4g} ms apart, "
@@ -407,9 +411,9 @@ def _undetermined(
 
 
 def _placed(
-    sweep: Sweep,
+    sweep: CameraSweep,
     views: Sequence[View],
-    clock: Clock,
+    clock: ClockOffset,
     warnings: Sequence[Finding],
     notes: Sequence[str],
 ) -> Clocked:
@@ -454,7 +458,7 @@ def _chosen(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> Int
 
 
 def _uncovered(
-    motion: Motion, views: Sequence[View], at_s: FloatArray, covered: Mask
+    motion: RobotMotion, views: Sequence[View], at_s: FloatArray, covered: Mask
 ) -> Iterator[tuple[int, str]]:
     """The views about which the stream says nothing, and why."""
     first_s, last_s = motion.flange.stamps_s[[0, -1]]

@@ -11,14 +11,20 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.clock import Clocked, Pair, Sweep, misread_joints, set_clock
+from visioncal.calibration.stages.clock import (
+    CameraSweep,
+    Clocked,
+    ClockPair,
+    misread_joints,
+    set_clock,
+)
 from visioncal.calibration.stages.motion import is_open, motion_of, stream_of
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import Clock
+from visioncal.calibration.stages.offset import ClockOffset
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.types import Rejection
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.parts import Effect
 from visioncal.robot import Robot
@@ -49,24 +55,24 @@ def set_clocks(seen: T) -> T:
     return seen
 
 
-def _waiting(session: Session) -> dict[Pair, list[View]]:
+def _waiting(session: Session) -> dict[ClockPair, list[View]]:
     """The rows that lack the pose of one robot that has a stream, where any of them has a time."""
     if not session.streams or not any(is_open(view) for view in session.views):
         return {}
-    found: dict[Pair, list[View]] = {}
+    found: dict[ClockPair, list[View]] = {}
     for observation in session.observations:
         if (
             len(observation.lacks) == 1
             and is_seen(observation.view)
             and stream_of(session, observation.lacks[0])
         ):
-            found.setdefault(Pair(observation.seer, observation.lacks[0]), []).append(
+            found.setdefault(ClockPair(observation.seer, observation.lacks[0]), []).append(
                 observation.view
             )
     return {pair: rows for pair, rows in found.items() if any(map(is_open, rows))}
 
 
-def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
+def _with_pair(seen: T, pair: ClockPair, rows: list[View]) -> T:
     session, lens = seen.session, seen.lenses.get(pair.camera)
     document = session.robot_documents.get(pair.robot)
     # An only pair needs no name, and there is nothing to go on with where it has no clock.
@@ -76,7 +82,7 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
     model = None if document is None else Robot.from_document(document)
     try:
         motion = motion_of(session, model, stream_of(session, pair.robot))
-        sweep = Sweep(
+        sweep = CameraSweep(
             motion,
             "eye-in-hand" if on_flange else "eye-to-hand",
             tuple(rows),
@@ -89,7 +95,9 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
         if is_only:
             raise
         lost = [Rejection(row.number, f"no pose: {error.message}") for row in rows]
-        found = Finding("clock", error.message, Step(error.next_step) if error.next_step else None)
+        found = Finding(
+            "clock", error.message, Remedy(error.next_step) if error.next_step else None
+        )
         return seen.noting(lost, (found.of(of),))
     named = {"robot": pair.robot} if pair.robot else {}
     views = tuple(replace(view, text={**view.text, **named}) for view in clocked.views)
@@ -102,7 +110,7 @@ def _with_pair(seen: T, pair: Pair, rows: list[View]) -> T:
     return seen.noting(clocked.rejections, (warning.of(of) for warning in clocked.warnings))
 
 
-def _set(sweep: Sweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
+def _set(sweep: CameraSweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
     try:
         return set_clock(sweep, poses)
     except (DataError, DegenerateError) as error:
@@ -123,7 +131,7 @@ def _stated_s(session: Session, camera: str) -> float | None:
 
 
 def clock_effects(
-    cell: Cell, clocks: Mapping[Pair, Clocked], erring: Collection[str] = ()
+    cell: Cell, clocks: Mapping[ClockPair, Clocked], erring: Collection[str] = ()
 ) -> tuple[Effect, ...]:
     """The errors of offsets and times within images [s], as effects on the cell's rows.
 
@@ -146,7 +154,7 @@ def clock_effects(
     return tuple(found)
 
 
-def _effect(cell: Cell, pair: Pair, clock: Clock, sigma_s: float) -> Effect:
+def _effect(cell: Cell, pair: ClockPair, clock: ClockOffset, sigma_s: float) -> Effect:
     speeds = clock.speeds
     concerned = np.array([row.view in speeds for row in cell.rows], dtype=bool)
     robot = robot_key(pair.robot)

@@ -15,9 +15,9 @@ from visioncal.core.types import Camera, Corners, FloatArray, Image, Progress, R
 from visioncal.results.evidence import ExplainedImage, ViewEvidence
 from visioncal.session import Session, View
 from visioncal.vision.dense.blur import Blur
-from visioncal.vision.dense.fit import Fitted, fit_corners
+from visioncal.vision.dense.fit import FittedCorners, fit_corners
 from visioncal.vision.dense.library import ONE_TORCH_THREAD
-from visioncal.vision.dense.shown import MAGNIFIED, Explained, explain
+from visioncal.vision.dense.shown import MAGNIFIED, DenseImage, explain
 from visioncal.vision.finders.template import Refined, refine
 
 # Views that show whether smoothing helps, its sigma [px], and by how much it has to.
@@ -28,7 +28,7 @@ _KINDS = ("charuco", "checkerboard")
 # Of pictures for people.
 _QUALITY = 90
 # What the template has of an image, and what all pixels have.
-_Look: TypeAlias = tuple[Refined, Fitted | None]
+_Look: TypeAlias = tuple[Refined, FittedCorners | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Dense:
     """
 
     device: str
-    fits: Mapping[int, Fitted] = field(default_factory=dict)
+    fits: Mapping[int, FittedCorners] = field(default_factory=dict)
     threads: int = 0
 
     @property
@@ -165,7 +165,7 @@ def _smoothing_helps(plain: Sequence[_Look | None], smooth: Sequence[_Look | Non
     return bool(shares) and float(np.median(shares)) < _HELPS
 
 
-def _weighed(seen: Corners, fit: Fitted | None, weights: FloatArray) -> Corners:
+def _weighed(seen: Corners, fit: FittedCorners | None, weights: FloatArray) -> Corners:
     """The corners that a fit has, or those of the template, with weights where they are known."""
     known = np.isfinite(weights)
     if fit is None and known.any():
@@ -217,7 +217,7 @@ def _as_jpeg(image: Image) -> bytes:
     return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
 
 
-def _words(fit: Fitted, found: Explained) -> str:
+def _words(fit: FittedCorners, found: DenseImage) -> str:
     """What blurs an image, and how much of it is not explained."""
     blur = fit.blur
     cause = {

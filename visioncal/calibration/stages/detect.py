@@ -78,7 +78,7 @@ class Detections:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _Detection:
     """What one image gave."""
 
     found: Corners | Rejection
@@ -138,7 +138,7 @@ def detect(
     among = session.views if among is None else among
     views = [view for view in among if view.image and not view.has_corners]
     stated = _stated_resolution(session, among)
-    looks: list[_Look] = []
+    looks: list[_Detection] = []
     others = {board for board in session.boards if _shows_another(session, board, views)}
     quick = replace(options, quick=True, keeps=False)
     room = _Room()
@@ -148,7 +148,7 @@ def detect(
         ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
     ):
 
-        def look_at(view: View) -> _Look:
+        def look_at(view: View) -> _Detection:
             mine = quick if session.board_of(view) in others else options
             return _look(session, view, stated, mine, room, kept)
 
@@ -239,10 +239,10 @@ def _look(
     options: DetectOptions,
     room: _Room,
     kept: KeptCorners,
-) -> _Look:
+) -> _Detection:
     absence = session.images.absence(view.image)
     if absence:
-        return _Look(Rejection(view.number, f"{view.image} {absence}"), None)
+        return _Detection(Rejection(view.number, f"{view.image} {absence}"), None)
     name = session.board_of(view)
     target = session.boards[name]
     data = session.images.read(view.image)
@@ -250,22 +250,22 @@ def _look(
     pixels = size[0] * size[1]
     if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
         # Refused in any case: what another size shows need not be looked at.
-        return _Look(Rejection(view.number, f"{view.image} is of another size"), size)
+        return _Detection(Rejection(view.number, f"{view.image} is of another size"), size)
     # Digests of images take time, too.
     key = kept.key(data, target, name) if kept.entries or options.keeps else ""
     before = kept.get(key, view.number)
     if before is not None:
-        return _Look(before.found, before.size, before.misfit)
+        return _Detection(before.found, before.size, before.misfit)
     most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
     with room.taken(pixels / most):
         image = _decoded(view, data)
         if isinstance(image, Rejection):
-            return _Look(image, None)
+            return _Detection(image, None)
         found, misfit = look_for(image, target, view.number, options, name=name)
     searched = Searched(found, misfit, (image.shape[1], image.shape[0]))
     if key:
         kept.put(key, searched)
-    return _Look(found, searched.size, misfit)
+    return _Detection(found, searched.size, misfit)
 
 
 def look_for(
@@ -342,7 +342,7 @@ def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptio
 def _common_resolution(
     session: Session,
     views: Sequence[View],
-    looks: Sequence[_Look],
+    looks: Sequence[_Detection],
     given: Sequence[View],
     stated: tuple[int, int] | None,
 ) -> tuple[int, int]:
@@ -386,13 +386,13 @@ def _common_resolution(
     return wanted
 
 
-def _of_size(look: _Look, view: View, resolution: tuple[int, int]) -> _Look:
+def _of_size(look: _Detection, view: View, resolution: tuple[int, int]) -> _Detection:
     """The look at an image; a rejection where it has another size than the camera's."""
     if look.resolution in (None, resolution):
         return look
     (width, height), (wide, high) = look.resolution, resolution
     words = f"{view.image} is {width} x {height} px, and the camera's images are {wide} x {high}"
-    return _Look(Rejection(view.number, words), None)
+    return _Detection(Rejection(view.number, words), None)
 
 
 def _other_size(
@@ -448,12 +448,12 @@ def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, in
     return sizes.pop() if len(sizes) == 1 else None
 
 
-def _rejections(looks: Sequence[_Look]) -> list[Rejection]:
+def _rejections(looks: Sequence[_Detection]) -> list[Rejection]:
     return [look.found for look in looks if isinstance(look.found, Rejection)]
 
 
 def _check_layout(
-    session: Session, name: str, views: Sequence[View], looks: Sequence[_Look]
+    session: Session, name: str, views: Sequence[View], looks: Sequence[_Detection]
 ) -> None:
     """Refuses a board whose markers lie otherwise than declared in most views that show it."""
     target, board_of = session.boards[name], session.board_of

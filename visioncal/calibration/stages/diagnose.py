@@ -10,7 +10,7 @@ from visioncal.calibration.stages.cause_ranking import NO_JOINTS
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import PLAN, Finding, Step
+from visioncal.core.verdict import PLAN, Finding, Remedy
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
 from visioncal.estimation.moves import Move, Slip, log_gain, slight_move, slipped_joint
 from visioncal.estimation.problem import Problem
@@ -135,7 +135,7 @@ def doubts(
             f"under {SIGNIFICANT:.0f}): its links are off from the model by typically {size}; "
             "they were estimated along. What of them looks the same in all views is in no "
             "residual, and counts in the covariance.",
-            Step(
+            Remedy(
                 "Add stops all over the workspace, so that the arm can be calibrated along.",
                 f"{PLAN} --for kinematics",
             ),
@@ -151,7 +151,7 @@ def doubts(
             "moved_slowly",
             f"Residuals drift with time: from the first stop to the last, base or target moved by "
             f"{_size(moved.moved_m, moved.moved_rad)}.",
-            Step("Fasten base and target, let the arm warm up, and record again."),
+            Remedy("Fasten base and target, let the arm warm up, and record again."),
         )
     if alike is not None and alike.is_significant:
         yield Finding(
@@ -159,7 +159,7 @@ def doubts(
             f"Neighbouring stops err alike: leaving them out in blocks moves the answer "
             f"{figure(np.sqrt(alike.factor))} times farther than independent noise would. The "
             "robot's share of the sigmas was multiplied by as much.",
-            Step("Record again, with the stops in an order of chance."),
+            Remedy("Record again, with the stops in an order of chance."),
         )
 
 
@@ -185,7 +185,7 @@ def _at_once(
         "joint_slipped" if is_joint else "moved_at_once",
         f"{_step_words(step, from_when, joint)}; the result is between "
         f"{'before and after' if is_joint else 'both places'}.{instead}",
-        Step(f"{do}, and record again; or keep only the views before or after."),
+        Remedy(f"{do}, and record again; or keep only the views before or after."),
         mahalanobis_sq=step.mahalanobis_sq,
     )
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 
 # Errors of an arm's lengths are smaller, or leave as much unexplained; none are as large as the
 # last share.
@@ -53,7 +53,7 @@ def distance_scale(
         "board_size",
         f"By the robot's motion the distances in the measured poses (cft_) are too {short} by "
         f"{percent}: the board is {size} by that than the program was told that measured them.",
-        Step(
+        Remedy(
             "Measure the board with a caliper, and measure the poses again with its true size; or "
             f"multiply cft_x_m, cft_y_m and cft_z_m by {1.0 + share:.5g}."
         ),

@@ -11,11 +11,11 @@ from visioncal.calibration.stages.cause_ranking import (
     NO_JOINTS,
     adding,
 )
-from visioncal.calibration.stages.judged import Arm, Findings, Pair, Sensor
+from visioncal.calibration.stages.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mount
-from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Step, look_at
+from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Remedy, look_at
 from visioncal.results import Rms, ViewResult
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
@@ -139,7 +139,7 @@ def _is_mostly_of(findings: Findings, *sources: str) -> bool:
     return of_these > 0.5 * of_all
 
 
-def helping(findings: Findings) -> Step | None:
+def helping(findings: Findings) -> Remedy | None:
     """What makes a result less uncertain; None where that is said of the arm already."""
     if _is_of_board(findings):
         return MEASURE_BOARD
@@ -149,7 +149,7 @@ def helping(findings: Findings) -> Step | None:
     return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
-def _tilted(findings: Findings) -> Step:
+def _tilted(findings: Findings) -> Remedy:
     words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
     if not all(arm.can_tilt for arm in findings.arms):
         words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
@@ -183,7 +183,7 @@ def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
             "unexplained",
             f"Left out of the fit, views disagree with the others by "
             f"{', '.join(words)}, rms; the worst are {named}.",
-            Step(
+            Remedy(
                 f"Look at the worst views for possible causes: {_CAUSES[findings.mount]}, or an "
                 "arm with large model errors.",
                 REVIEW,
@@ -199,7 +199,7 @@ def _worst_views(views: Sequence[ViewResult]) -> list[ViewResult]:
     return sorted(measured, key=lambda view: -(view.residual_mm or 0.0))[:_LISTED_VIEWS]
 
 
-def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
+def _disagreement_doubts(pair: JudgedPair) -> Iterator[Finding]:
     """Names the views that were left out because they contradict the others."""
     out = pair.disagreeing
     if not out:
@@ -212,9 +212,9 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
         named, them, rows = f"views {', '.join(map(str, views))}", "them", "their rows"
         words = f"V{named[1:]} were left out. View {views[0]} {out[0].reason}.{run}"
     step = (
-        Step("Fasten what moved, and calibrate the views before and after it apart.")
+        Remedy("Fasten what moved, and calibrate the views before and after it apart.")
         if run
-        else Step(
+        else Remedy(
             f"Compare image and pose of {named}: record {them} again, or in views.csv, delete "
             f"{rows}.",
             look_at(views[0]),
@@ -224,7 +224,7 @@ def _disagreement_doubts(pair: Pair) -> Iterator[Finding]:
     yield Finding(kind, words, step, views, without_it=without_it).of(pair.name)
 
 
-def _run(pair: Pair) -> str:
+def _run(pair: JudgedPair) -> str:
     """Says so where the views that were left out follow each other, with no other between them."""
     out = [rejection.view for rejection in pair.disagreeing]
     compared = [view.view for view in pair.views if view.used or view.view in out]
@@ -251,7 +251,7 @@ def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
                 f"from the others, {ratio:.0f} times what is typical. It is in the fit and pulls "
                 "at it."
             )
-            step = Step(
+            step = Remedy(
                 "Look at its image and its pose, and take it out of views.csv if one is wrong.",
                 look_at(view.view),
             )
@@ -280,7 +280,7 @@ def _residual(view: ViewResult, between: str = ", ") -> str:
     return f"{figure(view.residual_mm or 0.0)} mm{turned}"
 
 
-def _holdout_doubts(pair: Pair, mount: Mount, limits: CalibrationLimits) -> Iterator[Finding]:
+def _holdout_doubts(pair: JudgedPair, mount: Mount, limits: CalibrationLimits) -> Iterator[Finding]:
     holdout, held = pair.holdout, pair.held_out
     if holdout is None:
         return
@@ -293,7 +293,7 @@ def _holdout_doubts(pair: Pair, mount: Mount, limits: CalibrationLimits) -> Iter
             "times worse than views left out in turn. They lie where the result does not hold, or "
             f"their poses or {observed} are wrong."
         )
-        step = Step("Record views where the result is to hold, with role = fit.")
+        step = Remedy("Record views where the result is to hold, with role = fit.")
         yield Finding("holdout", words, step).of(pair.name)
 
 
@@ -421,7 +421,7 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
             details += others[0].reason
         words = f"{len(lost)} of {count_all} views are not used{details}."
         words_do = "Look at the first of them, and repeat what is missing."
-        step = Step(words_do, look_at(others[0].view)) if others else None
+        step = Remedy(words_do, look_at(others[0].view)) if others else None
         views, is_fatal = tuple(rejection.view for rejection in lost), share > limits.lost_share[1]
         # Those that disagree have a finding of their own.
         kind = "lost_views" if others else "left_out"
@@ -439,18 +439,18 @@ def _noise_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding
             f"{check:g}): the intrinsics do not fit this camera, the board is not flat, or images "
             "are blurred."
         )
-        step = Step("Look for blur, glare, and a lens or a board that is not as stated.")
+        step = Remedy("Look for blur, glare, and a lens or a board that is not as stated.")
         yield Finding("corner_noise", words, step, is_fatal=noise > bad).of(sensor.name)
     if sensor.level > limits.level:
         words = (
             f"Its poses scatter {figure(sensor.level)} times as much as its corners say: squares "
             "of few pixels, blur, or a lens that is not as stated."
         )
-        step = Step("Go nearer, or show it larger squares.")
+        step = Remedy("Go nearer, or show it larger squares.")
         yield Finding("corner_noise", words, step).of(sensor.name)
 
 
-def _robot(arm: Arm) -> str:
+def _robot(arm: JudgedArm) -> str:
     return f"Robot {arm.name}" if arm.name else ""
 
 
@@ -468,14 +468,14 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
                 (
                     "the instrument reads worse than is stated of it, was moved, or the arm's "
                     "model is off by as much.",
-                    Step("Read a few stops twice to see how well readings repeat."),
+                    Remedy("Read a few stops twice to see how well readings repeat."),
                 )
                 if findings.mount == "instrument"
                 else (
                     "the board is of another size than stated, or warped, the intrinsics are not "
                     "this camera's, the arm's model is off by as much, or poses were read before "
                     "the arm stood still.",
-                    Step(
+                    Remedy(
                         "Stand still before each image, and read one pose twice to see how well it "
                         "repeats; measure the board over many squares; check the lens and the "
                         "arm's model."

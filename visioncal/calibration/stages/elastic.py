@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
@@ -188,7 +188,7 @@ def doubts(elastic: Elastic) -> Iterator[Finding]:
             f"{figure(factor.sigma)} times as far as the load times its reach asks of joints that "
             f"yield to the arm's own weight as they do. The load is {more} than stated "
             "(payload_kg, payload_x_m ...), or the masses of the arm's links are off.",
-            Step("Weigh the load, and correct payload_kg and its centre in views.csv."),
+            Remedy("Weigh the load, and correct payload_kg and its centre in views.csv."),
         )
 
 

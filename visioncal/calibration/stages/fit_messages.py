@@ -9,11 +9,11 @@ from visioncal.calibration.stages.image_size import other_images
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Target
-from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Step
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
 from visioncal.estimation.appearance import MOST_LOOSE
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.joint import (
-    Fitted,
+    ConvergedFit,
     MeasuredScale,
     Side,
     chance_limit,
@@ -37,7 +37,7 @@ _SAME_SIZE = 5e-4
 _LEAST_MOVE_PX = 0.1
 # No printed board is as it was drawn to less [m].
 _LEAST_BEND_M = 1e-5
-_NEW_LENS = Step(
+_NEW_LENS = Remedy(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
     "the camera anew.",
     CALIBRATE,
@@ -45,7 +45,7 @@ _NEW_LENS = Step(
 
 
 def found_of_looks(
-    side: Side, fitted: Fitted, covariance: FloatArray, stated: Problem | None
+    side: Side, fitted: ConvergedFit, covariance: FloatArray, stated: Problem | None
 ) -> Iterator[Finding]:
     """Says what a joint fit found of lenses and boards; what is no reason for doubt is a note.
 
@@ -105,7 +105,7 @@ def _noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> It
         "corner_noise" if more else NOTE,
         f"The corners scatter by {figure(shown)} px, and corners.csv states {figure(stated)} px "
         f"(sigma_px of a typical corner). The result goes {by}",
-        Step(advice),
+        Remedy(advice),
     )
 
 
@@ -135,7 +135,7 @@ def scale_found(
         "board_size",
         f"{sized} (stated to within {share}). The result takes the robot's scale; if the board is "
         "right, the arm's model is off by as much.",
-        Step(
+        Remedy(
             "Measure the board over many squares. If the robot is right, write square_m = "
             f"{1e-3 * side * (1 + written.scale):.4g} in the board's .toml; else check the arm.",
             CALIBRATE,
@@ -144,7 +144,7 @@ def scale_found(
     )
 
 
-def _shape_found(fitted: Fitted, board: int, called: str) -> Finding:
+def _shape_found(fitted: ConvergedFit, board: int, called: str) -> Finding:
     """Words a board that is bent, longer one way than the other, or sheared; a note of the least.
 
     Of these, what is more than chance is worded; all of them together are.
@@ -177,7 +177,7 @@ def _shape_found(fitted: Fitted, board: int, called: str) -> Finding:
     return Finding(
         "board_shape",
         f"The {called} is {', and '.join(parts)}. Its shape was estimated with the rest.",
-        Step(" ".join(steps)),
+        Remedy(" ".join(steps)),
     )
 
 
@@ -201,7 +201,7 @@ def _points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
             f"Point {target.point_numbers[worst]} of target {target.name} lies "
             f"{figure(1e3 * float(away[worst]))} mm from where its table has it, which is stated "
             f"to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by both.",
-            Step("Measure the point again."),
+            Remedy("Measure the point again."),
         )
 
 
@@ -215,7 +215,7 @@ def _rig_size_found(target: Target, measured: MeasuredScale) -> Iterator[Finding
         f"By the robot's motion target {target.name} is {figure(100 * abs(measured.scale))} % "
         f"{word} than the table of its points has it (sigma {figure(100 * measured.sigma)} %). The "
         "result goes by the table.",
-        Step(
+        Remedy(
             "Measure the distance of two points that are far apart. Where they are as the robot "
             f"says, multiply the table's x_m, y_m and z_m by {1 + measured.scale:.5g}; otherwise "
             "see to the arm.",
@@ -225,7 +225,7 @@ def _rig_size_found(target: Target, measured: MeasuredScale) -> Iterator[Finding
     )
 
 
-def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
+def _lens_found(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
     looks = fitted.looks
     problem, lens = looks.problems[camera], looks.lens_of(camera)
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
@@ -233,14 +233,14 @@ def _lens_found(fitted: Fitted, camera: str) -> Iterator[Finding]:
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
             f"{len(problem.stack.views)} views leave too little to judge by."
         )
-        yield Finding("remark", words, Step("Show a board with more corners, or more views."))
+        yield Finding("remark", words, Remedy("Show a board with more corners, or more views."))
     moved = np.intersect1d(lens, fitted.moving)
     if not problem.scene.estimated and len(moved) and _moved(fitted, moved):
         is_exact = problem.scene.matrix_sigma_px is None
         steps = (looks.values - looks.stated)[lens[:4]]
         words, do = other_images(problem.scene.camera, looks.values[lens[:4]])
         if words:
-            yield Finding("lens", f"{words} It was refined.", Step(do, CALIBRATE))
+            yield Finding("lens", f"{words} It was refined.", Remedy(do, CALIBRATE))
         else:
             is_wrong = is_exact or contradicted_lens(fitted, camera)
             moved_px = _corners_moved_px(problem, looks.camera(camera))
@@ -301,11 +301,11 @@ def _contest_found(scene: Scene, moves_px: FloatArray) -> Finding:
     )
 
 
-def _moves(fitted: Fitted, places: IntArray) -> bool:
+def _moves(fitted: ConvergedFit, places: IntArray) -> bool:
     return bool(np.isin(places, fitted.moving).all())
 
 
-def _moved(fitted: Fitted, places: IntArray) -> bool:
+def _moved(fitted: ConvergedFit, places: IntArray) -> bool:
     """Whether values were moved from what is stated by more than chance."""
     return _moves(fitted, places) and moved_mahalanobis_sq(fitted, places) > chance_limit(
         len(places)

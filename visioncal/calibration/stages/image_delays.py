@@ -14,7 +14,7 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.clock import ClockFit, DelayedFit, fit_delays
-from visioncal.estimation.clock_correlation import Frames
+from visioncal.estimation.clock_correlation import ImageTimes
 from visioncal.estimation.corners import CornerStack, floored_sigma_px, reproject
 from visioncal.estimation.effects import EFFECTS
 from visioncal.estimation.effects.delays import (
@@ -68,7 +68,7 @@ class FoundDelay:
 
 
 def find_delays(
-    flange: Trajectory, frames: Frames, camera: Camera | None, start: ClockFit
+    flange: Trajectory, frames: ImageTimes, camera: Camera | None, start: ClockFit
 ) -> tuple[DelayedFit | None, tuple[FoundDelay, ...]]:
     """Looks for times within images.
 
@@ -114,7 +114,7 @@ class Straight:
 
 
 def straighten(
-    frames: Frames,
+    frames: ImageTimes,
     flange: tuple[FloatArray, FloatArray],
     seen: Sequence[ViewPoses],
     camera: Camera,

@@ -22,7 +22,7 @@ from visioncal.vision.targets import rotation_transforms
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class InitialFrames:
     """A start.
 
     Attributes:
@@ -39,7 +39,7 @@ class Placed:
 
 def init_frames(
     problem: Problem, views: Sequence[ViewPoses], targets: Mapping[str, Target]
-) -> Placed:
+) -> InitialFrames:
     """Finds where the frames are, and which pose of each view goes with that.
 
     Args:
@@ -79,7 +79,7 @@ def init_frames(
             "(ChArUco, or an odd sum of columns and rows).",
         )
     rows = list(zip(views, picks.tolist(), unclear.tolist(), seen.observed, strict=True))
-    return Placed(
+    return InitialFrames(
         tied,
         tuple(
             chosen(view, pick, targets.get(frame)) for view, pick, value, frame in rows if not value

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from visioncal.calibration.stages.pair_observations import (
+    FramePair,
     Growth,
-    Pair,
     Relation,
     factors_of,
     product_of,
@@ -26,7 +26,7 @@ _NOMINAL_M = 1e-4
 
 def mounted_points(growth: Growth) -> Iterator[Relation]:
     """What an instrument says that reads points on a robot's flange: where both are."""
-    groups: dict[tuple[str, str], list[Pair]] = {}
+    groups: dict[tuple[str, str], list[FramePair]] = {}
     for pair in growth.pointed:
         if len(pair.robots) == 1 and not pair.robots[0].is_up:
             groups.setdefault((pair.seer, pair.robots[0].frame), []).append(pair)

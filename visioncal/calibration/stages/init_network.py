@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.calibration.stages.init_instruments import mounted_points
 from visioncal.calibration.stages.init_spanning_tree import spanning_tree
-from visioncal.calibration.stages.pair_observations import Growth, Pair, Relation, Sighted
+from visioncal.calibration.stages.pair_observations import FramePair, Growth, Relation, Sighted
 from visioncal.calibration.stages.pairwise import (
     FEWEST,
     Candidates,
@@ -79,11 +79,11 @@ def init_network(
     return Tied(edges, tuple(name for name in tree.unknown if name not in edges), ambiguous)
 
 
-def _pairs(tree: Tree, sighted: Sighted) -> tuple[Pair, ...]:
+def _pairs(tree: Tree, sighted: Sighted) -> tuple[FramePair, ...]:
     rows: dict[tuple[str, str], list[int]] = {}
     for at in np.argsort(sighted.stops, kind="stable").tolist():
         rows.setdefault((sighted.seers[at], sighted.seen[at]), []).append(at)
-    return tuple(Pair(*pair, np.array(at), tree.path(*pair)) for pair, at in rows.items())
+    return tuple(FramePair(*pair, np.array(at), tree.path(*pair)) for pair, at in rows.items())
 
 
 def _known(tree: Tree) -> Iterator[Relation]:
@@ -93,7 +93,7 @@ def _known(tree: Tree) -> Iterator[Relation]:
 
 
 def _solved(
-    tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted, pair: Pair
+    tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted, pair: FramePair
 ) -> Iterator[Relation]:
     """What one pair says by itself."""
     rows = sighted.early(pair.rows)
@@ -124,7 +124,7 @@ def _loose(growth: Growth) -> Iterator[Relation]:
 def _both(
     tree: Tree,
     sighted: Sighted,
-    pair: Pair,
+    pair: FramePair,
     edges: tuple[FloatArray, FloatArray],
     sigmas_m: tuple[float, float],
 ) -> Iterator[Relation]:
@@ -137,7 +137,7 @@ def _both(
 
 
 def _parted(
-    poses: Mapping[str, FloatArray], sighted: Sighted, pair: Pair, rows: IntArray
+    poses: Mapping[str, FloatArray], sighted: Sighted, pair: FramePair, rows: IntArray
 ) -> tuple[FloatArray, Candidates]:
     """The robot's part of the chain (m, 4, 4) in some views of a pair, and what these allow."""
     (step,) = pair.robots
@@ -145,5 +145,5 @@ def _parted(
     return robot if step.is_up else invert(robot), sighted.candidates.take(rows)
 
 
-def _mount(pair: Pair) -> Mount:
+def _mount(pair: FramePair) -> Mount:
     return "eye-in-hand" if pair.robots[0].is_up else "eye-to-hand"

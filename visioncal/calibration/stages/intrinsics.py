@@ -11,7 +11,7 @@ from visioncal.calibration.stages.cause_ranking import TILTED
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
-from visioncal.core.verdict import EMPTY_IMAGE, Finding, Step
+from visioncal.core.verdict import EMPTY_IMAGE, Finding, Remedy
 from visioncal.estimation.bundle import BundleFit, fit_bundle
 from visioncal.estimation.corners import CornerStack, mean_square_by_view
 from visioncal.estimation.gating import gate
@@ -220,7 +220,7 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
     focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
     causes = list(_causes(fit)) if _is_flat(stack) else []
     why = "".join(f" {cause.words}" for cause in causes)
-    step = causes[0].do if causes else Step("Add views, tilted and near the image's edges.")
+    step = causes[0].do if causes else Remedy("Add views, tilted and near the image's edges.")
     weak = [f"the focal length to {100 * focal:.1f} %"] * bool(focal > _FOCAL_LIMIT)
     weak += [f"the image centre to {centre:.1f} px"] * bool(centre > _CENTRE_LIMIT_PX)
     if weak:
@@ -236,7 +236,7 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
             EMPTY_IMAGE,
             f"No corner was ever seen in the {places} of the image, so the lens is extrapolated "
             "there.",
-            Step(f"In some views, move the target into {parts} of the image."),
+            Remedy(f"In some views, move the target into {parts} of the image."),
             # What is needed is needed where the views looked, or at a declared place.
             until_mm=0.0,
         )
@@ -259,7 +259,7 @@ def _causes(fit: BundleFit) -> Iterator[Finding]:
         yield Finding(
             "weak_lens",
             f"All views are from one distance (within {100 * (covariance - 1):.0f} %).",
-            Step("Vary the distance of the views."),
+            Remedy("Vary the distance of the views."),
             until_mm=0.0,
         )
 

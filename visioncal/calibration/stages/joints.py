@@ -14,7 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Step
+from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Remedy
 from visioncal.robot import Robot, placed_at, robot_names, with_zeros
 from visioncal.session import View
 from visioncal.session.table import reported_matrices
@@ -137,7 +137,7 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
             f"Joint angles were not used: there are {min(counts)} a row, and {robot.name} has "
             f"{robot.joint_count} joints."
         )
-        step = Step(
+        step = Remedy(
             "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
         )
         return Matched(robot, warnings=(Finding("misread_joints", words, step),) if poses else ())
@@ -157,7 +157,7 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
         sentence = guess.sentence("the reported poses")
         words = f"The joint angles were not used: they are misread. {sentence}"
         misread = f"The angles of this session are misread. {sentence} {guess.fix}"
-        doubt = Finding("misread_joints", words, Step(guess.fix))
+        doubt = Finding("misread_joints", words, Remedy(guess.fix))
         return Matched(robot, misread=misread, warnings=(doubt,))
     zero = None if guess is None else guess.zero
     if zero is not None and guess is not None:
@@ -165,7 +165,7 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
             "The joint angles do not belong to the reported poses as they are declared. "
             f"{guess.sentence('the reported poses')} {zero_taken(zero)}"
         )
-        lost = Finding("misread_joints", words, Step(zero.fix, ARM_AS_FOUND))
+        lost = Finding("misread_joints", words, Remedy(zero.fix, ARM_AS_FOUND))
         matched = replace(matched, zero=zero, warnings=(lost,))
     model = matched.arm.base_from_flange(q)
     found = _constants(model, poses, guess)
@@ -239,7 +239,7 @@ def _rows_out(
             f"The joint angles of views {first} and {second} are exchanged, or their poses are: "
             "each view's angles lead to the other's pose. The hand-eye result uses the poses."
         )
-        step = Step(
+        step = Remedy(
             "Exchange q1_rad ... of both rows in views.csv, or x_m to qw where these are wrong, "
             "and calibrate again.",
             CALIBRATE,
@@ -254,7 +254,7 @@ def _rows_out(
             f"by up to {figure(1e3 * shift)} mm and {_deg(angle)} deg; in the other views they "
             "agree. The hand-eye result uses the poses."
         )
-        step = Step("Correct what is wrong there in views.csv.")
+        step = Remedy("Correct what is wrong there in views.csv.")
         named = tuple(views[index] for index in rest)
         warnings.append(Finding("contradicting_joints", words, step, named))
     return replace(matched, contradicting=reasons, warnings=tuple(warnings))
@@ -286,7 +286,7 @@ def _based(matched: Matched, found: _Constants) -> Matched:
             f"180 deg about z from the base of {name}, as ROS's base_link is from the controller's "
             "base. The results are in the frame of the poses, and so is the arm."
         )
-        step = Step(
+        step = Remedy(
             "To have them in the controller's base, write a copy of the session whose poses are "
             "turned; to keep base_link, name a model that has it for its root.",
             GUESS,
@@ -323,7 +323,7 @@ def _described(matched: Matched, found: _Constants) -> Matched:
             f"The reported poses are of a tool frame, {offset_mm:.1f} mm and {turn_deg:.1f} deg "
             f"from the flange of {robot.name}: what the flange carries is placed in that frame."
         )
-        step = Step(
+        step = Remedy(
             "If the flange itself is meant, set the controller's tool to zero and record again, or "
             "delete x_m to qw in views.csv: the poses are then those of the joint angles."
         )
@@ -341,7 +341,7 @@ def _disagree(robot: Robot, figures: str) -> Finding:
         "other_arm",
         f"Poses and joint angles disagree: through the model of {robot.name} the joints give poses "
         f"that differ by up to {figures}. The hand-eye result uses the poses.",
-        Step("Check [robot] model and tip, and whether the base frame is the controller's."),
+        Remedy("Check [robot] model and tip, and whether the base frame is the controller's."),
     )
 
 

@@ -19,7 +19,7 @@ from visioncal.core.verdict import (
     NOT_USABLE,
     NOTE,
     Finding,
-    Step,
+    Remedy,
     Verdict,
     VerdictStatus,
     remarks,
@@ -112,7 +112,7 @@ def _met_words(findings: Findings, met: NeedMet) -> str:
 
 
 def _praise(findings: Findings, *, is_enough: bool) -> Finding:
-    keep = Step(
+    keep = Remedy(
         "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
         "compare later stops with it."
     )

@@ -13,7 +13,7 @@ from visioncal.session.frames import thing_name
 
 
 @dataclass(frozen=True)
-class Pair:
+class JudgedPair:
     """What one camera or instrument saw of one target.
 
     Attributes:
@@ -65,7 +65,7 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class Arm:
+class JudgedArm:
     """A robot.
 
     Attributes:
@@ -95,7 +95,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Place:
+class PointAccuracy:
     """How well a place is known where it counts.
 
     Attributes:
@@ -126,11 +126,11 @@ class Findings:
         picks: What picks err by, by each camera and robot; empty where that is not predicted.
     """
 
-    pairs: Sequence[Pair]
+    pairs: Sequence[JudgedPair]
     sensors: Sequence[Sensor]
-    arms: Sequence[Arm]
+    arms: Sequence[JudgedArm]
     worst: Sequence[Direction]
-    places: Sequence[Place]
+    places: Sequence[PointAccuracy]
     warnings: Sequence[Finding] = ()
     notes: Sequence[str] = ()
     mount: Mount = "eye-in-hand"

@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import CALIBRATE, Finding, Step
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.joint_functions import (
@@ -316,7 +316,7 @@ def doubts(kinematics: Kinematics) -> Iterator[Finding]:
             f"The views speak for more than the arm's {chosen.level}: with its {best.level} stops "
             f"left out are predicted to {figure(best.held_out_mm)} mm instead of "
             f"{figure(chosen.held_out_mm)} mm.",
-            Step("Leave --level out.", CALIBRATE),
+            Remedy("Leave --level out.", CALIBRATE),
         )
 
 

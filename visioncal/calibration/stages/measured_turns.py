@@ -6,7 +6,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import cross, invert, log, mean_transform
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Step
+from visioncal.core.verdict import Finding, Remedy
 
 # Of an arm's errors, and of its noise, the first is about one at most.
 _BEYOND_ARM, _LEAST_VIEWS = 2.0, 8
@@ -45,7 +45,7 @@ def measured_turns(
         f"{figure(1e3 * is_m)} mm against the others. A flange that is off by this turn would "
         f"shift it by {figure(1e3 * would_m)} mm: the measured rotations (cft_) are what scatters, "
         "as those of a single small marker do.",
-        Step(
+        Remedy(
             "Give visioncal the images; or measure the poses again, of a board of many corners "
             "that fills much of the image, with a calibrated lens."
         ),

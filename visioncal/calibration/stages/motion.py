@@ -25,7 +25,7 @@ _ARM_M = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class RobotMotion:
     """The robot's stream.
 
     Attributes:
@@ -75,7 +75,7 @@ def stream_of(session: Session, robot: str) -> str:
     return next((name for name in names if name in moving), "")
 
 
-def motion_of(session: Session, robot: Robot | None, name: str) -> Motion:
+def motion_of(session: Session, robot: Robot | None, name: str) -> RobotMotion:
     """Reads a robot's stream.
 
     Args:
@@ -93,9 +93,11 @@ def motion_of(session: Session, robot: Robot | None, name: str) -> Motion:
     if len(joints_s) >= 2:
         joints = Samples(joints_s), q
     if len(reported_s) >= 2:
-        return Motion(name, Trajectory(reported_s, poses), joints, reported=True)
+        return RobotMotion(name, Trajectory(reported_s, poses), joints, reported=True)
     if joints is not None and robot is not None and robot.joint_count == q.shape[1]:
-        return Motion(name, Trajectory(joints_s, robot.base_from_flange(q)), joints, reported=False)
+        return RobotMotion(
+            name, Trajectory(joints_s, robot.base_from_flange(q)), joints, reported=False
+        )
     needed = "a known [robot] model" if robot is None else f"{robot.joint_count} joints a sample"
     raise DataError(
         f"streams/{name}.csv: it has {len(reported_s)} poses and {len(joints_s)} rows of "

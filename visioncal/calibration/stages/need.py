@@ -134,7 +134,7 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class PickInputs:
     """What picks are predicted from.
 
     Attributes:
@@ -164,7 +164,7 @@ class Fitted:
     jitters: Mapping[str, float]
 
 
-def picks_of(fitted: Fitted, need: Need | None = None) -> tuple[Picks, ...]:
+def picks_of(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
     """Predicts picks, for each camera and each robot that parts it from what it sees.
 
     Args:
@@ -184,7 +184,7 @@ def picks_of(fitted: Fitted, need: Need | None = None) -> tuple[Picks, ...]:
     )
 
 
-def _part(fitted: Fitted, rows: Sequence[int]) -> Fitted:
+def _part(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
     """The information of some of the observations on picks."""
     chosen = np.isin(np.arange(len(fitted.problem)), rows)
     held = fitted.held_out
@@ -192,7 +192,7 @@ def _part(fitted: Fitted, rows: Sequence[int]) -> Fitted:
     return replace(fitted, problem=fitted.problem.subset(chosen), held_out=kept)
 
 
-def _picks(fitted: Fitted, camera: str, robot: str, need: Need | None) -> Picks:
+def _picks(fitted: PickInputs, camera: str, robot: str, need: Need | None) -> Picks:
     """Picks of what one camera sees by one robot, from the observations that it parts."""
     problem, state, noise = fitted.problem, fitted.fit.state, fitted.fit.noise
     seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
@@ -297,7 +297,7 @@ def _in_base(problem: Problem, state: State, base: str) -> FloatArray:
     return np.asarray(found @ problem.measured(state))
 
 
-def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
+def _to_base(fitted: PickInputs, base: str, in_base: FloatArray) -> Problem:
     """The observations as if they were of the base itself, by way of what they saw."""
     # What a lens does to the measured poses of targets then moves the base instead.
     problem = fitted.problem
@@ -321,7 +321,7 @@ def _to_base(fitted: Fitted, base: str, in_base: FloatArray) -> Problem:
     )
 
 
-def _of_things(fitted: Fitted) -> Problem:
+def _of_things(fitted: PickInputs) -> Problem:
     """The observations as if they were of things that stand where the boards' middles are."""
     # A board of another size was measured at another distance, and a thing is not: all that a
     # board's shape then moves is its middle.
@@ -357,7 +357,7 @@ def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:
 
 
 def _left_by_arm(
-    fitted: Fitted, robot: str, errors: ArmErrors, off: FloatArray
+    fitted: PickInputs, robot: str, errors: ArmErrors, off: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """What errors that a fit takes for noise make of each observation.
 
@@ -400,7 +400,7 @@ def _of_arm(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
     return np.asarray(jacobian @ np.swapaxes(jacobian, 1, 2))
 
 
-def _unpredicted(fitted: Fitted) -> FloatArray:
+def _unpredicted(fitted: PickInputs) -> FloatArray:
     """(6, 6) by how much left-out views err more than is predicted, and than chance lets them."""
     problem, noise = fitted.problem, fitted.fit.noise
     linear = problem.linear(fitted.fit.state, ideal=True)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
-from visioncal.calibration.stages.clock import Clocked, Pair
+from visioncal.calibration.stages.clock import Clocked, ClockPair
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import Reported
-from visioncal.calibration.stages.turned_images import Turned
+from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import Corners, FloatArray, Progress, Rejection
@@ -79,12 +79,12 @@ class Observed:
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     reasons: Mapping[int, str] = field(default_factory=dict)
     robots: Mapping[str, Reported] = field(default_factory=dict)
-    clocks: Mapping[Pair, Clocked] = field(default_factory=dict)
+    clocks: Mapping[ClockPair, Clocked] = field(default_factory=dict)
     warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     dense: Dense | None = None
     is_misread: bool = False
-    turned: Mapping[int, Turned] = field(default_factory=dict)
+    turned: Mapping[int, ImageTurn] = field(default_factory=dict)
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""

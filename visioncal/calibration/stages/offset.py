@@ -7,13 +7,13 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.calibration.stages.image_delays import FoundDelay
-from visioncal.calibration.stages.motion import Motion
+from visioncal.calibration.stages.motion import RobotMotion
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mask
-from visioncal.core.verdict import GUESS, Finding, Step
+from visioncal.core.verdict import GUESS, Finding, Remedy
 from visioncal.estimation.clock import ClockChange, ClockFit
 from visioncal.estimation.clock_correlation import Match
 from visioncal.estimation.trajectory import LONGEST_GAP_S
@@ -36,7 +36,7 @@ ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
 
 @dataclass(frozen=True, eq=False)
-class Clock:
+class ClockOffset:
     """How far the camera's clock is ahead of the robot's, and what that rests on.
 
     Attributes:
@@ -106,7 +106,7 @@ def turning_doubt(match: Match) -> Finding:
         f"{figure(1e3 * match.sigma_s)} ms), by the turning of both (correlation "
         f"{match.correlation:.2f}). It is known no better, because the chain of frames does not "
         "close over the motion.",
-        Step("Try other conventions of the poses.", GUESS),
+        Remedy("Try other conventions of the poses.", GUESS),
     )
 
 
@@ -132,7 +132,7 @@ def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
     return Finding(
         "clock_changed",
         f"The camera's clock {how}. The times were taken as they would be without that.",
-        Step(
+        Remedy(
             "Stamp images and robot by one clock, which no time server sets while it records; then "
             "record again."
         ),
@@ -140,7 +140,7 @@ def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
     )
 
 
-def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[Finding]:
+def stated_doubts(clock: ClockOffset, views: Sequence[View]) -> Iterator[Finding]:
     """Says so where what the session states is not what the motion gives."""
     if clock.stated_s is None:
         return
@@ -152,7 +152,7 @@ def stated_doubts(clock: Clock, views: Sequence[View]) -> Iterator[Finding]:
             f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
             f"motion gives {1e3 * clock.camera_minus_robot_s:+.2f} ms (sigma "
             f"{figure(1e3 * clock.sigma_s)} ms), which was taken.",
-            Step("Correct [clock] in session.toml, or look at how the stamps are made."),
+            Remedy("Correct [clock] in session.toml, or look at how the stamps are made."),
         )
 
 
@@ -235,7 +235,7 @@ def not_ascending(views: Sequence[View]) -> str:
 
 
 def no_offset(
-    motion: Motion, views: Sequence[View], resting: Mask, why: str
+    motion: RobotMotion, views: Sequence[View], resting: Mask, why: str
 ) -> DegenerateError | DataError:
     """What to raise where there is no way to the robot's poses."""
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
@@ -286,7 +286,7 @@ def no_offset(
     )
 
 
-def speed_words(clock: Clock, speeds: FloatArray, inside: int) -> str:
+def speed_words(clock: ClockOffset, speeds: FloatArray, inside: int) -> str:
     """How fast the flange moved at most in the views that are used, and what that costs."""
     if not len(speeds):
         return "No view lies within the stream."

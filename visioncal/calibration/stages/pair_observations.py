@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.tree import Step, Tree
+from visioncal.estimation.tree import PathStep, Tree
 
 # The earliest share of the stops, and the fewest views of a pair, that a start is taken from.
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
@@ -65,7 +65,7 @@ class Relation:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class FramePair:
     """The observations of one pair of frames.
 
     Attributes:
@@ -78,10 +78,10 @@ class Pair:
     seer: str
     seen: str
     rows: IntArray
-    way: tuple[Step, ...]
+    way: tuple[PathStep, ...]
 
     @property
-    def robots(self) -> tuple[Step, ...]:
+    def robots(self) -> tuple[PathStep, ...]:
         """The robots in the way."""
         return tuple(step for step in self.way if step.robot)
 
@@ -101,16 +101,16 @@ class Growth:
     tree: Tree
     poses: Mapping[str, FloatArray]
     sighted: Sighted
-    pairs: Sequence[Pair]
+    pairs: Sequence[FramePair]
     relations: Sequence[Relation]
 
     @property
-    def oriented(self) -> tuple[Pair, ...]:
+    def oriented(self) -> tuple[FramePair, ...]:
         """The pairs of which rotations were measured, too."""
         return tuple(pair for pair in self.pairs if not self.sighted.places[pair.rows[0]])
 
     @property
-    def pointed(self) -> tuple[Pair, ...]:
+    def pointed(self) -> tuple[FramePair, ...]:
         """The pairs of which places alone were read."""
         return tuple(pair for pair in self.pairs if self.sighted.places[pair.rows[0]])
 
@@ -124,7 +124,7 @@ class Factor:
     is_inverse: bool
 
 
-def factors_of(growth: Growth, pair: Pair, rows: IntArray) -> list[Factor]:
+def factors_of(growth: Growth, pair: FramePair, rows: IntArray) -> list[Factor]:
     """The chain `seer_from_seen` by bodies."""
     stops = growth.sighted.stops[rows]
     none = np.broadcast_to(np.eye(4), (len(rows), 4, 4))

@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.limits import MAX_BLUR_PX, CalibrationLimits
 from visioncal.core.types import Image, Target
-from visioncal.core.verdict import EMPTY_ROWS, LEAST_NEED_MM, MISSING, Finding, Step
+from visioncal.core.verdict import EMPTY_ROWS, LEAST_NEED_MM, MISSING, Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
 from visioncal.session.kinds import is_read, is_seen
@@ -63,7 +63,7 @@ def unnamed_images(session: Session) -> Iterator[Finding]:
         yield Finding(
             "unnamed_images",
             f"{have} no row in views.csv: {some_of(more, _LISTED)}.",
-            Step("Add a row for each, with the robot's pose, or take them out of the folder."),
+            Remedy("Add a row for each, with the robot's pose, or take them out of the folder."),
             until_mm=0.0,
         )
 
@@ -79,11 +79,11 @@ def _missing(session: Session) -> Iterator[Finding]:
     old, new = _renamed(session, names)
     if old:
         words = f"{words}; there is {names[0].replace(old, new)} instead."
-        step = Step(f"In views.csv, replace {old} by {new}.")
+        step = Remedy(f"In views.csv, replace {old} by {new}.")
     else:
         words = f"{words}."
         rows = ", ".join(str(view.number) for view in missing)
-        step = Step(
+        step = Remedy(
             f"Copy the image{'s' if len(names) > 1 else ''} there; or in views.csv, delete the "
             f"row{'s' if len(names) > 1 else ''} of view {rows}."
         )
@@ -101,14 +101,14 @@ def _empty_rows(session: Session) -> Iterator[Finding]:
     views, last = tuple(view.number for view in empty), len(shown) - len(empty) - 1
     named, these = some_of([*map(str, views)], _LISTED), "these rows" if views[1:] else "this row"
     words = f"{len(views)} of {len(shown)} rows of views.csv observe nothing: view {named}"
-    step = Step(f"In views.csv, fill in column image of {these}, or delete {these}.")
+    step = Remedy(f"In views.csv, fill in column image of {these}, or delete {these}.")
     if any(view.has_corners for view in session.views):
         words = f"{words}; without an image, a view needs rows in corners.csv"
         if all(shown[: last + 1]):
             words = (
                 f"{words}, which ends with view {session.views[last].number}, as if it was cut off"
             )
-        step = Step(f"Write corners.csv again, as a whole; or in views.csv, delete {these}.")
+        step = Remedy(f"Write corners.csv again, as a whole; or in views.csv, delete {these}.")
     many = len(views) > CalibrationLimits().lost_share[0] * len(shown)
     yield Finding("lost_rows" if many else EMPTY_ROWS, f"{words}.", step, views, until_mm=0.0)
 
@@ -147,7 +147,7 @@ def _shared(session: Session) -> Iterator[Finding]:
             yield Finding(
                 "shared_image",
                 f"{words}.",
-                Step(f"In views.csv, {do}; or delete the row of view {view.number}."),
+                Remedy(f"In views.csv, {do}; or delete the row of view {view.number}."),
                 (before.number, view.number),
                 until_mm=LEAST_NEED_MM,
             )
@@ -299,9 +299,9 @@ def _another(view: View, found: Identity, declared: Target) -> Finding:
     shipped = (load_target(name) for name in target_names())
     mine = [target.name for target in shipped if _is(found, target) and _as_large(target, declared)]
     if mine:
-        step = Step(f'In session.toml, write target = "{mine[0]}".')
+        step = Remedy(f'In session.toml, write target = "{mine[0]}".')
     else:
-        step = Step(
+        step = Remedy(
             'In session.toml, write target = "seen.toml", which this command makes; give it the '
             "measured side of a square.",
             _made_from(view, declared),
@@ -350,16 +350,16 @@ def _unread(view: View, image: Image, found: Identity | None, declared: Target) 
             f"The images are too blurred for the markers of {declared.name}: their edges have a "
             f"blur (sigma) of {blur_px:.1f} px, and a marker's modules are {module_px:.1f} px wide "
             f"(view {view.number}); up to {_READ * module_px:.1f} px are read.",
-            Step(
+            Remedy(
                 "Focus the lens, expose for a shorter time with more light, or bring the board "
                 "nearer; then record again."
             ),
             (view.number,),
         )
     marker_px = squares.square_px * declared.marker_m / declared.square_m
-    step = Step("Bring the board nearer, focus, or use a board of fewer and larger squares.")
+    step = Remedy("Bring the board nearer, focus, or use a board of fewer and larger squares.")
     if found is not None:  # Where a few markers are read after all, it is no checkerboard.
-        step = Step(
+        step = Remedy(
             f"{step.words} Where all of it is in the images, it serves as a checkerboard: write "
             'target = "seen.toml" in session.toml, which this command makes.',
             _made_from(view, declared),
@@ -390,7 +390,7 @@ def _mirrored(view: View) -> Finding:
         _MIRRORED,
         f"The images are mirrored: the board is seen in view {view.number} only where left and "
         "right are exchanged.",
-        Step(
+        Remedy(
             "Switch off mirroring (flip) in the camera's driver, and record again; or turn the "
             "images back.",
             f"mogrify -flop SESSION/{Path(view.image).parent.as_posix()}/*",
@@ -404,7 +404,7 @@ def _blurred(view: View, why: str, views: Sequence[View]) -> Finding:
     return Finding(
         "blurred_images",
         f"No board can be read{of_all}: in view {view.number}, {why}.",
-        Step("Focus the lens, expose for a shorter time with more light, and record again."),
+        Remedy("Focus the lens, expose for a shorter time with more light, and record again."),
         tuple(other.number for other in views),
     )
 

@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Step, remarks
+from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy, remarks
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.estimation.parts import FramePrior, State
 from visioncal.estimation.problem import Problem
@@ -223,5 +223,5 @@ def prior_words(
         if component.is_used:
             yield from remarks([component.remark], NOTE)
         else:
-            step = Step("Measure it again, or delete it from session.toml.", CALIBRATE)
+            step = Remedy("Measure it again, or delete it from session.toml.", CALIBRATE)
             yield Finding("prior", component.doubt, step, mahalanobis_sq=component.contradiction**2)

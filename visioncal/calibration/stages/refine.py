@@ -20,7 +20,7 @@ from visioncal.estimation.appearance import (
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import (
-    Fitted,
+    ConvergedFit,
     MeasuredScale,
     Scores,
     Side,
@@ -66,7 +66,7 @@ def free_of(seen: LinearisedCorners) -> LensBoardParameters:
 
 def refined(
     side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
-) -> tuple[Fitted, FramesSide]:
+) -> tuple[ConvergedFit, FramesSide]:
     """Fits lenses, boards and frames to all corners together; see `chosen`.
 
     Once these are as the corners ask for, the residuals determine the noise of each view, and all
@@ -99,7 +99,7 @@ def _refined(
     frames: Mapping[str, FloatArray],
     *,
     is_plain: bool,
-) -> tuple[Fitted, FramesSide]:
+) -> tuple[ConvergedFit, FramesSide]:
     levels = looks.levels
     answer, side = _equally_weighed(side, looks, frames)
     looks = answer.looks.weighed(answer.seen)
@@ -118,7 +118,7 @@ def _refined(
 
 def _equally_weighed(
     side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
-) -> tuple[Fitted, FramesSide]:
+) -> tuple[ConvergedFit, FramesSide]:
     """Fits all with the weights that the corners have."""
     # Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
     # passed for another lens or board: all is then chosen once more with them free. Errors of any
@@ -148,7 +148,7 @@ def _equally_weighed(
     return fitted, found
 
 
-def _sized(side: Side, fitted: Fitted) -> Fitted:
+def _sized(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     """The fit with boards as large as the motion says, where that is far from what is stated."""
     looks = fitted.looks
     away = np.array([_measured(side, fitted, index).scale for index in looks.printed])
@@ -159,7 +159,7 @@ def _sized(side: Side, fitted: Fitted) -> Fitted:
     return again(fitted, side, np.union1d(fitted.moving, sizes), looks)
 
 
-def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
+def lens_levels(side: Side, fitted: ConvergedFit) -> dict[str, LensLevels]:
     """Estimates the sizes of what lenses do beyond their models, near a fit.
 
     Lenses and boards are free for that, so that what they have wrong is not taken for it.
@@ -193,7 +193,7 @@ def lens_levels(side: Side, fitted: Fitted) -> dict[str, LensLevels]:
     }
 
 
-def _doubted(side: Side, fitted: Fitted) -> Fitted:
+def _doubted(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     """Fits given lenses that were held once more, as well known as corners and motion have them.
 
     A lens that is given may be off by less than shows beyond chance. Where its focal length follows
@@ -237,7 +237,7 @@ def _doubted(side: Side, fitted: Fitted) -> Fitted:
     return _contesting(side, again(fitted, side, together, looks.doubting(doubts)))
 
 
-def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
+def _still_asked_for(erring: Side, stated: ConvergedFit, answer: ConvergedFit) -> ConvergedFit:
     """The fit with errors of arms free, and of what was set free before what is still asked for."""
     # Before, noise was as large as these errors: what they had passed for is as stated again, and
     # what really is another is clear now.
@@ -261,7 +261,7 @@ def _still_asked_for(erring: Side, stated: Fitted, answer: Fitted) -> Fitted:
     return settle(restated, erring, np.unique(places), answer.frames)
 
 
-def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitted]:
+def _still_other_sizes(erring: Side, wide: ConvergedFit) -> tuple[list[IntArray], ConvergedFit]:
     """The scales of boards that are others than stated, and the fit with these alone free."""
     # What all boards have in common, links of arms may have, too, and free together none is clear:
     # the least clear one is as stated, and the rest are measured anew beside it.
@@ -279,7 +279,7 @@ def _still_other_sizes(erring: Side, wide: Fitted) -> tuple[list[IntArray], Fitt
     return [looks.scale_of(index) for index in free], wide
 
 
-def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
+def _measured(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScale:
     """Measures a board's size by the robots' motion, also where the fit is not linear in it."""
     # A view's line of sight is known much better than its distance. Where views and chain disagree
     # by millimetres, because a board is far off, their lines of sight do, too, and a size that is
@@ -289,7 +289,7 @@ def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
     if found.is_another or not any(robot[1] > _ROUGH_M for robot in noise.robots):
         return found
 
-    def held(scale: float) -> Fitted:
+    def held(scale: float) -> ConvergedFit:
         value = looks.values[place] + scale
         return again(fitted, side, fitted.moving, looks.with_values(place, value))
 
@@ -306,7 +306,7 @@ def _measured(side: Side, fitted: Fitted, board: int) -> MeasuredScale:
     return measured_scale(side, tried, board) if less.any() else found
 
 
-def chosen(side: Side, fitted: Fitted) -> Fitted:
+def chosen(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     """Sets free what the data speak for.
 
     The boards' bends, given intrinsics together with them, and the boards' scales are set free
@@ -331,7 +331,7 @@ def chosen(side: Side, fitted: Fitted) -> Fitted:
     return _contesting(side, resized)
 
 
-def _contesting(side: Side, answer: Fitted) -> Fitted:
+def _contesting(side: Side, answer: ConvergedFit) -> ConvergedFit:
     """The fit with the uncertainty of intrinsics that are held although corners contradict them."""
     contested = _contested(side, answer)
     if contested == [name for name, problem in answer.looks.problems.items() if problem.contested]:
@@ -339,7 +339,7 @@ def _contesting(side: Side, answer: Fitted) -> Fitted:
     return again(answer, side, answer.moving, answer.looks.contesting(contested))
 
 
-def _freed(side: Side, moving: IntArray, fitted: Fitted) -> Fitted:
+def _freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
     """Fits with more values free; a confident wrong prior is worse than none."""
     wider = again(fitted, side, moving)
     looks = wider.looks
@@ -353,7 +353,7 @@ def _freed(side: Side, moving: IntArray, fitted: Fitted) -> Fitted:
     return again(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
 
 
-def _resized(side: Side, answer: Fitted) -> Fitted:
+def _resized(side: Side, answer: ConvergedFit) -> ConvergedFit:
     """Sets the boards' scales free where the robot measures others than are stated."""
     # One after the other: a board that is off misleads about the others, too.
     for _ in answer.looks.printed:
@@ -371,7 +371,7 @@ def _resized(side: Side, answer: Fitted) -> Fitted:
     return answer
 
 
-def _wrongly_sized(side: Side, answer: Fitted) -> MeasuredScale | None:
+def _wrongly_sized(side: Side, answer: ConvergedFit) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
     looks = answer.looks
     held = [index for index in looks.printed if looks.scale_of(index)[0] not in answer.moving]
@@ -383,7 +383,7 @@ def _wrongly_sized(side: Side, answer: Fitted) -> MeasuredScale | None:
     return max(other, key=lambda value: abs(value.scale) / value.sigma, default=None)
 
 
-def _is_determined(wider: Fitted, fitted: Fitted) -> bool:
+def _is_determined(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
     """Whether the views still determine all frames to what is accepted, errors of arms aside."""
     after, before = _worst(wider), _worst(fitted)
     limits = np.tile([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], len(after) // 2)
@@ -391,7 +391,7 @@ def _is_determined(wider: Fitted, fitted: Fitted) -> bool:
     return bool(np.all((after < limits) | (before >= limits)))
 
 
-def _worst(fitted: Fitted) -> FloatArray:
+def _worst(fitted: ConvergedFit) -> FloatArray:
     """(2 e,) the largest sigma of each unknown frame's rotation [rad] and place [m]."""
     looks, fit = [effect.determined for effect in fitted.problem.effects[:1]], fitted.fit
     problem = fitted.problem.with_effects(looks)
@@ -401,7 +401,7 @@ def _worst(fitted: Fitted) -> FloatArray:
     return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(place, place)])[-1] for place in places])
 
 
-def _contested(side: Side, answer: Fitted) -> list[str]:
+def _contested(side: Side, answer: ConvergedFit) -> list[str]:
     """Cameras whose intrinsics are held, and explain the corners worse than chance does."""
     looks, moving = answer.looks, answer.moving
     held = [
@@ -441,7 +441,7 @@ def remade(
     )
 
 
-def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
+def _shapes(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
     """The bends, with given intrinsics or without, where they explain significantly more."""
     looks, now = fitted.looks, fitted.moving
     if not looks.has_spare_corners:
@@ -470,7 +470,7 @@ def _shapes(side: Side, fitted: Fitted) -> Iterator[IntArray]:
         yield bent
 
 
-def _predicts_worse(wider: Fitted, fitted: Fitted) -> bool:
+def _predicts_worse(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
     """Whether views that are left out are predicted worse, in position and in rotation."""
     # Intrinsics whose sigma is stated are free to move within that, whatever they predict.
     looks = wider.looks

@@ -16,7 +16,7 @@ from visioncal.calibration.stages.observed import Observed
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import skew
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
-from visioncal.core.verdict import CALIBRATE, Finding, Step
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.numbering import find_numbering
 from visioncal.estimation.poses import determines_pose
 from visioncal.vision.camera import normalise
@@ -38,7 +38,7 @@ _TRIALS, _SURE = 300, 0.9999
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _RigView:
     """One view of a rig, by the pose that most of its points agree on.
 
     Attributes:
@@ -82,7 +82,7 @@ def leave_out_wrong_points(seen: T) -> T:
 def _places_elsewhere(seen: Observed, target: Target, first: int) -> dict[int, FloatArray]:
     """Where points are in the rig's frame [m], by their places in the table: those elsewhere."""
     table = np.array(target.points_m)
-    looks: list[_Look] = []
+    looks: list[_RigView] = []
     for look in seen.cameras.values():
         if look.lens is None:
             continue
@@ -95,10 +95,10 @@ def _places_elsewhere(seen: Observed, target: Target, first: int) -> dict[int, F
 
 
 def _agreed(
-    looks: Sequence[_Look], table: FloatArray, sigmas_m: Sequence[float]
+    looks: Sequence[_RigView], table: FloatArray, sigmas_m: Sequence[float]
 ) -> dict[int, FloatArray]:
     """What most views place alike, and elsewhere than the table."""
-    by_point: dict[int, list[tuple[_Look, int]]] = defaultdict(list)
+    by_point: dict[int, list[tuple[_RigView, int]]] = defaultdict(list)
     for look in looks:
         for row, point in enumerate(look.at.tolist()):
             by_point[point].append((look, row))
@@ -115,7 +115,7 @@ def _agreed(
     return places if len(places) <= (1.0 - _MOST_AGREE) * len(by_point) else {}
 
 
-def _looks(at: IntArray, px: FloatArray, table: FloatArray, camera: Camera) -> Iterator[_Look]:
+def _looks(at: IntArray, px: FloatArray, table: FloatArray, camera: Camera) -> Iterator[_RigView]:
     """The view by the pose that most of its points agree on; nothing where there is none."""
     plane = normalise(camera, px)
     usable = np.isfinite(plane).all(axis=1)
@@ -147,10 +147,10 @@ def _looks(at: IntArray, px: FloatArray, table: FloatArray, camera: Camera) -> I
             return
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    yield _Look(at, np.column_stack([plane, np.ones(len(at))]), pose, agrees, focal)
+    yield _RigView(at, np.column_stack([plane, np.ones(len(at))]), pose, agrees, focal)
 
 
-def _triangulated(rows: Sequence[tuple[_Look, int]]) -> tuple[FloatArray, float]:
+def _triangulated(rows: Sequence[tuple[_RigView, int]]) -> tuple[FloatArray, float]:
     """Where the rays of a point meet in the rig's frame [m], and what is left of them [px]."""
     factors, values = [], []
     for look, row in rows:
@@ -191,5 +191,7 @@ def _said(target: Target, places: Mapping[int, FloatArray], name: str) -> Findin
     words = f"target {name}: {'; '.join(parts)}, by the views' other points. They were left out."
     step = " and ".join(steps)
     return Finding(
-        "rig_points", words[0].upper() + words[1:], Step(f"{step[0].upper()}{step[1:]}.", CALIBRATE)
+        "rig_points",
+        words[0].upper() + words[1:],
+        Remedy(f"{step[0].upper()}{step[1:]}.", CALIBRATE),
     )

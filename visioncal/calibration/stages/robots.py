@@ -22,7 +22,7 @@ from visioncal.calibration.stages.reported_poses import Reported, reported_poses
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
-from visioncal.core.verdict import Finding, Step, remarks
+from visioncal.core.verdict import Finding, Remedy, remarks
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, frame_name
 from visioncal.session.kinds import is_seen, name_of
@@ -184,7 +184,7 @@ def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class CameraTargetPair:
     """What one camera sees of one target by way of one robot alone.
 
     Attributes:
@@ -200,10 +200,10 @@ class Pair:
     poses: Mapping[int, ViewPoses]
 
 
-_NO_PAIR = Pair("", "", "eye-in-hand", {})
+_NO_PAIR = CameraTargetPair("", "", "eye-in-hand", {})
 
 
-def pairs_of(seen: Observed, robot: str) -> list[Pair]:
+def pairs_of(seen: Observed, robot: str) -> list[CameraTargetPair]:
     """The pairs of a camera and a target by way of one robot alone, those of most views first.
 
     Poses of different ones do not compare.
@@ -221,7 +221,7 @@ def pairs_of(seen: Observed, robot: str) -> list[Pair]:
     for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):
         on_flange = seen.session.frames[camera] == flange
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
-        found.append(Pair(camera, target, mount, pairs[camera, target]))
+        found.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
     return found
 
 
@@ -285,6 +285,6 @@ def _lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> Finding
     )
     if taken:
         return Finding(
-            "misread_joints", f"{words} {zero_taken(zero)}", Step(zero.fix, ARM_AS_FOUND)
+            "misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, ARM_AS_FOUND)
         )
-    return Finding("misread_joints", words, Step(zero.fix))
+    return Finding("misread_joints", words, Remedy(zero.fix))

@@ -11,7 +11,7 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import Corners, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
-from visioncal.estimation.joint import Fitted
+from visioncal.estimation.joint import ConvergedFit
 from visioncal.estimation.parts import Effect, Noise
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
@@ -78,7 +78,7 @@ class FramesSide:
             problem, observations=replace(before, measured=measured, covariance=covariance)
         ).with_effects([seen.effect(rows), *self.effects, *arms])
 
-    def with_errors(self, fitted: Fitted) -> Self:
+    def with_errors(self, fitted: ConvergedFit) -> Self:
         """Looks for errors of the arms; see `joint.Side`."""
         problem, fit = fitted.problem, fitted.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)

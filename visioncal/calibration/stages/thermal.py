@@ -10,7 +10,12 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.thermal_fit import Stops, ThermalFit, fit_thermal, uninformative
+from visioncal.calibration.stages.thermal_fit import (
+    ThermalFit,
+    ThermalStops,
+    fit_thermal,
+    uninformative,
+)
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
@@ -149,7 +154,7 @@ def _missing(missing: str) -> DataError:
 
 
 def find_drift(
-    problem: Problem, start: State, stops: Stops, inputs: Inputs, nominal: Robot
+    problem: Problem, start: State, stops: ThermalStops, inputs: Inputs, nominal: Robot
 ) -> ThermalFit:
     """Fits an arm's drift with the frames and, where they are off, its links.
 
@@ -203,7 +208,7 @@ def findings(fit: ThermalFit) -> Iterator[str]:
 
 
 def drift_result(
-    fit: ThermalFit, stops: Stops, views: Sequence[int], problem: Problem, solved: Solution
+    fit: ThermalFit, stops: ThermalStops, views: Sequence[int], problem: Problem, solved: Solution
 ) -> ThermalResult:
     """A drift's coefficients and its course, as a section of a calibration.
 
@@ -251,7 +256,7 @@ def _joints(model: ThermalModel) -> tuple[JointDrift, ...]:
     )
 
 
-def _by_view(fit: ThermalFit, stops: Stops, views: Sequence[int]) -> tuple[ViewDrift, ...]:
+def _by_view(fit: ThermalFit, stops: ThermalStops, views: Sequence[int]) -> tuple[ViewDrift, ...]:
     """How far the flange had drifted at (m,) views, and the largest rise of a link."""
     moved = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
     rises = fit.model.rises(fit.links_c(stops)).max(axis=1)
@@ -273,7 +278,7 @@ def _course(fit: ThermalFit, q: FloatArray) -> tuple[DriftPoint, ...]:
 
 
 def _seen(
-    fit: ThermalFit, stops: Stops, views: Sequence[int], problem: Problem, state: State
+    fit: ThermalFit, stops: ThermalStops, views: Sequence[int], problem: Problem, state: State
 ) -> tuple[ObservedDrift, ...]:
     """How far the stops in the typical posture see the flange to have moved, by their first view.
 

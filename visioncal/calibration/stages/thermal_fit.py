@@ -48,7 +48,7 @@ _ROUNDS, _SETTLED = 5, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Stops:
+class ThermalStops:
     """A robot's stops.
 
     Attributes:
@@ -99,15 +99,15 @@ class ThermalFit:
             name for name, share in zip(names, self.shares, strict=True) if share > _LITTLE
         )
 
-    def links_c(self, stops: Stops) -> FloatArray:
+    def links_c(self, stops: ThermalStops) -> FloatArray:
         """(m, n) temperatures of the links at some stops [deg C]."""
         return self.model.heating.links_c(self.inputs, stops.stamps_s)
 
-    def motion(self, stops: Stops) -> FloatArray:
+    def motion(self, stops: ThermalStops) -> FloatArray:
         """(m, 4, 4) how far the flange had moved at some stops, in its own frame."""
         return self.model.motion(stops.q, self.links_c(stops))
 
-    def effect(self, stops: Stops, count: int) -> Effect:
+    def effect(self, stops: ThermalStops, count: int) -> Effect:
         """The uncertainty of the parameters, as unknowns of the chain at all of so many stops.
 
         They stay where they were found, and count in the covariance with what was known of them
@@ -144,7 +144,12 @@ def uninformative(inputs: Inputs, stamps_s: FloatArray) -> str:
 
 
 def fit_thermal(
-    problem: Problem, state: State, robot: Robot, stops: Stops, inputs: Inputs, nominal: Robot
+    problem: Problem,
+    state: State,
+    robot: Robot,
+    stops: ThermalStops,
+    inputs: Inputs,
+    nominal: Robot,
 ) -> ThermalFit:
     """Estimates how an arm drifts, with all unknowns free.
 
@@ -156,7 +161,7 @@ def fit_thermal(
         inputs: What heats the arm.
         nominal: The arm without what is mounted on its flange: its lengths are what grows.
     """
-    warming = _Warming(problem, stops, inputs, _start(robot, nominal, inputs))
+    warming = _WarmingUnknowns(problem, stops, inputs, _start(robot, nominal, inputs))
     with one_blas_thread():
         cold = fit_problem(problem, state)
         found, noise = _descended(warming, _Warm(cold.state, np.zeros(warming.size)), cold.noise)
@@ -180,7 +185,7 @@ def fit_thermal(
     )
 
 
-def _descended(warming: "_Warming", state: "_Warm", noise: Noise) -> tuple["_Warm", Noise]:
+def _descended(warming: "_WarmingUnknowns", state: "_Warm", noise: Noise) -> tuple["_Warm", Noise]:
     """Minimises under the noise that the residuals show, until that stays the same."""
     for _ in range(_ROUNDS):
         state, _ = levenberg_marquardt(state, partial(warming.linearised, noise=noise), _SETTLED)
@@ -210,11 +215,11 @@ class _Warm:
 
 
 @dataclass(frozen=True, eq=False)
-class _Warming:
+class _WarmingUnknowns:
     """The fit's unknowns beside those of the cold arm's problem, in units of their sigmas."""
 
     cold: Problem
-    stops: Stops
+    stops: ThermalStops
     inputs: Inputs
     start: ThermalModel
 
@@ -273,7 +278,7 @@ def _effect(
     model: ThermalModel,
     values: FloatArray,
     sigmas: FloatArray,
-    stops: Stops,
+    stops: ThermalStops,
     inputs: Inputs,
     count: int,
 ) -> Effect:

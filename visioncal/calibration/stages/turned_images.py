@@ -18,7 +18,7 @@ _LEAST_PX = 0.05
 
 
 @dataclass(frozen=True)
-class Turned:
+class ImageTurn:
     """How an image was changed.
 
     Attributes:
@@ -31,19 +31,19 @@ class Turned:
 
 
 _Carried = Callable[[FloatArray, int, int], FloatArray]
-_HALF = Turned("turned by 180 deg", "-rotate 180")
-_LEFT = Turned("turned by 90 deg counterclockwise", "-rotate 90")
-_RIGHT = Turned("turned by 90 deg clockwise", "-rotate 270")
-_FLOPPED = Turned("mirrored left to right", "-flop")
-_FLIPPED = Turned("mirrored upside down", "-flip")
+_HALF = ImageTurn("turned by 180 deg", "-rotate 180")
+_LEFT = ImageTurn("turned by 90 deg counterclockwise", "-rotate 90")
+_RIGHT = ImageTurn("turned by 90 deg clockwise", "-rotate 270")
+_FLOPPED = ImageTurn("mirrored left to right", "-flop")
+_FLIPPED = ImageTurn("mirrored upside down", "-flip")
 # Where corners (n, 2) lie once it is undone, in images of a width and a height [px].
-_UNDONE: Mapping[Turned, _Carried] = {
+_UNDONE: Mapping[ImageTurn, _Carried] = {
     _HALF: lambda px, width, height: np.array([width - 1, height - 1]) - px,
     _FLOPPED: lambda px, width, _: np.array([width - 1, 0]) + np.array([-1, 1]) * px,
     _FLIPPED: lambda px, _, height: np.array([0, height - 1]) + np.array([1, -1]) * px,
 }
 # Only square images keep their size.
-_QUARTERS: Mapping[Turned, _Carried] = {
+_QUARTERS: Mapping[ImageTurn, _Carried] = {
     _LEFT: lambda px, _, height: np.stack([height - 1 - px[:, 1], px[:, 0]], axis=1),
     _RIGHT: lambda px, width, _: np.stack([px[:, 1], width - 1 - px[:, 0]], axis=1),
 }
@@ -51,7 +51,7 @@ _QUARTERS: Mapping[Turned, _Carried] = {
 
 def turned_how(
     px: FloatArray, predicted_px: FloatArray, size: tuple[int, int], typical_px: float
-) -> Turned | None:
+) -> ImageTurn | None:
     """Says how the image of a view that disagrees was turned or mirrored.
 
     Corners are compared with the nearest predicted one: a checkerboard's are numbered otherwise in

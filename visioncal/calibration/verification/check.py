@@ -31,7 +31,7 @@ from visioncal.core.types import FloatArray, Progress
 from visioncal.estimation.model_evidence import (
     Belief,
     Cause,
-    Explained,
+    CauseEvidence,
     explain,
     undone,
     with_change,
@@ -60,7 +60,7 @@ class Suspect:
 
     name: str
     probability: float
-    explained: Explained
+    explained: CauseEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +202,9 @@ def check(
     )
 
 
-def _left(seen: PredictedStops, belief: Belief, cause: Cause, explained: Explained) -> FloatArray:
+def _left(
+    seen: PredictedStops, belief: Belief, cause: Cause, explained: CauseEvidence
+) -> FloatArray:
     """(m, 6) where each sight places its board with a change undone, from where it was."""
     before = undone(seen.problem, cause, explained.values)
     return log(asked_of_boards(before, with_change(belief.state, cause)))

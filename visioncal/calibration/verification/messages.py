@@ -28,7 +28,7 @@ from visioncal.core.verdict import (
     PLAN,
     VERIFY,
     Finding,
-    Step,
+    Remedy,
     Verdict,
 )
 from visioncal.estimation.null_space import joint_words, listed
@@ -43,36 +43,36 @@ _LEAST_STOPS = 3
 _SURE = 6.0
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
-_ANOTHER_BOARD = Step(
+_ANOTHER_BOARD = Remedy(
     "Verify with the board that was calibrated with; or measure the squares of this one, and "
     f"{_ANEW}",
     CALIBRATE_ANEW,
 )
 _NEXT = {
-    CAMERA: Step(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW),
-    BOARD: Step(
+    CAMERA: Remedy(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW),
+    BOARD: Remedy(
         "Put the board back; if it was moved on purpose, verify without its place.",
         f"{VERIFY} --board-moved",
     ),
-    BOTH: Step(f"Fasten both, and {_ANEW}", CALIBRATE_ANEW),
+    BOTH: Remedy(f"Fasten both, and {_ANEW}", CALIBRATE_ANEW),
     SIZE: _ANOTHER_BOARD,
     REPLACED: _ANOTHER_BOARD,
-    JOINT: Step(
+    JOINT: Remedy(
         "Look whether the joint keeps its zero (a coupling that slips does so again), then "
         f"{_ANEW}",
         CALIBRATE_ANEW,
     ),
-    LENGTH: Step(
+    LENGTH: Remedy(
         "Let the arm come to the temperature at which it was calibrated, or calibrate it at the "
         "one at which it works."
     ),
-    NOISE: Step(
+    NOISE: Remedy(
         "Look for play in mounts and joints, and whether the robot stood still at each image; "
         "then verify again.",
         VERIFY,
     ),
 }
-_WRONG_VIEW = Step(
+_WRONG_VIEW = Remedy(
     "Take that stop again, whose image and pose do not belong together; then verify again.", VERIFY
 )
 
@@ -131,12 +131,12 @@ def verdict_of(check: Check) -> Verdict:
         reasons.append(_rivals(check, best, others))
     if not check.explained:
         words = "Alone it does not explain the stops: something else has changed too."
-        anew = _runnable(check, Step(_capital(_ANEW), CALIBRATE_ANEW))
+        anew = _runnable(check, Remedy(_capital(_ANEW), CALIBRATE_ANEW))
         reasons.append(Finding("unexplained", words, anew))
     return Verdict("bad", (*reasons, *(doubts if others else ())))
 
 
-def _runnable(check: Check, step: Step) -> Step:
+def _runnable(check: Check, step: Remedy) -> Remedy:
     """Advice without its command where these stops do not allow it."""
     session = check.seen.known.session
     of_images = any(view.image for view in session.views)
@@ -148,7 +148,7 @@ def _runnable(check: Check, step: Step) -> Step:
         and check.seen.stops >= _LEAST_STOPS
         and check.calibration.robot is not None,
     }
-    return step if allowed.get(step.command, True) else Step(step.words)
+    return step if allowed.get(step.command, True) else Remedy(step.words)
 
 
 def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
@@ -157,10 +157,10 @@ def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
     robot = check.calibration.calibrated_robot
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
-        return Finding("rivals", f"No stops separate that from {named}.", Step("Look at both."))
+        return Finding("rivals", f"No stops separate that from {named}.", Remedy("Look at both."))
     these = "This stop does" if check.seen.stops == 1 else f"These {check.seen.stops} stops do"
     words = f"{these} not separate that from {named}."
-    step = _runnable(check, Step("Verify with stops all over the workspace.", PLAN))
+    step = _runnable(check, Remedy("Verify with stops all over the workspace.", PLAN))
     return Finding("rivals", words, step)
 
 
@@ -361,7 +361,7 @@ def _doubts(check: Check) -> Iterator[Finding]:
     if check.seen.stops < CheckLimits.stops:
         verb = "distinguishes" if check.seen.stops == 1 else "distinguish"
         words = f"{_stops(check)} hardly {verb} one change from another."
-        step = _runnable(check, Step(f"Take {CheckLimits.stops} stops or more.", PLAN))
+        step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
         yield Finding("few_stops", words, step)
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table, did_you_mean, read_toml
+from visioncal.core.files import DocumentTable, did_you_mean, read_toml
 from visioncal.results import Calibration
 from visioncal.session import Session
 
@@ -61,7 +61,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Facts:
+class TriggerFacts:
     """What the triggers look at; None where it is not known.
 
     Attributes:
@@ -96,7 +96,7 @@ def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:
 
 
 def _trigger(row: Mapping[str, Any], label: str) -> Trigger:
-    table = Table(row, label)
+    table = DocumentTable(row, label)
     quantity, known = table.text("quantity"), (*_FLAGS, *_UNITS)
     if quantity not in known:
         raise DataError(
@@ -114,7 +114,7 @@ def facts_of(
     failed: bool,
     collision: bool,
     now: datetime | None = None,
-) -> Facts:
+) -> TriggerFacts:
     """Collects what triggers look at.
 
     Args:
@@ -139,7 +139,7 @@ def facts_of(
         unknown["age_days"] = f"the calibration's time is {calibration.created!r}"
     else:
         values["age_days"] = age_days
-    return Facts(values, {"failed_check": failed, "collision": collision}, unknown)
+    return TriggerFacts(values, {"failed_check": failed, "collision": collision}, unknown)
 
 
 def _age_days(created: str, now: datetime) -> float | None:
@@ -151,12 +151,12 @@ def _age_days(created: str, now: datetime) -> float | None:
     return round((now - then).total_seconds() / _DAY_S, 1)
 
 
-def outcomes(policy: Sequence[Trigger], facts: Facts) -> tuple[Outcome, ...]:
+def outcomes(policy: Sequence[Trigger], facts: TriggerFacts) -> tuple[Outcome, ...]:
     """Says of each trigger whether it fires."""
     return tuple(_outcome(trigger, facts) for trigger in policy)
 
 
-def _outcome(trigger: Trigger, facts: Facts) -> Outcome:
+def _outcome(trigger: Trigger, facts: TriggerFacts) -> Outcome:
     quantity, limit, label = trigger.quantity, trigger.limit, _LABELS[trigger.quantity]
     if limit is None:
         return Outcome(trigger, "fired" if facts.flags[quantity] else "quiet", None, label)

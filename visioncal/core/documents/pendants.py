@@ -64,7 +64,7 @@ class PendantPose:
 
 
 @dataclass(frozen=True)
-class _Written:
+class _PendantNumbers:
     """Numbers as they stand, the forms that they may be in, and the units that they say."""
 
     numbers: tuple[float, ...]
@@ -119,23 +119,23 @@ def _plain(line: str) -> str:
     return line.replace("°", " deg").replace("\N{MINUS SIGN}", "-")
 
 
-def _written(line: str) -> _Written | None:
+def _written(line: str) -> _PendantNumbers | None:
     plain = _plain(line)
     return _marked(plain) or _named(plain) or _bare(plain)
 
 
-def _marked(line: str) -> _Written | None:
+def _marked(line: str) -> _PendantNumbers | None:
     for form, pattern in _MARKED:
         found = pattern.findall(line)
         # Of two poses in a line it is not known which is meant.
         if len(found) == 1:
             words = re.split(r"[\s,\[\]]+", found[0].strip())
             if all(re.fullmatch(_NUMBER, word) for word in words):
-                return _Written(tuple(map(float, words)), (form,))
+                return _PendantNumbers(tuple(map(float, words)), (form,))
     return None
 
 
-def _named(line: str) -> _Written | None:
+def _named(line: str) -> _PendantNumbers | None:
     found = [(match[1].lower(), match[2], match[3]) for match in _NAMED.finditer(line)]
     values = {name: float(number) for name, number, _ in found}
     units = {name: unit for name, _, unit in found if unit}
@@ -152,18 +152,20 @@ def _named(line: str) -> _Written | None:
                 return None
             # Of those who write Rx, Ry, Rz only Universal Robots does so in radians.
             likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
-            return _Written(numbers, likely, next(iter(lengths), None), next(iter(angles), None))
+            return _PendantNumbers(
+                numbers, likely, next(iter(lengths), None), next(iter(angles), None)
+            )
     return None
 
 
-def _bare(line: str) -> _Written | None:
+def _bare(line: str) -> _PendantNumbers | None:
     words = [part for part in _BETWEEN.split(line) if part]
     if len(words) not in _BARE_FORMS or not all(re.fullmatch(_NUMBER, word) for word in words):
         return None
-    return _Written(tuple(map(float, words)), _BARE_FORMS[len(words)])
+    return _PendantNumbers(tuple(map(float, words)), _BARE_FORMS[len(words)])
 
 
-def _form(written: _Written, wished: str | None, where: str) -> str:
+def _form(written: _PendantNumbers, wished: str | None, where: str) -> str:
     if wished is None and len(written.forms) == 1:
         return written.forms[0]
     makers = ", ".join(written.forms)
@@ -184,7 +186,7 @@ def _form(written: _Written, wished: str | None, where: str) -> str:
     return wished
 
 
-def _reading(form: PoseForm, written: _Written) -> Reading:
+def _reading(form: PoseForm, written: _PendantNumbers) -> Reading:
     """The form's units, but for those that the line itself says."""
     length = written.length if written.length in UNITS_M else form.unit
     rotation = form.rotation

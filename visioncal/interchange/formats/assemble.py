@@ -16,7 +16,7 @@ from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.boards import described_target, target_name
 from visioncal.interchange.formats.corner_lists import with_corners
-from visioncal.interchange.formats.foreign import Foreign, Sweep, rows_of
+from visioncal.interchange.formats.foreign import Foreign, ForeignSweep, rows_of
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
@@ -130,7 +130,7 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     return replace(session, warnings=(*notes, *session.warnings))
 
 
-def _swept(foreign: Foreign, sweep: Sweep) -> Foreign:
+def _swept(foreign: Foreign, sweep: ForeignSweep) -> Foreign:
     """All that the camera saw, without the robot's poses: those stay in a stream of their own."""
     return replace(
         foreign,
@@ -142,7 +142,7 @@ def _swept(foreign: Foreign, sweep: Sweep) -> Foreign:
     )
 
 
-def _stream(sweep: Sweep) -> Stream:
+def _stream(sweep: ForeignSweep) -> Stream:
     rows = pose_cells(sweep.robot, known.POSE)
     numbers = np.array([[float(row[name]) for name in known.POSE] for row in rows])
     values = np.hstack([sweep.robot_s[:, None], numbers])
@@ -165,7 +165,7 @@ def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:
 
 
 @dataclass(frozen=True)
-class _Row:
+class _ViewRow:
     """One row of views.csv, and the file of its image by the path in the session."""
 
     cells: dict[str, str]
@@ -225,7 +225,7 @@ def _with_one_witness(foreign: Foreign, notes: list[str]) -> Foreign:
     return replace(foreign, images=(), corners=())
 
 
-def _written(foreign: Foreign) -> list[_Row]:
+def _written(foreign: Foreign) -> list[_ViewRow]:
     images = _image_paths(foreign)
     robot = pose_cells(foreign.robot, known.POSE)
     camera: list[dict[str, str]] = [{}] * len(foreign.robot)
@@ -240,7 +240,7 @@ def _written(foreign: Foreign) -> list[_Row]:
             cells["image"] = "" if image is None else image[0]
         cells |= _scalars(foreign, at) | robot[at] | camera[at]
         cells |= {name: column[at] for name, column in extra.items()}
-        rows.append(_Row(cells, dict([image]) if image is not None else {}))
+        rows.append(_ViewRow(cells, dict([image]) if image is not None else {}))
     return rows
 
 

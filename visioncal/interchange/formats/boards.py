@@ -7,7 +7,7 @@ from typing import Any
 
 from visioncal.core.documents.yamls import read_yaml
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table
+from visioncal.core.files import DocumentTable
 from visioncal.core.types import Target
 from visioncal.vision.targets import metres, read_target, target_from_document, target_names
 
@@ -60,7 +60,7 @@ def target_named(words: str, name: str = "") -> Target:
 def _of_kalibr(path: Path) -> dict[str, Any]:
     """Reads the target file of Kalibr: an AprilGrid, or a checkerboard of squares."""
     content = read_yaml(path)
-    table = Table(content if isinstance(content, dict) else {}, path.name)
+    table = DocumentTable(content if isinstance(content, dict) else {}, path.name)
     if table.choice("target_type", ("aprilgrid", "checkerboard")) == "aprilgrid":
         names = {"columns": "tagCols", "rows": "tagRows", "size_m": "tagSize"}
         names["spacing"] = "tagSpacing"

@@ -11,7 +11,7 @@ from visioncal.interchange.formats.import_options import ImportOptions
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class ForeignSweep:
     """Two streams of one motion, each with a clock of its own.
 
     Attributes:
@@ -77,7 +77,7 @@ class Foreign:
     lens: Mapping[str, Any] | None = None
     arm: Mapping[str, Any] | None = None
     views: tuple[int, ...] = ()
-    sweep: Sweep | None = None
+    sweep: ForeignSweep | None = None
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

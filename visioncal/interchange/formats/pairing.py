@@ -6,7 +6,7 @@ from visioncal.core.conventions import PoseNumbers
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.fields import Fields, stamp_name, unnamed_columns
-from visioncal.interchange.formats.foreign import Foreign, Sweep
+from visioncal.interchange.formats.foreign import Foreign, ForeignSweep
 from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import pose_names, poses_from
 from visioncal.interchange.formats.streams import pair_streams, seconds
@@ -83,7 +83,7 @@ def _by_time(
         robot=PoseNumbers.written(paired.base_from_flange, robot[1].reading, sampled.places),
         camera=sampled,
         stamps_s=camera_s[paired.rows],
-        sweep=Sweep(robot_s, robot[1].rows(robot_rows), camera_s, seen),
+        sweep=ForeignSweep(robot_s, robot[1].rows(robot_rows), camera_s, seen),
         notes=(
             *notes,
             f"The camera's clock is about {1e3 * paired.match.offset_s:+.0f} ms ahead of the "

@@ -35,7 +35,7 @@ from visioncal.session.columns import (
     position_columns,
 )
 from visioncal.session.corners import CornerTable
-from visioncal.session.table import Row, parse_csv
+from visioncal.session.table import TextRow, parse_csv
 from visioncal.vision.targets import LARGEST_M
 
 # Distances between consecutive rows of one log go up and down together.
@@ -180,7 +180,7 @@ def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Table:
+class _PoseTable:
     """A views.csv whose poses are written otherwise than sessions have them.
 
     Attributes:
@@ -188,11 +188,11 @@ class _Table:
         robot: What it says of the poses.
     """
 
-    plain: tuple[tuple[str, ...], tuple[Row, ...]]
+    plain: tuple[tuple[str, ...], tuple[TextRow, ...]]
     robot: PoseNumbers
 
 
-def _otherwise_written(folder: Path) -> _Table | None:
+def _otherwise_written(folder: Path) -> _PoseTable | None:
     """Reads positions and rotations of other columns or forms; None where there are none."""
     if not (folder / "views.csv").is_file():
         return None
@@ -225,7 +225,7 @@ def _otherwise_written(folder: Path) -> _Table | None:
         pose = [*map(repr, position.tolist()), *_NO_TURN] if is_there else [""] * len(POSE)
         plain.append(replace(row, cells=(*(mine.get(name, "") for name in kept), *pose)))
     robot = PoseNumbers(positions, rotations, Reading(form), tuple(row.where for row in rows))
-    return _Table(((*kept, *POSE), tuple(plain)), robot)
+    return _PoseTable(((*kept, *POSE), tuple(plain)), robot)
 
 
 def _number(cell: str) -> float:

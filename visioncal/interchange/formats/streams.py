@@ -9,7 +9,12 @@ from visioncal.calibration.stages.motion import slow_and_new
 from visioncal.calibration.stages.offset import LEAST_CORRELATION
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.clock_correlation import WIDEST_OFFSET_S, Frames, Match, turning_matches
+from visioncal.estimation.clock_correlation import (
+    WIDEST_OFFSET_S,
+    ImageTimes,
+    Match,
+    turning_matches,
+)
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 
 # Less in common determines no offset; more is a recording of work, not of a calibration.
@@ -76,7 +81,7 @@ def pair_streams(
     """
     _check_common(robot_s, camera_s)
     flange = Trajectory(robot_s, robot)
-    match = _match(flange, Frames("eye-in-hand", camera_s, camera))
+    match = _match(flange, ImageTimes("eye-in-hand", camera_s, camera))
     at_s = camera_s - match.offset_s
     rows = np.flatnonzero(flange.covers(at_s))
     if len(rows) < 3:
@@ -110,7 +115,7 @@ def _check_common(robot_s: FloatArray, camera_s: FloatArray) -> None:
         )
 
 
-def _match(flange: Trajectory, frames: Frames) -> Match:
+def _match(flange: Trajectory, frames: ImageTimes) -> Match:
     best = next(iter(turning_matches(flange, frames)), Match(0.0, np.inf, 0.0))
     if flange.step_s >= LONGEST_GAP_S:
         # Nothing can be compared; whoever looks for covered samples says so.

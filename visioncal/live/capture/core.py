@@ -15,7 +15,7 @@ from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.predict import Prediction
-from visioncal.live.capture.take import Missed, Taken, settle, take
+from visioncal.live.capture.take import Missed, TakenView, settle, take
 from visioncal.live.planning.accuracy import Accuracy
 from visioncal.live.planning.messages import accuracy_words
 from visioncal.vision.finders.imaging import decode_image
@@ -31,7 +31,7 @@ class Times:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class CaptureEvent:
     """What became of a view, for whoever watches.
 
     Attributes:
@@ -48,7 +48,7 @@ class Step:
     view: int
     place: int
     count: int
-    found: Taken | Missed
+    found: TakenView | Missed
     covered: str
     accuracy: Accuracy | None
     advice: str
@@ -58,7 +58,7 @@ class Step:
 class Watcher(Protocol):
     """Whoever watches a recording; what it does must be quick."""
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Takes note of a view on the disk, or of a stop that gave none."""
 
 
@@ -86,7 +86,7 @@ class Capture:
     coach: Coach
     prediction: Prediction | None
     watchers: Sequence[Watcher] = ()
-    steps: list[Step] = field(default_factory=list)
+    steps: list[CaptureEvent] = field(default_factory=list)
 
     def catch_up(self) -> None:
         """Takes into account what is on the disk already."""
@@ -106,7 +106,7 @@ class Capture:
         count: int,
         moved_s: float,
         advise: Callable[[], str],
-    ) -> Step:
+    ) -> CaptureEvent:
         """Takes a view where the arm stands.
 
         Args:
@@ -124,7 +124,7 @@ class Capture:
         begun = clock.now()
         settled = settle(self.cell, self.options)
         rested = clock.now()
-        found: Taken | Missed
+        found: TakenView | Missed
         if isinstance(settled, Missed):
             found = settled
         else:
@@ -133,7 +133,9 @@ class Capture:
         accuracy = self._accuracy()
         times = Times(moved_s, rested - begun, clock.now() - rested)
         advice = advise()
-        step = Step(number, place, count, found, self.coach.words(), accuracy, advice, times)
+        step = CaptureEvent(
+            number, place, count, found, self.coach.words(), accuracy, advice, times
+        )
         self.steps.append(step)
         for watcher in self.watchers:
             watcher.stepped(step)
@@ -151,7 +153,7 @@ class Capture:
             return f"view {view}"
         return f"view {view}, for {figure(then.mm)} mm"
 
-    def _kept(self, number: int, found: Taken | Missed) -> Taken | Missed:
+    def _kept(self, number: int, found: TakenView | Missed) -> TakenView | Missed:
         """Puts a view on the disk, if it can be believed."""
         if isinstance(found, Missed):
             return found
@@ -185,14 +187,14 @@ class Capture:
         )
 
 
-def missed(steps: Sequence[Step]) -> Iterator[tuple[int, str]]:
+def missed(steps: Sequence[CaptureEvent]) -> Iterator[tuple[int, str]]:
     """The stops that gave no view, with the reasons."""
     for step in steps:
         if isinstance(step.found, Missed):
             yield step.view, step.found.reason
 
 
-def line_of(step: Step) -> str:
+def line_of(step: CaptureEvent) -> str:
     """Says what became of a view: `[3/30] view 2: 54 corners, ...; coverage 45 % -> next: ...`."""
     found, place = step.found, f"[{step.place}{f'/{step.count}' if step.count else ''}]"
     onward = f" -> next: {step.advice}" if step.advice else ""
@@ -205,7 +207,7 @@ def line_of(step: Step) -> str:
     )
 
 
-def note_of(step: Step) -> str:
+def note_of(step: CaptureEvent) -> str:
     """The same in Markdown, for the viewer."""
     sigma = "" if step.accuracy is None else f"\n\nPredicted sigma: {accuracy_words(step.accuracy)}"
     return f"**View {step.view}**\n\n{step.covered}{sigma}\n\nNext: {step.advice or 'anything new'}"

@@ -9,7 +9,7 @@ import tomli_w
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.types import Camera, FloatArray, Mount, Target
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import ArmState
 from visioncal.robot import Robot, load_robot, robot_file, robot_names
 from visioncal.session import View
@@ -20,7 +20,7 @@ _TARGET_FILE = "target.toml"
 
 
 @dataclass(frozen=True, eq=False)
-class Facts:
+class CaptureFacts:
     """What does not change from view to view.
 
     Attributes:
@@ -86,7 +86,9 @@ class Facts:
         return table
 
 
-def view_of(number: int, image: str, taken: Taken, facts: Facts, unix_offset_s: float) -> View:
+def view_of(
+    number: int, image: str, taken: TakenView, facts: CaptureFacts, unix_offset_s: float
+) -> View:
     """Writes a view as a row of views.csv.
 
     Args:
@@ -123,7 +125,7 @@ def state_of(view: View) -> ArmState | None:
     return ArmState(view.stamp_s or 0.0, np.asarray(pose.as_matrix()), view.joints_rad)
 
 
-def _texts(taken: Taken, state: ArmState, facts: Facts) -> dict[str, str]:
+def _texts(taken: TakenView, state: ArmState, facts: CaptureFacts) -> dict[str, str]:
     """Columns that calibration passes through: what the devices said of themselves."""
     texts = {
         "safety": state.safety,

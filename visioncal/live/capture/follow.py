@@ -8,12 +8,12 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.core import Capture, Step
+from visioncal.live.capture.core import Capture, CaptureEvent
 from visioncal.live.capture.live import Clock, LiveCell
 from visioncal.live.capture.options import Stillness
 from visioncal.live.capture.record import closed_cleanly
 from visioncal.live.capture.still import why_arm_moves
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import Arm, ArmState
 
 # How often a guided arm is asked where it is [s].
@@ -44,7 +44,7 @@ class HeldArm:
         """Nothing is held."""
 
 
-def follow(capture: Capture, count: int) -> list[Step]:
+def follow(capture: Capture, count: int) -> list[CaptureEvent]:
     """Takes a view whenever a guided arm rests at a new place.
 
     Args:
@@ -67,7 +67,7 @@ def follow(capture: Capture, count: int) -> list[Step]:
                 been.append(state.base_from_flange)
                 place = len(capture.journal.views) + 1
                 step = capture.view(_next(capture), place, count, took_s, capture.coach.advice)
-                if isinstance(step.found, Taken):
+                if isinstance(step.found, TakenView):
                     # The hand may have gone on while the rest was waited for.
                     been.append(step.found.state.base_from_flange)
         except KeyboardInterrupt:
@@ -82,7 +82,7 @@ def follow(capture: Capture, count: int) -> list[Step]:
 
 def ask_and_take(
     capture: Capture, arm: Arm, count: int, ask: Callable[[str], str] | None
-) -> list[Step]:
+) -> list[CaptureEvent]:
     """Takes a view whenever a person says so, and asks for its pose.
 
     Args:

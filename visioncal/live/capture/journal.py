@@ -20,8 +20,8 @@ from visioncal.core.files import (
 )
 from visioncal.core.temporary_files import remove_abandoned
 from visioncal.core.version import __version__
-from visioncal.live.capture.facts import Facts, view_of
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.facts import CaptureFacts, view_of
+from visioncal.live.capture.take import TakenView
 from visioncal.session import Session, View
 from visioncal.session.table import write_csv
 
@@ -48,7 +48,7 @@ class Journal:
         views: The views that are on the disk.
     """
 
-    def __init__(self, folder: Path, facts: Facts, unix_offset_s: float) -> None:
+    def __init__(self, folder: Path, facts: CaptureFacts, unix_offset_s: float) -> None:
         """Takes a folder as it is; `begin` and `resume` prepare one."""
         self.folder = folder
         self.views: tuple[View, ...] = ()
@@ -56,7 +56,9 @@ class Journal:
         self._facts, self._offset_s = facts, unix_offset_s
 
     @classmethod
-    def begin(cls, folder: Path, facts: Facts, unix_offset_s: float, views: int) -> "Journal":
+    def begin(
+        cls, folder: Path, facts: CaptureFacts, unix_offset_s: float, views: int
+    ) -> "Journal":
         """Begins a session.
 
         Args:
@@ -91,7 +93,9 @@ class Journal:
         return journal
 
     @classmethod
-    def resume(cls, folder: Path, facts: Facts, unix_offset_s: float, views: int) -> "Journal":
+    def resume(
+        cls, folder: Path, facts: CaptureFacts, unix_offset_s: float, views: int
+    ) -> "Journal":
         """Goes on with a session, or begins it where nothing was recorded yet.
 
         What a killed process left half written is removed.
@@ -121,7 +125,7 @@ class Journal:
             journal.views, journal._columns = session.views, session.columns
         return journal
 
-    def append(self, number: int, taken: Taken) -> View:
+    def append(self, number: int, taken: TakenView) -> View:
         """Puts a view on the disk; when this returns, it stays there.
 
         Raises:
@@ -187,7 +191,7 @@ def _columns(view: View) -> tuple[str, ...]:
     return ("view", "image", *view.numbers, *view.text)
 
 
-def _check_same(before: dict[str, Any], facts: Facts, folder: Path) -> None:
+def _check_same(before: dict[str, Any], facts: CaptureFacts, folder: Path) -> None:
     """Refuses to go on with the recording of something else."""
     now = facts.provenance()
     differ = [name for name, value in now.items() if before.get(name) != value]

@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError, DriverError, VisioncalError
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, FloatArray
 from visioncal.live.capture.coach import Coach
-from visioncal.live.capture.core import Capture, Step, Watcher
+from visioncal.live.capture.core import Capture, CaptureEvent, Watcher
 from visioncal.live.capture.drive import drive, joints_of, travel_s
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
@@ -72,7 +72,7 @@ def departure(
     stops = tuple(stop for stop in plan.stops if stop.view not in done)
     if not stops:
         return Departure((), here, (), 0.0, 0.0)
-    first = Ways(plan).to(stops[0], here)
+    first = CheckedPaths(plan).to(stops[0], here)
     pace = (options.speed, options.acceleration)
     way = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
     legs = [travel_s(a, b, *pace) for a, b in pairwise(way)]
@@ -88,7 +88,7 @@ def record(
     watchers: Sequence[Watcher] = (),
     *,
     lens: Camera | None = None,
-) -> list[Step]:
+) -> list[CaptureEvent]:
     """Records the stops of a plan that have no view yet.
 
     However it ends, the arm stands still and every reported view is on the disk.
@@ -130,7 +130,7 @@ def record(
     capture.catch_up()
     done = {view.number for view in journal.views}
     left = [stop for stop in plan.stops if stop.view not in done]
-    ways = Ways(plan)
+    ways = CheckedPaths(plan)
     with closed_cleanly(cell, journal, options):
         for at, stop in enumerate(left):
             begun = cell.clock.now()
@@ -211,7 +211,7 @@ def _check_model(cell: LiveCell, plan: PlanFile, here: FloatArray) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class CheckedPaths:
     """Ways that were looked at: those of the plan, and others where the arm stands elsewhere."""
 
     plan: PlanFile

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from visioncal.live.capture.core import Step, note_of
+from visioncal.live.capture.core import CaptureEvent, note_of
 from visioncal.live.capture.take import Missed
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ class Shown:
 
     drawing: "LiveDrawing"
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Draws a view."""
         # Rerun takes half a second to import, which recordings that nobody watches need not wait.
         from visioncal.present.recording.live import LiveView

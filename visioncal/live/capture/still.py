@@ -24,7 +24,7 @@ _ALIKE = 25.0
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class StillFrame:
     """A frame with the states of the arm around its exposure."""
 
     frame: Frame

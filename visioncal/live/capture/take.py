@@ -10,7 +10,7 @@ from visioncal.core.errors import DriverError
 from visioncal.core.types import Corners, Image, Rejection, Target
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
-from visioncal.live.capture.still import Look, grey, why_arm_moves, why_image_moves
+from visioncal.live.capture.still import StillFrame, grey, why_arm_moves, why_image_moves
 from visioncal.live.drivers.protocols import ArmState, Frame
 from visioncal.vision.finders import blur_of
 
@@ -21,7 +21,7 @@ _ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
+class TakenView:
     """A view.
 
     Attributes:
@@ -48,11 +48,11 @@ class Missed:
 class Settled:
     """The first look of a rest, and the last by which it was long enough."""
 
-    first: Look
-    last: Look
+    first: StillFrame
+    last: StillFrame
 
 
-def _take_look(cell: LiveCell) -> Look:
+def _take_look(cell: LiveCell) -> StillFrame:
     """Takes a frame, with the states of the arm around its exposure."""
     asked = cell.clock.now()
     before = cell.state()
@@ -65,7 +65,7 @@ def _take_look(cell: LiveCell) -> Look:
             culprits=[cell.camera.name],
             next_step="The camera hands out old pictures, or its clock is not the host's.",
         )
-    return Look(frame, before, after)
+    return StillFrame(frame, before, after)
 
 
 def settle(cell: LiveCell, options: CaptureOptions) -> Settled | Missed:
@@ -90,7 +90,7 @@ def settle(cell: LiveCell, options: CaptureOptions) -> Settled | Missed:
             return Missed(f"nothing came to rest in {still.patience_s:g} s: {why or 'too slow'}")
 
 
-def _why_moving(first: Look, then: Look, options: CaptureOptions) -> tuple[str, float]:
+def _why_moving(first: StillFrame, then: StillFrame, options: CaptureOptions) -> tuple[str, float]:
     """Says what moved from one look to another, or nothing; and the image's motion [px]."""
     why = why_arm_moves(first.before, then.before, options.still)
     why = why or why_arm_moves(first.before, then.after, options.still)
@@ -101,7 +101,7 @@ def _why_moving(first: Look, then: Look, options: CaptureOptions) -> tuple[str, 
 
 def take(
     cell: LiveCell, settled: Settled, target: Target, view: int, options: CaptureOptions
-) -> Taken | Missed:
+) -> TakenView | Missed:
     """Takes a view of an arm at rest.
 
     All frames, and the arm around each of them, must stand where they stood when the rest began;
@@ -131,7 +131,7 @@ def take(
 
 def _frames(
     cell: LiveCell, settled: Settled, options: CaptureOptions
-) -> tuple[list[Look], str, float]:
+) -> tuple[list[StillFrame], str, float]:
     """Frames of one rest, the reason why they are none, and how far the image moved [px]."""
     looks, moved = [settled.last], 0.0
     while len(looks) < (1 if options.single else options.frames):
@@ -144,8 +144,8 @@ def _frames(
 
 
 def _chosen(
-    looks: Sequence[Look], target: Target, view: int, options: CaptureOptions, moved: float
-) -> Taken | Missed:
+    looks: Sequence[StillFrame], target: Target, view: int, options: CaptureOptions, moved: float
+) -> TakenView | Missed:
     if options.keep == "mean":
         return _taken(_mean(looks), target, view, moved)
     first = _taken(looks[0], target, view, moved)
@@ -158,14 +158,14 @@ def _chosen(
     return first if sharpest == 0 else _taken(looks[sharpest], target, view, moved)
 
 
-def _taken(kept: Look, target: Target, view: int, moved: float) -> Taken | Missed:
+def _taken(kept: StillFrame, target: Target, view: int, moved: float) -> TakenView | Missed:
     found, _ = look_for(grey(kept.frame.image), target, view)
     if isinstance(found, Rejection):
         return Missed(found.reason)
-    return Taken(kept.frame, kept.state, found, moved)
+    return TakenView(kept.frame, kept.state, found, moved)
 
 
-def _mean(looks: Sequence[Look]) -> Look:
+def _mean(looks: Sequence[StillFrame]) -> StillFrame:
     """The mean of all frames, with the arm as it was at the middle one."""
     middle = looks[len(looks) // 2]
     images = np.stack([look.frame.image for look in looks]).astype(np.float32)

@@ -65,7 +65,7 @@ class Source(Protocol[T_co]):
 
 
 @dataclass(eq=False)
-class _Request(Generic[T]):
+class _PictureRequest(Generic[T]):
     """A wish for a picture whose exposure began after a moment [s], and what came of it."""
 
     moment_s: float
@@ -84,8 +84,8 @@ class Newest(Generic[T]):
     def __init__(self, source: Source[T], name: str) -> None:
         self._source, self._name = source, name
         self._news = threading.Condition()
-        self._first: _Request[T] = _Request(-math.inf)
-        self._request: _Request[T] | None = self._first
+        self._first: _PictureRequest[T] = _PictureRequest(-math.inf)
+        self._request: _PictureRequest[T] | None = self._first
         self._came_s, self._late_s = time.monotonic(), 0.0
         self._stamps_s: deque[float] = deque()
         self._error: Exception | None = None
@@ -107,7 +107,7 @@ class Newest(Generic[T]):
         Raises:
             DriverError: None came, with for how long, or the camera is at its end.
         """
-        request: _Request[T] = _Request(moment_s)
+        request: _PictureRequest[T] = _PictureRequest(moment_s)
         with self._news:
             self._request = request
         return self._answered(request, timeout_s)
@@ -118,7 +118,7 @@ class Newest(Generic[T]):
         self._source.interrupt()
         self._thread.join(_ENDING_S)
 
-    def _answered(self, request: _Request[T], timeout_s: float) -> tuple[Arrival, T]:
+    def _answered(self, request: _PictureRequest[T], timeout_s: float) -> tuple[Arrival, T]:
         waiting = Stopwatch()
         with self._news:
             while request.given is None:
@@ -182,7 +182,7 @@ class Newest(Generic[T]):
         last = list(self._stamps_s)[-_LAST - 1 :]
         return max((min(b - a, _LONGEST_S) for a, b in pairwise(last)), default=0.0)
 
-    def _missed(self, request: _Request[T]) -> DriverError:
+    def _missed(self, request: _PictureRequest[T]) -> DriverError:
         if request.passed_by > _INTERVALS:
             return DriverError(
                 f"The {self._name} gives no fresh pictures: its last one came {self._late_s:.1f} s "

@@ -113,7 +113,7 @@ def candidates(
     Raises:
         DataError: There are too few; the message names what keeps the others from it.
     """
-    search = _Search(cell, count, seed)
+    search = _CandidateSearch(cell, count, seed)
     search.run(progress)
     if len(search.kept) < (least or max(_LEAST_SHARE * count, min(_LEAST, count))):
         search.ask_again()
@@ -123,7 +123,7 @@ def candidates(
     return Candidates(q, cell.cam_from_target(q), shares, search.losses.counts())
 
 
-class _Search:
+class _CandidateSearch:
     """Stops as they are found, with a count of what the others were lost to."""
 
     def __init__(self, cell: PlanCell, count: int, seed: int) -> None:

@@ -53,7 +53,7 @@ _FEWEST_CORNERS = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RecordedStops:
     """Stops that were recorded already.
 
     Attributes:
@@ -167,7 +167,7 @@ def worlds_of(
     purpose: Purpose,
     q: FloatArray,
     *,
-    recorded: Recorded | None = None,
+    recorded: RecordedStops | None = None,
     workspace: Box | None = None,
 ) -> tuple[World, ...]:
     """Predicts the information of candidates, in each of some cells.
@@ -189,7 +189,7 @@ def worlds_of(
 
 
 def stop_factors(
-    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: Recorded | None = None
+    cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None = None
 ) -> FloatArray:
     """Predicts the information of stops.
 
@@ -278,7 +278,7 @@ def _world(
     cell: PlanCell,
     purpose: Purpose,
     q: FloatArray,
-    recorded: Recorded | None,
+    recorded: RecordedStops | None,
     workspace: Box | None,
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
@@ -330,7 +330,7 @@ def _world(
     )
 
 
-def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: Recorded) -> FloatArray:
+def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedStops) -> FloatArray:
     """(p + a, p + a) of the stops and of what was measured by hand, known effects aside."""
     q = recorded.q
     if q is None and purpose.blocks:
@@ -399,7 +399,7 @@ def _sigma(purpose: Purpose) -> float:
     return next(iter(purpose.blocks.values()), 1.0)
 
 
-def _arm_size(robot: Robot, purpose: Purpose, recorded: Recorded | None = None) -> int:
+def _arm_size(robot: Robot, purpose: Purpose, recorded: RecordedStops | None = None) -> int:
     """How many errors of the arm `_erring` adds."""
     if purpose.blocks or recorded is None or recorded.arm is None:
         return sum(block_size(name, robot.joint_count) for name in purpose.blocks)

@@ -65,7 +65,7 @@ class Detours:
         """
         low = np.maximum(np.minimum(start, end) - _ASIDE_RAD, self._lower)
         high = np.minimum(np.maximum(start, end) + _ASIDE_RAD, self._upper)
-        trees = (_Tree(start), _Tree(end))
+        trees = (_PostureTree(start), _PostureTree(end))
         for draw in range(_DRAWS):
             near, far = trees if draw % 2 == 0 else trees[::-1]
             grown = self._grow(near, self._rng.uniform(low, high), steps=1)
@@ -78,7 +78,7 @@ class Detours:
                 return way if near is trees[0] else way[::-1]
         return None
 
-    def _grow(self, tree: "_Tree", goal: FloatArray, steps: int) -> int | None:
+    def _grow(self, tree: "_PostureTree", goal: FloatArray, steps: int) -> int | None:
         """Grows a tree towards a posture, until something is in the way: its last new place."""
         place, new = tree.nearest(goal), None
         for _ in range(steps):
@@ -105,7 +105,7 @@ class Detours:
         return np.asarray(way[kept])
 
 
-class _Tree:
+class _PostureTree:
     """Postures that can be reached from the first of them."""
 
     def __init__(self, root: FloatArray) -> None:

@@ -34,7 +34,7 @@ _ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
+class PlanRequest:
     """What is asked of a plan.
 
     Attributes:
@@ -115,7 +115,7 @@ class Plan:
     """
 
     cell: PlanCell
-    request: Request
+    request: PlanRequest
     stops: tuple[PlannedStop, ...]
     design: Design
     length_rad: float
@@ -132,7 +132,7 @@ class Plan:
 @typed
 def make_plan(
     cell: PlanCell,
-    request: Request,
+    request: PlanRequest,
     *,
     begun: Begun | None = None,
     progress: Progress | None = None,
@@ -209,7 +209,7 @@ class _Chosen:
 
 def _with_a_way(
     cells: tuple[PlanCell, ...],
-    request: Request,
+    request: PlanRequest,
     q: FloatArray,
     worlds: tuple[World, ...],
     begun: Begun | None,
@@ -241,7 +241,7 @@ def _with_a_way(
 
 def _enough(
     cells: tuple[PlanCell, ...],
-    request: Request,
+    request: PlanRequest,
     q: FloatArray,
     worlds: tuple[World, ...],
     begun: Begun | None,
@@ -287,7 +287,7 @@ def _needless(design: Design) -> DataError:
 
 def _stops(
     cell: PlanCell,
-    request: Request,
+    request: PlanRequest,
     found: Candidates,
     world: World,
     taken: _Chosen,

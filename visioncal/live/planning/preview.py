@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.written import MotionPlan
 from visioncal.live.planning.messages import accuracy_words, looks_note, plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
@@ -88,5 +88,5 @@ def motion_preview(plan: MotionPlan) -> MotionPreview:
     return MotionPreview(name, allowed.robot, parts, boxes, allowed.share.floor_m, note)
 
 
-def _part(plan: MotionPlan, name: str, motion: Motion) -> MotionPart:
+def _part(plan: MotionPlan, name: str, motion: JointMotion) -> MotionPart:
     return MotionPart(name, motion, plan.allowed.torques(motion))

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.documents.jsons import parse_json
 from visioncal.core.errors import DataError
-from visioncal.core.files import Table, read_text
+from visioncal.core.files import DocumentTable, read_text
 from visioncal.core.types import MOUNTS, Camera, CameraKind, FloatArray, Mount, Target
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.parts import Noise
@@ -83,7 +83,7 @@ def read_plan(path: Path | str) -> PlanFile:
             culprits=[str(file)],
             next_step="Make one with visioncal plan -o FOLDER.",
         )
-    Table(document, str(file)).integer("schema", SCHEMA, SCHEMA)
+    DocumentTable(document, str(file)).integer("schema", SCHEMA, SCHEMA)
     try:
         return _plan(document)
     except (LookupError, TypeError, ValueError, AttributeError) as error:
@@ -152,7 +152,7 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
 
 def _camera(lens: Mapping[str, Any]) -> Camera:
     width, height = lens["resolution"]
-    kind = Table(lens, "plan.json: camera").choice("model", ("brown", "fisheye"))
+    kind = DocumentTable(lens, "plan.json: camera").choice("model", ("brown", "fisheye"))
     return Camera(
         cast("CameraKind", kind),
         (int(width), int(height)),

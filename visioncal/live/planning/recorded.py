@@ -24,7 +24,7 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information, normal_equations
 from visioncal.live.planning.cell import Box, Limits, PlanCell
-from visioncal.live.planning.information import Recorded
+from visioncal.live.planning.information import RecordedStops
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
 from visioncal.vision.targets import first_corners
@@ -42,7 +42,7 @@ _STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
+class RoughEdges:
     """Rough guesses of both edges (4, 4), and how well they are known, per axis [rad and m]."""
 
     x: FloatArray
@@ -71,7 +71,7 @@ class Begun:
     """
 
     cell: PlanCell
-    recorded: Recorded
+    recorded: RecordedStops
     refusal: str
     views: tuple[int, ...]
 
@@ -104,7 +104,7 @@ def so_far(session: Session, *, progress: Progress | None = None) -> SoFar:
 def begin(
     found: SoFar,
     *,
-    guess: Guess | None = None,
+    guess: RoughEdges | None = None,
     limits: Limits | None = None,
     boxes: tuple[Box, ...] = (),
 ) -> Begun:
@@ -154,7 +154,7 @@ def begin(
     alike = (
         () if known.answer is None else (misfit.alike for misfit in known.answer.misfits.values())
     )
-    recorded = Recorded(
+    recorded = RecordedStops(
         begun.problem,
         edges,
         begun.free,
@@ -178,7 +178,7 @@ def begin(
 
 
 @dataclass(frozen=True, eq=False)
-class _Start:
+class _RecordedStart:
     """What a session determines.
 
     Attributes:
@@ -200,7 +200,7 @@ class _Start:
     views: tuple[int, ...]
 
 
-def _fitted(known: RunState, solved: Solved) -> _Start:
+def _fitted(known: RunState, solved: Solved) -> _RecordedStart:
     """What the fit of a session determines, even where that leaves a direction open."""
     if solved.seen is None:
         raise _missing(known)
@@ -225,7 +225,7 @@ def _fitted(known: RunState, solved: Solved) -> _Start:
         effects=tuple(effect.of_stops(seen_at) for effect in bare.effects),
     ).merged()
     noise = solved.agreed.fit.noise
-    return _Start(
+    return _RecordedStart(
         problem,
         problem.start(frames),
         replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
@@ -236,7 +236,7 @@ def _fitted(known: RunState, solved: Solved) -> _Start:
     )
 
 
-def _guessed(known: RunState, guess: Guess | None) -> _Start:
+def _guessed(known: RunState, guess: RoughEdges | None) -> _RecordedStart:
     """What stops too few for a fit determine, beside a guess."""
     looked = ObservedPoses.of(known)
     views = [
@@ -262,7 +262,7 @@ def _guessed(known: RunState, guess: Guess | None) -> _Start:
     looks = FramesSide(problem, alone, mine, {}).looks({frame: scene}, {frame: poses})
     looked = replace(looked, free=free_of(looks.seen(looks.first))).posed(poses)
     problem = looked.problem(mine).merged()
-    return _Start(
+    return _RecordedStart(
         problem,
         problem.start(looked.frames),
         _TYPICAL,
@@ -285,7 +285,7 @@ def _held_pull(known: RunState, problem: Problem) -> FloatArray:
     ]
 
 
-def _beside_noise(known: RunState, begun: "_Start") -> FloatArray:
+def _beside_noise(known: RunState, begun: "_RecordedStart") -> FloatArray:
     """(12, c) how the edges err by what an arm does wrong whose joints are not known, if any."""
     if known.answer is None or begun.arm.is_modelled or "arm" not in known.answer.beside:
         return np.zeros((12, 0))
@@ -306,7 +306,7 @@ def _arm(arm: RobotArm, robot: Robot) -> Robot:
 
 
 def _nearest(
-    problem: Problem, state: State, noise: Noise, mount: Mount, guess: Guess | None
+    problem: Problem, state: State, noise: Noise, mount: Mount, guess: RoughEdges | None
 ) -> tuple[FloatArray, FloatArray]:
     """The likeliest edges with what is known beforehand, and the covariance (12, 12) of two."""
     # These are the camera's and that of the board that is planned for.
@@ -328,7 +328,7 @@ def _nearest(
     return state.edges, covariance[:12, :12]
 
 
-def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
+def _weights(mount: Mount, guess: RoughEdges | None) -> FloatArray:
     if guess is not None:
         return np.tile(np.repeat([guess.sigma_rad**-2.0, guess.sigma_m**-2.0], 3), 2)
     weights = np.full((2, 2, 3), 1e-6)
@@ -336,7 +336,7 @@ def _weights(mount: Mount, guess: Guess | None) -> FloatArray:
     return weights.ravel()
 
 
-def _away(edges: FloatArray, guess: Guess | None) -> FloatArray:
+def _away(edges: FloatArray, guess: RoughEdges | None) -> FloatArray:
     """(12,) steps from what is known beforehand to the edges (2, 4, 4)."""
     if guess is not None:
         return np.asarray(log(invert(np.stack([guess.x, guess.z])) @ edges).ravel())

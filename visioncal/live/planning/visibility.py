@@ -109,7 +109,7 @@ def _between(normals: FloatArray, points: FloatArray) -> Mask:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class CameraAim:
     """A camera that looks at a board.
 
     Attributes:
@@ -170,7 +170,7 @@ class Sight:
         doubt = _DOUBTED * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance_m, cell.sigma_rad)
         return np.asarray(cell.camera.matrix[:2].mean() * (across / distance_m + doubt))
 
-    def nearer_to(self, cam_from_target: FloatArray) -> "Sight":
+    def nearer_to(self, cam_from_target: FloatArray) -> "CameraAim":
         """The same, drawing distances like those of (k, 4, 4) views that turned out well."""
         distance = self.distances_m(cam_from_target)
         low, high = self.distance_m
@@ -233,7 +233,7 @@ class Sight:
         return np.asarray(((depth >= span[0]) & (depth <= span[1])).all(axis=1))
 
 
-def sight_of(cell: PlanCell, seed: int) -> Sight:
+def sight_of(cell: PlanCell, seed: int) -> CameraAim:
     """Prepares the views of a cell, with draws of what its guesses may really be.
 
     Raises:
@@ -251,7 +251,7 @@ def sight_of(cell: PlanCell, seed: int) -> Sight:
         )
     drawn = cell.guesses(_GUESSES, seed)
     low, high = extent_m(cell.target)
-    return Sight(
+    return CameraAim(
         cell,
         cell.limits.distance_m or _distance_m(cell),
         _outline(cell.target),

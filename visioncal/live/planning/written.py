@@ -17,7 +17,7 @@ from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
 from visioncal.live.planning.accuracy import Accuracy, Wish
 from visioncal.live.planning.cell import Box, PlanCell
-from visioncal.live.planning.plan import Plan, PlannedStop, Request
+from visioncal.live.planning.plan import Plan, PlannedStop, PlanRequest
 from visioncal.robot import has_ur_axes
 from visioncal.session.columns import POSE
 from visioncal.vision.targets import target_document
@@ -233,7 +233,7 @@ def _given(asked: Wish | Need) -> dict[str, float]:
     }
 
 
-def _request_document(request: Request) -> dict[str, Any]:
+def _request_document(request: PlanRequest) -> dict[str, Any]:
     wish = request.wish
     document: dict[str, Any] = {
         "purpose": request.purpose.name,

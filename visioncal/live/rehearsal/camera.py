@@ -14,7 +14,7 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, FloatArray, Image
 from visioncal.live.drivers.protocols import Frame
-from visioncal.simulation import Cell
+from visioncal.simulation import SimulatedCell
 from visioncal.simulation.live import LiveView
 
 # Moments of an exposure at which the arm is asked for its joints, the beginning and end included.
@@ -40,7 +40,7 @@ class Pace:
 
 
 @dataclass(frozen=True)
-class Clock:
+class RehearsalClock:
     """The time, and how to wait; tests put others in their place."""
 
     now: Callable[[], float] = time.monotonic
@@ -62,17 +62,17 @@ class RehearsalCamera:
 
     def __init__(
         self,
-        cell: Cell,
+        cell: SimulatedCell,
         true_joints: Callable[[FloatArray], FloatArray],
         *,
         pace: Pace | None = None,
-        clock: Clock | None = None,
+        clock: RehearsalClock | None = None,
     ) -> None:
         self._cell = cell
         self._view = LiveView(cell)
         self._true_joints = true_joints
         self._pace = pace or Pace()
-        self._clock = clock or Clock()
+        self._clock = clock or RehearsalClock()
         self._began = self._clock.now()
         self._last: tuple[FloatArray, Image] | None = None
         self.fault: Fault = "none"

@@ -9,7 +9,7 @@ from visioncal.core.types import CameraMount
 from visioncal.live.planning.cell import TYPICAL_NOISE, TYPICAL_PX, Limits, PlanCell
 from visioncal.live.rehearsal.machine import ControllerOptions, true_arm
 from visioncal.robot import load_robot
-from visioncal.simulation import Cell, CellOptions, simulate
+from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.simulation.arms import ArmErrors
 
 # How far the user's guesses of both edges are off: as measured by a ruler and by eye [m, rad].
@@ -49,7 +49,7 @@ class RehearsedCell:
         known: What a user knows before: rough guesses and the factory's lens.
     """
 
-    truth: Cell
+    truth: SimulatedCell
     controller: ControllerOptions
     known: PlanCell
 
@@ -74,7 +74,7 @@ def rehearsed_cell(options: RehearsalOptions) -> RehearsedCell:
     return RehearsedCell(truth, controller, _known(truth, wanted))
 
 
-def _known(truth: Cell, options: CellOptions) -> PlanCell:
+def _known(truth: SimulatedCell, options: CellOptions) -> PlanCell:
     """The cell as its user would describe it to `visioncal plan`."""
     draws = np.random.default_rng([options.seed, _GUESSES]).standard_normal((2, 2, 3))
     ways = draws / np.linalg.norm(draws, axis=2, keepdims=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.choices import Faults
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.core import Step
+from visioncal.live.capture.core import CaptureEvent
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.camera import Fault as CameraFault
 from visioncal.live.rehearsal.truth import Fault, TruthClient
@@ -54,7 +54,7 @@ class FaultInjection:
         self.injected_s: float | None = None
         self.q: FloatArray = np.zeros(0)
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Prepares the fault once so many views were tried."""
         if step.place == self._after:
             threading.Thread(target=self._inject, daemon=True).start()

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from visioncal.core.types import FloatArray
 from visioncal.live.rehearsal.motion import Brake, Motion, Rest
-from visioncal.simulation.arms import Arm, ArmErrors, disturb, forward, inverse, ur_arm
+from visioncal.simulation.arms import ArmErrors, DhArm, disturb, forward, inverse, ur_arm
 
 # How long the arm's past is kept [s]: a picture is asked for within this time.
 _MEMORY_S = 60.0
@@ -65,12 +65,12 @@ class ControllerOptions:
     rate_hz: float = 125.0
 
 
-def believed_arm(options: ControllerOptions) -> Arm:
+def believed_arm(options: ControllerOptions) -> DhArm:
     """The arm by which the controller reckons: its data sheet."""
     return ur_arm(options.robot)
 
 
-def true_arm(options: ControllerOptions) -> Arm:
+def true_arm(options: ControllerOptions) -> DhArm:
     """The arm that really stands there."""
     return disturb(believed_arm(options), options.errors, np.random.default_rng([options.seed, 2]))
 

@@ -10,10 +10,10 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert, log, pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.core import Step
+from visioncal.live.capture.core import CaptureEvent
 from visioncal.live.capture.drive import travel_s
 from visioncal.live.capture.options import CaptureOptions
-from visioncal.live.capture.take import Taken
+from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.read_back import PlanFile
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.truth import TruthClient
@@ -39,10 +39,10 @@ class Witness:
     bench: Bench
     away_mm: list[float] = field(default_factory=list)
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: CaptureEvent) -> None:
         """Looks at a view."""
         found = step.found
-        if not isinstance(found, Taken) or found.state.q is None:
+        if not isinstance(found, TakenView) or found.state.q is None:
             return
         with closing(TruthClient(self.bench.controller.host)) as truth:
             really = truth.state([found.frame.stamp_s]).base_from_flange[0]
@@ -72,7 +72,7 @@ class Pace:
 
 
 def pace_of(
-    steps: Sequence[Step], plan: PlanFile, start_q: FloatArray, options: CaptureOptions
+    steps: Sequence[CaptureEvent], plan: PlanFile, start_q: FloatArray, options: CaptureOptions
 ) -> Pace:
     """Tells motion and settling from what a recording adds to them.
 
@@ -101,7 +101,7 @@ def pace_of(
 
 
 @dataclass(frozen=True)
-class Explained:
+class EdgeCheck:
     """Whether the errors of all edges together are what their covariance lets expect.
 
     Attributes:
@@ -120,7 +120,7 @@ class Explained:
         return self.chi_square <= self.limit
 
 
-def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> Explained:
+def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> EdgeCheck:
     """Weighs the errors of all edges by their joint covariance.
 
     Args:
@@ -131,4 +131,4 @@ def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) ->
         [log(invert(transforms[name]) @ edge.matrix) for name, edge in calibration.edges.items()]
     )
     squared = float(away @ np.linalg.solve(calibration.joint_covariance, away))
-    return Explained(squared, away.size, _LARGER**2 * float(chi2_limit(_CHANCE, away.size)))
+    return EdgeCheck(squared, away.size, _LARGER**2 * float(chi2_limit(_CHANCE, away.size)))

@@ -101,7 +101,7 @@ class Header:
         count = len(self.streams) // 2
         return dict(zip(self.streams[:count], self.streams[count:], strict=True))
 
-    def cells(self, row: "Row") -> list[str]:
+    def cells(self, row: "StoredRow") -> list[str]:
         """Writes a row as texts in the order of the columns, as `View.cell` does."""
         numbers, texts = iter(row.numbers), iter(row.texts)
         cells = []
@@ -115,7 +115,7 @@ class Header:
 
 
 @dataclass(frozen=True)
-class Row:
+class StoredRow:
     """One row as it is kept: NaN and empty text stand for cells that are not filled.
 
     Attributes:
@@ -129,7 +129,7 @@ class Row:
     image_sha256: str
 
     @classmethod
-    def of(cls, columns: tuple[str, ...], view: View, image_sha256: str) -> "Row":
+    def of(cls, columns: tuple[str, ...], view: View, image_sha256: str) -> "StoredRow":
         """Collects the cells of a view."""
         return cls(
             tuple(view.numbers.get(name, math.nan) for name in columns if is_number(name)),
@@ -162,7 +162,7 @@ def log_header(stream: rr.RecordingStream, header: Header) -> None:
     stream.log(paths.SESSION, rr.DynamicArchetype(_HEADER, components=components), static=True)
 
 
-def log_row(stream: rr.RecordingStream, row: Row) -> None:
+def log_row(stream: rr.RecordingStream, row: StoredRow) -> None:
     """Logs one row of the session at the stream's current time."""
     components = {
         "numbers": pa.array(row.numbers, pa.float64()),
@@ -262,12 +262,12 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
     return found, header
 
 
-def read_rows(batch: pa.RecordBatch) -> dict[int, Row]:
+def read_rows(batch: pa.RecordBatch) -> dict[int, StoredRow]:
     """Reads those rows whose seal holds, by their place in the session."""
     rows = {}
     for place, index in enumerate(places(batch)):
         stored = values_of(batch, _ROW, place)
-        row = Row(
+        row = StoredRow(
             tuple(stored.get("numbers") or ()), tuple(stored["texts"]), stored["image_sha256"][0]
         )
         if row.seal() == stored["seal"][0]:

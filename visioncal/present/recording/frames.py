@@ -32,7 +32,7 @@ _LZ4_RATIO = 255
 
 
 @dataclass(frozen=True)
-class Frame:
+class MessageFrame:
     """One message.
 
     Attributes:
@@ -65,7 +65,7 @@ class Scan:
     """
 
     path: Path
-    frames: tuple[Frame, ...]
+    frames: tuple[MessageFrame, ...]
     end: int
     finished: bool
     cut: bool
@@ -111,7 +111,7 @@ def scan(path: Path) -> Scan:
     return Scan(path, tuple(frames), end, closed, end < size and not closed)
 
 
-def _walk(file: BinaryIO, size: int) -> Iterator[Frame]:
+def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
     """Finds whole messages; stops behind the first of kind LAST."""
     at = _START_BYTES
     while at + _HEAD.size <= size:
@@ -127,12 +127,12 @@ def _walk(file: BinaryIO, size: int) -> Iterator[Frame]:
         at = frame.end
 
 
-def _frame(head: bytes, at: int) -> Frame:
+def _frame(head: bytes, at: int) -> MessageFrame:
     kind, length = _HEAD.unpack(head)
-    return Frame(kind, at + _HEAD.size, length)
+    return MessageFrame(kind, at + _HEAD.size, length)
 
 
-def read_payload(path: Path, frame: Frame) -> bytes:
+def read_payload(path: Path, frame: MessageFrame) -> bytes:
     """Reads one message's payload.
 
     Raises:

@@ -11,7 +11,7 @@ from rerun.blueprint import BlueprintLike
 
 from visioncal.core.files import written_beside
 from visioncal.core.types import FloatArray
-from visioncal.dynamics.motion import Motion
+from visioncal.dynamics.motion import JointMotion
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.arm import log_arm, log_frames
 from visioncal.present.recording.markdown import markdown
@@ -35,7 +35,7 @@ class MotionPart:
     """
 
     name: str
-    motion: Motion
+    motion: JointMotion
     torques_nm: FloatArray | None
 
 

@@ -13,7 +13,14 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import parse_toml, sha256
 from visioncal.present.recording import codec, paths
 from visioncal.present.recording.elsewhere import ImagesElsewhere
-from visioncal.present.recording.frames import CHUNK, Frame, Scan, read_payload, record_batch, scan
+from visioncal.present.recording.frames import (
+    CHUNK,
+    MessageFrame,
+    Scan,
+    read_payload,
+    record_batch,
+    scan,
+)
 from visioncal.session import Session, Stream
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore
@@ -72,7 +79,7 @@ def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> Imag
 class _Image:
     """Where an image is: a row of a chunk. And the SHA-256 of its bytes."""
 
-    frame: Frame
+    frame: MessageFrame
     place: int
     digest: str
 
@@ -137,7 +144,7 @@ class _Records:
     """
 
     header: codec.Header
-    rows: Mapping[int, codec.Row]
+    rows: Mapping[int, codec.StoredRow]
     images: Mapping[int, _Image]
     streams: Mapping[str, Stream]
     corners: CornerTable | None
@@ -163,8 +170,8 @@ class _Records:
 
 
 def chunks(
-    scanned: Scan, entities: Container[str], damaged: list[Frame]
-) -> Iterator[tuple[Frame, str, pa.RecordBatch]]:
+    scanned: Scan, entities: Container[str], damaged: list[MessageFrame]
+) -> Iterator[tuple[MessageFrame, str, pa.RecordBatch]]:
     """Unpacks the chunks of some entities, in the order of the file.
 
     Args:
@@ -188,11 +195,11 @@ def chunks(
 
 def _read_records(scanned: Scan) -> _Records:
     found: tuple[int, codec.Header] | None = None
-    rows: dict[int, codec.Row] = {}
+    rows: dict[int, codec.StoredRow] = {}
     images: dict[int, _Image] = {}
     streams: dict[str, Stream] = {}
     corners: CornerTable | None = None
-    damaged: list[Frame] = []
+    damaged: list[MessageFrame] = []
     closed: int | None = None
     entities = (
         paths.SESSION,
@@ -228,14 +235,14 @@ def _read_records(scanned: Scan) -> _Records:
     return _Records(header, rows, images, streams, corners, closed, len(damaged))
 
 
-def _images(frame: Frame, batch: pa.RecordBatch) -> dict[int, _Image]:
+def _images(frame: MessageFrame, batch: pa.RecordBatch) -> dict[int, _Image]:
     return {
         row: _Image(frame, place, sha256(codec.image_at(batch, place)))
         for row, place in codec.image_places(batch).items()
     }
 
 
-def _no_header(scanned: Scan, damaged: Sequence[Frame]) -> DataError:
+def _no_header(scanned: Scan, damaged: Sequence[MessageFrame]) -> DataError:
     next_step = _AGAIN
     if damaged:
         what = "is damaged: the session's declaration cannot be read"

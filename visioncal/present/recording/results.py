@@ -20,10 +20,10 @@ from visioncal.core.files import sha256
 from visioncal.core.types import Corners, FloatArray
 from visioncal.present import parts
 from visioncal.present.recording import codec, notes, overlays, paths
-from visioncal.present.recording.frames import Frame, scan
+from visioncal.present.recording.frames import MessageFrame, scan
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder
-from visioncal.present.recording.scene import Scene
+from visioncal.present.recording.scene import SceneDrawing
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
@@ -103,7 +103,7 @@ def _draw(
     evidence: Mapping[int, ViewEvidence],
 ) -> None:
     stream = recorder.stream
-    scene = Scene.of(session, calibration, evidence)
+    scene = SceneDrawing.of(session, calibration, evidence)
     overlay = overlays.Overlay.of(session, calibration, evidence)
     scene.log_static(stream)
     if calibration is not None:
@@ -121,7 +121,7 @@ def _draw(
 
 
 def _log_views(
-    stream: rr.RecordingStream, session: Session, calibration: Calibration, scene: Scene
+    stream: rr.RecordingStream, session: Session, calibration: Calibration, scene: SceneDrawing
 ) -> None:
     """Logs what became of each view, and how the arms had drifted."""
     views = dict(enumerate(session.views))
@@ -195,7 +195,7 @@ def _read_result(path: Path) -> _Result:
     """Reads the last result, with what is intact of its evidence."""
     last: dict[str, Any] = {}
     evidence: dict[str, dict[int, ViewEvidence]] = {}
-    damaged: list[Frame] = []
+    damaged: list[MessageFrame] = []
     entities = (paths.CALIBRATION, paths.EVIDENCE, paths.ALIGNMENT)
     try:
         for _, entity, batch in chunks(scan(path), entities, damaged):

@@ -34,7 +34,7 @@ SMALL_FRUSTUM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class SceneDrawing:
     """What is drawn of the cell. Frames are placed on what they hang on.
 
     Attributes:
@@ -50,7 +50,7 @@ class Scene:
 
     session: Session
     calibration: Calibration | None
-    frames: parts.Frames
+    frames: parts.FrameHierarchy
     states: Mapping[str, Mapping[int, RobotState]]
     size_m: float
     uncertainty: Uncertainty | None
@@ -63,7 +63,7 @@ class Scene:
         session: Session,
         calibration: Calibration | None,
         evidence: Mapping[int, ViewEvidence],
-    ) -> "Scene":
+    ) -> "SceneDrawing":
         """Collects the poses of the flanges, from the evidence or else as they were recorded."""
         frames = parts.frames(calibration)
         states = robot_states(session, calibration, evidence)
@@ -325,7 +325,7 @@ class Scene:
         _send_strips(stream, entity, strips, rr.LineStrips3D.columns(colors=colour))
 
 
-def _size_m(frames: parts.Frames, states: Mapping[str, Mapping[int, RobotState]]) -> float:
+def _size_m(frames: parts.FrameHierarchy, states: Mapping[str, Mapping[int, RobotState]]) -> float:
     """How far flanges are from their bases, or half of how far apart things stand in the cell."""
     poses = [robot_state.pose for mine in states.values() for robot_state in mine.values()]
     distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]

@@ -17,7 +17,7 @@ from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 from visioncal.session.checks import check_images_can_be_used
-from visioncal.session.table import Row, View, read_views
+from visioncal.session.table import TextRow, View, read_views
 
 
 class RecordingWriter:
@@ -101,7 +101,9 @@ class RecordingWriter:
         name = view.image if self._kept == "full" else f"{view.image}.jpg"
         with named_errors(self._label):
             recorder.at(row)
-            codec.log_row(recorder.stream, codec.Row.of(self._session.columns, view, image_sha256))
+            codec.log_row(
+                recorder.stream, codec.StoredRow.of(self._session.columns, view, image_sha256)
+            )
             codec.log_image(recorder.stream, name, shown)
             recorder.keep()
         self._numbers.add(view.number)
@@ -156,7 +158,7 @@ class RecordingWriter:
     def _checked(self, cells: Sequence[str]) -> View:
         """Refuses a row that could be written but not be read again."""
         where, corners = self._where, self._session.corner_table is not None
-        rows = [Row(where, tuple(cells))]
+        rows = [TextRow(where, tuple(cells))]
         (view,) = read_views(self._session.columns, rows, "views.csv", with_corners=corners)
         check_images_can_be_used(self._session.declaration, [view])
         if view.number in self._numbers:

@@ -17,7 +17,7 @@ from visioncal.present.report import svg
 from visioncal.present.report.axes import Margins, Panel, Scale, boxes
 from visioncal.present.report.svg import Figure
 from visioncal.present.report.templates import template
-from visioncal.present.tables import Row, Table
+from visioncal.present.tables import Table, TableRow
 
 _WIDE_IN, _HIGH_IN = 9.2, 3.6
 # Bars of a stop, side by side, and how many labels have room below them.
@@ -41,7 +41,7 @@ def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) ->
         changes=_change_table(check),
         triggers=_trigger_table(triggers),
         not_used=_reasons(
-            Row((str(view), "not used", reason), "rejected")
+            TableRow((str(view), "not used", reason), "rejected")
             for view, reason in sorted(check.seen.known.reasons.items())
         ),
         residuals=_residual_table(stops, before, after if undone else None),
@@ -107,7 +107,7 @@ def _change_table(check: Check) -> Table:
             "found" if named else "ruled out",
             thing(check, suspect),
         )
-        rows.append(Row(cells, "left-out" if named else "rejected"))
+        rows.append(TableRow(cells, "left-out" if named else "rejected"))
     return _reasons(rows, ("share", "", "change"))
 
 
@@ -116,7 +116,7 @@ def _trigger_table(triggers: Sequence[Outcome]) -> Table:
     words = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
     states = [*words]
     return _reasons(
-        Row(
+        TableRow(
             (words[outcome.state], "", outcome.words),
             "look" if outcome.state == "fired" else "rejected",
         )
@@ -124,7 +124,7 @@ def _trigger_table(triggers: Sequence[Outcome]) -> Table:
     )
 
 
-def _reasons(rows: Iterable[Row], titles: tuple[str, str, str] = ("", "", "")) -> Table:
+def _reasons(rows: Iterable[TableRow], titles: tuple[str, str, str] = ("", "", "")) -> Table:
     return Table(titles, tuple(rows), (0, 1, 2))
 
 

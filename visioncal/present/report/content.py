@@ -10,7 +10,7 @@ from visioncal.present import parts
 from visioncal.present.advice import mark_of
 from visioncal.present.cellmap import weakest_frame
 from visioncal.present.facts import DEGREE, PLUS_MINUS, answering_solver, frame_words, of
-from visioncal.present.tables import Fact, Row, Table
+from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
 from visioncal.results.evidence import ViewEvidence
@@ -173,7 +173,7 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
 def touch_table(test: TouchTest) -> Table:
     """The gaps at the points of a touch test, and those that were predicted."""
     rows = [
-        Row(
+        TableRow(
             (point.name, significant(point.gap_mm), significant(point.radius95_mm)),
             "left-out" if point.gap_mm > point.radius95_mm else "",
         )
@@ -234,5 +234,5 @@ def view_table(calibration: Calibration, outlying: Collection[int]) -> Table:
         mark = "look" if view.used and view.view in outlying else mark_of(view)
         names = (str(view.view), view.seer, view.seen)
         cells = (*names, corners, *map(significant, figures), words[mark])
-        rows.append(Row(cells, mark, f"view-{view.view}"))
+        rows.append(TableRow(cells, mark, f"view-{view.view}"))
     return Table.of(("view", "who", "saw", "corners", "px", "mm", "deg", "used"), rows, (1, 2, 7))

@@ -7,7 +7,7 @@ from itertools import groupby
 
 from visioncal.core.number_format import significant
 from visioncal.present.report.templates import template
-from visioncal.present.tables import Row, Table
+from visioncal.present.tables import Table, TableRow
 from visioncal.results.fleet import CellFigures, FleetRow
 
 _ERRORS = {
@@ -85,7 +85,7 @@ def _cell_table(cells: Sequence[CellFigures]) -> Table:
 
 def _reasons(rows: Iterable[tuple[str, str, str, str]]) -> Table:
     """Sessions by name, with what is said of them and how that is marked."""
-    marked = (Row((name, kind, words.strip()), mark) for name, kind, words, mark in rows)
+    marked = (TableRow((name, kind, words.strip()), mark) for name, kind, words, mark in rows)
     return Table(("", "", ""), tuple(marked), (0, 1, 2))
 
 

@@ -8,7 +8,7 @@ from markupsafe import Markup
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.present.cellmap import (
-    Pair,
+    SeenPair,
     pairs,
     places,
     sigma_words,
@@ -168,7 +168,7 @@ def _draw_robot(
                       anchor="middle")  # fmt: skip
 
 
-def _ends(pair: Pair, frames: Mapping[str, tuple[float, float]]) -> FloatArray:
+def _ends(pair: SeenPair, frames: Mapping[str, tuple[float, float]]) -> FloatArray:
     """(2, 2) where the line between a camera and what it saw begins and ends."""
     (x, y), (to_x, to_y) = frames[pair.seer], frames[pair.seen]
     # Lines leave towards where they go, so that those of one frame part at once.
@@ -176,7 +176,7 @@ def _ends(pair: Pair, frames: Mapping[str, tuple[float, float]]) -> FloatArray:
     return np.array([[x + lean, y - 0.5 * _BOX_H], [to_x - lean, to_y + 0.5 * _BOX_H]])
 
 
-def _draw_pair(panel: Panel, pair: Pair, frames: Mapping[str, tuple[float, float]]) -> None:
+def _draw_pair(panel: Panel, pair: SeenPair, frames: Mapping[str, tuple[float, float]]) -> None:
     """A line between a camera and what it saw, as wide as it is often."""
     x, y = _ends(pair, frames).T
     colour = svg.BAD if not pair.used else svg.ACCENT
@@ -185,7 +185,7 @@ def _draw_pair(panel: Panel, pair: Pair, frames: Mapping[str, tuple[float, float
     panel.figure.path(line, stroke=colour, width=width, opacity=0.55)
 
 
-def _count_pair(panel: Panel, pair: Pair, frames: Mapping[str, tuple[float, float]]) -> None:
+def _count_pair(panel: Panel, pair: SeenPair, frames: Mapping[str, tuple[float, float]]) -> None:
     """How often it saw it, on the line."""
     # Nearer to the board, the lines of one camera have parted.
     start, end = _ends(pair, frames)

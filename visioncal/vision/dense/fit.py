@@ -75,7 +75,7 @@ _FEWEST_LIT, _LIT = 12, 0.995
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FittedCorners:
     """Corners of one image.
 
     Attributes:
@@ -111,7 +111,7 @@ def fit_corners(
     *,
     device: str = "cpu",
     smooth_px: float = 0.0,
-) -> Fitted | None:
+) -> FittedCorners | None:
     """Fits the corners of a checkerboard or a ChArUco board in one image.
 
     Args:
@@ -144,7 +144,7 @@ def fit_corners(
         if smooth_px:
             smooth = library("kornia").filters.gaussian_blur2d
             pixels = smooth(pixels[None, None], (_TAPS, _TAPS), (smooth_px, smooth_px))[0, 0]
-        scene = _Scene(pixels, Print.of(target), board, smooth_px)
+        scene = _ImageScene(pixels, Print.of(target), board, smooth_px)
         best = _started(scene, px, widths_px)
         found, good, jacobian = px, np.ones(len(px), bool), np.zeros((len(px), 2, 2))
         for _ in range(_PASSES):
@@ -171,7 +171,7 @@ def fit_corners(
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class _ImageScene:
     """What is looked at.
 
     Attributes:
@@ -203,7 +203,7 @@ class _Patches:
         inside: (n,) the share of a patch that is inside the image.
     """
 
-    scene: _Scene
+    scene: _ImageScene
     px: FloatArray
     normals: FloatArray
     spectrum: "Tensor"
@@ -216,7 +216,7 @@ class _Patches:
     @classmethod
     def cut(
         cls,
-        scene: _Scene,
+        scene: _ImageScene,
         px: FloatArray,
         good: Mask,
         chosen: IntArray,
@@ -480,7 +480,7 @@ def _searched(patches: _Patches, values: FloatArray, turns: int) -> tuple[FloatA
     return values, sums.cost(good) / float(sums.pixels[good].sum())
 
 
-def _started(scene: _Scene, px: FloatArray, widths_px: FloatArray) -> FloatArray:
+def _started(scene: _ImageScene, px: FloatArray, widths_px: FloatArray) -> FloatArray:
     """Blur and tone near the best, from the widths of edges along the board's x and y."""
     good = np.ones(len(px), bool)
     sample = _spread(good, _START_SAMPLE)
@@ -569,7 +569,7 @@ def _fitted(
     values: FloatArray,
     good: Mask,
     found: FloatArray,
-) -> Fitted:
+) -> FittedCorners:
     """The corners with their covariance, by what is odd of the residuals about them."""
     levels = np.concatenate([sums.levels, np.zeros((len(good), 2))], axis=1)
     variance = _odd_variance(patches, values, shift, levels[:, :2])
@@ -579,7 +579,7 @@ def _fitted(
         variance = variance / float(np.sum(taps**2)) ** 2
     noise = float(np.sqrt(np.median(variance[good]))) if good.any() else np.nan
     covariance = np.where(good[:, None, None], noise**2 * sums.inverse[:, 2:, 2:], np.nan)
-    return Fitted(
+    return FittedCorners(
         found,
         covariance,
         good,

@@ -32,7 +32,7 @@ _FEWEST = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
+class DenseImage:
     """An image, as far as it is explained.
 
     Attributes:
@@ -54,7 +54,7 @@ def explain(
     camera: Camera,
     blur: Blur,
     tone: float,
-) -> Explained | None:
+) -> DenseImage | None:
     """Draws the board into an image.
 
     Args:
@@ -97,7 +97,7 @@ def explain(
         drawn[place] = np.where(on, np.clip(np.rint(model), 0, 255), part).astype(np.uint8)
         off = np.where(on, MAGNIFIED * (part - model), 0.0) + MIDDLE
         rest[place] = np.clip(np.rint(off), 0, 255).astype(np.uint8)
-        return Explained(drawn, rest, float(np.sqrt(np.mean((part - model)[on] ** 2))))
+        return DenseImage(drawn, rest, float(np.sqrt(np.mean((part - model)[on] ** 2))))
     return None
 
 

@@ -297,7 +297,7 @@ class _Windows:
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class _GaussNewtonStep:
     """One Gauss-Newton step of n corners.
 
     Attributes:
@@ -532,9 +532,9 @@ def _fitted(
     pattern: _Pattern,
     blur_px: FloatArray,
     slopes: FloatArray | None,
-    first: _Step,
+    first: _GaussNewtonStep,
     still_px: float,
-) -> tuple[FloatArray, _Step]:
+) -> tuple[FloatArray, _GaussNewtonStep]:
     """Where the corners are from where they were (n, 2) [squares], and their last steps."""
     shift = np.zeros((len(windows.px), 2))
     moving = np.arange(len(shift))
@@ -565,7 +565,7 @@ def _step(
     slopes: FloatArray | None = None,
     *,
     blurs: bool = False,
-) -> _Step:
+) -> _GaussNewtonStep:
     """One Gauss-Newton step; `slopes` (n, 2, 2) of offset and contrast by x and y."""
     return _steps(windows, pattern, shift, blur_px, (slopes,), blurs=blurs)[0]
 
@@ -578,7 +578,7 @@ def _steps(
     lights: Sequence[FloatArray | None],
     *,
     blurs: bool = False,
-) -> list[_Step]:
+) -> list[_GaussNewtonStep]:
     """One Gauss-Newton step by each of some slopes, None of even light."""
     count = len(shift)
     sx, sy, dx, dy, signs = (
@@ -638,7 +638,7 @@ def _steps(
     sums[:, 0, 0] = np.count_nonzero(used, axis=(1, 2))
     own = [*range(unknowns)]
     return [
-        _Step.solved(sums[:, [*own, at]][:, :, [*own, at]], blurs=len(slopes_of) - 2)
+        _GaussNewtonStep.solved(sums[:, [*own, at]][:, :, [*own, at]], blurs=len(slopes_of) - 2)
         for at in range(unknowns, len(columns) + 1)
     ]
 
@@ -738,7 +738,7 @@ def _erf(t: _Float32Array, bell: _Float32Array) -> _Float32Array:
 
 
 def _reasons(
-    windows: _Windows, step: _Step, moved_px: FloatArray, last_px: float
+    windows: _Windows, step: _GaussNewtonStep, moved_px: FloatArray, last_px: float
 ) -> tuple[str, ...]:
     """(n,) why corners cannot be used, in words; empty where they can."""
     last = windows.length_px(step.shift)

@@ -3,12 +3,12 @@
 from visioncal.vision.printing.files import write_board
 from visioncal.vision.printing.page import Page, Sheet, arrange, pages_named
 from visioncal.vision.printing.pattern import Pattern, draw_pattern
-from visioncal.vision.printing.request import Request, requested_target, side_metres
+from visioncal.vision.printing.request import BoardRequest, requested_target, side_metres
 
 __all__ = [
+    "BoardRequest",
     "Page",
     "Pattern",
-    "Request",
     "Sheet",
     "arrange",
     "draw_pattern",

@@ -30,7 +30,7 @@ _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 
 
 @dataclass(frozen=True)
-class Request:
+class BoardRequest:
     """A board that somebody wants; None and empty texts are chosen.
 
     Attributes:
@@ -84,7 +84,7 @@ def side_metres(option: str, side_mm: float) -> float:
     return metres(side_mm)
 
 
-def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
+def requested_target(request: BoardRequest, pages: tuple[Page, ...]) -> Target:
     """Builds the target that is wished for.
 
     Args:
@@ -105,7 +105,7 @@ def requested_target(request: Request, pages: tuple[Page, ...]) -> Target:
     return _target(request, largest)
 
 
-def _target(request: Request, square_mm: float) -> Target:
+def _target(request: BoardRequest, square_mm: float) -> Target:
     document: dict[str, Any] = {"kind": request.kind}
     of_tags = request.kind in OF_TAGS
     side_m = side_metres("--size-mm" if of_tags else "--square-mm", square_mm)
@@ -145,7 +145,7 @@ def _target(request: Request, square_mm: float) -> Target:
     return target if request.name else target_from_document(document, _name(target))
 
 
-def _enough(request: Request) -> str:
+def _enough(request: BoardRequest) -> str:
     """The first of the usual dictionaries that has enough markers."""
     needed = (request.columns or 0) * (request.rows or 0) // 2
     for name in _USUAL:
