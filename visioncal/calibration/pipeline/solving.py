@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.arm_results import (
 )
 from visioncal.calibration.pipeline.inliers import find_inliers, levelled, settled, with_repeats
 from visioncal.calibration.pipeline.solved import Solved
-from visioncal.calibration.pipeline.starting import started
+from visioncal.calibration.pipeline.starting import Start, started
 from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clocks import clock_effects
@@ -27,7 +27,7 @@ from visioncal.calibration.stages.refine import lens_levels, refined
 from visioncal.calibration.stages.turned_images import ImageTurn, turned_how
 from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import SolverName
-from visioncal.core.errors import ConvergenceError, DegenerateError
+from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import settle as settle_looks
@@ -73,11 +73,21 @@ def solve(
     if solver != "joint":
         cell, asked = replace(cell, priors=()), "hand-eye"
     begun = started(cell, looked)
-    if begun.cell.mount is not None and not looked.is_misread:
-        # Along a direction that nothing determines, the fit of lens and frames runs away.
-        noise = starting_noise(begun.problem)
-        refuse_open_motion(begun.problem, begun.state, noise, begun.cell.mount)
+    if begun.cell.mount is not None and begun.cell.priors and not looked.is_misread:
         _refuse_open_lens(looked, begun.problem, begun.cell.mount)
+    try:
+        found = _fitted(begun, looked, arms, asked)
+    except (VisioncalError, np.linalg.LinAlgError):
+        # Along a direction that nothing determines, the fit of lens and frames runs away.
+        if begun.cell.mount is not None and not looked.is_misread:
+            noise = starting_noise(begun.problem)
+            refuse_open_motion(begun.problem, begun.state, noise, begun.cell.mount)
+        raise
+    return found if solver == "joint" else _by_closed_form(found, solver)
+
+
+def _fitted(begun: Start, looked: Observed, arms: Mapping[str, RobotArm], asked: str) -> Solved:
+    """Alternates between what agrees, lenses and boards, and arms."""
     cell, poses = begun.cell, begun.poses
     sizes: Mapping[str, float] = {}
     if looked.is_misread:
@@ -100,12 +110,11 @@ def solve(
     if asked != "hand-eye" and not looked.is_misread:
         found = _with_functions(found)
     found = replace(found, agreed=with_repeats(found.agreed))
-    found = replace(found, arms=with_pose_errors(found.arms, found.part, found.agreed.fit))
-    return found if solver == "joint" else _by_closed_form(found, solver)
+    return replace(found, arms=with_pose_errors(found.arms, found.part, found.agreed.fit))
 
 
 def _refuse_open_lens(looked: Observed, problem: Problem, mount: Mount) -> None:
-    """Refuses a lens that corners leave open and turns about one axis do not determine either."""
+    """Refuses a lens that corners leave open, nor turns about one axis beside priors determine."""
     poses = problem.poses[problem.robots[0]]
     # Images of a sweep have no pose of their own before its clock is known.
     poses = poses[np.isfinite(poses[:, 0, 0])]
