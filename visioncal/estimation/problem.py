@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TypeAlias
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -42,9 +41,21 @@ class _Group:
     path: tuple[PathStep, ...]
 
 
-# Places of the c values that move a group, by (m, 6, c) how they move what was measured, and how
-# the flange of each step of its path.
-_MovedGroup: TypeAlias = tuple[IntArray, FloatArray, tuple[FloatArray | None, ...]]
+@dataclass(frozen=True, eq=False)
+class _MovedGroup:
+    """What of the effects moves the m observations of a group.
+
+    Attributes:
+        values: (c,) which of the effects' values.
+        places: (s,) the places of those, among these, that move what was measured.
+        by_sensor: (m, 6, s) how these do.
+        by_steps: (m, 6, c) how all of them move the flange of each step of the group's path.
+    """
+
+    values: IntArray
+    places: IntArray
+    by_sensor: FloatArray
+    by_steps: tuple[FloatArray | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +189,8 @@ class Problem:
             return self
         seen, by_sensor = self.observations.take(first), self.by_sensor[first]
         measured, covariance = seen.measured.copy(), seen.covariance.copy()
-        information, gradient = np.zeros((by_sensor.shape[2],) * 2), np.zeros(by_sensor.shape[2])
+        width = by_sensor.shape[2]
+        information, gradient = np.zeros((width, width)), np.zeros(width)
         for unit in np.flatnonzero(np.bincount(units) > 1).tolist():
             rows = np.flatnonzero(units == unit)
             weights = np.tile(np.eye(6), (len(rows), 1, 1))
@@ -198,14 +210,16 @@ class Problem:
                 gradient += np.einsum("mij,mj->i", weighted, away - shift)
         effects, at = [], 0
         for effect in self.effects:
-            mine = slice(at, at + len(effect))
-            at += len(effect)
-            known = Knowledge(
-                effect.known.information + information[mine, mine],
-                effect.known.gradient + gradient[mine],
-            )
-            moved = None if effect.by_sensor is None else by_sensor[:, :, mine]
-            effects.append(replace(effect.take(first), known=known, by_sensor=moved))
+            taken = effect.take(first)
+            if effect.by_sensor is not None:
+                mine = slice(at, at + len(effect))
+                at += len(effect)
+                known = Knowledge(
+                    effect.known.information + information[mine, mine],
+                    effect.known.gradient + gradient[mine],
+                )
+                taken = replace(taken, known=known, by_sensor=by_sensor[:, :, mine])
+            effects.append(taken)
         return replace(
             self,
             observations=replace(seen, measured=measured, covariance=covariance),
@@ -362,12 +376,15 @@ class Problem:
         return of, robots
 
     @cached_property
+    def sensor_values(self) -> IntArray:
+        """(s,) which of the effects' values move measured poses."""
+        moves = [np.full(len(effect), effect.by_sensor is not None) for effect in self.effects]
+        return np.flatnonzero(np.concatenate(moves)) if moves else np.zeros(0, dtype=np.int64)
+
+    @cached_property
     def by_sensor(self) -> FloatArray:
-        """(n, 6, k) how the measured poses move with all effects."""
-        parts = [
-            np.zeros((len(self), 6, len(effect))) if effect.by_sensor is None else effect.by_sensor
-            for effect in self.effects
-        ]
+        """(n, 6, s) how the measured poses move with the `sensor_values`."""
+        parts = [effect.by_sensor for effect in self.effects if effect.by_sensor is not None]
         found = np.concatenate([np.zeros((len(self), 6, 0)), *parts], axis=2)
         # Repeats move alike: slopes that differ by the noise of each would explain that noise.
         for rows in self.repeats:
@@ -462,7 +479,7 @@ class Problem:
         poses, change = self.observations.measured, state.values - self.start_values
         if not change.any():
             return poses
-        return np.asarray(poses @ exp(self.by_sensor @ change))
+        return np.asarray(poses @ exp(self.by_sensor @ change[self.sensor_values]))
 
     def linear(self, state: State, *, ideal: bool = False) -> Linear:
         """Linearises all residuals.
@@ -507,7 +524,7 @@ class Problem:
                     robots = members[of[group.rows]] == self.robots.index(step.robot)
                     slot = np.where(robots.any(axis=1), robots.argmax(axis=1), -1)
                     if step.robot in self.flange_jacobian:
-                        moves.append(self.flange_jacobian[step.robot][group.rows])
+                        moves.append(_rows_of(self.flange_jacobian[step.robot], group.rows))
                 elif (known := self.tree.branches[step.frame].known) is not None:
                     poses.append(np.broadcast_to(known, (count, 4, 4)))
                 slots.append(slot)
@@ -517,7 +534,7 @@ class Problem:
                     steps[0].is_up,
                     np.concatenate(edges) if edges else np.zeros(0, dtype=np.int64),
                     found if steps[0].is_up else invert(found),
-                    np.concatenate(moves) if moves else None,
+                    None if not moves else np.concatenate(moves) if moves[1:] else moves[0],
                     np.concatenate(slots),
                 )
             )
@@ -530,15 +547,23 @@ class Problem:
         found = []
         for group in self.groups:
             by_sensor = self.by_sensor[group.rows]
+            seen = by_sensor.any(axis=(0, 1))
             flanges = [self.flange_jacobian.get(step.robot) for step in group.path]
-            by_steps = [None if flange is None else flange[group.rows] for flange in flanges]
-            moved = by_sensor.any(axis=(0, 1))
-            for item in by_steps:
-                if item is not None:
-                    moved |= item.any(axis=(0, 1))
-            values = np.flatnonzero(moved)
-            steps = tuple(None if step is None else step[:, :, values] for step in by_steps)
-            found.append((values, by_sensor[:, :, values], steps))
+            by_steps = [
+                None if flange is None else _rows_of(flange, group.rows) for flange in flanges
+            ]
+            moved = np.zeros(sum(map(len, self.effects)), dtype=bool)
+            moved[self.sensor_values] = seen
+            for by_step in by_steps:
+                if by_step is not None:
+                    moved |= by_step.any(axis=(0, 1))
+            values, every = np.flatnonzero(moved), bool(moved.all())
+            steps = tuple(
+                by_step if by_step is None or every else by_step[:, :, values]
+                for by_step in by_steps
+            )
+            places = np.searchsorted(values, self.sensor_values[seen])
+            found.append(_MovedGroup(values, places, by_sensor[:, :, seen], steps))
         return tuple(found)
 
     def _moved(self, state: State) -> tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]:
@@ -562,9 +587,9 @@ class Problem:
                     errors[ways.rows[erring], :, stride.slots[erring]] += step[erring]
             unknown = [at for at, stride in enumerate(ways.strides) if len(stride.edges)]
             for at, place in ways.groups:
-                values, _, by_steps = self._moved_groups[at]
-                effects = np.zeros((place.stop - place.start, 6, len(values)))
-                for step, by_flange in zip(moved, by_steps, strict=True):
+                group = self._moved_groups[at]
+                effects = np.zeros((place.stop - place.start, 6, len(group.values)))
+                for step, by_flange in zip(moved, group.by_steps, strict=True):
                     if by_flange is not None:
                         effects += step[place] @ by_flange
                 edges = [
@@ -572,7 +597,7 @@ class Problem:
                 ]
                 blocks[at] = JacobianBlock(
                     ways.rows[place],
-                    np.concatenate([*edges, 6 * len(self.unknown) + values]),
+                    np.concatenate([*edges, 6 * len(self.unknown) + group.values]),
                     np.concatenate([*(moved[index][place] for index in unknown), effects], axis=2),
                 )
         for rows in self.repeats:
@@ -604,11 +629,11 @@ class Problem:
         by_predicted[rotation] = -by_measured[rotation] @ adjoint(invert(error[rotation]))
         by_predicted[places] = -_place_slope(np.broadcast_to(np.eye(4), error[places].shape))
         blocks = []
-        for block, (_, by_sensor, _) in zip(moved, self._moved_groups, strict=True):
+        for block, group in zip(moved, self._moved_groups, strict=True):
             jacobian = by_predicted[block.rows] @ block.jacobian
-            if by_sensor.shape[2]:
-                behind = jacobian[:, :, -by_sensor.shape[2] :]
-                behind += by_measured[block.rows] @ by_sensor
+            if len(group.places):
+                behind = len(block.columns) - len(group.values) + group.places
+                jacobian[:, :, behind] += by_measured[block.rows] @ group.by_sensor
             blocks.append(replace(block, jacobian=jacobian))
         by_flanges = by_predicted @ errors
         by_errors = by_flanges
@@ -678,6 +703,11 @@ class Problem:
             # With it, the mean of n repeats is known as well as one of them.
             found[at, :6, :6] = (1.0 - 1.0 / len(rows)) * own[rows].mean(axis=0)
         return found
+
+
+def _rows_of(array: FloatArray, rows: IntArray) -> FloatArray:
+    """Some rows in ascending order; where they are all, the array itself, which may be large."""
+    return array if len(rows) == len(array) else array[rows]
 
 
 def _places(error: FloatArray) -> FloatArray:
