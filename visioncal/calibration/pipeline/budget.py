@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.pipeline.solved import Solved, within
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.validate import HeldOut, validate
@@ -172,7 +172,7 @@ def middles_moved(solved: Solved) -> dict[str, FloatArray]:
     if seen is None or looks is None:
         return {}
     plates, at = solved.cell.session.plates, looks.boards
-    free = seen.free[(seen.free >= at.start) & (seen.free < at.stop)]
+    free = within(seen.free, at)
     found = {}
     for (name, target), mine in zip(
         plates.items(), shape_slices(tuple(plates.values()), at.start), strict=True
@@ -199,8 +199,5 @@ def _looks(solved: Solved) -> dict[str, IntArray]:
     slices = shape_slices(tuple(boards.values()), looks.boards.start)
     for name, item in zip(boards, slices, strict=True):
         places[f"board {name}".strip()] = item
-    free = {
-        name: seen.free[(seen.free >= place.start) & (seen.free < place.stop)]
-        for name, place in places.items()
-    }
+    free = {name: within(seen.free, place) for name, place in places.items()}
     return {name: solved.columns_of(array) for name, array in free.items() if len(array)}

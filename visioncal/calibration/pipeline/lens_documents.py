@@ -1,13 +1,13 @@
 """What is written of lenses and targets beside the frames."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from visioncal.calibration.pipeline.lens_fields import lens_field_of
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.core.types import FloatArray, IntArray, TargetKind
+from visioncal.calibration.pipeline.solved import within
+from visioncal.core.types import IntArray
 from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
 from visioncal.results import CameraResult
 from visioncal.results.sections import BoardResult, CellJointFit, RigResult
@@ -64,62 +64,30 @@ def fit_section(known: RunState) -> CellJointFit:
     )
 
 
-def boards_of(known: RunState) -> dict[str, BoardResult]:
-    """The boards as they were found to be, by name."""
-    return {
-        shape.name: BoardResult(
-            shape=dict(zip(BOARD_NAMES, shape.values.tolist(), strict=True)),
-            sigma={BOARD_NAMES[at]: float(shape.sigmas[at]) for at in shape.free},
-            estimated=tuple(BOARD_NAMES[at] for at in shape.moving),
-            bend_mm=1e3 * float(np.ptp(shape.corners[:, 2])),
-        )
-        for shape in _found_shapes(known)
-        if shape.kind != "points"
-    }
-
-
-def rigs_of(known: RunState) -> dict[str, RigResult]:
-    """The rigs as they were found to be, by name; those that are exact are left out."""
-    return {
-        shape.name: RigResult(shape=shape.values.reshape(-1, 3), sigma=shape.sigmas.reshape(-1, 3))
-        for shape in _found_shapes(known)
-        if shape.kind == "points" and shape.free
-    }
-
-
-@dataclass(frozen=True, eq=False)
-class _FoundShape:
-    """A target's shape: its values with their sigmas, and which of them are free and moved."""
-
-    name: str
-    kind: TargetKind
-    values: FloatArray
-    sigmas: FloatArray
-    free: tuple[int, ...]
-    moving: tuple[int, ...]
-    corners: FloatArray
-
-
-def _found_shapes(known: RunState) -> Iterator[_FoundShape]:
-    """The shapes of the targets that were placed."""
+def shapes_of(known: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
+    """The boards and the rigs as they were found to be, by name; exact rigs are left out."""
     solved, covariance = known.fitted, known.solved.covariance
     seen, looks = solved.seen, solved.looks
+    boards, rigs = dict[str, BoardResult](), dict[str, RigResult]()
     if seen is None or looks is None:
-        return
-    sigmas = np.zeros(len(looks.values))
-    sigmas[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
+        return boards, rigs
+    every = np.zeros(len(looks.values))
+    every[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
     shapes = zip(_shapes(known).items(), known.session.boards.items(), looks.corners, strict=True)
     for (name, mine), (plate, target), corners in shapes:
-        if frame_name("target", plate) in solved.part.tree.branches:
-            yield _FoundShape(
-                name,
-                target.kind,
-                looks.values[mine],
-                sigmas[mine],
-                _among(seen.free, mine),
-                _among(seen.moving, mine),
-                corners,
+        if frame_name("target", plate) not in solved.part.tree.branches:
+            continue
+        values, sigmas, free = looks.values[mine], every[mine], _among(seen.free, mine)
+        if target.kind != "points":
+            boards[name] = BoardResult(
+                shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
+                sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in free},
+                estimated=tuple(BOARD_NAMES[at] for at in _among(seen.moving, mine)),
+                bend_mm=1e3 * float(np.ptp(corners[:, 2])),
             )
+        elif free:
+            rigs[name] = RigResult(shape=values.reshape(-1, 3), sigma=sigmas.reshape(-1, 3))
+    return boards, rigs
 
 
 def _shapes(known: RunState) -> dict[str, slice]:
@@ -134,5 +102,4 @@ def _shapes(known: RunState) -> dict[str, slice]:
 
 def _among(places: IntArray, mine: slice) -> tuple[int, ...]:
     """Which values of a lens or a target are among some, from its own first on."""
-    free = places[(places >= mine.start) & (places < mine.stop)]
-    return tuple(int(value) for value in free - mine.start)
+    return tuple(int(value) for value in within(places, mine) - mine.start)

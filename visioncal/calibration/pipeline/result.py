@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.pipeline.holdout import held_by_both_arms
-from visioncal.calibration.pipeline.lens_documents import boards_of, cameras_of, rigs_of
+from visioncal.calibration.pipeline.lens_documents import cameras_of, shapes_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.whole import (
     arm_sections,
@@ -65,6 +65,7 @@ def result_of(known: RunState) -> Calibration:
     size = 6 * len(names)
     was_left_out = np.isfinite(answer.held_out.away_m).any()
     method = answer.held_out.method if was_left_out else ""
+    boards, rigs = shapes_of(known)
     found = Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
@@ -78,8 +79,8 @@ def result_of(known: RunState) -> Calibration:
         rms=rms_of(answer.views),
         validation=Validation.of(method, answer.views, by_pair=True),
         verdict=verdict,
-        boards=boards_of(known),
-        rigs=rigs_of(known),
+        boards=boards,
+        rigs=rigs,
         cell=cell,
         need=need_met(findings.need, findings.picks, whole=cell is not None),
     )

@@ -156,3 +156,8 @@ class Solved:
         first = self.agreed.problem.effect_columns.get(LENSES, slice(0, 0)).start
         free = np.zeros(0) if self.seen is None else self.seen.free
         return np.asarray(first + np.searchsorted(free, places))
+
+
+def within(places: IntArray, mine: slice) -> IntArray:
+    """Those of some ascending places that lie in a slice."""
+    return np.asarray(places[(places >= mine.start) & (places < mine.stop)])
