@@ -92,8 +92,7 @@ def _stops_of(solved: Solved, key: str) -> list[int]:
 
 def movements(solved: Solved) -> tuple[Moved, ...]:
     """What moved, in the order of time."""
-    found, names = [], versions(solved)
-    edges = dict(zip(solved.agreed.problem.unknown, solved.agreed.fit.state.edges, strict=True))
+    found, names, edges = [], versions(solved), solved.frames
     for move in sorted(solved.agreed.moves, key=lambda value: value.stop):
         after = names[move.twin]
         earlier = [

@@ -107,8 +107,7 @@ def lens_field_of(
         rows[:, shared], rows[:, beyond] = found.slope[:, open_], found.open
         values = solved.agreed.problem.values_of(LENSES, state)
         moved = values[: len(seen.free)] - looks.values[seen.free]
-        first = solved.agreed.problem.effect_columns.get(LENSES, slice(0, 0)).start
-        fitted = values[beyond - first]
+        fitted = values[beyond - solved.lens_columns.start]
         mean = found.mean + found.slope[:, open_] @ moved[np.isin(seen.free, place)]
         mean = (mean + found.open @ fitted) / noise_px
         own = rows @ covariance @ rows.T / noise_px**2 + found.rest @ found.rest.T

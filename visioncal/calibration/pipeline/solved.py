@@ -145,17 +145,20 @@ class Solved:
         return chain_rms_px([view.corners for view in views], poses, cameras, looks.points)
 
     @property
+    def lens_columns(self) -> slice:
+        """The problem's columns of lenses and boards, and of what lenses do beyond their models."""
+        return self.agreed.problem.effect_columns.get(LENSES, slice(0, 0))
+
+    @property
     def field_columns(self) -> IntArray:
         """The problem's columns of what lenses do beyond their models."""
-        mine = self.agreed.problem.effect_columns.get(LENSES, slice(0, 0))
-        free = 0 if self.seen is None else len(self.seen.free)
+        mine, free = self.lens_columns, 0 if self.seen is None else len(self.seen.free)
         return np.arange(mine.start + free, mine.stop)
 
     def columns_of(self, places: IntArray) -> IntArray:
         """The problem's columns of free values of lenses and boards, by their places."""
-        first = self.agreed.problem.effect_columns.get(LENSES, slice(0, 0)).start
         free = np.zeros(0) if self.seen is None else self.seen.free
-        return np.asarray(first + np.searchsorted(free, places))
+        return np.asarray(self.lens_columns.start + np.searchsorted(free, places))
 
 
 def within(places: IntArray, mine: slice) -> IntArray:
