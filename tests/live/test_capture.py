@@ -12,7 +12,7 @@ from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
 from visioncal.live.capture.core import missed
-from visioncal.live.capture.drive import travel_s
+from visioncal.live.capture.drive import JointPace
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
@@ -229,9 +229,10 @@ def test_joints_and_poses_of_other_moments_disagree(plan):
 
 
 def test_motion_takes_its_time():
+    pace = JointPace(0.5, 1.0)
     # 1 rad at 0.5 rad/s and 1 rad/s^2: half a second up, half a second down, 1.5 s in between.
-    assert travel_s(np.zeros(2), np.array([1.0, 0.2]), 0.5, 1.0) == pytest.approx(2.5)
-    assert travel_s(np.zeros(1), np.array([0.01]), 0.5, 1.0) == pytest.approx(0.2)
+    assert pace.travel_s(np.zeros(2), np.array([1.0, 0.2])) == pytest.approx(2.5)
+    assert pace.travel_s(np.zeros(1), np.array([0.01])) == pytest.approx(0.2)
 
 
 def test_an_arm_that_hangs_or_ends_elsewhere_is_told(plan, tmp_path):

@@ -1,13 +1,12 @@
 """The live camera: as good as the simulator's own pictures at rest, honestly smeared in motion."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from support.live_cell import FakeClock
 
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.drivers.protocols import CameraDevice
-from visioncal.live.rehearsal.camera import Pace, RehearsalCamera, RehearsalClock
+from visioncal.live.rehearsal.camera import Pace, RehearsalCamera
 from visioncal.simulation import CellOptions, Second, prepare_scene, render, simulate
 from visioncal.simulation.live import LiveView
 from visioncal.vision.finders.charuco import find_charuco
@@ -90,15 +89,9 @@ def test_two_boards_are_refused():
 
 def a_camera(true_joints=None, **options):
     """A camera, with a clock that passes only where somebody waits."""
-    cell, time = a_cell(**options), SimpleNamespace(at=100.003)
-
-    def sleep(seconds):
-        time.at += seconds
-
+    cell, time = a_cell(**options), FakeClock(100.003)
     told = true_joints or (lambda moments: np.tile(cell.robot.joints[0], (len(moments), 1)))
-    camera = RehearsalCamera(
-        cell, told, pace=Pace(10.0, 0.02), clock=RehearsalClock(lambda: time.at, sleep)
-    )
+    camera = RehearsalCamera(cell, told, pace=Pace(10.0, 0.02), clock=time)
     return cell, time, camera
 
 
@@ -107,7 +100,7 @@ def test_pictures_come_at_even_times_and_begin_after_the_call():
     assert isinstance(camera, CameraDevice)
     stamps = []
     for _ in range(3):
-        asked = time.at
+        asked = time.seconds
         frame = camera.frame()
         assert frame.stamp_s - 0.5 * frame.exposure_s >= asked - 1e-9
         stamps.append(frame.stamp_s)
@@ -135,10 +128,10 @@ def test_an_unplugged_camera_says_so_in_time_and_a_frozen_one_repeats_itself():
     assert np.array_equal(first.image, again.image)
     assert again.stamp_s > first.stamp_s
     camera.fault = "unplugged"
-    before = time.at
+    before = time.seconds
     with pytest.raises(DriverError, match="no picture within"):
         camera.frame(timeout_s=0.5)
-    assert time.at - before <= 0.5 + 1e-9
+    assert time.seconds - before <= 0.5 + 1e-9
 
 
 def test_the_camera_outlives_a_controller_that_dies():

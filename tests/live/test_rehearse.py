@@ -13,7 +13,7 @@ from visioncal.cli import rehearse as command
 from visioncal.core.errors import DriverError
 from visioncal.core.transforms import exp, pose_difference
 from visioncal.live.capture.core import CaptureEvent, Times
-from visioncal.live.capture.drive import travel_s
+from visioncal.live.capture.drive import JointPace
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import Missed
 from visioncal.live.planning.purposes import purpose_of
@@ -118,7 +118,7 @@ def test_what_a_recording_adds_is_told_from_motion_driving_and_settling():
     stops = (Stop(1, q[0], np.zeros((0, 6))), Stop(2, q[2], np.array([q[1]])))
     plan = PlanFile(known, purpose_of("hand-eye"), stops, None, "0" * 64)
     taking = CaptureOptions(speed=1.0, acceleration=1.0)
-    ways = [0.0, travel_s(q[0], q[1], 1.0, 1.0) + travel_s(q[1], q[2], 1.0, 1.0)]
+    ways = [0.0, JointPace(1.0, 1.0).way_s(q[:3])]
     times = [Times(ways[0] + 0.1, 0.5, 0.2), Times(ways[1] + 0.3, 0.7, 0.4)]
     steps = [CaptureEvent(1, 1, 2, Missed("none"), "", None, "", time) for time in times]
     pace = pace_of(steps, plan, q[0], taking)

@@ -1,12 +1,14 @@
 """Driving an arm from posture to posture, under a watchdog."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.live import Clock, LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.drivers.protocols import MovingArm
 
@@ -22,15 +24,74 @@ _TIMES, _MORE_S = 1.5, 3.0
 _ARRIVED_RAD = 2e-2
 
 
-def travel_s(start: FloatArray, end: FloatArray, speed: float, acceleration: float) -> float:
-    """How long the joints turn from one posture to another [s].
+@dataclass(frozen=True)
+class JointPace:
+    """How fast joints turn together: the one that turns farthest leads.
 
-    The joint that turns farthest leads by a trapezoid, or a triangle where the way is short.
+    Attributes:
+        speed: Of that joint [rad/s].
+        acceleration: Likewise [rad/s^2].
     """
-    far = float(np.abs(np.asarray(end) - start).max(initial=0.0))
-    if far * acceleration < speed**2:
-        return float(2.0 * np.sqrt(far / acceleration))
-    return far / speed + speed / acceleration
+
+    speed: float
+    acceleration: float
+
+    @classmethod
+    def of(cls, options: CaptureOptions) -> "JointPace":
+        """That of a recording."""
+        return cls(options.speed, options.acceleration)
+
+    def travel_s(self, start: FloatArray, end: FloatArray) -> float:
+        """How long they turn from one posture to another, by a trapezoid or a triangle [s]."""
+        far = float(np.abs(np.asarray(end) - start).max(initial=0.0))
+        if far * self.acceleration < self.speed**2:
+            return float(2.0 * np.sqrt(far / self.acceleration))
+        return far / self.speed + self.speed / self.acceleration
+
+    def way_s(self, way: Iterable[FloatArray]) -> float:
+        """How long they turn on a way from posture to posture [s]."""
+        return sum(self.travel_s(start, end) for start, end in pairwise(way))
+
+
+def watched(
+    arm: MovingArm,
+    expected_s: float,
+    clock: Clock,
+    state: Callable[[], object],
+    glance: Callable[[], None] = lambda: None,
+) -> None:
+    """Waits until an arm that was started stands.
+
+    Args:
+        arm: The arm.
+        expected_s: How long its motion should take [s].
+        clock: The time.
+        state: Asks the arm for its state; raises where it is stopped or lost.
+        glance: Called every now and then while it moves.
+
+    Raises:
+        DriverError: It takes too long; or from `state` or `glance`.
+    """
+    begun = glanced = clock.now()
+    while True:
+        # It is late where it still moves after this moment, by a state that is newer: what a stall
+        # of this computer or a slow picture takes, it moves on by itself.
+        took = clock.now() - begun
+        state()
+        if not arm.moving():
+            return
+        if took > _TIMES * expected_s + _MORE_S:
+            raise DriverError(
+                f"{arm.name}: still moving after {took:.1f} s, where {expected_s:.1f} s were "
+                "expected.",
+                culprits=[arm.name],
+                next_step="Check the speed slider on the pendant, and whether somebody holds the "
+                "arm.",
+            )
+        if clock.now() - glanced > _GLANCE_S:
+            glance()
+            glanced = clock.now()
+        clock.sleep(_POLL_S)
 
 
 def drive(
@@ -75,32 +136,10 @@ def _move(
     options: CaptureOptions,
     glance: Callable[[], None],
 ) -> None:
-    here = joints_of(cell)
-    speed, acceleration = options.speed, options.acceleration
-    expected_s = travel_s(here, goal, speed, acceleration)
-    allowed_s = _TIMES * expected_s + _MORE_S
-    begun = cell.clock.now()
-    arm.start_move(goal, speed=speed, acceleration=acceleration)
-    glanced = begun
-    while True:
-        # It is late where it still moves after this moment, by a state that is newer: what a stall
-        # of this computer or a slow picture takes, it moves on by itself.
-        took = cell.clock.now() - begun
-        cell.state()
-        if not arm.moving():
-            break
-        if took > allowed_s:
-            raise DriverError(
-                f"{arm.name}: still moving after {took:.1f} s, where {expected_s:.1f} s were "
-                "expected.",
-                culprits=[arm.name],
-                next_step="Check the speed slider on the pendant, and whether somebody holds the "
-                "arm.",
-            )
-        if cell.clock.now() - glanced > _GLANCE_S:
-            glance()
-            glanced = cell.clock.now()
-        cell.clock.sleep(_POLL_S)
+    pace = JointPace.of(options)
+    expected_s = pace.travel_s(joints_of(cell), goal)
+    arm.start_move(goal, speed=pace.speed, acceleration=pace.acceleration)
+    watched(arm, expected_s, cell.clock, cell.state, glance)
     off = np.abs(joints_of(cell) - goal)
     if off.max() > _ARRIVED_RAD:
         joint = int(off.argmax())

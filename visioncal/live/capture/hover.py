@@ -1,6 +1,5 @@
 """Brings the tip of a driven arm to a safe height above points that a person then touches."""
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,16 +9,14 @@ import numpy as np
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.drive import travel_s
+from visioncal.live.capture.drive import JointPace, watched
+from visioncal.live.capture.live import HostClock
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 
-# Somebody stands beside the arm [rad/s], [rad/s^2].
-_SPEED, _ACCELERATION = 0.25, 0.5
-_POLL_S = 0.02
-# A motion may take so many times its time, and so much longer [s], before something is wrong.
-_TIMES, _MORE_S = 1.5, 3.0
+# Somebody stands beside the arm.
+_PACE = JointPace(speed=0.25, acceleration=0.5)
 # On its way the tip keeps this share of the height; it is looked at in so many places.
 _KEPT, _PLACES = 0.5, 100
 # Joints that turn farther are brought nearer by hand [rad].
@@ -137,20 +134,6 @@ class Hovering:
         return state.q
 
     def _move(self, goal: FloatArray) -> None:
-        expected_s = travel_s(self._joints(), goal, _SPEED, _ACCELERATION)
-        ends_s = time.monotonic() + _TIMES * expected_s + _MORE_S
-        self.arm.start_move(goal, speed=_SPEED, acceleration=_ACCELERATION)
-        while True:
-            # It is late where it still moves after this moment, by a state that is newer.
-            asked_s = time.monotonic()
-            self.arm.state()
-            if not self.arm.moving():
-                return
-            if asked_s > ends_s:
-                raise DriverError(
-                    f"{self.arm.name}: still moving after the {expected_s:.1f} s that were "
-                    "expected.",
-                    culprits=[self.arm.name],
-                    next_step="Check the speed slider on the pendant.",
-                )
-            time.sleep(_POLL_S)
+        expected_s = _PACE.travel_s(self._joints(), goal)
+        self.arm.start_move(goal, speed=_PACE.speed, acceleration=_PACE.acceleration)
+        watched(self.arm, expected_s, HostClock(), self.arm.state)

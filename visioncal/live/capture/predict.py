@@ -52,7 +52,7 @@ class PlannedAccuracy:
         place, turn = (
             np.trace(array @ covariance) for array in (self.world.place, self.world.turn)
         )
-        return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))
+        return Accuracy.of(float(place), float(turn))
 
     def close(self) -> None:
         """Nothing works for it."""
@@ -95,5 +95,4 @@ def _calibrated(folder: Path) -> Accuracy | None:
     if known.answer is None:
         return None
     covariance = known.answer.covariance[:6, :6]
-    place, turn = float(np.trace(covariance[3:, 3:])), float(np.trace(covariance[:3, :3]))
-    return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))
+    return Accuracy.of(float(np.trace(covariance[3:, 3:])), float(np.trace(covariance[:3, :3])))

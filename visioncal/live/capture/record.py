@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Camera, FloatArray
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, CaptureEvent, Watcher
-from visioncal.live.capture.drive import drive, joints_of, travel_s
+from visioncal.live.capture.drive import JointPace, drive, joints_of
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
@@ -73,11 +72,10 @@ def departure(
     if not stops:
         return Departure((), here, (), 0.0, 0.0)
     first = CheckedPaths(plan).to(stops[0], here)
-    pace = (options.speed, options.acceleration)
     way = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
-    legs = [travel_s(a, b, *pace) for a, b in pairwise(way)]
     turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
-    return Departure(stops, here, first, float(turns.max()), sum(legs) + _STOP_S * len(stops))
+    duration_s = JointPace.of(options).way_s(way) + _STOP_S * len(stops)
+    return Departure(stops, here, first, float(turns.max()), duration_s)
 
 
 def record(

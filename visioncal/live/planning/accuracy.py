@@ -40,6 +40,11 @@ class Accuracy:
     mm: float
     deg: float
 
+    @classmethod
+    def of(cls, place_m2: float, turn_rad2: float) -> "Accuracy":
+        """The accuracy by the sums of the variances of all axes [m^2], [rad^2]."""
+        return cls(1e3 * float(np.sqrt(place_m2)), float(np.rad2deg(np.sqrt(turn_rad2))))
+
     @property
     def is_open(self) -> bool:
         """Whether a direction is not determined at all; the figures are nothing to go by then."""

@@ -164,33 +164,25 @@ def make_plan(
         workspace=request.workspace,
     )
     progress("choice", 0, 1)
-    chosen_stops = _with_a_way(cells, request, found.q, worlds, begun, progress)
-    world, route = worlds[0], chosen_stops.route
-    design = chosen_stops.design
-    first = 1 if begun is None else 1 + max(begun.views)
-    numbers = np.empty(len(design.rows), dtype=np.int64)
-    numbers[list(route.order)] = first + np.arange(len(design.rows))
-    stops = _stops(cell, request, found, world, chosen_stops, numbers, begun)
-    map_m, map_sigma_m = np.zeros((0, 3)), np.zeros(0)
-    if request.purpose.judged == "workspace" and not design.predicted.is_open:
-        covariance = world.covariance(design.rows)
-        map_m, map_sigma_m = place_sigmas(cell, request.purpose, covariance, request.workspace)
-    wish, needed = request.wish, None
+    planning = _Planning(cells, request, found, worlds, begun)
+    design, route, in_the_way = planning.with_a_way(progress)
+    map_m, map_sigma_m = planning.mapped(design)
+    needed = None
     if request.need is not None:
         picking = Picking(cells, worlds, found.q, request.need)
         needed = need_planned(picking, design.rows, request.count)
-    missing = [] if wish is None else [shortfall(design, wish, request.count)]
+    missing = [] if request.wish is None else [shortfall(design, request.wish, request.count)]
     missing += [] if needed is None else [needed.limits]
     return Plan(
         cell,
         request,
-        stops,
+        planning.stops(design, route),
         design,
         route.length_rad,
         begun,
         len(found),
         found.lost,
-        chosen_stops.in_the_way,
+        in_the_way,
         " ".join(name for name in missing if name),
         map_m,
         map_sigma_m,
@@ -199,81 +191,129 @@ def make_plan(
 
 
 @dataclass(frozen=True, eq=False)
-class _Chosen:
-    """A design whose rows are those of all candidates, and the way through it."""
+class _Planning:
+    """By what stops are chosen.
 
-    design: Design
-    route: Route
-    in_the_way: tuple[str, ...]
+    Attributes:
+        cells: The cell as it is guessed to be, and some of what else it may be.
+        request: What is asked.
+        found: The candidates.
+        worlds: Their information in each of the cells.
+        begun: What was recorded already; None for nothing.
+    """
 
+    cells: tuple[PlanCell, ...]
+    request: PlanRequest
+    found: Candidates
+    worlds: tuple[World, ...]
+    begun: Begun | None
 
-def _with_a_way(
-    cells: tuple[PlanCell, ...],
-    request: PlanRequest,
-    q: FloatArray,
-    worlds: tuple[World, ...],
-    begun: Begun | None,
-    progress: Progress,
-) -> _Chosen:
-    """Chooses stops that can be driven to one after the other."""
-    left = np.arange(len(q))
-    given_up: list[str] = []
-    for turn in range(_ROUNDS):
-        few = tuple(
-            replace(world, factors=world.factors[left], misfit=world.misfit[left])
-            for world in worlds
-        )
-        design = _enough(cells, request, q[left], few, begun)
-        design = replace(design, rows=left[design.rows])
-        progress("path", turn, _ROUNDS)
-        route = ordered(cells[0], request.start_q, q[design.rows], request.seed)
-        if not route.unreachable:
-            return _Chosen(design, route, tuple(given_up))
-        given_up += route.unreachable.values()
-        left = np.setdiff1d(left, design.rows[list(route.unreachable)])
-    raise DataError(
-        f"plan: no safe way through {request.count} stops was found in {_ROUNDS} choices; in the "
-        f"way were {some_of(list(dict.fromkeys(given_up)))}.",
-        culprits=tuple(dict.fromkeys(given_up)),
-        next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",
-    )
+    @property
+    def recorded(self) -> int:
+        """How many stops were recorded already."""
+        return 0 if self.begun is None else len(self.begun.views)
 
+    def with_a_way(self, progress: Progress) -> tuple[Design, Route, tuple[str, ...]]:
+        """Chooses stops that can be driven to one after the other.
 
-def _enough(
-    cells: tuple[PlanCell, ...],
-    request: PlanRequest,
-    q: FloatArray,
-    worlds: tuple[World, ...],
-    begun: Begun | None,
-) -> Design:
-    """Chooses the fewest stops that meet what is wished and needed, or as many as are allowed."""
-
-    def of(count: int) -> Design:
-        return chosen(worlds, count, criterion=request.criterion, wish=request.wish)
-
-    design = of(request.count)
-    if not len(design.rows):
-        raise _needless(design)
-    if request.need is None:
-        return design
-    picking = Picking(cells, worlds, q, request.need)
-    fewest, share = picking.fewest(design.rows), picking.share_of(design.rows)
-    recorded = 0 if begun is None else len(begun.views)
-    if fewest == 0 and recorded >= CalibrationLimits.stops[0]:
-        before = percent(picking.chance(design.rows[:0]))
+        Returns:
+            The design, the way through it, and what kept stops from being driven to.
+        """
+        left = np.arange(len(self.found.q))
+        given_up: list[str] = []
+        for turn in range(_ROUNDS):
+            design = self._enough(left)
+            progress("path", turn, _ROUNDS)
+            q = self.found.q[design.rows]
+            route = ordered(self.cells[0], self.request.start_q, q, self.request.seed)
+            if not route.unreachable:
+                return design, route, tuple(given_up)
+            given_up += route.unreachable.values()
+            left = np.setdiff1d(left, design.rows[list(route.unreachable)])
+        obstacles = tuple(dict.fromkeys(given_up))
         raise DataError(
-            f"plan: by what was recorded, {before} of picks land within {words_of(request.need)}; "
-            "no stop needs to be added.",
-            next_step="Need less than that, or leave the need out to see what stops would give.",
+            f"plan: no safe way through {self.request.count} stops was found in {_ROUNDS} choices; "
+            f"in the way were {some_of(list(obstacles))}.",
+            culprits=obstacles,
+            next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",
         )
-    # Few stops tell what they determine, and not whether one of them is wrong.
-    fewest = max(fewest, CalibrationLimits.stops[0] - recorded)
-    # The first of many stops are not the best of few, which may be enough where one less is not.
-    for count in range(max(fewest - 1, 1), len(design.rows)):
-        smaller = of(count)
-        if count >= CalibrationLimits.stops[0] - recorded and picking.chance(smaller.rows) >= share:
-            return smaller
-    return design
+
+    def _enough(self, left: IntArray) -> Design:
+        """The fewest of some candidates that meet wish and need, or as many as are allowed."""
+        request, needed_stops = self.request, CalibrationLimits.stops[0]
+        worlds = tuple(
+            replace(world, factors=world.factors[left], misfit=world.misfit[left])
+            for world in self.worlds
+        )
+
+        def of(count: int) -> Design:
+            return chosen(worlds, count, criterion=request.criterion, wish=request.wish)
+
+        design = of(request.count)
+        if not len(design.rows):
+            raise _needless(design)
+        if request.need is not None:
+            picking = Picking(self.cells, worlds, self.found.q[left], request.need)
+            fewest, share = picking.fewest(design.rows), picking.share_of(design.rows)
+            if fewest == 0 and self.recorded >= needed_stops:
+                raise _met(request.need, picking.chance(design.rows[:0]))
+            # Few stops tell what they determine, and not whether one of them is wrong.
+            fewest = max(fewest, needed_stops - self.recorded)
+            # The first of many stops are not the best of few, which may be enough where one less
+            # is not.
+            for count in range(max(fewest - 1, 1), len(design.rows)):
+                smaller = of(count)
+                enough = count >= needed_stops - self.recorded
+                if enough and picking.chance(smaller.rows) >= share:
+                    design = smaller
+                    break
+        return replace(design, rows=left[design.rows])
+
+    def stops(self, design: Design, route: Route) -> tuple[PlannedStop, ...]:
+        """The stops in driving order."""
+        cell, found, begun = self.cells[0], self.found, self.begun
+        first = 1 if begun is None else 1 + max(begun.views)
+        numbers = np.empty(len(design.rows), dtype=np.int64)
+        numbers[list(route.order)] = first + np.arange(len(design.rows))
+        names = [f"view {number}" for number in numbers]
+        purpose, world = self.request.purpose, self.worlds[0]
+        said = tuple(helps(cell, purpose, found.q, world, design, names, begun=begun))
+        q = found.q[design.rows]
+        flange = cell.robot.base_from_flange(q)
+        segments = route.segments
+        if len(segments) < len(route.order):
+            segments = (np.zeros((0, q.shape[1])), *segments)
+        return tuple(
+            PlannedStop(
+                int(numbers[at]),
+                q[at],
+                via,
+                flange[at],
+                found.cam_from_target[design.rows[at]],
+                float(found.seen[design.rows[at]]),
+                at + 1,
+                said[at],
+                design.history[at],
+                design.history[at + 1],
+            )
+            for at, via in zip(route.order, segments, strict=True)
+        )
+
+    def mapped(self, design: Design) -> tuple[FloatArray, FloatArray]:
+        """Places (w, 3) all over the workspace, and (w,) their sigmas, if these count [m]."""
+        request = self.request
+        if request.purpose.judged != "workspace" or design.predicted.is_open:
+            return np.zeros((0, 3)), np.zeros(0)
+        covariance = self.worlds[0].covariance(design.rows)
+        return place_sigmas(self.cells[0], request.purpose, covariance, request.workspace)
+
+
+def _met(need: Need, before: float) -> DataError:
+    return DataError(
+        f"plan: by what was recorded, {percent(before)} of picks land within {words_of(need)}; "
+        "no stop needs to be added.",
+        next_step="Need less than that, or leave the need out to see what stops would give.",
+    )
 
 
 def _needless(design: Design) -> DataError:
@@ -282,42 +322,6 @@ def _needless(design: Design) -> DataError:
         f"plan: the wish is met by what was recorded, which predicts {figure(found.mm)} mm and "
         f"{figure(found.deg)} deg; no stop needs to be added.",
         next_step="Wish for more, or leave the wish out to see what further stops would give.",
-    )
-
-
-def _stops(
-    cell: PlanCell,
-    request: PlanRequest,
-    found: Candidates,
-    world: World,
-    taken: _Chosen,
-    numbers: IntArray,
-    begun: Begun | None,
-) -> tuple[PlannedStop, ...]:
-    """The stops in driving order; `numbers` are their views' in the order of the design."""
-    design, route = taken.design, taken.route
-    names = [f"view {number}" for number in numbers]
-    said = tuple(helps(cell, request.purpose, found.q, world, design, names, begun=begun))
-    q = found.q[design.rows]
-    flange = cell.robot.base_from_flange(q)
-    still = np.zeros((0, q.shape[1]))
-    segments = route.segments
-    if len(segments) < len(route.order):
-        segments = (still, *segments)
-    return tuple(
-        PlannedStop(
-            int(numbers[at]),
-            q[at],
-            via,
-            flange[at],
-            found.cam_from_target[design.rows[at]],
-            float(found.seen[design.rows[at]]),
-            at + 1,
-            said[at],
-            design.history[at],
-            design.history[at + 1],
-        )
-        for at, via in zip(route.order, segments, strict=True)
     )
 
 

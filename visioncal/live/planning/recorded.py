@@ -135,10 +135,9 @@ def begin(
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
         raise _too_vague(known, len(begun.views))
-    arm = begun.arm
     cell = PlanCell(
         known.session.mount,
-        _arm(arm, robot),
+        _arm(begun.arm, robot),
         begun.free.appearance.camera,
         targets[begun.board],
         edges[0],
@@ -151,30 +150,31 @@ def begin(
         boxes,
         covariance,
     )
-    alike = (
-        () if known.answer is None else (misfit.alike for misfit in known.answer.misfits.values())
-    )
-    recorded = RecordedStops(
+    first_corner = int(first_corners(targets)[begun.board])
+    recorded = _recorded(known, begun, edges, first_corner)
+    return Begun(cell, recorded, found.refusal, begun.views)
+
+
+def _recorded(
+    known: RunState, begun: "_RecordedStart", edges: FloatArray, first_corner: int
+) -> RecordedStops:
+    """The session's information, at the edges where the plan takes them to be."""
+    arm, misfits = begun.arm, () if known.answer is None else known.answer.misfits.values()
+    alike = [misfit.alike for misfit in misfits if misfit.alike is not None]
+    factors = (neighbours.factor for neighbours in alike if neighbours.is_significant)
+    return RecordedStops(
         begun.problem,
         edges,
         begun.free,
         arm.joints_rad,
         begun.noise,
-        int(first_corners(targets)[begun.board]),
+        first_corner,
         # Of few stops, sizes of errors that noise alone explains are mostly chance.
         arm.errors if arm.is_modelled and arm.errors and arm.errors.is_likely else None,
-        max(
-            (
-                neighbours.factor
-                for neighbours in alike
-                if neighbours is not None and neighbours.is_significant
-            ),
-            default=1.0,
-        ),
+        max(factors, default=1.0),
         _beside_noise(known, begun),
         _held_pull(known, begun.problem),
     )
-    return Begun(cell, recorded, found.refusal, begun.views)
 
 
 @dataclass(frozen=True, eq=False)

@@ -231,7 +231,7 @@ class Selection:
         """What is predicted."""
         place = np.mean([world.place.of(covariance) for world, covariance in self._worlds()])
         turn = np.mean([world.turn.of(covariance) for world, covariance in self._worlds()])
-        return Accuracy(1e3 * float(np.sqrt(place)), float(np.rad2deg(np.sqrt(turn))))
+        return Accuracy.of(float(place), float(turn))
 
     def best_to_add(self) -> int:
         """The candidate that would lessen the value most."""

@@ -3,7 +3,6 @@
 It free-runs as a camera does: exposures begin at even times, whether or not anybody asks.
 """
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -13,6 +12,7 @@ import numpy as np
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Camera, FloatArray, Image
+from visioncal.live.capture.live import Clock, HostClock
 from visioncal.live.drivers.protocols import Frame
 from visioncal.simulation import SimulatedCell
 from visioncal.simulation.live import LiveView
@@ -39,14 +39,6 @@ class Pace:
     exposure_s: float = 0.008
 
 
-@dataclass(frozen=True)
-class RehearsalClock:
-    """The time, and how to wait; tests put others in their place."""
-
-    now: Callable[[], float] = time.monotonic
-    sleep: Callable[[float], None] = time.sleep
-
-
 class RehearsalCamera:
     """A camera device that sees a simulated cell.
 
@@ -66,13 +58,13 @@ class RehearsalCamera:
         true_joints: Callable[[FloatArray], FloatArray],
         *,
         pace: Pace | None = None,
-        clock: RehearsalClock | None = None,
+        clock: Clock | None = None,
     ) -> None:
         self._cell = cell
         self._view = LiveView(cell)
         self._true_joints = true_joints
         self._pace = pace or Pace()
-        self._clock = clock or RehearsalClock()
+        self._clock = clock or HostClock()
         self._began = self._clock.now()
         self._last: tuple[FloatArray, Image] | None = None
         self.fault: Fault = "none"

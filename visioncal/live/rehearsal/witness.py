@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert, log, pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.live.capture.core import CaptureEvent
-from visioncal.live.capture.drive import travel_s
+from visioncal.live.capture.drive import JointPace
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import TakenView
 from visioncal.live.planning.read_back import PlanFile
@@ -85,8 +84,7 @@ def pace_of(
     here, motions = start_q, []
     for _, stop in zip(steps, plan.stops, strict=False):
         way = [here, *stop.via, stop.q]
-        pace = (options.speed, options.acceleration)
-        motions.append(sum(travel_s(a, b, *pace) for a, b in pairwise(way)))
+        motions.append(JointPace.of(options).way_s(way))
         here = stop.q
     times = [step.times for step in steps]
     motion_s, added = float(np.mean(motions)), [time.worked_s for time in times]
