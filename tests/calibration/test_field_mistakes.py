@@ -1,7 +1,7 @@
 """Mistakes made in cells: what is said first. Sessions are made with numpy and OpenCV alone."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -132,3 +132,12 @@ def test_a_table_of_corners_that_was_cut_off_is_named(tmp_path):
     one = visioncal.calibrate(write(tmp_path / "one", stops, has_corners=lambda view: view != 4))
     assert one.verdict.status == "good"
     assert one.verdict.top[0].startswith("1 of 16 rows of views.csv observe nothing: view 4;")
+
+
+def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path):
+    bumped = FLANGE_FROM_CAM * RigidTransform.from_translation([0.0012, -0.0012, 0.0011])
+    stops = looks(18)
+    stops[9:] = [replace(stop, flange_from_cam=bumped) for stop in stops[9:]]
+    first = visioncal.calibrate(write(tmp_path / "bumped", stops)).verdict.causes[0]
+    assert first.kind == "moved_at_once"
+    assert first.words.startswith("The camera moved at once: from view 9 on, it is 1.9 mm and")

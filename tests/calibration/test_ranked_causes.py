@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import chdtrc
-from support.cells import calibrated
+from support.cells import calibrated, showing
 from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.pipeline import calibrate
@@ -328,6 +328,22 @@ def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped)
         assert "from view 9 on" in found.words
         # Processes over posture and time explain the same, and are not the cause.
         assert calibrate(session).verdict.causes[0].kind == "moved_at_once"
+
+
+@pytest.mark.parametrize("dh_sigma", [0.0, 3e-4])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_camera_that_was_bumped_is_named_beside_the_errors_of_its_arm(mount, dh_sigma):
+    # Without joint angles; halfway, so that views of neither half are outliers.
+    options = CellOptions(mount=mount, seed=0, dh_sigma_m=dh_sigma, dh_sigma_rad=dh_sigma)
+    before, after = (
+        simulate(replace(options, camera_moved_m=shift_m)).corners for shift_m in (0.0, 4e-3)
+    )
+    known = calibrated(showing(simulate(options), before[:10] + after[10:]), joints=False)
+    first = known.verdict.causes[0]
+    assert first.kind == "moved_at_once"
+    assert "The camera moved at once: from view 10 on, it is" in first.words
+    still = calibrated(simulate(options), joints=False).verdict
+    assert {cause.kind for cause in still.causes} <= {"arm_errors"}
 
 
 @pytest.mark.parametrize("since", [12, 6])

@@ -9,7 +9,8 @@ from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_sta
 from visioncal.calibration.stages.init_network import init_network
 from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
-from visioncal.estimation.moves import slight_move
+from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
+from visioncal.estimation.moves import Move, evidence_gain, slight_move
 from visioncal.estimation.outliers import agree, settle
 from visioncal.estimation.parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import (
@@ -183,6 +184,30 @@ def test_repeats_share_errors_that_a_step_does_not_pass_for():
     np.testing.assert_allclose(known[:size], 0.0, atol=1e-6 * np.abs(information).max())
     frames = tuple(problem.unknown)
     assert all(slight_move(*still_cell(seed), frames) is None for seed in range(6))
+
+
+def test_steps_are_as_likely_as_their_evidence_says():
+    """Half of the cells have one, of the sizes that steps have; robots hide the smallest."""
+    frame, found = "target_b", []
+    for seed in range(90):
+        rng = np.random.default_rng(seed)
+        cell = replace(world(rng, 14), robot_sigmas={"a": (1e-3, 1e-3), "b": (1e-3, 1e-3)})
+        steps = rng.random() < 0.5
+        twist = steps * rng.choice(SIZES_M) * np.repeat([TURN_PER_M, 1.0], 3) * rng.normal(size=6)
+        changed = {(frame, stop): moved(cell.truth[frame], twist) for stop in range(6, 14)}
+        problem = observed(cell, rng, changed)
+        fit = fit_problem(problem, true_state(cell, problem.tree))
+        gain, wider, _ = evidence_gain(problem, fit, Move(frame, f"{frame}@2", 6, np.eye(4)))
+        assert f"{frame}@2" in wider.unknown
+        found.append((steps, 1.0 / (1.0 + np.exp(-0.5 * gain))))
+    stepped, likely = np.array(found).T
+    # The number of steps is off by as much as they are uncertain; a few are never seen, and none
+    # is seen where there is none.
+    spread = np.sqrt(np.sum(likely * (1.0 - likely)))
+    assert 1.0 < spread < 4.0
+    assert abs(np.sum(stepped - likely)) < 3.0 * spread
+    assert stepped[likely > 0.99].all()
+    assert np.sum(likely > 0.99) > 25
 
 
 def test_the_fit_is_as_good_as_its_covariance_says():

@@ -17,6 +17,7 @@ from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.linalg import covariance_from, scaled_values
+from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.parts import UNEVEN, Effect, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
@@ -24,7 +25,9 @@ from visioncal.estimation.solve import (
     Solution,
     by_noise_alone,
     equations_from,
+    fit_problem,
     fitted_covariance,
+    robot_likelihood,
 )
 from visioncal.estimation.variance import Knowledge
 
@@ -160,16 +163,30 @@ def needless_move(problem: Problem, fit: Solution, moves: Sequence[Move]) -> Mov
     known = fitted_covariance(problem, fit.state, fit.noise)
     found = []
     for move in moves:
-        first, second = (problem.unknown[name] for name in (move.frame, move.twin))
-        between = invert(fit.state.edges[first]) @ fit.state.edges[second]
-        slope = np.zeros((6, len(known)))
-        slope[:, 6 * first : 6 * first + 6] = -adjoint(invert(between))
-        slope[:, 6 * second : 6 * second + 6] = np.eye(6)
-        away = log(between)
-        found.append((float(away @ np.linalg.solve(slope @ known @ slope.T, away)), move))
+        away, covariance = _fitted_change(problem, fit, known, move)
+        found.append((float(away @ np.linalg.solve(covariance, away)), move))
     squared, move = min(found, key=lambda pair: pair[0])
     stops = len(np.unique(problem.observations.stops))
     return move if squared < _move_limit(problem, len(problem.unknown) * stops) else None
+
+
+def _fitted_change(
+    problem: Problem, fit: Solution, known: FloatArray, move: Move
+) -> tuple[FloatArray, FloatArray]:
+    """A change (6,) in the frame's own place before, and its covariance (6, 6), by a fit.
+
+    Args:
+        problem: The observations, with both places.
+        fit: The unknowns and the noise.
+        known: (p, p) the covariance of the unknowns.
+        move: What moved.
+    """
+    first, second = (problem.unknown[name] for name in (move.frame, move.twin))
+    between = invert(fit.state.edges[first]) @ fit.state.edges[second]
+    slope = np.zeros((6, len(known)))
+    slope[:, 6 * first : 6 * first + 6] = -adjoint(invert(between))
+    slope[:, 6 * second : 6 * second + 6] = np.eye(6)
+    return log(between), slope @ known @ slope.T
 
 
 def unmoved(
@@ -427,6 +444,41 @@ def log_gain(problem: Problem, fit: Solution, mahalanobis_sq: float) -> float:
     freedom = _residual_freedom(problem, fit)
     share = min(mahalanobis_sq / freedom, _MOST_EXPLAINED)
     return -freedom * float(np.log1p(-share))
+
+
+def evidence_gain(problem: Problem, fit: Solution, move: Move) -> tuple[float, Problem, Solution]:
+    """Twice the logarithm of a move's Bayes factor: by a fit with it, whose noise is its own.
+
+    `log_gain` has one level of noise for rotations and places. A camera that was pushed is in that
+    of places alone, of which the score has no more than a half.
+
+    Args:
+        problem: The observations.
+        fit: The unknowns and the noise, without the move.
+        move: What moved.
+
+    Returns:
+        The gain, and the problem with the move and its fit.
+    """
+    wider, start = moved(problem, fit, move)
+    there = fit_problem(wider, start.state, start.noise)
+    # Of sensors' levels the likelihood knows one share: they are the same for both.
+    before, after = (
+        robot_likelihood(part, state, there.noise).least_unlikely
+        for part, state in ((problem, fit.state), (wider, there.state))
+    )
+    known = fitted_covariance(wider, there.state, there.noise)
+    change, covariance = _fitted_change(wider, there, known, move)
+    # Restricted likelihood integrates over a change of any size, all as likely; these come in all
+    # orders of magnitude.
+    units = np.repeat([TURN_PER_M, 1.0], 3)
+    likely = []
+    for size_m in SIZES_M:
+        total = covariance + np.diag((size_m * units) ** 2)
+        square = float(change @ np.linalg.solve(total, change))
+        likely.append(-0.5 * (float(np.linalg.slogdet(total)[1]) + square))
+    prior = float(np.logaddexp.reduce(likely) - np.log(len(likely)))
+    return 2.0 * (before - after + prior), wider, there
 
 
 def step_covariance(

@@ -520,6 +520,11 @@ class RobotLikelihood:
         """The levels (r, 2) from above, and the negative logarithm of their likelihood."""
         return self._levels(np.maximum(self.rms, _START_SIGMA) * np.ones_like(self.before))
 
+    @property
+    def least_unlikely(self) -> float:
+        """The negative log-likelihood at the most likely levels, with what no level changes."""
+        return self.white[1] + 0.5 * self.reduced.cost
+
     def _levels(self, start: FloatArray) -> tuple[FloatArray, float]:
         if not len(self.components.known):
             return self.before, 0.0

@@ -278,15 +278,16 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     """Kinds of findings that another one of these passes for."""
     # What moves along a camera's axis passes for changes of its focus, which are random in the fit;
     # a focus that changes does not go by the time, and is found moving in one session of ten
-    # thousand. Before and after a step, errors by posture and time are alike because of it. What a
-    # held lens that the corners contradict does to views passes for a board of another size or
-    # shape, and, with the views' postures, for an arm that errs; the corners alone do not show the
-    # size, and the lens is tested beside all three. What is left of a clock's jump passes for
-    # motion.
+    # thousand. Before and after a step, errors by posture and time are alike because of it, and it
+    # is found beside these. What a held lens that the corners contradict does to views passes for a
+    # board of another size or shape, and, with the views' postures, for an arm that errs; the
+    # corners alone do not show the size, and the lens is tested beside all three. What is left of a
+    # clock's jump passes for motion.
     feigned: set[str] = set()
     if moved := [first[name].mahalanobis_sq for name in _MOVED if name in first]:
         feigned.add("focus")
-        if "arm_errors" in first and max(moved) > first["arm_errors"].mahalanobis_sq:
+        arm = first.get("arm_errors")
+        if arm and (first.keys() & {*MOVED_AT_ONCE} or max(moved) > arm.mahalanobis_sq):
             feigned.add("arm_errors")
     if "clock_changed" in first:
         feigned |= {*_MOVED, "arm_errors", "correlated_errors"}

@@ -1,6 +1,6 @@
 """Whether the residuals are noise: what they show beyond it, in words."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -12,7 +12,15 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import PLAN, Finding, Remedy
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
-from visioncal.estimation.moves import Move, Slip, log_gain, slight_move, slipped_joint
+from visioncal.estimation.moves import (
+    Move,
+    Slip,
+    evidence_gain,
+    log_gain,
+    slight_move,
+    slipped_joint,
+)
+from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.solve import Solution
@@ -70,7 +78,7 @@ def misfits(
         steps = _steps(problem, fit, (slight, slipped), crept)
         # What a process over postures or time explains as well is no motion.
         if arm:
-            steps = [step for step in steps if step.mahalanobis_sq >= arm.gain]
+            steps = [*_beside_errors(problem, fit, steps, arm, robot)]
         if arm and crept and crept.mahalanobis_sq < arm.gain:
             crept = None
         if steps:
@@ -90,10 +98,9 @@ def _steps(
     crept: Drift | None,
 ) -> list[Move | Slip]:
     """What moved at once, where that explains the residuals better than a creep from end to end."""
-    # A step may be at any stop and of any frame or joint: it must gain by twice the logarithm of
-    # these. A joint's has one number where a frame's has six, of which each must gain by as much as
+    # A joint's has one number where a frame's has six, of which each must gain by as much as
     # the Bayesian information criterion asks for (Schwarz 1978).
-    price = 2.0 * np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max())))
+    price = _price(problem)
     each = float(np.log(problem.observations.directions.sum()))
     likely: list[tuple[float, Move | Slip]] = []
     least = log_gain(problem, fit, crept.mahalanobis_sq) if crept else 0.0
@@ -105,6 +112,27 @@ def _steps(
         likely.append((gain - numbers * each, replace(move, mahalanobis_sq=gain)))
     likely.sort(key=lambda pair: -pair[0])
     return [move for gain, move in likely if gain > likely[0][0] - _CLEARLY]
+
+
+def _price(problem: Problem) -> float:
+    """What a step has to gain more, as it may be at any stop and of any frame or joint."""
+    return 2.0 * float(np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max()))))
+
+
+def _beside_errors(
+    problem: Problem, fit: Solution, steps: Sequence[Move | Slip], arm: ArmErrors, robot: str
+) -> Iterator[Move | Slip]:
+    """The steps that a robot's errors do not explain, with what they gain beside these."""
+    for step in steps:
+        if isinstance(step, Slip):
+            if step.mahalanobis_sq >= arm.gain:
+                yield step
+            continue
+        gain, apart, there = evidence_gain(problem, fit, step)
+        errors = find_pose_errors(apart, there.state, there.noise, robot)
+        beside = gain - _price(problem) + (errors.gain if errors else 0.0) - arm.gain
+        if beside > _CLEARLY:
+            yield replace(step, mahalanobis_sq=beside)
 
 
 def doubts(
