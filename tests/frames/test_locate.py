@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.beyond import an_error, moved, with_error, with_field
 from support.cells import exact, session_of
+from support.later import ANYHOW, FITTED, lot
 from support.marks import slow
 from support.picks import (
     before_camera,
@@ -237,6 +238,29 @@ def test_the_region_holds_the_true_place(options):
         # half would hold every one of them.
         assert held == pytest.approx(0.95, abs=0.08)
         assert np.mean(near) == pytest.approx(0.95, abs=0.08)
+
+
+def test_a_calibrated_arm_errs_by_what_its_calibration_left_open():
+    point, surprises, shares = np.array([0.13, 0.09, 0.0]), [], []
+    for seed in range(5):
+        known = lot(replace(ANYHOW, seed=seed), 4)
+        cell, calibration = known.cell, known.calibration
+        base_from_target = cell.transforms["base_from_target"]
+        truth = base_from_target[:3, :3] @ point + base_from_target[:3, 3]
+        for at in range(FITTED, FITTED + 4):
+            q = cell.robot.joints[at]
+            look = (calibration, cell.corners[at], BOARD, calibration.standing(q[None])[0], point)
+            by_pose, by_joints = locate_target(*look), locate_target(*look, joints_rad=q)
+            assert "arm" in by_pose.budget_mm
+            assert "arm" not in by_joints.budget_mm
+            np.testing.assert_array_equal(by_joints.p_base, by_pose.p_base)
+            shares.append(by_joints.budget_mm["total"] / by_pose.budget_mm["total"])
+            error = by_joints.p_base - truth
+            surprises.append(error @ np.linalg.solve(by_joints.covariance, error))
+    # Chi-square of three degrees of freedom a cell, whose picks share its calibration: the mean of
+    # five has a standard deviation of 1.1.
+    assert np.mean(surprises) == pytest.approx(3.0, abs=2.5)
+    assert np.median(shares) < 0.5
 
 
 @pytest.mark.slow

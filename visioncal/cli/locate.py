@@ -124,15 +124,17 @@ def locate_command(
         refuse_given({"--pose": pose}, "the session has the poses of its views")
     else:
         refuse_given({"--view": view}, "only a session has views")
-    flange = None if pose is None else _flange(pose)
+    flange, joints_rad = None if pose is None else _flange(pose), None
     if pixel:
         refuse_given({"--point-mm": point, "--target": target}, "a pixel is placed by its plane")
         if session is not None:
-            flange = _flange_of(session, _chosen(session, view), known)
+            flange, joints_rad = _flange_of(session, _chosen(session, view), known)
         elif source is not None:
             check_size(Eye.of(known), read_image(source), source.name)
         boards = boards_before(result, Choice(camera, robot), EYE)
-        found = _by_plane(known, boards, pixel, plane, plane_sigma or 0.0, flange, sigma_px)
+        found = _by_plane(
+            known, boards, pixel, plane, plane_sigma or 0.0, flange, joints_rad, sigma_px
+        )
     else:
         refuse_given({"--plane": plane, "--plane-sigma-mm": plane_sigma}, "it is for --pixel")
         origin_m = 1e-3 * np.array(numbers_in(point or "0,0,0", "--point-mm", "x,y,z"))
@@ -195,14 +197,17 @@ def _flange(words: str) -> "FloatArray":
 
 def _flange_of(
     session: "Session", views: "Sequence[View]", calibration: "Calibration"
-) -> "FloatArray | None":
-    """Where the flange was at the one view that is meant; a camera that stands still needs none."""
-    from visioncal.frames.session_observations import pose_of
+) -> "tuple[FloatArray | None, FloatArray | None]":
+    """Where the flange was at the one view that is meant, and a calibrated arm's joints there.
+
+    A camera that stands still needs neither.
+    """
+    from visioncal.frames.session_observations import calibrated_joints, pose_of
     from visioncal.results.picking import check_mount
 
     check_mount(session, calibration)
     if calibration.mount == "eye-to-hand":
-        return None
+        return None, None
     if len(views) > 1:
         raise DataError(
             f"session {session.name!r} has {len(views)} views, and a camera on the flange "
@@ -218,7 +223,7 @@ def _flange_of(
             culprits=[f"view {view.number}"],
             next_step="Fill in x_m to qw, or joint angles and [robot] model.",
         )
-    return flange
+    return flange, calibrated_joints(view, calibration)
 
 
 def _by_plane(
@@ -228,6 +233,7 @@ def _by_plane(
     plane: str | None,
     sigma_mm: float,
     flange: "FloatArray | None",
+    joints_rad: "FloatArray | None",
     sigma_px: float | None,
 ) -> tuple[_Found, ...]:
     import numpy as np
@@ -242,7 +248,7 @@ def _by_plane(
         )
     px = np.array([numbers_in(pixel, "--pixel", "u,v") for pixel in pixels])
     declared, note = plane_of(plane, sigma_mm, calibration, boards)
-    places = locate(calibration, px, declared, flange, sigma_px=sigma_px)
+    places = locate(calibration, px, declared, flange, joints_rad=joints_rad, sigma_px=sigma_px)
     return tuple(
         _Found(
             f"pixel ({u:g}, {v:g})",

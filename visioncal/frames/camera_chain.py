@@ -3,11 +3,15 @@
 Eye-in-hand, `base_from_cam = base_from_flange * flange_from_cam`: the robot's noise at the stop
 where the image was taken is new, and adds to the camera's transform. Eye-to-hand,
 `base_from_cam` is the camera's transform itself, and no robot stands between.
+
+Where the arm was calibrated along and the joints of a look are known, the arm errs by what its
+calibration left open, which is correlated with the camera's transform: the last joint's zero, say,
+is in both and moves no place. Any other arm errs by as much as the calibration's own stops showed.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self, TypeAlias
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -18,12 +22,59 @@ from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.arm import pose_basis
 from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult
+from visioncal.vision.camera import intrinsics
+
+# A pixel is placed in a millisecond, and need not wait for what calibrated arms take to import.
+if TYPE_CHECKING:
+    from visioncal.estimation.armmodel import ArmModel
 
 # A transform, or its (4, 4) matrix.
 Pose: TypeAlias = FloatArray | RigidTransform
 
 # No arm reaches this far [m]: such numbers are in millimetres.
 FAR_M = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class LearntArm:
+    """An arm that was calibrated along with the camera, and what that left open of its errors.
+
+    Attributes:
+        model: The arm, with the p errors that it may still have.
+        covariance: (p, p) of these.
+        with_camera: (6 + k + m, p) their covariance with the camera's edge and lens, as in `Eye`.
+    """
+
+    model: "ArmModel"
+    covariance: FloatArray
+    with_camera: FloatArray
+
+    @classmethod
+    def of(cls, calibration: Calibration, camera: FloatArray) -> Self | None:
+        """Reads it from a calibration; None where its arm was not calibrated.
+
+        Args:
+            calibration: The camera's.
+            camera: (6 + k + m,) squared covariance of the camera's edge and lens.
+        """
+        found, fit = calibration.arm, calibration.joint_fit
+        # Functions of the joints are in no such covariance.
+        if fit is None or not calibration.arm_is_calibrated or found is None or found.functions:
+            return None
+        from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+
+        prior = CalibrationPrior.of(calibration)
+        if prior.model is None or calibration.camera is None:
+            return None
+        lens_size = len(intrinsics(calibration.camera.camera))
+        free = [at for at in prior.looks if at < lens_size]
+        behind = 6 + 6 * len(prior.boards)
+        fitted = [*range(6), *(behind + prior.looks.index(at) for at in free)]
+        kept = [*range(6), *(6 + at for at in free)]
+        arm = slice(behind + len(prior.looks), None)
+        # What was no unknown of the fit has to do with the arm only by way of what was.
+        shares = camera[:, kept] @ np.linalg.pinv(camera[np.ix_(kept, kept)], hermitian=True)
+        return cls(prior.model, prior.covariance[arm, arm], shares @ prior.covariance[fitted, arm])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +89,7 @@ class Eye:
         flange_sigmas: (6,) noise of the flange at one stop, per axis [rad, m].
         arm_sigma: Size of errors that follow the arm's posture [rad], 0.5 m of length for each
             radian; zero where there are none.
+        arm: The arm, where it was calibrated along.
         pixel_px: Noise of a corner's coordinate [px]; None where the calibration does not say.
         freedom: Degrees of freedom that the noise was estimated with, infinite where not said.
         warnings: Why not to trust it, in sentences.
@@ -49,6 +101,7 @@ class Eye:
     covariance: FloatArray
     flange_sigmas: FloatArray
     arm_sigma: float
+    arm: LearntArm | None
     pixel_px: float | None
     freedom: float
     warnings: tuple[str, ...]
@@ -70,13 +123,15 @@ class Eye:
         edge = calibration.edges[edge_names(calibration.mount)[0]]
         verdict = calibration.verdict
         bad = f"The calibration's verdict is bad: {' '.join(verdict.reasons[:1])}"
+        covariance = result.covariance_with(edge.covariance)
         return cls(
             calibration.mount,
             result,
             edge.matrix,
-            result.covariance_with(edge.covariance),
+            covariance,
             _flange_sigmas(calibration),
             _arm_sigma(calibration),
+            LearntArm.of(calibration, covariance),
             calibration.noise.get("pixel_px"),
             calibration.noise_dof,
             (bad,) if verdict.status == "bad" else (),
@@ -113,19 +168,23 @@ class Eye:
             raise DataError(f"locate: sigma_px is {sigma!r}; a standard deviation is needed.")
         return float(sigma)
 
-    def at(self, base_from_flange: Pose | None) -> "ChainStop":
+    def at(
+        self, base_from_flange: Pose | None, joints_rad: FloatArray | None = None
+    ) -> "ChainStop":
         """The chain while the flange stands somewhere.
 
         Args:
             base_from_flange: As the robot reported it when the image was taken. A camera that
                 stands still needs none, and takes no notice of one.
+            joints_rad: (n,) where that is the calibrated arm's pose by these joints [rad].
 
         Raises:
             DataError: A camera on the flange needs the pose and there is none, or it is no rigid
                 transform in metres.
         """
         if self.mount == "eye-to-hand":
-            return ChainStop(self.edge, np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 0)))
+            nothing = np.zeros((6, 6))
+            return ChainStop(self.edge, nothing, nothing, np.zeros((6, self.arm_size)))
         if base_from_flange is None:
             raise DataError(
                 "locate: the camera is on the flange (eye-in-hand), and the robot's pose at the "
@@ -141,7 +200,7 @@ class Eye:
             base_from_flange @ self.edge,
             adjoint(invert(self.edge)),
             self.flange_noise,
-            self.arm_basis(base_from_flange),
+            self.arm_basis(base_from_flange, joints_rad),
         )
 
     @property
@@ -149,15 +208,44 @@ class Eye:
         """(6, 6) covariance of the flange's right perturbation at one stop."""
         return np.asarray(np.diag(self.flange_sigmas**2))
 
-    def arm_basis(self, base_from_flange: FloatArray) -> FloatArray:
-        """(6, p) how the flange errs with the arm's posture, by p independent errors of size one.
+    @property
+    def arm_size(self) -> int:
+        """How many errors `arm_basis` knows."""
+        return self.posture_size + (0 if self.arm is None else len(self.arm.covariance))
 
-        By the shape of any arm's errors (`estimation.arm.pose_basis`), as independent of those that
-        the calibration met: the camera's transform has taken a part of them up, and nothing says
-        which. Without such errors p is zero.
+    @property
+    def posture_size(self) -> int:
+        """How many of these are of an arm that was not calibrated, or whose joints are not said."""
+        return pose_basis(np.eye(4)[None]).shape[2] if self.arm_sigma > 0.0 else 0
+
+    def arm_basis(
+        self, base_from_flange: FloatArray, joints_rad: FloatArray | None = None
+    ) -> FloatArray:
+        """(6, a) how the flange errs with the arm's posture, by the errors of `shared_covariance`.
+
+        Those of a calibrated arm, where the joints are known. Else by the shape of any arm's errors
+        (`estimation.arm.pose_basis`), as independent of those that the calibration met: the
+        camera's transform has taken a part of them up, and nothing says which.
         """
-        basis = pose_basis(base_from_flange[None])[0]
-        return np.asarray(self.arm_sigma * basis[:, : basis.shape[1] * (self.arm_sigma > 0.0)])
+        basis, postures = np.zeros((6, self.arm_size)), self.posture_size
+        if self.arm is not None and joints_rad is not None:
+            basis[:, postures:] = self.arm.model.kept_basis(joints_rad[None])[0]
+        elif postures:
+            basis[:, :postures] = self.arm_sigma * pose_basis(base_from_flange[None])[0]
+        return basis
+
+    @property
+    def shared_covariance(self) -> FloatArray:
+        """(6 + k + m + a,) squared, of what all looks share: camera, lens, and the arm's errors."""
+        camera, size = len(self.covariance), len(self.covariance) + self.arm_size
+        covariance = np.eye(size)
+        covariance[:camera, :camera] = self.covariance
+        if self.arm is not None:
+            learnt = slice(camera + self.posture_size, size)
+            covariance[learnt, learnt] = self.arm.covariance
+            covariance[:camera, learnt] = self.arm.with_camera
+            covariance[learnt, :camera] = self.arm.with_camera.T
+        return covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +257,7 @@ class ChainStop:
         flange_jacobian: (6, 6) how it moves, on its right, with the flange; zero for a camera that
             stands still.
         flange_noise: (6, 6) covariance of the flange by its noise.
-        arm_basis: (6, p) how the flange errs with the arm's posture; see `Eye.arm_basis`.
+        arm_basis: (6, a) how the flange errs with the arm's posture; see `Eye.arm_basis`.
     """
 
     base_from_cam: FloatArray

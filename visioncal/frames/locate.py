@@ -30,6 +30,7 @@ def locate(
     plane: Plane,
     base_from_flange: Pose | None = None,
     *,
+    joints_rad: FloatArray | None = None,
     sigma_px: float | None = None,
     camera: str | None = None,
     robot: str | None = None,
@@ -42,6 +43,7 @@ def locate(
         plane: What they lie in.
         base_from_flange: Where the robot stood at the image, as it reported it; only for a camera
             on the flange.
+        joints_rad: (n,) where that is the calibrated arm's pose by these joints [rad].
         sigma_px: Noise of a feature's coordinate [px]; the calibration's corners' where None.
         camera: Which camera is meant, of a whole cell's calibration.
         robot: In which robot's base; likewise.
@@ -54,7 +56,7 @@ def locate(
             ray does not meet the plane in front of the camera.
     """
     eye = Eye.of(calibration.chosen(Choice(camera, robot), EYE))
-    noise_px, stop = eye.noise_px(sigma_px), eye.at(base_from_flange)
+    noise_px, stop = eye.noise_px(sigma_px), eye.at(base_from_flange, joints_rad)
     px = np.atleast_2d(np.asarray(px, dtype=float))
     rays = _rays(eye, px)
     return tuple(
@@ -147,10 +149,16 @@ def _camera_parts(
 ) -> dict[str, FloatArray]:
     """What the calibration and the robot add to a place, by how it moves with camera and lens."""
     flange_jacobian = by_camera @ stop.flange_jacobian
+    by_arm = flange_jacobian @ stop.arm_basis
+    # What is left open of a calibrated arm is one with the camera's transform.
+    apart = slice(0, eye.posture_size)
+    learnt = by_arm.copy()
+    learnt[:, apart] = 0.0
+    by_calibration = np.concatenate([by_camera, by_lens, learnt], axis=1)
     return {
-        "calibration": _carried(np.concatenate([by_camera, by_lens], axis=1), eye.covariance),
+        "calibration": _carried(by_calibration, eye.shared_covariance),
         "robot": _carried(flange_jacobian, stop.flange_noise),
-        "arm": _carried(flange_jacobian @ stop.arm_basis, np.eye(stop.arm_basis.shape[1])),
+        "arm": _carried(by_arm[:, apart], np.eye(eye.posture_size)),
     }
 
 
@@ -208,6 +216,7 @@ def locate_target(
     base_from_flange: Pose | None = None,
     point_target_m: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
     *,
+    joints_rad: FloatArray | None = None,
     sigma_px: float | None = None,
     label: str = "image",
     camera: str | None = None,
@@ -225,6 +234,7 @@ def locate_target(
         base_from_flange: Where the robot stood at the image, as it reported it; only for a camera
             on the flange.
         point_target_m: (3,) the point in the target's frame [m].
+        joints_rad: (n,) where the pose is the calibrated arm's by these joints [rad].
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
         label: What messages call the image.
         camera: Which camera is meant, of a whole cell's calibration.
@@ -235,7 +245,7 @@ def locate_target(
             target.
     """
     eye = Eye.of(calibration.chosen(Choice(camera, robot), EYE))
-    stop = eye.at(base_from_flange)
+    stop = eye.at(base_from_flange, joints_rad)
     board = target if isinstance(target, Target) else load_target(target)
     view = see(eye, seen, board, label, sigma_px)
     point = checked_point(point_target_m, "point_target_m")

@@ -76,6 +76,7 @@ def locate_views(
                 shown.target,
                 sight.base_from_flange,
                 point_target_m,
+                joints_rad=sight.joints_rad,
                 sigma_px=sigma_px,
                 label=sight.label,
             )

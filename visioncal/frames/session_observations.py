@@ -10,7 +10,7 @@ from visioncal.calibration.stages.observed import by_reason
 from visioncal.calibration.stages.reported_poses import Reported, reported_poses
 from visioncal.calibration.verification.prediction import check_robot
 from visioncal.core.errors import DataError
-from visioncal.core.types import FloatArray, Progress, Rejection, Target
+from visioncal.core.types import Corners, FloatArray, Image, Progress, Rejection, Target
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.single_view import Parent, Sight, needs_robot
 from visioncal.results import HELD_BACK, Calibration
@@ -78,10 +78,7 @@ def session_looks(
     lost |= {rejection.view: rejection.reason for rejection in seen.rejections}
     views = _usable(session, asked, target, lost)
     check_resolution(session, calibration, seen.resolution)
-    sights = [
-        Sight(_label(view), seen.corners[view.number], poses.get(view.number), view.stop)
-        for view in views
-    ]
+    sights = [_sight(view, seen.corners[view.number], poses, calibration) for view in views]
     return Sighting(
         session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
     )
@@ -114,7 +111,7 @@ def pictured(
             lost[view.number] = image.reason
             continue
         check_resolution(session, calibration, (image.shape[1], image.shape[0]))
-        sights.append(Sight(_label(view), image, poses.get(view.number), view.stop))
+        sights.append(_sight(view, image, poses, calibration))
     views = _usable(session, asked, target, lost)
     return Sighting(
         session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
@@ -129,6 +126,25 @@ def for_fits(session: Session) -> tuple[View, ...]:
 def held_back(session: Session) -> dict[int, str]:
     """The views that none may use, by their numbers, with the reason."""
     return {view.number: HELD_BACK for view in session.views if view.holdout}
+
+
+def calibrated_joints(view: View, calibration: Calibration) -> FloatArray | None:
+    """(n,) joints by which a calibrated arm places a view's flange [rad]; None without one."""
+    arm, joints = calibration.calibrated_robot, view.joints_rad
+    if arm is None or not calibration.arm_is_calibrated or joints is None:
+        return None
+    return joints if len(joints) == arm.joint_count else None
+
+
+def _sight(
+    view: View,
+    seen: Corners | Image,
+    poses: Mapping[int, FloatArray],
+    calibration: Calibration,
+) -> Sight:
+    pose = poses.get(view.number)
+    joints_rad = None if pose is None else calibrated_joints(view, calibration)
+    return Sight(_label(view), seen, pose, view.stop, joints_rad)
 
 
 def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArray | None:
@@ -222,12 +238,10 @@ def _poses(
 def _flange(session: Session, calibration: Calibration, asked: tuple[View, ...]) -> Reported:
     """The robot's side of some views, through the calibrated arm where there is one."""
     reported = reported_poses(replace(session, views=asked), _robot(session, calibration))
-    arm, poses = calibration.calibrated_robot, dict(reported.base_from_flange)
-    if arm is None or not calibration.arm_is_calibrated:
-        return reported
+    poses = dict(reported.base_from_flange)
     for view in asked:
-        joints = view.joints_rad
-        if joints is not None and len(joints) == arm.joint_count:
+        joints = calibrated_joints(view, calibration)
+        if joints is not None:
             loads = loads_of([view.numbers])
             poses[view.number] = calibration.standing(joints[None], loads)[0]
     return replace(reported, base_from_flange=poses)

@@ -37,12 +37,14 @@ class Sight:
             no robot stands between parent and target.
         stop: Number of the robot's stop, where stops are numbered; else images with the same pose
             are of one.
+        joints_rad: (n,) where the pose is the calibrated arm's by these joints [rad].
     """
 
     label: str
     seen: Corners | Image
     base_from_flange: FloatArray | None = None
     stop: int | None = None
+    joints_rad: FloatArray | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -75,9 +77,8 @@ class TargetPlace:
 
 
 def common_covariance(eye: Eye, scale_sigma: float) -> FloatArray:
-    """(c, c) of what all images share: the camera's edge, its lens, the target's size, the arm."""
-    arm = eye.arm_basis(np.eye(4)).shape[1]
-    return np.asarray(block_diag(eye.covariance, [[scale_sigma**2]], np.eye(arm)))
+    """(c, c) of what all images share: the camera's edge, its lens, the arm, the target's size."""
+    return np.asarray(block_diag(eye.shared_covariance, [[scale_sigma**2]]))
 
 
 def needs_robot(eye: Eye, parent: Parent) -> bool:
@@ -114,7 +115,7 @@ def places(
     flange = sight.base_from_flange
     if not needs_robot(eye, parent):
         still = np.zeros((len(view.turns), 6, 6))
-        return _carried(eye, view, eye.edge, still, np.eye(4), of_stop)
+        return _carried(view, eye.edge, still, np.zeros((6, eye.arm_size)), of_stop)
     if flange is None:
         raise DataError(
             f"{sight.label}: the robot stands between the {parent} and what the camera "
@@ -123,23 +124,22 @@ def places(
             next_step="Give base_from_flange as the robot reported it when the image was taken.",
         )
     checked_pose(flange, f"{sight.label}: base_from_flange")
+    arm = eye.arm_basis(flange, sight.joints_rad)
     if parent == "base":
         flange_jacobian = adjoint(invert(eye.edge @ view.cam_from_target))
-        return _carried(eye, view, flange @ eye.edge, flange_jacobian, flange, of_stop)
+        return _carried(view, flange @ eye.edge, flange_jacobian, arm, of_stop)
     flange_from_cam = invert(flange) @ eye.edge
     flange_jacobian = -adjoint(invert(flange_from_cam @ view.cam_from_target))
-    return _carried(eye, view, flange_from_cam, flange_jacobian, flange, of_stop)
+    return _carried(view, flange_from_cam, flange_jacobian, arm, of_stop)
 
 
 def _carried(
-    eye: Eye,
     view: SeenTarget,
     parent_from_cam: FloatArray,
     flange_jacobian: FloatArray,
-    base_from_flange: FloatArray,
+    arm: FloatArray,
     of_stop: int,
 ) -> tuple[TargetPlace, ...]:
-    arm = eye.arm_basis(base_from_flange)
     by_edge = adjoint(invert(view.cam_from_target))
     return tuple(
         TargetPlace(
@@ -150,8 +150,8 @@ def _carried(
                 [
                     by_edge[at],
                     view.by_lens[at],
-                    view.by_scale[at][:, None],
                     flange_jacobian[at] @ arm,
+                    view.by_scale[at][:, None],
                 ],
                 axis=1,
             ),
