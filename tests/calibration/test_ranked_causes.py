@@ -346,6 +346,23 @@ def test_a_camera_that_was_bumped_is_named_beside_the_errors_of_its_arm(mount, d
     assert {cause.kind for cause in still.causes} <= {"arm_errors"}
 
 
+@pytest.mark.parametrize("since", [24, 6])
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_views_left_out_after_a_bump_name_it_before_the_errors_of_the_arm(mount, since):
+    options = CellOptions(mount=mount, seed=2, views=30, dh_sigma_m=3e-4, dh_sigma_rad=3e-4)
+    before, after = (
+        simulate(replace(options, camera_moved_m=shift_m)).corners for shift_m in (0.0, 4e-3)
+    )
+    bumped = showing(simulate(options), before[:since] + after[since:])
+    verdict = calibrated(bumped, joints=False).verdict
+    assert ids(verdict) == ["something_moved", "arm_errors"]
+    # Fewer of them, in front or behind, are left out.
+    when = "from view 24 on" if since == 24 else "before view 6"
+    said = re.search(rf"{when}, as they agree, the camera stood (\S+) mm", verdict.causes[0].words)
+    # What an arm errs by at six stops is another mean.
+    assert float(said.group(1)) == pytest.approx(4.0, abs=0.5)
+
+
 @pytest.mark.parametrize("since", [12, 6])
 @pytest.mark.parametrize("which", ["tool", "base"])
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

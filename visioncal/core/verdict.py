@@ -27,7 +27,7 @@ NOT_USABLE = (MISSING, EMPTY_ROWS, OTHER_SIZE)
 # A part of the image in which no corner was seen: a hint where the task says what it needs.
 EMPTY_IMAGE = "empty_image"
 # Rows of poses that are exchanged come first among causes that are as good as certain.
-EXCHANGED, _SURE = "exchanged_views", 0.99
+EXCHANGED, ARM_ERRORS, _SURE = "exchanged_views", "arm_errors", 0.99
 # What says how large errors are, the most important first.
 _SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
 
@@ -191,9 +191,11 @@ class Verdict:
         """What may be why it is not good, likeliest first."""
         found = (finding for finding in self.findings if finding.probability)
 
-        def order(finding: Finding) -> tuple[float, bool, float]:
-            # Among what is as good as certain, rows that are exchanged mislead all the rest.
-            return -min(finding.probability, _SURE), finding.kind != EXCHANGED, -finding.probability
+        def order(finding: Finding) -> tuple[float, int, float]:
+            # Among what is as good as certain, rows that are exchanged mislead all the rest, and
+            # errors of an arm, which are always there, come after what happened.
+            place = {EXCHANGED: -1, ARM_ERRORS: 1}.get(finding.kind, 0)
+            return -min(finding.probability, _SURE), place, -finding.probability
 
         return tuple(sorted(found, key=order))
 

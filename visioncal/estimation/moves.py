@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from visioncal.core.quantiles import chi2_limit, f_limit
-from visioncal.core.transforms import adjoint, exp, invert, log
+from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.linalg import covariance_from, scaled_values
@@ -355,6 +355,35 @@ def _asked_spread(problem: Problem, fit: Solution, frame: str) -> FloatArray:
     covariance = problem.total_covariance(linear, fit.noise)
     back = np.linalg.inv(linear.jacobian[:, :, problem.edge_columns(frame)])
     return np.asarray(back @ covariance @ np.swapaxes(back, 1, 2))
+
+
+def common_change(
+    problem: Problem, fit: Solution, frame: str, some: Mask
+) -> tuple[FloatArray, Mask] | None:
+    """The other place of a frame that some observations ask for together.
+
+    Args:
+        problem: All n observations.
+        fit: The unknowns and the noise, by others.
+        frame: The frame.
+        some: (n,) which observations.
+
+    Returns:
+        (4, 4) the change in the frame's own place, and for each of them whether noise explains what
+        is left; None where not all have to do with the frame.
+    """
+    part = problem.subset(some)
+    if not part.observations.involves(frame).all():
+        return None
+    asked, covariance = part.change_of(frame, fit.state), _asked_spread(part, fit, frame)
+    middle = mean_transform(asked)
+    apart, weights = log(invert(middle) @ asked), np.linalg.inv(covariance)
+    pulls = np.einsum("nij,nj->i", weights, apart)
+    mean = np.linalg.solve(weights.sum(axis=0), pulls)
+    left = apart - mean
+    squares = np.einsum("ni,nij,nj->n", left, weights, left)
+    limit = _MARGIN**2 * float(chi2_limit(_FALSE_ALARM / len(problem), 6))
+    return middle @ exp(mean), squares < limit
 
 
 def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.stages.cause_ranking import run_evidence
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import apart
@@ -16,11 +17,13 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Remedy, exchanging, look_at
+from visioncal.estimation.moves import common_change
 from visioncal.results import Moved
 
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
-# Views that one step explains agree on it to within this share of it.
+# What the fit leaves uncertain grows with a step: views that a large one explains agree on it to
+# within this share of it.
 _SURELY_ALIKE = 0.05
 # A robot's pose is wrong where so many observations of its stop say so.
 _FEWEST = 2
@@ -183,31 +186,24 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     # A tool frame that is switched on in the controller moves what is on the flange, as it is
     # reported, and another base frame what stands.
     agreed, rows = solved.agreed, solved.cell.rows
-    problem, out = agreed.problem, np.flatnonzero(~agreed.used)
+    problem = agreed.problem
     order = np.argsort(problem.observations.stops, kind="stable")
-    used = agreed.used[order]
-    is_run = len(out) >= _FEWEST_STOPS and np.sum(used[1:] != used[:-1]) == 1
-    if not is_run or not problem.observations.has_rotation[out].all():
+    used = np.flatnonzero(agreed.used[order])
+    before, after = order[: used[0]], order[used[-1] + 1 :]
+    run = max(before, after, key=len)
+    if len(run) < _FEWEST_STOPS or not problem.observations.has_rotation[run].all():
         return
-    asked = {name: problem.change_of(name, agreed.fit.state)[out] for name in problem.unknown}
-    asked = {name: change for name, change in asked.items() if np.isfinite(change).all()}
-    scatter_m = {
-        name: float(np.median(distances(change, mean_transform(change))[0]))
-        for name, change in asked.items()
-    }
-    if not scatter_m:
+    steps = _common_steps(solved, run)
+    if not steps:
         return
-    frame = min(scatter_m, key=scatter_m.__getitem__)
-    change, edge = mean_transform(asked[frame]), agreed.fit.state.edges[problem.unknown[frame]]
-    shift_mm, turn_deg = pose_difference(np.eye(4), change)
-    if 1e3 * scatter_m[frame] > _SURELY_ALIKE * shift_mm:
-        return
-    ordered = [rows[index].view for index in order.tolist()]
-    first = int(np.argmax(used[1:] != used[:-1])) + 1
-    when = f"from view {ordered[first]} on" if used[0] else f"before view {ordered[first]}"
-    views = _numbers(solved, out.tolist())
-    thing = frame.partition("_")[0].replace("cam", "camera")
-    moved = f"the {thing} stood {figure(shift_mm)} mm and {figure(turn_deg)} deg elsewhere"
+    (frame, change), *rivals = steps
+    edge = agreed.fit.state.edges[problem.unknown[frame]]
+    if run is after:
+        when = f"from view {rows[int(run[0])].view} on"
+    else:
+        when = f"before view {rows[int(order[used[0]])].view}"
+    moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
+    moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
     step = Remedy("Fasten what moved, and calibrate the views before and after it apart.")
     parent = problem.tree.branches.get(problem.tree.branches[frame].parent)
     on_flange = parent is not None and bool(parent.robot)
@@ -222,9 +218,41 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
             f"Look which {which} frame was active in the controller, and set the same one for all "
             "views; or fasten what moved, and calibrate the views before and after it apart."
         )
-    words = f"{_views(solved, out.tolist())} were left out: {when}, as they agree, {moved}."
-    found = Finding("something_moved", f"V{words[1:]}", step, views)
-    yield PoseFault(found, tuple(out.tolist()), f"{when}, something had moved")
+    out = np.sort(run).tolist()
+    words = f"{_views(solved, out)} were left out: {when}, as they agree, {moved}."
+    found = Finding(
+        "something_moved",
+        f"V{words[1:]}",
+        step,
+        _numbers(solved, out),
+        mahalanobis_sq=run_evidence(len(run), len(rows)),
+    )
+    yield PoseFault(found, tuple(out), f"{when}, something had moved")
+
+
+def _common_steps(solved: Solved, run: IntArray) -> list[tuple[str, FloatArray]]:
+    """Frames of which one step explains some views, and the step: that scatters least first."""
+    agreed, found = solved.agreed, []
+    some = np.isin(np.arange(len(agreed.used)), run)
+    for frame in agreed.problem.unknown:
+        step = common_change(agreed.problem, agreed.fit, frame, some)
+        if step is None:
+            continue
+        change, explained = step
+        asked = agreed.problem.change_of(frame, agreed.fit.state)[run]
+        scatter_m = float(np.median(distances(asked, change)[0]))
+        if explained.all() or scatter_m < _SURELY_ALIKE * float(np.linalg.norm(change[:3, 3])):
+            found.append((scatter_m, frame, change))
+    return [(frame, change) for _, frame, change in sorted(found, key=lambda item: item[0])]
+
+
+def _thing(frame: str) -> str:
+    return frame.partition("_")[0].replace("cam", "camera")
+
+
+def _elsewhere(change: FloatArray) -> str:
+    shift_mm, turn_deg = pose_difference(np.eye(4), change)
+    return f"{figure(shift_mm)} mm and {figure(turn_deg)} deg elsewhere"
 
 
 def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:

@@ -13,6 +13,7 @@ How likely a cause is rests on what is computed today:
   causes.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,6 +23,7 @@ from scipy.special import chdtrc
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
+from visioncal.core.quantiles import chi2_limit
 from visioncal.core.verdict import (
     EXCHANGED,
     GOOD_FOR,
@@ -312,6 +314,18 @@ def _chance(doubt: Finding) -> float:
     """With which chance a sound session shows it: by its figures, or the limit of its test."""
     limit, square = EVIDENCE[doubt.kind].chance, doubt.mahalanobis_sq
     return min(max(float(chdtrc(1.0, square)), _LEAST_CHANCE), limit) if square else limit
+
+
+def run_evidence(count: int, of: int) -> float:
+    """What it says that views which were left out follow each other, as a chi-square of one.
+
+    Args:
+        count: How many were left out.
+        of: Of how many views.
+    """
+    # Views that are wrong one by one are any of them.
+    chance = EVIDENCE["something_moved"].chance * (of - count + 1) / math.comb(of, count)
+    return float(chi2_limit(max(chance, _LEAST_CHANCE), 1))
 
 
 def _odds(chance: float) -> float:

@@ -10,6 +10,7 @@ from visioncal.calibration.stages.cause_ranking import (
     MOVED_AT_ONCE,
     NO_JOINTS,
     adding,
+    run_evidence,
 )
 from visioncal.calibration.stages.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.core.limits import CalibrationLimits
@@ -220,8 +221,16 @@ def _disagreement_doubts(pair: JudgedPair) -> Iterator[Finding]:
             look_at(views[0]),
         )
     )
-    kind, without_it = "something_moved" if run else "wrong_views", _without(views, pair.held_out)
-    yield Finding(kind, words, step, views, without_it=without_it).of(pair.name)
+    compared = sum(view.used for view in pair.views) + len(out)
+    found = Finding(
+        "something_moved" if run else "wrong_views",
+        words,
+        step,
+        views,
+        without_it=_without(views, pair.held_out),
+        mahalanobis_sq=run_evidence(len(out), compared) if run else 0.0,
+    )
+    yield found.of(pair.name)
 
 
 def _run(pair: JudgedPair) -> str:
