@@ -18,6 +18,7 @@ from visioncal.simulation import (
     BOARDS,
     BoardAt,
     CameraAt,
+    RobotAt,
     cell_session,
     fine_camera,
     simulate,
@@ -95,6 +96,19 @@ def test_a_sound_cell_is_good_and_says_how_good(session):
         f"All {used} used views agree: left out of the fit, they are predicted"
     )
     assert "offset along the cell's" in reason
+
+
+def test_frames_that_take_up_a_calibrated_arms_zeros_are_no_doubt():
+    slipped = RobotAt("b", CELL.robots[1].place_m, offset_sigma_rad=5e-3)
+    found = align(
+        recorded(simulate(replace(CELL, robots=(CELL.robots[0], slipped), stops=24, seed=0)))
+    )
+    # No stop tells the zeros of the first joint and of the last one from a base and a plate that
+    # are turned, and more stops would not.
+    assert found.cell.robots["b"].arm.level == "offsets"
+    assert found.edges["cell_from_base_b"].sigma_deg > 0.3
+    assert found.edges["flange_b_from_target_plate_b"].sigma_deg > 0.3
+    assert found.verdict.status == "good", found.verdict.reasons
 
 
 def test_one_wrong_pose_of_a_robot_is_named(session):

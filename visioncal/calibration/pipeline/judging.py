@@ -166,6 +166,8 @@ def _of_cell(known: RunState) -> _Parts:
     """The worst directions and the frames of a whole cell, and what moved in it."""
     answer, solved = known.solved, known.fitted
     edges, budget = answer.last_edges, answer.budget_mm
+    taken_up = {*_taking_up(known)}
+    edges = {frame: edge for frame, edge in edges.items() if frame not in taken_up}
     worst = [
         direction
         for frame, edge in edges.items()
@@ -179,6 +181,22 @@ def _of_cell(known: RunState) -> _Parts:
         ],
         [moved_found(move) for move in answer.moved],
     )
+
+
+def _taking_up(known: RunState) -> Iterator[str]:
+    """The frames that take up what is open of a calibrated arm's first and last link.
+
+    Its poses make up for that, so that the sigma of such a frame alone says little.
+    """
+    answer, cell = known.solved, known.fitted.cell
+    for robot, base in cell.tree.bases.items():
+        if answer.arms[robot].numbers is None:
+            continue
+        bodies = {cell.tree.flanges[robot]}
+        # All that stands in the cell is placed from the reference, and turns with its arm's zero.
+        bodies |= {cell.tree.root} if base == cell.reference else set()
+        yield base
+        yield from (frame for frame in cell.tree.branches if cell.tree.body(frame) in bodies)
 
 
 def _mount(sights: Sequence[ViewResult]) -> Mount:

@@ -117,11 +117,13 @@ def _praise(findings: Findings, *, is_enough: bool) -> Finding:
         "compare later stops with it."
     )
     used = sum(view.used for view in findings.views)
-    worst = findings.worst[0]
+    known = "".join(
+        f", and {worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm"
+        for worst in findings.worst[:1]
+    )
     return Finding(
         AGREEMENT,
         f"All {used} used views agree: left out of the fit, they are predicted to "
-        f"{findings.held_out.words} (rms), and "
-        f"{worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm.",
+        f"{findings.held_out.words} (rms){known}.",
         keep if is_enough else None,
     )

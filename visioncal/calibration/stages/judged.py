@@ -117,8 +117,9 @@ class Findings:
         pairs: What each camera saw of each target.
         sensors: The cameras and instruments.
         arms: The robots.
-        worst: The worst directions of all unknown edges; the first is named in a good verdict.
-        places: How well places are known.
+        worst: The worst directions of the unknown edges; the first is named in a good verdict. None
+            of those of a cell that take up what is open of a calibrated arm.
+        places: How well places are known; likewise.
         warnings: What earlier stages had to say.
         notes: What of it is no reason for doubt.
         mount: What observed whom.
