@@ -64,6 +64,16 @@ def test_a_planted_mistake_is_named(name, mount):
     assert guess.declared in guess.candidates
 
 
+def test_rows_in_reverse_or_sorted_as_text_are_named():
+    poses, named = cell_poses("eye-in-hand"), set()
+    for seed in range(24):
+        planted = MISTAKES["rows in another order"](poses, np.random.default_rng(seed))
+        guess = guessed(planted)
+        assert is_named(guess, planted), guess.sentence
+        named.add(guess.best.differences)
+    assert len(named) == 5
+
+
 def test_angles_about_two_axes_reach_beyond_those_about_three():
     # The tool points down, and the middle angle about Z, Y, Z is 142 to 170 degrees; as a rotation
     # that was made of it as if about Z, Y, X is written, it is 38 to 10.

@@ -305,6 +305,17 @@ def test_rows_that_were_shuffled_are_named(mount, shuffled, named):
     assert verdict.status == ("bad" if named else "check")
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_rows_paired_crosswise_are_named(seed):
+    """Each pair of views that are exchanged turns as it should, which shuffled rows do not."""
+    cell = simulate(CellOptions(views=12, seed=seed))
+    mates = np.random.default_rng(seed).permutation(12).reshape(6, 2)
+    order = np.arange(12)
+    order[mates] = mates[:, ::-1]
+    verdict = calibrate(session_of(cell, cell.robot.base_from_flange[order])).verdict
+    assert "poses are not those of the images" in verdict.top[0]
+
+
 @pytest.mark.parametrize("bumped", [False, True])
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_what_was_bumped_on_the_flange_is_named_whatever_the_need(mount, bumped):

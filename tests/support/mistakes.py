@@ -161,6 +161,19 @@ def _swapped(poses: Poses, rng: np.random.Generator) -> Poses:
     return replace(poses, robot=numbers(told))
 
 
+def _reordered(poses: Poses, rng: np.random.Generator) -> Poses:
+    """All rows in reverse; or one side's sorted as text, their numbers beginning with 0 or 1."""
+    true, way, start = poses.true_robot, rng.integers(3), int(rng.integers(2))
+    if way == 0:
+        return replace(poses, robot=numbers(true[::-1].copy()))
+    as_text = np.array(sorted(range(start, start + len(true)), key=str)) - start
+    if way == 1:
+        return replace(poses, robot=numbers(true[as_text]))
+    told = np.empty_like(true)
+    told[as_text] = true
+    return replace(poses, robot=numbers(told))
+
+
 def _transposed(poses: Poses, _: np.random.Generator) -> Poses:
     return _told(poses, "matrix-transposed", "m", Reading("matrix"))
 
@@ -191,6 +204,7 @@ MISTAKES: Mapping[str, Plant] = {
     "the other mount": _mount,
     "rows shifted by one": _shifted,
     "two rows exchanged": _swapped,
+    "rows in another order": _reordered,
     "matrices transposed": _transposed,
     "one axis left-handed": _left_handed,
     "base_link for base": _base_link,

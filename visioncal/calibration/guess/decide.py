@@ -26,7 +26,7 @@ from visioncal.calibration.guess.given import (
 from visioncal.calibration.guess.hypothesis import HALF_TURN, Hypothesis
 from visioncal.calibration.guess.messages import notes, sentence
 from visioncal.calibration.guess.result import Candidate, Guess
-from visioncal.calibration.guess.row_exchange import exchanged
+from visioncal.calibration.guess.row_exchange import exchanged, reordered
 from visioncal.calibration.guess.search import search
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
@@ -109,6 +109,12 @@ def _found(recording: Recording, chain: FloatArray | None) -> _Found:
         others = [_by_chain(other, recording, chain) for other in others]
     scored = [declared, *others]
     best = _decided(recording, scored)
+    if best.hypothesis.shift or best.score > CLOSING_SCORE:
+        # Rows that are sorted as text follow each other by shifts, a few at a time.
+        in_order = reordered(recording, declared)
+        if in_order is not None and _explains_more(recording, in_order, best):
+            best = in_order
+            scored.append(best)
     swapped = exchanged(recording, best, is_poor=_is_poor(recording, best))
     if swapped is not None:
         best = swapped
@@ -222,6 +228,18 @@ def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
     return declared if is_open or _is_poor(recording, best) else best
 
 
+def _explains_more(recording: Recording, tried: Scored, best: Scored) -> bool:
+    """Whether more views agree with an order of the rows than with what is best without it."""
+    if _is_poor(recording, tried):
+        return False
+    return best.score > CLOSING_SCORE or _agreeing(tried.fit) > _agreeing(best.fit)
+
+
+def _agreeing(fit: Fit) -> int:
+    """How many views agree with each other."""
+    return int((fit.away <= _AGREES * max(fit.score, SCORE_FLOOR)).sum())
+
+
 def _is_turned_about(recording: Recording, scored: Scored) -> bool:
     """Whether a reading of many views is but an inverse or another mount."""
     tried, declared = scored.hypothesis, recording.declared
@@ -279,7 +297,7 @@ def _candidate(recording: Recording, scored: Scored) -> Candidate:
         rms_mm=1e3 * shift,
         rms_deg=float(np.rad2deg(angle)),
         score=scored.score,
-        agreeing=int((fit.away <= _AGREES * max(fit.score, SCORE_FLOOR)).sum()),
+        agreeing=_agreeing(fit),
         rows=len(fit.away),
         is_board=recording.is_measured,
         other_mount=() if scored.other_mount is None else recording.changes(scored.other_mount),

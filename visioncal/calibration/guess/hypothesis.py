@@ -1,6 +1,6 @@
 """One way to take the numbers of a recording, and what it changes of what was declared."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -133,6 +133,29 @@ class SideReading:
         )
 
 
+def _as_text(count: int) -> IntArray:
+    """(count,) the numbers from 0 on, sorted as text: 0, 1, 10, 11, ..., 2."""
+    return np.array(sorted(range(count), key=str))
+
+
+def _as_text_from_one(count: int) -> IntArray:
+    """(count,) the same where the first has the number 1."""
+    return np.array(sorted(range(1, count + 1), key=str)) - 1
+
+
+# Orders in which the robot's rows stand beside the camera's, and which row belongs to each of
+# `count` views.
+ROW_ORDERS: dict[str, Callable[[int], IntArray]] = {
+    "the robot's poses in reverse order": lambda count: np.arange(count)[::-1].copy(),
+    "the images sorted as text (10 before 2)": _as_text,
+    "the images, counted from 1, sorted as text (10 before 2)": _as_text_from_one,
+    "the robot's poses sorted as text (10 before 2)": lambda count: np.argsort(_as_text(count)),
+    "the robot's poses, counted from 1, sorted as text (10 before 2)": lambda count: np.argsort(
+        _as_text_from_one(count)
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Hypothesis:
     """One way to take a whole recording.
@@ -143,6 +166,7 @@ class Hypothesis:
         mount: How the camera is mounted.
         shift: The robot's row `i + shift` belongs to the camera's row `i`.
         swap: Two of the robot's rows that are exchanged; empty for none.
+        order: In which of `ROW_ORDERS` the rows stand; empty where it is that of the views.
     """
 
     robot: SideReading
@@ -150,10 +174,12 @@ class Hypothesis:
     mount: Mount
     shift: int = 0
     swap: tuple[int, ...] = ()
+    order: str = ""
 
     def rows(self, count: int) -> IntArray:
         """(n,) which of `count` rows of the robot belongs to each of the camera's; -1 for none."""
-        rows = np.arange(count) + self.shift
+        rows = ROW_ORDERS[self.order](count) if self.order else np.arange(count)
+        rows += self.shift
         rows[(rows < 0) | (rows >= count)] = -1
         if self.swap:
             first, second = self.swap
@@ -214,6 +240,8 @@ def _differences(
         where = "after" if tried.shift > 0 else "before"
         count = "one row" if abs(tried.shift) == 1 else f"{abs(tried.shift)} rows"
         yield f"the robot's pose of a view {count} {where} it"
+    if tried.order:
+        yield tried.order
     if tried.swap:
         first, second = (places[row] for row in tried.swap)
         yield f"the robot's poses of {first} and {second} exchanged"

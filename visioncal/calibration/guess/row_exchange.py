@@ -1,4 +1,4 @@
-"""Two rows of the robot that were exchanged: found among the views that disagree with the rest."""
+"""Rows of the robot in another order than the views: two exchanged, or all of them sorted."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -6,8 +6,15 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.calibration.guess.fit import distances, robust_fit
-from visioncal.calibration.guess.given import CLOSING_SCORE, SCORE_FLOOR, Recording, Scored, fitted
-from visioncal.calibration.guess.hypothesis import Hypothesis
+from visioncal.calibration.guess.given import (
+    CLOSING_SCORE,
+    SCORE_FLOOR,
+    STANDS_OUT,
+    Recording,
+    Scored,
+    fitted,
+)
+from visioncal.calibration.guess.hypothesis import ROW_ORDERS, Hypothesis
 
 # A view stands out from here, in the typical distance of those that agree. Exchanged back it has
 # to be nearer than that, and by this many times nearer than it was.
@@ -20,6 +27,25 @@ _FEW = 8
 _CLEARLY = 2.0
 # More views than this that disagree are no two rows exchanged.
 _MOST = 8
+# Sets of views from which the fit of an order is begun.
+_STARTS = 12
+
+
+def reordered(recording: Recording, declared: Scored) -> Scored | None:
+    """Finds the order of all rows in which a chain closes that does not as declared.
+
+    Args:
+        recording: What was recorded.
+        declared: The declared reading.
+
+    Returns:
+        The same reading with its rows in that order; None where none of them closes the chain.
+    """
+    rows = recording.common_rows()[:_MOST_ROWS]
+    ways = (replace(declared.hypothesis, order=order) for order in ROW_ORDERS)
+    best = min((fitted(recording, way, rows, _STARTS) for way in ways), key=lambda way: way.score)
+    is_clear = best.score <= CLOSING_SCORE and STANDS_OUT * best.score < declared.score
+    return replace(best, cost=recording.cost(best.hypothesis)) if is_clear else None
 
 
 def exchanged(recording: Recording, scored: Scored, *, is_poor: bool) -> Scored | None:
@@ -44,9 +70,9 @@ def exchanged(recording: Recording, scored: Scored, *, is_poor: bool) -> Scored 
     out = np.flatnonzero(fit.away > _OUT * typical)
     if not 2 <= len(out) <= min(_MOST, len(fit.away) - 4):
         return None
-    found = []
+    of_robot, found = tried.rows(len(recording.robot)), []
     for pair in combinations(out, 2):
-        rows = tuple(int(scored.rows[at] + tried.shift) for at in pair)
+        rows = tuple(of_robot[scored.rows[list(pair)]].tolist())
         again = _with(recording, scored, replace(tried, swap=rows))
         before, after = fit.away[list(pair)], again.fit.away[list(pair)]
         if after.max() < _OUT * typical and (after < before / _NEARER).all():
@@ -69,8 +95,9 @@ def _on_all_rows(recording: Recording, scored: Scored) -> Scored:
 def _exchanged_among_few(recording: Recording, scored: Scored) -> Scored | None:
     """Tries every exchange: among few views the right ones are no majority to be seen by."""
     tried, found = scored.hypothesis, []
+    of_robot = tried.rows(len(recording.robot))
     for pair in combinations(scored.rows, 2):
-        rows = tuple(int(row + tried.shift) for row in pair)
+        rows = tuple(of_robot[list(pair)].tolist())
         changed = replace(tried, swap=rows)
         robot, camera = changed.chain(recording.robot, recording.camera)
         fit = robust_fit(robot[scored.rows], camera[scored.rows])
