@@ -191,6 +191,24 @@ def test_the_size_of_breathing_does_not_hang_on_where_the_fit_before_had_it(monk
     assert gains[1:] == [pytest.approx(gains[0], abs=1e-2)] * 2
 
 
+def test_a_field_is_not_counted_beside_itself(monkeypatch):
+    """What a fit takes for a lens's field has no part in the next estimate of its size."""
+    asked = []
+    original = refine.lens_levels
+    monkeypatch.setattr(refine, "lens_levels", lambda *them: asked.append(them) or original(*them))
+    calibrated(simulate(replace(FINE, views=20, seed=2)), joints=False)
+    side, fitted = asked[-1]
+    sizes = []
+    for field in (0.0, 0.5):
+        levels = dict.fromkeys(fitted.looks.problems, LensLevels(field=field))
+        before = again(fitted, side, fitted.moving, fitted.looks.with_levels(levels))
+        (found,) = original(side, before).values()
+        sizes.append((found.field, found.gains[0]))
+    assert sizes[0][0] > 0.0
+    # Counted twice, it gained a fifth of that.
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.02)
+
+
 def test_a_fit_that_has_run_away_is_no_bug_of_the_likelihood():
     """`refine.refined` then takes lenses for what their models say."""
     with pytest.raises(ConvergenceError, match="runs away"):

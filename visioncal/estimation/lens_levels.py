@@ -431,6 +431,10 @@ def _rows(
     gradient[places] -= weight * seen.compressed[which].shared_gradient
     kept = problem.moving & jacobian.any(axis=(0, 1))
     kept[places] = problem.moving[places]
+    # What the fit took for this lens's errors is what is asked for anew: it has no place beside.
+    sizes = [compressed.by_field.shape[2] for compressed in seen.compressed]
+    first = problem.effect_columns[LENSES].start + len(seen.free) + sum(sizes[:which])
+    kept[first : first + sizes[which]] = False
     known, gradient = _without(known, gradient, problem.moving & ~kept, kept)
     return _Rows(
         stack,

@@ -108,7 +108,7 @@ def _refined(
         for name, problem in looks.problems.items()
     ):
         answer = again(answer, side, answer.moving, looks)
-    elif np.array_equal(answer.moving, looks.first) and not (levels or side.errors):
+    elif np.array_equal(answer.moving, looks.first) and not (levels or side.has_errors):
         return answer, side
     if is_plain:
         return answer, side
