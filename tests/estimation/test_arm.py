@@ -10,6 +10,7 @@ from support.marks import slow
 import visioncal
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.estimation.arm import LEVER_M, link_basis, pose_basis
+from visioncal.estimation.armmodel import ArmModel
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session
 
@@ -31,6 +32,20 @@ def test_links_move_the_flange_as_their_basis_says():
                 slope = log(invert(links[-1]) @ moved) / step
                 # The first order of a step of 1e-6.
                 np.testing.assert_allclose(basis[row, :, 6 * link + axis], slope, atol=1e-5)
+
+
+@pytest.mark.parametrize("tool_m", [0.0, 0.1])
+def test_the_mean_of_noise_is_no_tool(tool_m):
+    robot, rng, tool = load_robot("ur5e"), np.random.default_rng(0), np.eye(4)
+    tool[2, 3] = tool_m
+    q = rng.uniform(-1.5, 1.5, (25, 6))
+    noise = exp(rng.normal(size=(25, 6)) * np.repeat([5e-5, 3e-5], 3))
+    found = ArmModel.of(robot, q, robot.base_from_flange(q) @ tool @ noise).flange_from_reported
+    if tool_m:
+        # Five times the standard deviation of a mean of 25.
+        np.testing.assert_allclose(found, tool, atol=5e-5)
+    else:
+        np.testing.assert_array_equal(found, np.eye(4))
 
 
 def test_base_and_flange_move_the_flange_as_their_basis_says():

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors
@@ -19,6 +20,8 @@ COMPLIANCE, BACKLASH, WEIGHT = "compliance", "backlash", "weight"
 # Functions of the joints beyond their eccentricity.
 HARMONICS = "harmonics"
 RIGID = ("links", *_FUNCTIONS)
+# The mean of fewer twists says nothing of their noise; that of noise is beyond with this chance.
+_FEWEST_TWISTS, _BY_CHANCE = 6, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,9 @@ class ArmModel:
             q: (m, n) joint angles [rad].
             reported: (m, 4, 4) what the controller reported for them.
         """
-        tool = mean_transform(invert(nominal.base_from_flange(q)) @ reported)
+        tools = invert(nominal.base_from_flange(q)) @ reported
+        # The mean of noise is no tool.
+        tool = np.eye(4) if _is_noise(log(tools)) else mean_transform(tools)
         functions = WeightFunctions.of(nominal) if nominal.masses is None else None
         return cls(nominal, tool, {}, np.zeros(0), functions=functions)
 
@@ -257,6 +262,17 @@ class ArmModel:
         return np.concatenate(
             [value * self.columns(name, q) for name, value in rest.items()], axis=2
         )
+
+
+def _is_noise(twists: FloatArray) -> bool:
+    """Whether the mean of (m, 6) twists is zero but for what they scatter by, alike in all axes."""
+    count = len(twists)
+    if count < _FEWEST_TWISTS:
+        return False
+    mean = twists.mean(axis=0).reshape(2, 3)
+    scatter = (twists - twists.mean(axis=0)).reshape(count, 2, 3).var(axis=(0, 2), ddof=1)
+    limit = f_limit(_BY_CHANCE, 3, 3 * (count - 1))
+    return bool((count * (mean**2).mean(axis=1) <= limit * scatter).all())
 
 
 def blocks_of(robot: Robot, loads: Loads) -> tuple[str, ...]:
