@@ -1,5 +1,6 @@
 """Mistakes made in cells: what is said first. Sessions are made with numpy and OpenCV alone."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,8 +67,9 @@ def write(
     camera: str = "",
     more: str = "",
     has_corners: Callable[[int], bool] = lambda _: True,
+    noise_px: float = 0.1,
 ) -> Path:
-    """Writes a session with corners.csv; robot and corners have noise of 0.03 mm and 0.1 px.
+    """Writes a session with corners.csv; the robot has noise of 0.03 mm.
 
     Args:
         folder: Where.
@@ -75,6 +77,7 @@ def write(
         camera: Further lines of `[camera]`.
         more: Further tables of session.toml.
         has_corners: Whether a view has rows in corners.csv.
+        noise_px: Of the corners' coordinates.
     """
     rng = np.random.default_rng(5)
     folder.mkdir()
@@ -95,7 +98,8 @@ def write(
         lens = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         turn, place = seen.rotation.as_rotvec(), seen.translation
         px, _ = cv2.projectPoints(points, turn, place, lens, np.array(DISTORTION))
-        for point, (u_px, v_px) in enumerate(px[:, 0] + rng.normal(0.0, 0.1, (len(points), 2))):
+        noise = rng.normal(0.0, noise_px, (len(points), 2))
+        for point, (u_px, v_px) in enumerate(px[:, 0] + noise):
             if has_corners(view):
                 corners.append(f"{view},{point},{u_px:.4f},{v_px:.4f}")
     (folder / "views.csv").write_text("\n".join(views) + "\n")
@@ -141,3 +145,38 @@ def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path):
     first = visioncal.calibrate(write(tmp_path / "bumped", stops)).verdict.causes[0]
     assert first.kind == "moved_at_once"
     assert first.words.startswith("The camera moved at once: from view 9 on, it is 1.9 mm and")
+    assert "Another tool frame in the controller would look the same." in first.words
+
+
+def with_lens(stops: Sequence[Stop], longer: Sequence[float], aside_px: float = 0.0) -> list[Stop]:
+    """The same stops with focal lengths that are longer by some shares, and another centre."""
+    fx, fy, cx, cy = MATRIX
+    return [
+        replace(stop, matrix=(fx + fx * share, fy + fy * share, cx + aside_px, cy - aside_px))
+        for stop, share in zip(stops, longer, strict=True)
+    ]
+
+
+def test_a_lens_that_was_zoomed_midway_is_no_camera_that_moved(tmp_path):
+    stops = with_lens(looks(18), [0.0] * 7 + [0.02] * 11)
+    first = visioncal.calibrate(write(tmp_path / "zoomed", stops)).verdict.causes[0]
+    assert first.kind == "lens_changed"
+    found = re.search(r"from view 7 on, its focal length is (\S+) % longer", first.words)
+    # By a step of Newton's method, which is exact to as much as the step.
+    assert float(found.group(1)) == pytest.approx(2.0, abs=0.3)
+    assert "autofocus" in first.do.words
+    # A lens that was hit: its centre is elsewhere.
+    stops = [*looks(18)[:7], *with_lens(looks(18)[7:], [0.0] * 11, aside_px=8.0)]
+    first = visioncal.calibrate(write(tmp_path / "hit", stops)).verdict.causes[0]
+    assert first.kind == "lens_changed"
+    found = re.search(r"from view 7 on, its principal point is \((\S+), (\S+)\) px", first.words)
+    # Known to 1 px.
+    assert np.array(found.groups(), float) == pytest.approx([8.0, -8.0], abs=3.0)
+
+
+@pytest.mark.parametrize("count", [12, 30])
+def test_an_autofocus_is_no_lens_that_changed_midway(tmp_path, count):
+    longer = np.random.default_rng(1).normal(0.0, 0.005, count).tolist()
+    stops = with_lens(looks(count), longer)
+    first = visioncal.calibrate(write(tmp_path / "focus", stops, noise_px=0.02)).verdict.causes[0]
+    assert first.words.startswith("The lens changes its focal length by")

@@ -205,8 +205,7 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
     moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
     step = Remedy("Fasten what moved, and calibrate the views before and after it apart.")
-    parent = problem.tree.branches.get(problem.tree.branches[frame].parent)
-    on_flange = parent is not None and bool(parent.robot)
+    on_flange = problem.tree.body(frame) != problem.tree.root
     if on_flange or len(problem.robots) == 1:
         which = "tool" if on_flange else "base"
         other_mm, other_deg = pose_difference(np.eye(4), edge @ change @ invert(edge))

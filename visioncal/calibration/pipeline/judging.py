@@ -1,6 +1,7 @@
 """What a session is judged by: its cameras, robots and targets, and its weakest link."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -9,11 +10,11 @@ from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
 from visioncal.calibration.pipeline.budget import columns_of_boards, middles_moved, middles_of
 from visioncal.calibration.pipeline.fault_messages import moved_found
-from visioncal.calibration.pipeline.lens_fields import errors_found
+from visioncal.calibration.pipeline.lens_fields import errors_found, lens_changes
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.cause_ranking import NO_JOINTS
+from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.distance_scale import distance_scale
 from visioncal.calibration.stages.judged import (
@@ -35,6 +36,7 @@ from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
 from visioncal.estimation.intervals import freedom_of
+from visioncal.estimation.moves import Move
 from visioncal.estimation.observability import (
     CellWords,
     Direction,
@@ -57,7 +59,8 @@ def findings_of(known: RunState) -> Findings:
     explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
     of_arms = [
-        *doubts_of_arms(
+        _with_alike(doubt, known)
+        for doubt in doubts_of_arms(
             solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell.from_when
         )
     ]
@@ -68,6 +71,10 @@ def findings_of(known: RunState) -> Findings:
         *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
         *solved.found_of_looks(answer.covariance),
     ]
+    of_lenses = [*errors_found(answer.lenses)]
+    doubted = {finding.kind for finding in (*of_arms, *of_lenses, *of_rest)}
+    if doubted & OF_CHAIN or not solved.agreed.used.all():
+        of_lenses += lens_changes(solved)
     return Findings(
         _pairs(tied, explained, answer, alone=known.mount is not None),
         _sensors(tied, answer.sigmas, solved.shown_px, known),
@@ -77,7 +84,7 @@ def findings_of(known: RunState) -> Findings:
         (
             *(fault.found for fault in answer.faults),
             *of_arms,
-            *errors_found(answer.lenses),
+            *of_lenses,
             *known.warnings,
             *(finding for finding in of_rest if finding.kind != NOTE),
             *warnings,
@@ -93,6 +100,17 @@ def findings_of(known: RunState) -> Findings:
         known.session.need,
         picks_of(_pickable(known), known.session.need),
     )
+
+
+def _with_alike(found: Finding, known: RunState) -> Finding:
+    """A frame of one camera and robot that moved at once, with what would look the same."""
+    steps = [test.step for test in known.solved.misfits.values() if isinstance(test.step, Move)]
+    if found.kind != MOVED_FRAME or known.mount is None or not steps:
+        return found
+    tree = known.fitted.cell.tree
+    on_flange = tree.body(steps[0].frame) != tree.root
+    same = "Another tool frame in the controller" if on_flange else "A robot's base that was pushed"
+    return replace(found, words=f"{found.words} {same} would look the same.")
 
 
 def _pickable(known: RunState) -> PickInputs:

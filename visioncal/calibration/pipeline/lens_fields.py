@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.stages.cause_ranking import LENS_CHANGED
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray, IntArray
 from visioncal.core.verdict import Finding, Remedy
@@ -13,11 +14,14 @@ from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, depths_m, displacements
 from visioncal.estimation.lens_levels import SIGNIFICANT
+from visioncal.estimation.lens_step import LensStep, lens_step
 from visioncal.estimation.residual_tests import common_errors, lens_field
 from visioncal.results.lens import LensField
 
 # Variance of displacements that is none beside that of corners; and places an axis to see that.
 _INVISIBLE, _GRID = 1e-4, 12
+# Parts of a step of a lens that are named, in sigmas.
+_CLEARLY = 3.0
 
 
 @dataclass(frozen=True)
@@ -150,6 +154,54 @@ def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatAr
     values, vectors = np.linalg.eigh(np.outer(size, size) * covariance)
     kept = values > _INVISIBLE
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]) / size[:, None])
+
+
+def lens_changes(solved: Solved) -> Iterator[Finding]:
+    """Lenses that were zoomed, focused anew or hit midway, by the corners alone."""
+    seen, looks = solved.seen, solved.looks
+    if seen is None or looks is None:
+        return
+    stations = {row.view: row.station for row in solved.cell.rows}
+    for which, (name, problem) in enumerate(looks.problems.items()):
+        views = problem.stack.views
+        # Images of the lens alone have no time.
+        timed = np.array([view in stations for view in views])
+        stack = replace(problem.stack, zooms=None)
+        stack = stack.with_points(looks.points[stack.ids]).keep(timed[stack.view_of])
+        order = np.argsort([stations[view] for view in stack.views], kind="stable")
+        poses = seen.compressed[which].cam_from_target[timed]
+        step = lens_step(stack, looks.camera(name), poses, order)
+        if step is None:
+            continue
+        first = solved.cell.from_when(stations[stack.views[int(order[step.first])]])
+        of = "The lens" if len(looks.problems) == 1 else f"The lens of {name}"
+        yield Finding(
+            LENS_CHANGED,
+            f"{of} changed: {first}, {_step_words(step)}, by the corners alone; the result is "
+            "between both lenses.",
+            Remedy(
+                "Switch off autofocus and image stabilisation, fasten zoom and focus rings, and "
+                "record again; or keep only the views before or after."
+            ),
+            mahalanobis_sq=step.gain,
+        )
+
+
+def _step_words(step: LensStep) -> str:
+    words = []
+    if abs(step.zoom) > _CLEARLY * step.sigmas[0]:
+        longer = "longer" if step.zoom > 0.0 else "shorter"
+        words.append(
+            f"its focal length is {figure(100.0 * abs(step.zoom))} % {longer} (sigma "
+            f"{figure(100.0 * step.sigmas[0])} %)"
+        )
+    x, y = step.centre_px
+    if max(abs(x) / step.sigmas[1], abs(y) / step.sigmas[2]) > _CLEARLY:
+        words.append(
+            f"its principal point is ({figure(x)}, {figure(y)}) px from where it was (sigma "
+            f"{figure(max(step.sigmas[1:]))} px)"
+        )
+    return " and ".join(words) or "its focal length and principal point are others"
 
 
 def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:

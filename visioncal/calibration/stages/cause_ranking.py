@@ -79,6 +79,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "lens": Evidence(1e-4, _CHAIN),
     "lens_field": Evidence(1e-4, _CHAIN),
     "focus": Evidence(1e-4, _CHAIN),
+    "lens_changed": Evidence(1e-4, _CHAIN),
     "corner_noise": Evidence(1e-4, "corners"),
     "moved_slowly": Evidence(1e-4, _CHAIN),
     "moved_at_once": Evidence(1e-4, _CHAIN),
@@ -92,7 +93,10 @@ EVIDENCE: Mapping[str, Evidence] = {
     "misread_joints": Evidence(1e-3),
     "unexplained": Evidence(_REMARK, _CHAIN),
 }
-MOVED_AT_ONCE = ("moved_at_once", "joint_slipped")
+LENS_CHANGED = "lens_changed"
+MOVED_FRAME = "moved_at_once"
+MOVED_AT_ONCE = (MOVED_FRAME, "joint_slipped")
+OF_CHAIN = frozenset(kind for kind, evidence in EVIDENCE.items() if evidence.misfit == _CHAIN)
 _MOVED = ("moved_slowly", *MOVED_AT_ONCE)
 _OF_ROBOT = ("arm_errors", "robot_noise", "robot_noise_of_pick")
 _UNUSED_JOINTS = ("misread_joints", "other_arm")
@@ -202,9 +206,9 @@ def ranked(
     if picks and (unmet or (too_large and any(doubt.until_mm == 0.0 for doubt in doubts))):
         known = {finding.kind for finding in found if finding.probability}
         # What moved is in the arm's errors by posture and time, too, which are no cause then.
-        known |= {"arm_errors"} if known & {*_MOVED} else set()
+        known |= {"arm_errors"} if known & {*_MOVED, LENS_CHANGED} else set()
         # ... and in the calibration's uncertainty.
-        known |= {"calibration"} if known & {*MOVED_AT_ONCE} else set()
+        known |= {"calibration"} if known & {*MOVED_AT_ONCE, LENS_CHANGED} else set()
         # What was measured badly is in all that the robot seems to err by.
         known |= {*_OF_ROBOT} if "measured_turns" in known else set()
         found += [source for source in _sources(picks, met, more) if source.kind not in known]
@@ -293,6 +297,8 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
             feigned.add("arm_errors")
     if "clock_changed" in first:
         feigned |= {*_MOVED, "arm_errors", "correlated_errors"}
+    if LENS_CHANGED in first:
+        feigned |= OF_CHAIN - {LENS_CHANGED}
     if "lens" in first and first["lens"].mahalanobis_sq:
         feigned |= {"board_size", "board_shape", "arm_errors"}
     return feigned

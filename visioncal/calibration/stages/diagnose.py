@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import NO_JOINTS
+from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
@@ -210,7 +210,7 @@ def _at_once(
         thing = _THINGS.get(step.frame, step.frame)
         do = f"Fasten {thing[0].lower()}{thing[1:]}"
     return Finding(
-        "joint_slipped" if is_joint else "moved_at_once",
+        "joint_slipped" if is_joint else MOVED_FRAME,
         f"{_step_words(step, from_when, joint)}; the result is between "
         f"{'before and after' if is_joint else 'both places'}.{instead}",
         Remedy(f"{do}, and record again; or keep only the views before or after."),
