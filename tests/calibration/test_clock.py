@@ -366,6 +366,20 @@ def test_views_in_milliseconds_are_named(session):
     assert "Divide the column stamp_s" in caught.value.next_step
 
 
+def test_a_stream_that_ends_before_the_views_is_not_taken_for_milliseconds(session):
+    stream = session.streams["robot"]
+    begin = Stream(stream.columns, stream.values[:50])
+    stamps_s = begin["stamp_s"]
+    rows = [
+        {**view.numbers, "stamp_s": stamps_s[-1] + 1.0 + 0.1 * at}
+        for at, view in enumerate(session.views)
+    ]
+    views = [replace(view, numbers=row) for view, row in zip(session.views, rows, strict=True)]
+    short = replace(session, views=tuple(views)).with_streams({"robot": begin})
+    with pytest.raises(DataError, match=r"No view lies within streams/robot\.csv"):
+        calibrate(short)
+
+
 @pytest.mark.parametrize(("per_s", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
 def test_times_of_views_and_robot_in_another_unit_are_named(session, per_s, unit):
     stream = session.streams["robot"]

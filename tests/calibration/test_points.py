@@ -33,6 +33,7 @@ from visioncal.calibration.verification.prediction import predict_stops
 from visioncal.core.errors import DataError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert, log
+from visioncal.core.types import Target
 from visioncal.interchange.formats import load_in_doubt
 from visioncal.present.recording import board, write_recording
 from visioncal.present.report import write_report
@@ -723,3 +724,43 @@ def test_a_rigs_size_is_parted_from_errors_of_the_links(tmp_path, mount, size, d
         percent, sigma = map(float, said.groups())
         assert abs(percent - 0.4) < 4.0 * sigma < 0.1
     assert (result.verdict.status == "good") == (size == 1.0)
+
+
+@pytest.mark.parametrize("is_rig", [False, True])
+@pytest.mark.parametrize("exchanged", ["columns", "size"])
+def test_exchanged_axes_are_named_where_corners_lie_outside_the_image(exchanged, is_rig):
+    cell = simulate(CellOptions(views=12, seed=2))
+    px = [view_corners.px for view_corners in cell.corners]
+    width, height = cell.stated[""].resolution
+    # Some views reach beyond where a turned image ends.
+    assert width > max(view[:, 0].max() for view in px) > height
+    target = cell.options.target
+    if is_rig:
+        places = corner_positions(target)
+        target = Target(
+            "rig",
+            "points",
+            len(places),
+            1,
+            0.3,
+            0.0,
+            points_m=tuple(map(tuple, places.tolist())),
+            point_numbers=tuple(range(len(places))),
+        )
+    seen = [view[:, ::-1] if exchanged == "columns" else view for view in px]
+    size = (height, width) if exchanged == "size" else (width, height)
+    session = Session.from_corners(
+        [(view_corners.ids, view) for view_corners, view in zip(cell.corners, seen, strict=True)],
+        cell.robot.base_from_flange,
+        target,
+        size,
+        mount=cell.options.mount,
+    )
+    with pytest.raises(DataError, match="exchanged") as caught:
+        calibrate(session)
+    error = caught.value
+    assert f"outside the image of {size[0]} x {size[1]} px" in error.message
+    if is_rig or exchanged == "columns":
+        assert "xchange the headings u_px and v_px" in error.next_step
+    if is_rig or exchanged == "size":
+        assert f"resolution = [{size[1]}, {size[0]}]" in error.next_step

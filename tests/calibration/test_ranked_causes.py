@@ -154,6 +154,12 @@ def test_views_that_are_left_out_are_a_cause(views, cause: str) -> None:
     assert ids(judge(left_out(views)))[0] == cause
 
 
+def test_what_happened_comes_before_what_nothing_explains() -> None:
+    found = judge(changed(left_out(range(12, 20)), away_mm=1.0))
+    assert ids(found)[:2] == ["something_moved", "unexplained"]
+    assert found.reasons[0].startswith("Views 12, 13")
+
+
 @pytest.mark.parametrize("need", [None, Need(0.5)])
 def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     large, small = (np.diag(np.repeat([1e-6, value], 3) ** 2)[None] for value in (4e-4, 3e-4))

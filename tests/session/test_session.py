@@ -644,6 +644,13 @@ def test_millimetres_and_degrees_are_noticed(folder: Path) -> None:
     assert "It looks like degrees" in wide
 
 
+def test_positions_in_inches_are_not_called_millimetres(folder: Path) -> None:
+    edit(folder, "views.csv", "0.5,-0.1,.3", "29.5,-3.9,11.8")
+    edit(folder, "views.csv", "0.6,0,0.3", "33.6,0,11.8")
+    (far,) = Session.load(folder).warnings
+    assert "Metres are needed, and these are inches, centimetres or millimetres" in far
+
+
 @pytest.mark.parametrize("extra", ["point", "meas_x_m,meas_y_m,meas_z_m"])
 def test_touches_and_readings_need_no_image(folder: Path, extra: str) -> None:
     cells = "tip" if extra == "point" else "1,2,3"

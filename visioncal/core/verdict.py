@@ -27,9 +27,9 @@ NOT_USABLE = (MISSING, EMPTY_ROWS, OTHER_SIZE)
 # A part of the image in which no corner was seen: a hint where the task says what it needs.
 EMPTY_IMAGE = "empty_image"
 # Rows of poses that are exchanged come first among causes that are as good as certain.
-EXCHANGED, ARM_ERRORS, _SURE = "exchanged_views", "arm_errors", 0.99
+EXCHANGED, ARM_ERRORS, UNEXPLAINED, _SURE = "exchanged_views", "arm_errors", "unexplained", 0.99
 # What says how large errors are, the most important first.
-_SIZES = (NEED, GOOD_FOR, "unexplained", "optimism", "weak_motion", "place", "workspace")
+_SIZES = (NEED, GOOD_FOR, UNEXPLAINED, "optimism", "weak_motion", "place", "workspace")
 
 
 # No need is as small [mm]: what is left out of a result takes nothing from it.
@@ -193,8 +193,9 @@ class Verdict:
 
         def order(finding: Finding) -> tuple[float, int, float]:
             # Among what is as good as certain, rows that are exchanged mislead all the rest, and
-            # errors of an arm, which are always there, come after what happened.
-            place = {EXCHANGED: -1, ARM_ERRORS: 1}.get(finding.kind, 0)
+            # errors of an arm, which are always there, come after what happened; so does what no
+            # cause is known of.
+            place = {EXCHANGED: -1, ARM_ERRORS: 1, UNEXPLAINED: 1}.get(finding.kind, 0)
             return -min(finding.probability, _SURE), place, -finding.probability
 
         return tuple(sorted(found, key=order))

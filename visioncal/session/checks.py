@@ -12,6 +12,8 @@ from visioncal.session.table import View
 
 # No arm reaches this far [m], and no joint of one turns this far [rad].
 _FAR_M, _WIDE_RAD = 20.0, 7.0
+# Positions in inches or centimetres are under this number, those in millimetres mostly beyond.
+_SURELY_MM = 200.0
 
 
 def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) -> None:
@@ -72,11 +74,14 @@ def view_warnings(views: Sequence[View]) -> Iterator[str]:
             for view in views
             if names[0] in view.numbers
         ]
-        if norms and float(np.median(norms)) > _FAR_M:
-            yield (
-                f"views.csv: the median length of ({', '.join(names)}) is {np.median(norms):.4g} "
-                "m. It looks like millimetres: multiply these columns by 0.001."
+        far = float(np.median(norms)) if norms else 0.0
+        if far > _FAR_M:
+            unit = (
+                "It looks like millimetres: multiply these columns by 0.001."
+                if far > _SURELY_MM
+                else "Metres are needed, and these are inches, centimetres or millimetres."
             )
+            yield f"views.csv: the median length of ({', '.join(names)}) is {far:.4g} m. {unit}"
     angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]
     if angles and float(np.median(angles)) > _WIDE_RAD:
         yield (

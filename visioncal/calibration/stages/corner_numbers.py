@@ -1,4 +1,4 @@
-"""Whether corners that another detector has found lie as the drawing numbers them.
+"""Whether corners that another detector has found lie as the drawing numbers them, in the image.
 
 A view of a flat board is a homography, but for noise, the lens and single wild corners: these stay
 under a tenth of the corners' spread. Numbers of another board leave nearly all of it.
@@ -18,6 +18,10 @@ from visioncal.vision.targets import corner_positions
 _MOST_LEFT = 0.3
 # A homography takes four points; with two more there is something left.
 _FEWEST = 6
+# Detectors place corners at the image's edge, or this far outside of it [px].
+_BORDER_PX = 2.0
+# Share of the views from which on targets are taken to be seen from behind.
+_MOST_FROM_BEHIND = 0.5
 # Corners of one row of a grid that are tried; a sheet of paper holds fewer.
 _MOST_A_ROW = 100
 # What a drawing's columns have beyond the corners of a row, by its kind: those whose numbers go row
@@ -73,6 +77,63 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
         culprits=culprits,
         next_step=f"Set columns = {columns} and rows = {rows} in the target's .toml.",
     )
+
+
+def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, int]) -> None:
+    """Refuses corners whose columns, or those of the image's size, are exchanged.
+
+    Args:
+        views: The corners of each view, with its target.
+        resolution: Width and height of the image, as stated [px].
+
+    Raises:
+        DataError: Corners lie beyond the image, and none of all would with the other order.
+    """
+    size = np.array(resolution, dtype=float)
+    outside = [corners for corners, _ in views if _is_beyond(corners.px, size)]
+    if not outside or any(_is_beyond(corners.px, size[::-1]) for corners, _ in views):
+        return
+    width, height = resolution
+    seen = (
+        f"corners of {len(outside)} of {len(views)} views lie outside the image of {width} x "
+        f"{height} px"
+    )
+    columns, sides = "the columns u_px and v_px", "width and height in resolution"
+    # A rig's z may point either way.
+    boards = [(corners, target) for corners, target in views if target.kind != "points"]
+    if not boards:
+        raise DataError(
+            f"Either {columns} of corners.csv or {sides} of session.toml are exchanged: {seen}, "
+            "with either exchanged none.",
+            culprits=["corners.csv: u_px", "corners.csv: v_px", "session.toml: resolution"],
+            next_step=f"If images are {width} x {height} px, exchange the headings u_px and v_px "
+            f"in corners.csv; else write resolution = [{height}, {width}] in session.toml.",
+        )
+    if np.mean([_is_from_behind(*view) for view in boards]) > _MOST_FROM_BEHIND:
+        raise DataError(
+            f"corners.csv: {columns} are exchanged: {seen}, with the columns exchanged none, and "
+            "as they are, the target would be seen from behind.",
+            culprits=["corners.csv: u_px", "corners.csv: v_px"],
+            next_step="Exchange the headings u_px and v_px in the first line of corners.csv.",
+        )
+    raise DataError(
+        f"session.toml: {sides} are exchanged: {seen}, and none outside one of {height} x {width} "
+        "px.",
+        culprits=["session.toml: resolution", *(f"view {corners.view}" for corners in outside)],
+        next_step=f"In [camera] of session.toml, write resolution = [{height}, {width}].",
+    )
+
+
+def _is_beyond(px: FloatArray, size: FloatArray) -> bool:
+    return bool(((px < -_BORDER_PX) | (px > size - 1.0 + _BORDER_PX)).any())
+
+
+def _is_from_behind(corners: Corners, target: Target) -> bool:
+    """Whether the corners of a board turn the other way round than as seen from before it."""
+    points = corner_positions(target)[corners.ids, :2]
+    away = points - points.mean(axis=0)
+    px_from_plane = np.linalg.lstsq(away, corners.px - corners.px.mean(axis=0))[0]
+    return bool(np.linalg.det(px_from_plane) < 0.0)
 
 
 def _fitting_width(views: Iterable[Corners]) -> int | None:

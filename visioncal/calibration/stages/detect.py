@@ -13,7 +13,7 @@ from threading import Condition
 import cv2
 import numpy as np
 
-from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS, check_numbers
+from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS, check_axes, check_numbers
 from visioncal.calibration.stages.image_size import other_size_step
 from visioncal.calibration.stages.kept_corners import KeptCorners, Searched
 from visioncal.core.errors import DataError
@@ -165,6 +165,10 @@ def detect(
     for name in session.boards:
         _check_layout(session, name, views, looks)
     own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
+    check_axes(
+        [(session.corners[view.number], session.boards[session.board_of(view)]) for view in given],
+        resolution,
+    )
     elsewhere = {view.number: _given(session, view, resolution) for view in given}
     for name, target in session.boards.items():
         mine = [elsewhere[view.number] for view in given if session.board_of(view) == name]

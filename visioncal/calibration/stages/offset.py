@@ -28,6 +28,8 @@ FEWEST_VIEWS = 3
 _STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
 # Images of one time whose targets are farther apart, as a share of their distance, are of several.
 _ELSEWHERE = 0.05
+# Views that follow each other faster than cameras take images have no times in milliseconds [ms].
+_LEAST_STEP_MS = 5.0
 # Rows by the names of their images ("10" before "2") fall in a tenth of the steps, shuffled ones in
 # half.
 _SHUFFLED = 0.25
@@ -247,7 +249,8 @@ def no_offset(
             next_step="Fill in stamp_s where the target is in the image.",
         )
     outside = not motion.flange.covers(stamps_s).any()
-    if outside and motion.flange.covers(1e-3 * stamps_s).any():
+    step_s = float(np.median(np.abs(np.diff(stamps_s)))) if len(stamps_s) > 1 else np.inf
+    if outside and motion.flange.covers(1e-3 * stamps_s).any() and step_s > _LEAST_STEP_MS:
         return DataError(
             f"The views' times look like milliseconds: {stamps_s[0]:.6g} to {stamps_s[-1]:.6g}, "
             f"where streams/{motion.name}.csv goes from {begin_s:.6f} to {end_s:.6f} s.",
