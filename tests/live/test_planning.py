@@ -21,9 +21,10 @@ from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.recorded import RoughEdges, begin
 from visioncal.live.planning.selection import CRITERIA
+from visioncal.live.planning.visibility import sight_of
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, Second, fine_camera, simulate
-from visioncal.vision.targets import corner_positions
+from visioncal.vision.targets import corner_positions, extent_m
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
 HAND_EYE, OFFSETS, KINEMATICS = (PURPOSES[name] for name in ("hand-eye", "offsets", "kinematics"))
@@ -266,6 +267,22 @@ def test_open_edges_are_those_nearest_to_what_is_known(mount):
     middle = corner_positions(options.target).mean(axis=0)
     there = [item.cam_from_target(cell.robot.joints)[:, :3] @ [*middle, 1.0] for item in drawn]
     assert np.ptp(there, axis=0).max() < 2e-3
+
+
+def test_stops_are_added_as_far_from_the_board_as_it_has_been_seen():
+    options = CellOptions(robot="ur5e", mount="eye-to-hand", views=10, seed=1)
+    cell = simulate(options)
+    found = begin(so_far_of(cell)).cell
+    low, high = extent_m(found.target)
+    seen, centre = cell.cam_from_target, np.append(0.5 * (low + high), 0.0)
+    away = np.linalg.norm(seen[:, :3, :3] @ centre + seen[:, :3, 3], axis=1)
+    # The fit places camera and board to a tenth of a millimetre.
+    assert found.shown_m == pytest.approx((away.min(), away.max()), abs=1e-3)
+    # Farther off than where the board fills the image, as a camera at the cell's edge looks.
+    near, far = sight_of(replace(found, shown_m=None), 0).distance_m
+    wider = sight_of(replace(found, shown_m=(3.0 * near, 3.0 * far)), 0).distance_m
+    assert wider[0] == near
+    assert wider[1] > 3.0 * far
 
 
 def test_a_session_that_is_good_already_needs_no_stop():

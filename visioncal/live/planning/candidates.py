@@ -117,7 +117,7 @@ def candidates(
     search.run(progress)
     if len(search.kept) < (least or max(_LEAST_SHARE * count, min(_LEAST, count))):
         search.ask_again()
-        raise search.losses.error(len(search.kept), count)
+        raise search.error()
     q = _unwound(cell, search.collisions, np.array([array for array, _ in search.kept]))
     shares = np.array([share for _, share in search.kept])
     return Candidates(q, cell.cam_from_target(q), shares, search.losses.counts())
@@ -165,6 +165,25 @@ class _CandidateSearch:
             q = np.array([q for q, _ in self.kept])
             self._sight = self._sight.nearer_to(self._cell.cam_from_target(q))
             self._narrowed = True
+
+    def error(self) -> DataError:
+        """The error that too few were found."""
+        error, cell = self.losses.error(len(self.kept), self._count), self._cell
+        if (
+            cell.mount == "eye-in-hand"
+            or cell.limits.distance_m is not None
+            or self.losses.worst() not in (AWAY, REACH)
+        ):
+            return error
+        # A camera that does not move may look from farther off than its board asks for.
+        near, far = (1e3 * distance for distance in self._sight.distance_m)
+        return DataError(
+            error.message,
+            culprits=error.culprits,
+            next_step=f"Allow other distances than those at which the board fills the image, "
+            f"{near:.0f} to {far:.0f} mm (--distance-mm), bring camera and arm nearer to each "
+            "other, or look whether the guesses are right.",
+        )
 
     def ask_again(self) -> None:
         """Finds the joints whose limits alone kept the arm from views that it did not reach."""

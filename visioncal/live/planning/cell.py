@@ -122,6 +122,8 @@ class PlanCell:
         covariance: (12, 12) covariance of both edges together (rotation, translation; right
             perturbations), where recorded stops determine it: then both sigmas are typical of it.
             None where the sigmas say all.
+        shown_m: At which distances, from the least to the greatest, the board has been seen already
+            [m]; None where it has not. They are possible, whether it fills the image there or not.
     """
 
     mount: Mount
@@ -137,6 +139,7 @@ class PlanCell:
     limits: Limits = field(default_factory=Limits)
     boxes: tuple[Box, ...] = ()
     covariance: FloatArray | None = None
+    shown_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if corner_positions(self.target)[:, 2].any():
@@ -254,6 +257,7 @@ def cell_of_calibration(
     sigma_m = max(1e-3 * x.sigma_mm, 1e-3 * z.sigma_mm) / np.sqrt(3.0)
     sigma_rad = np.deg2rad(max(x.sigma_deg, z.sigma_deg)) / np.sqrt(3.0)
     noise, pixel_px = _noise(calibration)
+    work = calibration.budget
     return PlanCell(
         calibration.mount,
         arm,
@@ -267,6 +271,7 @@ def cell_of_calibration(
         pixel_px,
         limits,
         boxes,
+        shown_m=None if work is None else (work.distance_m, work.distance_m),
     )
 
 

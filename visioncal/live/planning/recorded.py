@@ -27,7 +27,7 @@ from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.information import RecordedStops
 from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
-from visioncal.vision.targets import first_corners
+from visioncal.vision.targets import extent_m, first_corners
 
 # Without a guess, what is mounted on the flange is about so far from it, per axis [m].
 _MOUNTED_M = 0.1
@@ -150,9 +150,21 @@ def begin(
         boxes,
         covariance,
     )
+    cell = replace(cell, shown_m=_shown_m(cell, begun.problem))
     first_corner = int(first_corners(targets)[begun.board])
     recorded = _recorded(known, begun, edges, first_corner)
     return Begun(cell, recorded, found.refusal, begun.views)
+
+
+def _shown_m(cell: PlanCell, problem: Problem) -> tuple[float, float]:
+    """The least and the greatest distance at which stops show the board that is planned for."""
+    _, board, *_ = problem.unknown
+    shows = np.array(problem.observations.observed) == board
+    flange = problem.poses[problem.robots[0]][problem.observations.stops[shows]]
+    low, high = extent_m(cell.target)
+    seen, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
+    away = np.linalg.norm(seen[:, :3, :3] @ centre + seen[:, :3, 3], axis=1)
+    return float(away.min()), float(away.max())
 
 
 def _recorded(

@@ -263,6 +263,14 @@ def sight_of(cell: PlanCell, seed: int) -> CameraAim:
 
 
 def _distance_m(cell: PlanCell) -> tuple[float, float]:
+    """Distances at which the board fills the image, or has been seen already [m]."""
+    near, far = _filling_m(cell)
+    if cell.shown_m is None:
+        return near, far
+    return min(near, cell.shown_m[0] / _WIDER), max(far, _WIDER * cell.shown_m[1])
+
+
+def _filling_m(cell: PlanCell) -> tuple[float, float]:
     """Distances at which the board fills the image, and stays in it if the guesses are off [m]."""
     # At a distance d the board is off by the errors of both places, by d times the error of the
     # camera's direction, and by half its own size times the error of its own.
