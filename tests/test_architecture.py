@@ -103,7 +103,7 @@ def test_heavy_libraries_enter_in_one_place():
     [
         (
             "visioncal.calibration.pipeline, visioncal.interchange.outputs, "
-            "visioncal.present.report, visioncal.present.recording, visioncal.cli.recorded",
+            "visioncal.present.report, visioncal.present.recording, visioncal.cli.recorded_cell",
             {"depthai", "rtde_control", "rtde_receive", "torch", "kornia", "matplotlib"},
         ),
         # Calibrating a session drives no robot, and simulates none.

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
         DriverError,
         VisioncalError,
     )
+    from visioncal.frames.camera_chain import Plane
     from visioncal.frames.fixture import touched_fixture
     from visioncal.frames.frame_from_images import seen_frame
     from visioncal.frames.locate import locate, locate_target
     from visioncal.frames.located import Located
     from visioncal.frames.picks import locate_views
-    from visioncal.frames.plane import Plane
     from visioncal.frames.single_view import Sight
     from visioncal.frames.target_pose import place_seen
     from visioncal.frames.tcp import touched_tool
@@ -68,7 +68,7 @@ _HOMES = {
     "Loads": "visioncal.robot",
     "Located": "visioncal.frames.located",
     "OnlineCompensator": "visioncal.robot.thermal",
-    "Plane": "visioncal.frames.plane",
+    "Plane": "visioncal.frames.camera_chain",
     "Session": "visioncal.session",
     "Sight": "visioncal.frames.single_view",
     "Verdict": "visioncal.results",

@@ -12,14 +12,7 @@ from pathlib import Path
 import numpy as np
 from results import first, wished, write_section
 from support import thirdparty
-from support.tracked import (
-    errors_of,
-    information,
-    known_of,
-    mounting_bound,
-    reads,
-    solved_of,
-)
+from support.tracked import errors_of, information, known_of, mounting_bound, reads, solved_of
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import invert

@@ -36,7 +36,7 @@ from visioncal.estimation import joint_functions
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.solve import Solution
 from visioncal.interchange.exports import Selection, document
-from visioncal.results.compensation.arms import predicted_sigma_mm
+from visioncal.results.compensation.correction import predicted_sigma_mm
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.session import Session

@@ -18,11 +18,7 @@ from pathlib import Path
 from results import few, write_section
 
 from visioncal.calibration.pipeline import Run, run
-from visioncal.present.recording import (
-    RecordingWriter,
-    read_session,
-    write_recording,
-)
+from visioncal.present.recording import RecordingWriter, read_session, write_recording
 from visioncal.present.viewer import blueprint
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, fine_camera, simulate, write_session

@@ -21,7 +21,7 @@ from results import WORDS, few, first, need, write_section
 from support.killed import kill_and_resume
 
 from visioncal.cli.recorded_cell import RecordedSetup, facts_of, scene_of
-from visioncal.cli.rehearsed import TAKING, planned, recorded
+from visioncal.cli.rehearsal import TAKING, planned, recorded
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture.core import CaptureEvent

@@ -16,13 +16,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    read_truth,
-    simulate,
-    write_session,
-)
+from visioncal.simulation import BOARDS, CellOptions, read_truth, simulate, write_session
 
 CONTRACT_KEYS = {
     "joint_fit",

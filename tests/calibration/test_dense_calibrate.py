@@ -17,12 +17,7 @@ from visioncal.calibration.stages.detect import detect
 from visioncal.core.errors import DataError
 from visioncal.results.sections import CornerResiduals
 from visioncal.session.selecting import is_whole_cell
-from visioncal.simulation import (
-    CellOptions,
-    NetworkOptions,
-    cell_session,
-    simulate,
-)
+from visioncal.simulation import CellOptions, NetworkOptions, cell_session, simulate
 from visioncal.simulation.optics import wide_camera
 from visioncal.simulation.options import BOARDS
 

@@ -9,14 +9,7 @@ import pytest
 from support.cells import arm_found
 from support.commands import visioncal as command
 from support.marks import slow
-from support.tracked import (
-    errors_of,
-    information,
-    known_of,
-    mounting_bound,
-    reads,
-    solved_of,
-)
+from support.tracked import errors_of, information, known_of, mounting_bound, reads, solved_of
 
 import visioncal
 from visioncal.calibration.pipeline import calibrate

@@ -12,13 +12,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import Camera, Corners
 from visioncal.core.verdict import EMPTY_IMAGE
 from visioncal.session import Session
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    fisheye_camera,
-    simulate,
-    wide_camera,
-)
+from visioncal.simulation import BOARDS, CellOptions, fisheye_camera, simulate, wide_camera
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import corner_positions
 

@@ -7,19 +7,13 @@ import pytest
 from support.cells import calibrated, error_of, known_of, session_of
 from support.marks import slow
 
+from visioncal.calibration.pipeline.running import view_evidence
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.pipeline.view_evidence import view_evidence
 from visioncal.calibration.stages.observed import nothing_seen
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, Camera, Target
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.simulation import (
-    CellOptions,
-    fine_camera,
-    fisheye_camera,
-    simulate,
-    wide_camera,
-)
+from visioncal.simulation import CellOptions, fine_camera, fisheye_camera, simulate, wide_camera
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 # Its corners look the same after half a turn, and at small tilts its mirrored pose fits as well.

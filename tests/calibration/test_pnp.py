@@ -12,13 +12,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    project,
-    simulate,
-    wide_camera,
-)
+from visioncal.simulation import BOARDS, CellOptions, project, simulate, wide_camera
 from visioncal.vision.targets import corner_positions, rotations
 
 NOISE_PX = 0.2

@@ -12,11 +12,7 @@ from support.cells import calibrated, showing
 from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages.cause_ranking import (
-    MEASURE_BOARD,
-    NO_JOINTS,
-    with_misread,
-)
+from visioncal.calibration.stages.cause_ranking import MEASURE_BOARD, NO_JOINTS, with_misread
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.judged import PointAccuracy

@@ -11,13 +11,7 @@ from visioncal import calibrate
 from visioncal.core.transforms import exp, invert
 from visioncal.session import MemoryImages, Session, target_document
 from visioncal.session.corners import CornerTable
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    cell_session,
-    read_cell,
-    simulate,
-)
+from visioncal.simulation import BOARDS, CellOptions, cell_session, read_cell, simulate
 from visioncal.simulation.rows import pose_row
 
 SIGMA_PX = 0.05

@@ -15,11 +15,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.effects import EFFECTS
-from visioncal.estimation.effects.delays import (
-    delayed_points,
-    shares_of,
-    target_twists,
-)
+from visioncal.estimation.effects.delays import delayed_points, shares_of, target_twists
 from visioncal.present.recording import write_recording
 from visioncal.present.report.content import method_facts
 from visioncal.session import Session

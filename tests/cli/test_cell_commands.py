@@ -9,9 +9,9 @@ from support.arm_documents import arm_of
 from support.commands import turned_poses, visioncal, write_poses
 from support.whole_cells import LATER, OPTIONS, misfit, part, recorded, saved, simulated, truth
 
+from visioncal.frames.camera_chain import Plane
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.locate import locate
-from visioncal.frames.plane import Plane
 from visioncal.present.advice import left_out
 from visioncal.results import Calibration, RobotResult
 from visioncal.results.compare import compare

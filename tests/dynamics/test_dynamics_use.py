@@ -32,13 +32,7 @@ from visioncal.present.recording.paths import MOTION_TIMELINE
 from visioncal.robot import Inertias, Loads, Robot, load_robot, small_urdf
 from visioncal.session import Session
 from visioncal.simulation.dynamics import LinkBody, drive_torques, real_dynamics
-from visioncal.simulation.exercise import (
-    Senses,
-    exercise_session,
-    multi_sine,
-    record,
-    slow_sweep,
-)
+from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record, slow_sweep
 
 # The rotors of the simulated arm are not among what the maker tells.
 TERMS = FrictionTerms(motor_inertia=True, slow_rad_s=3e-4)

@@ -14,12 +14,11 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
 from visioncal.dynamics import excitation
 from visioncal.dynamics.base import BaseModel, smooth_condition
-from visioncal.dynamics.excitation import ExcitationRequest, excite
+from visioncal.dynamics.excitation import ExcitationRequest, Objective, excite
 from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import Missing, Share, allowed_motion, kept_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import JointMotion
-from visioncal.dynamics.objective import Objective
 from visioncal.robot import Robot, joint_torques, load_robot
 from visioncal.robot.bodies import Body
 from visioncal.simulation.arms import ur_arm

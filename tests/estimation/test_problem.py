@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.problems import ROBOT_SIGMAS, away, moved, observed, pose, true_state, world
 
-from visioncal.calibration.stages.init_network import init_network
+from visioncal.calibration.stages.init_frames import init_network
 from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M

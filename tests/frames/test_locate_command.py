@@ -16,8 +16,8 @@ from visioncal.cli.locate import locate_command
 from visioncal.cli.options import PartOptions
 from visioncal.cli.tcp import tcp_command
 from visioncal.core.errors import DataError
+from visioncal.frames.camera_chain import Plane
 from visioncal.frames.locate import locate
-from visioncal.frames.plane import Plane
 from visioncal.results import Calibration, Edge, FrameFile, Verdict
 
 IN_HAND, TO_HAND = "eye-in-hand", "eye-to-hand"

@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Target
 from visioncal.frames.camera_chain import Eye
-from visioncal.frames.marker_points import seen_markers
+from visioncal.frames.fixture_from_markers import seen_markers
 from visioncal.frames.single_view import Sight, places
 from visioncal.frames.target_in_image import see
 from visioncal.frames.target_pose import place_seen

@@ -12,7 +12,7 @@ import rerun as rr
 from support.commands import Done, visioncal
 from support.drawn import column
 
-from visioncal.calibration.stages.next_views_hint import with_proposal
+from visioncal.calibration.pipeline.running import with_proposal
 from visioncal.cli.review import find_recording
 from visioncal.core.errors import DataError
 from visioncal.present.recording import paths

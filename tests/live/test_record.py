@@ -20,7 +20,7 @@ from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 from support.mjpeg import NetworkCamera, number_of, served
 from support.recorded import REPEATABILITY_M
 
-from visioncal.cli import recorded
+from visioncal.cli import recorded_cell
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import devices
 from visioncal.live.capture.live import HostClock
@@ -62,7 +62,7 @@ def cell(planned, monkeypatch):
 def _use(monkeypatch, arm: FakeArm, camera: FakeCamera) -> None:
     monkeypatch.setattr(devices, "ARMS", {"fake": lambda _: arm, "manual": lambda _: arm})
     monkeypatch.setattr(devices, "CAMERAS", {"fake": lambda *_: camera})
-    monkeypatch.setattr(recorded, "HostClock", lambda: arm.clock)
+    monkeypatch.setattr(recorded_cell, "HostClock", lambda: arm.clock)
 
 
 def record(out, *more: object) -> Done:

@@ -20,13 +20,7 @@ from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.scene import SceneDrawing
 from visioncal.results import Calibration, Edge, ViewResult, to_document
 from visioncal.session import MemoryImages, Session
-from visioncal.simulation import (
-    BoardAt,
-    CameraAt,
-    NetworkOptions,
-    cell_session,
-    simulate,
-)
+from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, cell_session, simulate
 
 KEPT = Path(__file__).parents[1] / "data"
 OPTIONS = NetworkOptions(

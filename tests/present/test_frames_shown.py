@@ -35,7 +35,7 @@ from visioncal.present.recording import (
 from visioncal.present.recording.uncertainty import SIGMAS_95
 from visioncal.present.report.content import edge_facts
 from visioncal.present.report.page import render
-from visioncal.present.report.tools import frame_plot
+from visioncal.present.report.plots import frame_plot
 from visioncal.results import Calibration, Frame, Verdict, to_document
 
 

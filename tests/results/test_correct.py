@@ -25,7 +25,7 @@ from visioncal.results.arm import (
     WorkspacePlace,
     WorkspaceSigma,
 )
-from visioncal.results.compensation.arms import predicted_sigma_mm
+from visioncal.results.compensation.correction import predicted_sigma_mm
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.simulation import forward, simulate

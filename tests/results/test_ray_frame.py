@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.results import Calibration, CameraResult, Edge, to_document
 from visioncal.results.compare import compare
-from visioncal.results.ray_frame import ray_frame
+from visioncal.results.lens import ray_frame
 
 NAME = "flange_from_cam"
 SAMPLE = made_up(4).calibration

@@ -28,13 +28,7 @@ from visioncal.interchange.result_files import load_result
 from visioncal.results import Alignment, Calibration, RobotResult, to_document
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.simulation import (
-    BoardAt,
-    NetworkOptions,
-    RobotAt,
-    cell_session,
-    simulate,
-)
+from visioncal.simulation import BoardAt, NetworkOptions, RobotAt, cell_session, simulate
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
 

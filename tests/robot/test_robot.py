@@ -11,13 +11,7 @@ import pytest
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import parse_toml
-from visioncal.robot import (
-    Robot,
-    load_robot,
-    read_robot_document,
-    robot_file,
-    robot_names,
-)
+from visioncal.robot import Robot, load_robot, read_robot_document, robot_file, robot_names
 
 # Joint, then tool, with a branch (camera) and a wheel that are not between base and tip.
 URDF = """<?xml version="1.0"?>

@@ -6,12 +6,7 @@ from support.moved_arms import robot_with_bodies
 
 from visioncal.core.errors import DataError
 from visioncal.robot import body_regressor, joint_torques
-from visioncal.simulation.dynamics import (
-    LinkBody,
-    drive_torques,
-    nominal_dynamics,
-    real_dynamics,
-)
+from visioncal.simulation.dynamics import LinkBody, drive_torques, nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import multi_sine, record, slow_sweep
 
 

@@ -14,12 +14,7 @@ from visioncal.core.transforms import invert, log
 from visioncal.dynamics.identified import Identified
 from visioncal.results import Calibration
 from visioncal.session import Session
-from visioncal.simulation import (
-    cell_names,
-    cell_session,
-    read_cell,
-    simulate,
-)
+from visioncal.simulation import cell_names, cell_session, read_cell, simulate
 from visioncal.simulation.dynamics import real_dynamics
 
 # Chi-square of six exceeds this in one case of a thousand.

@@ -8,15 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.types import Corners
-from visioncal.results import (
-    Calibration,
-    Edge,
-    Rms,
-    SolverResult,
-    Validation,
-    Verdict,
-    ViewResult,
-)
+from visioncal.results import Calibration, Edge, Rms, SolverResult, Validation, Verdict, ViewResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import MemoryImages, Session, Stream, View
 

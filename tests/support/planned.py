@@ -13,8 +13,8 @@ from visioncal.estimation.parts import Noise
 from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Limits, PlanCell
 from visioncal.live.planning.design import Design, chosen
-from visioncal.live.planning.improving import helps
 from visioncal.live.planning.information import WORLDS, worlds_of
+from visioncal.live.planning.plan import helps
 from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun, SoFar
 from visioncal.robot import load_robot

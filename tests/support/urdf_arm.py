@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from visioncal.robot import (
-    Robot,
-)
+from visioncal.robot import Robot
 
 # A lift and a slanted joint, a fixed joint on the way and one that carries the tip, a joint without
 # an origin, and what a rewritten file must keep.

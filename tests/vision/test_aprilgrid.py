@@ -14,12 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.formats.boards import described_target
 from visioncal.session import Session
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    simulate,
-    write_session,
-)
+from visioncal.simulation import BOARDS, CellOptions, simulate, write_session
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
 from visioncal.vision.finders.identify import identify
 from visioncal.vision.targets import corner_positions, target_document, target_from_document

@@ -13,8 +13,7 @@ from visioncal.core.types import Camera
 from visioncal.vision.dense import library
 from visioncal.vision.dense.blur import Blur, transfer
 from visioncal.vision.dense.fit import fit_corners
-from visioncal.vision.dense.prints import Print
-from visioncal.vision.dense.shown import MIDDLE, explain
+from visioncal.vision.dense.shown import MIDDLE, Print, explain
 from visioncal.vision.finders.template import refine
 
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)

@@ -15,13 +15,7 @@ from visioncal.calibration.stages.detect import DetectOptions, detect
 from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.session import MemoryImages, Session, View
-from visioncal.simulation import (
-    BOARDS,
-    CellOptions,
-    prepare_scene,
-    render,
-    simulate,
-)
+from visioncal.simulation import BOARDS, CellOptions, prepare_scene, render, simulate
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
 from visioncal.vision.finders.headers import claimed_size
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image

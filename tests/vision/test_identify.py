@@ -15,13 +15,7 @@ from typer.testing import CliRunner
 
 from visioncal.cli.target import target_app
 from visioncal.core.errors import DataError
-from visioncal.simulation import (
-    CellOptions,
-    fisheye_camera,
-    prepare_scene,
-    render,
-    simulate,
-)
+from visioncal.simulation import CellOptions, fisheye_camera, prepare_scene, render, simulate
 from visioncal.vision.finders.circles import seen_grids
 from visioncal.vision.finders.identify import identify
 from visioncal.vision.finders.identify_text import to_toml

@@ -17,8 +17,12 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.result_files import load_calibration
 from visioncal.results import Calibration
-from visioncal.results.compensation.arms import CalibratedArm, predicted_sigma_mm
-from visioncal.results.compensation.correction import Corrected, correct
+from visioncal.results.compensation.correction import (
+    CalibratedArm,
+    Corrected,
+    correct,
+    predicted_sigma_mm,
+)
 from visioncal.results.compensation.table import (
     Targets,
     columns_to_send,

@@ -11,7 +11,7 @@ from visioncal.core.files import did_you_mean, some_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from visioncal.frames.plane import Plane
+    from visioncal.frames.camera_chain import Plane
     from visioncal.results import Calibration, Edge
 
 # Digits of a view's number, or of the width or height of an image, and more than any has.
@@ -140,7 +140,7 @@ def plane_of(
     """
     import numpy as np
 
-    from visioncal.frames.plane import Plane
+    from visioncal.frames.camera_chain import Plane
 
     frame, _, height = words.rpartition(":") if ":" in words else (words, "", "z=0")
     if words.startswith("z="):
@@ -160,7 +160,7 @@ def _of_frame(
     calibration: "Calibration",
     boards: "Mapping[str, Edge]",
 ) -> "tuple[Plane, str]":
-    from visioncal.frames.plane import Plane
+    from visioncal.frames.camera_chain import Plane
 
     placed = {**calibration.placed, **boards}
     planes = [name for name in placed if name.startswith(_LEAD) and name != f"{_LEAD}cam"]

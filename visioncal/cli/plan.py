@@ -97,12 +97,7 @@ def _begin(
 
 
 def _report(plan: "Plan") -> None:
-    from visioncal.live.planning.messages import (
-        accuracy_words,
-        looks_note,
-        need_words,
-        summary_of,
-    )
+    from visioncal.live.planning.messages import accuracy_words, looks_note, need_words, summary_of
 
     console = answers()
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))

@@ -69,17 +69,20 @@ def record_command(
     Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
     recording ended before, the arm stands still, and --resume goes on.
     """
-    from visioncal.cli.recorded import (
+    from visioncal.cli.recorded_cell import (
         ViewLines,
         check_all,
         check_driven,
         check_not_begun,
         driven,
+        facts_of,
         finish,
+        guided,
         opened,
         report_departure,
+        scene_of,
+        shown_in,
     )
-    from visioncal.cli.recorded_cell import facts_of, guided, scene_of, shown_in
     from visioncal.live.capture.devices import ArmWish, is_folder
     from visioncal.live.capture.journal import Journal
     from visioncal.live.capture.record import departure

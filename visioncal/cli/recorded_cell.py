@@ -1,27 +1,68 @@
-"""The cell that is recorded: from a plan, or from options."""
+"""The parts of `visioncal record`: the cell from a plan or from options, its stops, its words."""
 
+import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from visioncal.cli.console import say
+import typer
+from rich.markup import escape
+
+from visioncal.cli.console import messages, print_json, say
 from visioncal.cli.record_options import RecordCellOptions
 from visioncal.core.errors import DataError, DriverError
+from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.boards import target_named
 from visioncal.live.capture.coach import Coach
-from visioncal.live.capture.core import Capture, CaptureEvent, Watcher
+from visioncal.live.capture.core import Capture, CaptureEvent, Watcher, line_of, missed, note_of
+from visioncal.live.capture.devices import ArmWish, open_arm, open_camera
 from visioncal.live.capture.facts import CaptureFacts
 from visioncal.live.capture.follow import ask_and_take, follow
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
-from visioncal.live.capture.live import LiveCell
+from visioncal.live.capture.live import HostClock, LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.predict import RecordedAccuracy
-from visioncal.live.drivers.protocols import MovingArm
+from visioncal.live.capture.record import Departure, departure, record
+from visioncal.live.capture.take import Missed
+from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
 from visioncal.live.planning.read_back import PlanFile, read_plan
 from visioncal.robot import Robot, load_robot
+
+if TYPE_CHECKING:
+    from visioncal.present.recording.live import LiveDrawing
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A watcher that draws each view."""
+
+    drawing: "LiveDrawing"
+
+    def stepped(self, step: CaptureEvent) -> None:
+        """Draws a view."""
+        # Rerun takes half a second to import, which recordings that nobody watches need not wait.
+        from visioncal.present.recording.live import LiveView
+
+        found = step.found
+        if isinstance(found, Missed):
+            return
+        known = None if step.accuracy is None or step.accuracy.is_open else step.accuracy.mm
+        self.drawing.draw(
+            LiveView(
+                step.view,
+                found.frame.image,
+                found.corners.px,
+                found.state.base_from_flange,
+                found.state.q,
+                known,
+                note_of(step),
+            )
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +222,6 @@ def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[
         yield []
         return
     # Rerun takes half a second to import, which a recording that nobody watches need not wait for.
-    from visioncal.live.capture.shown import Shown
     from visioncal.present.recording import live
     from visioncal.present.viewer.live import live_viewer
 
@@ -205,3 +245,151 @@ def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[
         except DriverError as error:
             say(f"{error} The recording goes on without it.")
         yield watchers
+
+
+@contextmanager
+def opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
+    """Opens both devices; the block's end lets go of them."""
+    with closing(open_arm(arm, wish)) as opened:
+        if not wish.watch_only and not isinstance(opened, MovingArm):
+            raise DriverError(
+                f"{opened.name} cannot be driven.",
+                culprits=[opened.name],
+                next_step="Guide it by hand: --follow.",
+            )
+        with closing(open_camera(camera, requested)) as device:
+            yield LiveCell(opened, device, HostClock())
+
+
+class ViewLines:
+    """Tells each view in a line."""
+
+    def stepped(self, step: CaptureEvent) -> None:
+        """Prints the line."""
+        say(line_of(step))
+
+
+def driven(
+    cell: LiveCell,
+    scene: RecordedSetup,
+    journal: Journal,
+    taking: CaptureOptions,
+    watchers: Sequence[Watcher],
+    *,
+    asks: bool,
+) -> list[CaptureEvent]:
+    """Drives the plan's stops, after a word of the user."""
+    leaving = departure(cell, scene.planned, [view.number for view in journal.views], taking)
+    report_departure(leaving, cell, taking)
+    if not leaving.stops:
+        return []
+    if asks:
+        _confirm(cell)
+    return record(cell, scene.planned, journal, taking, watchers, lens=cell.camera.factory)
+
+
+def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions) -> None:
+    """Says what is about to happen."""
+    say, count = messages().print, len(leaving.stops)
+    if not count:
+        say("All stops of the plan have their view; nothing is left to drive.")
+        return
+    first, seconds = leaving.stops[0], leaving.duration_s
+    long = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
+    postures = len(leaving.first)
+    via = (
+        f" by {postures - 1} posture{'s' if postures > 2 else ''} in between"
+        if postures > 1
+        else ""
+    )
+    say(
+        escape(
+            f"{cell.arm.name}, {cell.camera.name}: {count} stop{'s' if count > 1 else ''} to drive "
+            f"at {taking.speed:g} rad/s, about {long}"
+        )
+    )
+    say(
+        f"  first to view {first.view}{via}; a joint turns by up to "
+        f"{figure(math.degrees(leaving.turn_rad))} deg; the way is clear of all that was declared "
+        "to the plan"
+    )
+
+
+def _confirm(cell: LiveCell) -> None:
+    if not sys.stdin.isatty():
+        raise DataError(
+            "record: nobody can be asked whether the arm may move: stdin is no terminal.",
+            culprits=["--yes"],
+            next_step="Say --yes where the cell is clear and somebody holds the stop button.",
+        )
+    sentence = f"{cell.arm.name} will move. Is the cell clear, and a hand on the stop button?"
+    if not typer.confirm(sentence, err=True):
+        raise DataError("record: not begun; nothing moved.", next_step="Look with --dry-run.")
+
+
+def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
+    """Ends with status 2 where stops of the plan gave no view."""
+    without = dict(missed(steps))
+    if without:
+        words = "; ".join(f"view {key}: {reason}" for key, reason in without.items())
+        raise DataError(
+            f"{len(without)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
+            f"views are in {journal.folder}.",
+            culprits=[f"view {index}" for index in without],
+            next_step="--resume tries them again.",
+        )
+
+
+def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
+    """Says what there is now."""
+    if as_json:
+        print_json(_summary(journal, steps))
+        return
+    count = len(journal.views)
+    say(
+        f"{count} view{'s' if count != 1 else ''} in {journal.folder}; next: visioncal "
+        f"calibrate {journal.folder} -o out"
+    )
+
+
+def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
+    known = [
+        step.accuracy for step in steps if step.accuracy is not None and not step.accuracy.is_open
+    ]
+    summary: dict[str, Any] = {
+        "session": str(journal.folder),
+        "views": [view.number for view in journal.views],
+        "times_s": [
+            {
+                "view": step.view,
+                **{name: round(value, 3) for name, value in vars(step.times).items()},
+            }
+            for step in steps
+        ],
+    }
+    if known:
+        summary["predicted"] = {"sigma_mm": known[-1].mm, "sigma_deg": known[-1].deg}
+    return summary
+
+
+def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
+    """Refuses to drive without a plan, before a device is asked for."""
+    if drives:
+        _ = scene.planned
+        return
+    raise DataError(
+        "--dry-run: a guided arm is not driven, so there is nothing to say of it.",
+        culprits=["--dry-run"],
+        next_step="Leave it out.",
+    )
+
+
+def check_not_begun(journal: Journal, camera: str) -> None:
+    """A folder begins with its first picture again, which would go to the wrong pose."""
+    if journal.views:
+        raise DataError(
+            f"--resume: {camera} begins with its first picture again, and {len(journal.views)} "
+            "views are there.",
+            culprits=["--resume"],
+            next_step="Record all of it into a new folder.",
+        )

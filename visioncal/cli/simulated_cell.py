@@ -22,13 +22,7 @@ from visioncal.simulation import (
     simulate,
 )
 from visioncal.simulation.dynamics import LinkBody
-from visioncal.simulation.exercise import (
-    ExerciseOptions,
-    Senses,
-    exercise,
-    seed_of,
-    with_exercises,
-)
+from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise, seed_of, with_exercises
 from visioncal.simulation.tracked import THREE, Tracked
 
 _T = TypeVar("_T", RobotAt, CameraAt)

@@ -19,12 +19,7 @@ from scipy.linalg import block_diag
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
-from visioncal.estimation.lens_field import (
-    Coefficients,
-    LensLevels,
-    breathing_columns,
-    field_modes,
-)
+from visioncal.estimation.lens_field import Coefficients, LensLevels, breathing_columns, field_modes
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.variance import Knowledge

@@ -8,10 +8,7 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import (
-    RATIO_PRIOR,
-    robot_likelihood,
-)
+from visioncal.estimation.solve import RATIO_PRIOR, robot_likelihood
 from visioncal.estimation.variance import profile_interval
 
 # Logarithms of the scales at which levels are weighed, from a hundredth, under which they add

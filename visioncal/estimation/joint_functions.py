@@ -23,13 +23,7 @@ from visioncal.estimation.linalg import gram, weighted_gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_likelihood
-from visioncal.estimation.variance import (
-    LEAST_SIGMA,
-    MOST_SIGMA,
-    Knowledge,
-    Likely,
-    most_likely,
-)
+from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge, Likely, most_likely
 
 # Twice the gain in log-likelihood over the same arm without them.
 SIGNIFICANT = 20.0

@@ -17,12 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask
-from visioncal.estimation.corners import (
-    CornerStack,
-    WithoutPoses,
-    floored_sigma_px,
-    reproject,
-)
+from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigma_px, reproject
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, distances, field_modes, zooms
 from visioncal.estimation.linalg import covariance_from, gram

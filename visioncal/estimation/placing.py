@@ -11,12 +11,7 @@ from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.groups import GroupFit, State
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.observability import (
-    SIGMA_LIMIT_M,
-    SIGMA_LIMIT_RAD,
-    Direction,
-    axis_words,
-)
+from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 
 # No instrument of a cell is better [m]: exact coordinates would otherwise be judged by rounding.
 LEAST_NOISE_M = 1e-6

@@ -1,4 +1,4 @@
-"""The calibrated chain from the base to the camera, and its uncertainty at one stop.
+"""The calibrated chain from the base to the camera, its uncertainty at one stop; planes.
 
 Eye-in-hand, `base_from_cam = base_from_flange * flange_from_cam`: the robot's noise at the stop
 where the image was taken is new, and adds to the camera's transform. Eye-to-hand,
@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Self, TypeAlias
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import adjoint, invert, rigid_fault, skew
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.arm import pose_basis
 from visioncal.estimation.chain import edge_names
-from visioncal.results import Calibration, CameraResult
+from visioncal.results import Calibration, CameraResult, Edge
 from visioncal.vision.camera import intrinsics
 
 # A pixel is placed in a millisecond, and need not wait for what calibrated arms take to import.
@@ -333,3 +334,95 @@ def _arm_sigma(calibration: Calibration) -> float:
     found = calibration.arm_errors
     # Where joints are not known, the flange's noise is that of single looks, all of them in it.
     return float(np.deg2rad(found.sigma_deg)) if found and found.of is None else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane in the base: `normal . p = offset`.
+
+    Attributes:
+        normal: (3,) of unit length.
+        offset_m: Its distance from the base's origin along the normal [m].
+        covariance: (4, 4) of normal and offset.
+    """
+
+    normal: FloatArray
+    offset_m: float
+    covariance: FloatArray
+
+    @classmethod
+    @typed
+    def horizontal(cls, z_m: float, sigma_m: float = 0.0) -> Self:
+        """The plane `z = z_m` of the base, of a height known to `sigma_m` [m]."""
+        return cls.through(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, z_m]), sigma_m)
+
+    @classmethod
+    @typed
+    def through(cls, normal: FloatArray, point: FloatArray, sigma_m: float = 0.0) -> Self:
+        """A plane by its normal and a point in it.
+
+        Args:
+            normal: (3,) of any length but zero.
+            point: (3,) in the base [m].
+            sigma_m: How well its offset along the normal is known [m].
+
+        Raises:
+            DataError: The normal has no direction, or a number is not finite or no length in
+                metres.
+        """
+        for name, array in (("normal", normal), ("point", point)):
+            if np.shape(array) != (3,):
+                raise DataError(f"plane: the {name} is {array!r}; three numbers are needed.")
+        length = float(np.linalg.norm(normal))
+        if not np.isfinite(length) or length < 1e-9:
+            raise DataError(
+                f"plane: the normal {np.asarray(normal).tolist()} has no direction.",
+                next_step="Give one of any length but zero; 0,0,1 is upward in the base.",
+            )
+        unit = np.asarray(normal, dtype=float) / length
+        return cls(unit, _length(float(unit @ point)), _offset_covariance(sigma_m))
+
+    @classmethod
+    @typed
+    def of_frame(cls, edge: Edge, z_m: float = 0.0, sigma_m: float = 0.0) -> Self:
+        """The plane `z = z_m` of a frame in the base, such as a fixture.
+
+        The frame counts as independent of the calibration. One that this same camera has placed is
+        not: what both have in common is counted twice then.
+
+        Args:
+            edge: `base_from_fixture`, with its covariance.
+            z_m: Height of the plane in the frame [m].
+            sigma_m: How well that height is known [m].
+        """
+        rotation, origin = edge.matrix[:3, :3], edge.matrix[:3, 3]
+        normal = rotation[:, 2]
+        # What moves the frame by (w, v) turns its normal by w x z and carries its origin along.
+        by_rotation = -rotation @ skew(np.array([0.0, 0.0, 1.0]))
+        slope = np.zeros((4, 6))
+        slope[:3, :3] = by_rotation
+        slope[3, :3] = origin @ by_rotation
+        slope[3, 3:] = normal @ rotation
+        offset = float(normal @ origin) + _length(z_m)
+        covariance = slope @ edge.covariance @ slope.T + _offset_covariance(sigma_m)
+        return cls(normal, _length(offset), covariance)
+
+
+def _length(value_m: float) -> float:
+    if not np.isfinite(value_m) or abs(value_m) > FAR_M:
+        raise DataError(
+            f"plane: it lies {value_m:.4g} m from the base's origin, and no arm reaches farther "
+            f"than {FAR_M:g} m.",
+            next_step="Give the plane in metres.",
+        )
+    return value_m
+
+
+def _offset_covariance(sigma_m: float) -> FloatArray:
+    if not np.isfinite(sigma_m) or sigma_m < 0.0:
+        raise DataError(
+            f"plane: sigma_m is {sigma_m!r}; a standard deviation is needed.",
+            culprits=["sigma_m"],
+            next_step="Give how well its height is known, 0 or more.",
+        )
+    return np.diag([0.0, 0.0, 0.0, sigma_m**2])

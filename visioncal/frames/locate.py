@@ -10,9 +10,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
-from visioncal.frames.camera_chain import ChainStop, Eye, Pose, checked_point, point_slope
+from visioncal.frames.camera_chain import ChainStop, Eye, Plane, Pose, checked_point, point_slope
 from visioncal.frames.located import Located
-from visioncal.frames.plane import Plane
 from visioncal.frames.target_in_image import SeenTarget, see
 from visioncal.results import Calibration
 from visioncal.session.choosing import EYE, Choice

@@ -11,13 +11,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Corners, FloatArray, Image, Target
-from visioncal.estimation.appearance import (
-    SCALE,
-    Appearance,
-    Compressed,
-    compress,
-    shape_basis,
-)
+from visioncal.estimation.appearance import SCALE, Appearance, Compressed, compress, shape_basis
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.gating import gate
 from visioncal.estimation.lens_field import depths_m, zooms

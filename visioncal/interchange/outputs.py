@@ -221,7 +221,7 @@ def write_motions(
 
     def draw(path: Path) -> None:
         from visioncal.live.planning.preview import motion_preview
-        from visioncal.present.recording.motions import write_motion_preview
+        from visioncal.present.recording.preview import write_motion_preview
         from visioncal.present.viewer.planned import motion_blueprint
 
         preview = motion_preview(plan)
@@ -255,7 +255,7 @@ def write_dynamics(folder: Path, run: "Run") -> Written:
 
     def record(path: Path) -> None:
         from visioncal.present.recording.dynamics import write_dynamics_recording
-        from visioncal.present.viewer.dynamics import dynamics_blueprint
+        from visioncal.present.viewer.planned import dynamics_blueprint
 
         write_dynamics_recording(path, run, dynamics_blueprint(run))
 

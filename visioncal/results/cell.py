@@ -10,13 +10,7 @@ from visioncal.core.types import Mount
 from visioncal.results.lens import CameraResult
 from visioncal.results.parts import RobotResult
 from visioncal.results.sections import CellDetails, CellJointFit, CellUncertainty
-from visioncal.session.frames import (
-    CELL,
-    frame_called,
-    frames_of_kind,
-    robots_between,
-    thing_name,
-)
+from visioncal.session.frames import CELL, frame_called, frames_of_kind, robots_between, thing_name
 
 
 @dataclass(frozen=True)

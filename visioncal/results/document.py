@@ -13,7 +13,7 @@ from visioncal.results.arm import StoredRobot
 from visioncal.results.cell import CellResult, Moved, Untied
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
-from visioncal.results.lens import CameraResult
+from visioncal.results.lens import CameraResult, RayFrame
 from visioncal.results.parts import (
     SCHEMA,
     NeedMet,
@@ -22,13 +22,7 @@ from visioncal.results.parts import (
     StoredVerdict,
     check_schema,
 )
-from visioncal.results.ray_frame import RayFrame
-from visioncal.results.sections import (
-    BoardResult,
-    CalibrationSections,
-    CellDetails,
-    RigResult,
-)
+from visioncal.results.sections import BoardResult, CalibrationSections, CellDetails, RigResult
 from visioncal.results.views import CellView, Rms, Validation, ViewResult, rms_of
 from visioncal.session.frames import thing_name
 

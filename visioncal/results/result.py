@@ -29,9 +29,8 @@ from visioncal.results.cell import CellResult
 from visioncal.results.document import ALIGNMENT, fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
-from visioncal.results.lens import CameraResult
+from visioncal.results.lens import CameraResult, RayFrame, ray_frame
 from visioncal.results.parts import NeedMet, RobotResult, SolverResult
-from visioncal.results.ray_frame import RayFrame, ray_frame
 from visioncal.results.sections import CalibrationSections, CellDetails, CellUncertainty
 from visioncal.results.selecting import selected_fields
 from visioncal.results.tree import FrameTree

@@ -4,7 +4,6 @@ This is the only package that knows Pinocchio, and it imports it where a model i
 """
 
 from visioncal.robot.chain import FUNCTION_NAMES, Chain
-from visioncal.robot.constant_part import fit_links, without_functions
 from visioncal.robot.conversion import (
     PARALLEL_RAD,
     convert_table,
@@ -36,22 +35,18 @@ from visioncal.robot.inertia import (
 from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
 from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
 from visioncal.robot.rates import RATE_KEYS, Rates
-from visioncal.robot.tables import (
-    DHTable,
-    table_document,
-    table_from_document,
-)
+from visioncal.robot.tables import DHTable, table_document, table_from_document
 from visioncal.robot.torques import body_regressor, joint_torques, momenta, torque_regressor
-from visioncal.robot.urdf_bodies import weighed_urdf
-from visioncal.robot.urdfs import corrected_tip, corrected_urdf
-from visioncal.robot.weighing import with_inertias
+from visioncal.robot.urdfs import corrected_tip, corrected_urdf, weighed_urdf, with_inertias
 from visioncal.robot.weights import WeightFunctions
 from visioncal.robot.writing import (
+    fit_links,
     small_urdf,
     table_toml,
     unwritten,
     ur_flange,
     ur_kinematics_yaml,
+    without_functions,
 )
 
 __all__ = [

@@ -25,14 +25,7 @@ from visioncal.robot.kinematics import (
     placement_derivatives,
     weight_jacobian,
 )
-from visioncal.robot.loads import (
-    MASS_KEYS,
-    Loads,
-    Masses,
-    gravity_of,
-    load_torques,
-    masses_of_rows,
-)
+from visioncal.robot.loads import MASS_KEYS, Loads, Masses, gravity_of, load_torques, masses_of_rows
 from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
 

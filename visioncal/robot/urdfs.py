@@ -1,6 +1,7 @@
-"""A given URDF with other origins of its joints, and nothing else changed."""
+"""A given robot or URDF with other origins of its joints or inertias, and nothing else changed."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -10,8 +11,11 @@ from visioncal.core.documents import Element, parse_xml
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
+from visioncal.robot.chain import chain_document
+from visioncal.robot.inertia import Inertias
 from visioncal.robot.model import Robot
-from visioncal.robot.writing import comment_lines, numbers_text
+from visioncal.robot.tables import row_frames, table_from_document
+from visioncal.robot.writing import comment_lines, inertial_lines, numbers_text
 
 
 def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) -> str:
@@ -129,3 +133,100 @@ def _more(tip: str, joints: Mapping[str, Element], step: FloatArray) -> bytes:
         f'    <origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"/>\n'
         "  </joint>\n"
     ).encode()
+
+
+def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
+    """Builds an arm whose links weigh otherwise.
+
+    Args:
+        robot: The arm. A table or a chain stays one; a URDF becomes a chain.
+        inertias: Of its links, in the joints' frames.
+
+    Returns:
+        The arm, whose document states the masses, their centres and the inertias.
+    """
+    if "convention" in robot.document:
+        document = dict(robot.document)
+        joint_from_row = row_frames(table_from_document(document))
+    else:
+        document = robot.weighted(chain_document(robot.name, robot.tip, robot.chain))
+        joint_from_row = np.broadcast_to(np.eye(4), (robot.joint_count, 4, 4))
+    rows = zip(document["joint"], _seen_from(inertias, joint_from_row).rows(), strict=True)
+    joints: list[dict[str, Any]] = [{**row, **own} for row, own in rows]
+    return Robot.from_document(document | {"joint": joints})
+
+
+def _seen_from(inertias: Inertias, joint_from_row: FloatArray) -> Inertias:
+    """The inertias in other frames of the same links."""
+    row_from_joint = invert(joint_from_row)
+    rotation, place = row_from_joint[:, :3, :3], row_from_joint[:, :3, 3]
+    masses = inertias.masses
+    centres = (rotation @ masses.centres_m[:, :, None])[:, :, 0] + place
+    about = rotation @ inertias.about_centres @ np.swapaxes(rotation, 1, 2)
+    return Inertias.of_bodies(masses.kg, centres, about)
+
+
+def weighed_urdf(robot: Robot, inertias: Inertias, notes: Sequence[str] = ()) -> str:
+    """Writes the URDF of a robot with the inertias that were identified.
+
+    What moves with a joint of the arm is one body: the link behind the joint gets all of its
+    inertia, and other links that move with it none.
+
+    Args:
+        robot: The robot as a URDF describes it.
+        inertias: Of what moves with its joints.
+        notes: Lines for comments at the head of the robot.
+
+    Returns:
+        The text.
+
+    Raises:
+        DataError: The robot is not of a URDF.
+    """
+    text = robot.document.get("urdf")
+    if not isinstance(text, str):
+        raise DataError(
+            f"robot {robot.name}: a robot of a URDF is needed.",
+            culprits=[robot.name],
+            next_step="Write a small URDF or a joint table instead.",
+        )
+    data = text.encode("utf-8")
+    root, joints = joints_of(data)
+    links = {child.attributes["name"]: child for child in root.children if child.tag == "link"}
+    masses = inertias.masses
+    bodies = zip(masses.kg.tolist(), masses.centres_m, inertias.about_centres, strict=True)
+    edits = []
+    for joint, body in zip(robot.joint_names, bodies, strict=True):
+        own = end_of(joints[joint], "child")
+        for name in _moving_with(own, joints, robot.joint_names):
+            lines = inertial_lines(*body) if name == own else []
+            edits.append(_inertial_edit(data, links[name], "\n".join(lines)))
+    if notes:
+        head = "\n" + "\n".join(comment_lines(robot, notes))
+        edits.append((root.inside, root.inside, head.encode("utf-8")))
+    return edited(data, edits)
+
+
+def _moving_with(link: str, joints: Mapping[str, Element], arm: Sequence[str]) -> list[str]:
+    """A link and all that hang on it without one of the arm's joints between."""
+    found = [link]
+    for name in found:
+        found += [
+            end_of(element, "child")
+            for joint, element in joints.items()
+            if end_of(element, "parent") == name and joint not in arm
+        ]
+    return found
+
+
+def _inertial_edit(data: bytes, link: Element, inertial: str) -> tuple[int, int, bytes]:
+    """From where to where to put what, to give a link another inertia or none."""
+    before = link.child("inertial")
+    if before is not None:
+        return before.begin, before.end, inertial.strip().encode("utf-8")
+    if not inertial:
+        return link.inside, link.inside, b""
+    if not link.is_empty:
+        return link.inside, link.inside, f"\n{inertial}".encode()
+    slash = data.rindex(b"/", link.begin, link.inside)
+    return slash, link.inside, f">\n{inertial}\n  </link>".encode()

@@ -1,7 +1,7 @@
 """Sessions: what was recorded of a cell, as a folder of session.toml, views.csv and images.
 
 A folder may come from a stranger. What its tables name lies inside it, wherever links lead; what
-session.toml names itself, boards and robots, may lie outside, which `outside` says to the user.
+session.toml names itself, boards and robots, may lie outside, which `kinds` says to the user.
 """
 
 from visioncal.session.document import Declaration

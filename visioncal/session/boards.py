@@ -8,7 +8,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Target
 from visioncal.core.verdict import READ_AGAIN
 from visioncal.session.document import Declaration
-from visioncal.session.outside import without_content
+from visioncal.session.kinds import without_content
 from visioncal.vision.targets import misspelt_keys, read_target, target_from_document
 
 # The column of views.csv that names the target of a row.

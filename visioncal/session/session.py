@@ -33,9 +33,14 @@ from visioncal.session.digest import digest_facts
 from visioncal.session.document import Declaration, declaration_warnings, read_declaration
 from visioncal.session.frames import check_frames, frame_name, resolve_frames, robots_of
 from visioncal.session.images import FolderImages, ImageStore, MemoryImages
-from visioncal.session.kinds import check_kinds_named, is_seen, kind_warnings, read_robots
+from visioncal.session.kinds import (
+    check_kinds_named,
+    is_seen,
+    kind_warnings,
+    outside_warnings,
+    read_robots,
+)
 from visioncal.session.observations import Observation, observations_of, stop_warnings
-from visioncal.session.outside import outside_warnings
 from visioncal.session.saving import placed_files, write_folder
 from visioncal.session.selecting import select
 from visioncal.session.streams import (

@@ -35,10 +35,9 @@ from visioncal.simulation.optics import (
     wide_camera,
 )
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
-from visioncal.simulation.real_arm import ArmOptions
 from visioncal.simulation.records import cell_session, measured_poses, write_session
 from visioncal.simulation.render import RenderScene, prepare_scene, render
-from visioncal.simulation.sag import Payload
+from visioncal.simulation.sag import ArmOptions, Payload
 from visioncal.simulation.sweep import sweep
 from visioncal.simulation.touching import touch
 from visioncal.simulation.truth import Truth, read_truth, truth_path

@@ -11,7 +11,7 @@ from visioncal.simulation.draws import DrawOptions
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
 from visioncal.simulation.poses import Motion, Viewpoints
-from visioncal.simulation.real_arm import ArmOptions
+from visioncal.simulation.sag import ArmOptions
 
 # Where robots meet [m].
 MIDDLE_M = (0.0, 0.0, 0.4)

@@ -30,13 +30,7 @@ from visioncal.simulation.rasters import (
     columns_of,
     trace,
 )
-from visioncal.simulation.textures import (
-    SheetTexture,
-    draw_sheet,
-    draw_table,
-    draw_wall,
-    margin_m,
-)
+from visioncal.simulation.textures import SheetTexture, draw_sheet, draw_table, draw_wall, margin_m
 
 # Sub-pixels along a pixel's side.
 _SAMPLES = 3

@@ -9,8 +9,8 @@ from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation.arms import DhArm, arm_named, forward
-from visioncal.simulation.real_arm import ArmOptions
 from visioncal.simulation.rows import POSE, load_row, pose_row
+from visioncal.simulation.sag import ArmOptions
 from visioncal.simulation.truth import write_truth
 
 

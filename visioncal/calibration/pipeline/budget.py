@@ -11,12 +11,7 @@ from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.validate import HeldOut, validate
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import shape_basis, shape_slices
-from visioncal.estimation.budget import (
-    Sources,
-    covariance_by_source,
-    point_covariance,
-    radius95,
-)
+from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.parts import State

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
-from visioncal.calibration.pipeline.inliers import first_inliers
 from visioncal.calibration.pipeline.reading_hints import misreadings, reading_hint
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first
+from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.image_size import other_images

@@ -16,7 +16,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.distance_scale import distance_scale
+from visioncal.calibration.stages.distance_scale import distance_scale, measured_turns
 from visioncal.calibration.stages.judged import (
     Findings,
     JudgedArm,
@@ -24,7 +24,6 @@ from visioncal.calibration.stages.judged import (
     PointAccuracy,
     Sensor,
 )
-from visioncal.calibration.stages.measured_turns import measured_turns
 from visioncal.calibration.stages.need import PickInputs, picks_of
 from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.files import some_of

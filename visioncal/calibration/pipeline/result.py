@@ -1,4 +1,4 @@
-"""What is known when all steps have run, put together as a Calibration.
+"""What is known when all steps have run, put together as a Calibration, a whole cell too.
 
 With it goes what a later look at the same cell has to know of the joint fit.
 """
@@ -10,33 +10,49 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.pipeline.holdout import held_by_both_arms
-from visioncal.calibration.pipeline.lens_documents import cameras_of, shapes_of
+from visioncal.calibration.pipeline.answer import held_by_both_arms
+from visioncal.calibration.pipeline.judging import weakest_link
+from visioncal.calibration.pipeline.lens_fields import lens_field_of
+from visioncal.calibration.pipeline.network_ties import untied_words
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.whole import (
-    arm_sections,
-    cell_edges,
-    cell_of,
-    noise_intervals,
-)
+from visioncal.calibration.pipeline.solved import within
+from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
 from visioncal.calibration.stages.readings import Readings
 from visioncal.core.transforms import adjoint, invert
-from visioncal.core.types import FloatArray
-from visioncal.estimation.arm import misfit_jacobian
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.appearance import BOARD_NAMES, shape_slices
+from visioncal.estimation.arm import misfit_jacobian, stops_of
 from visioncal.estimation.armmodel import HARMONICS
 from visioncal.estimation.chain import edge_names
-from visioncal.results import HELD_BACK, Calibration, SolverResult, Validation, ViewResult
+from visioncal.results import (
+    HELD_BACK,
+    Calibration,
+    CameraResult,
+    CellResult,
+    RobotResult,
+    SolverResult,
+    Untied,
+    Validation,
+    ViewResult,
+)
 from visioncal.results.arm import ArmSections
 from visioncal.results.sections import (
+    BoardResult,
+    CellDetails,
+    CellJointFit,
+    CellUncertainty,
     FittedArm,
     InstrumentResult,
+    Intervals,
     JointFit,
     PointResult,
+    RigResult,
     UncertaintyResult,
 )
 from visioncal.results.views import rms_of
+from visioncal.robot import Robot
 from visioncal.session import View, frame_name
 from visioncal.session.frames import thing_name
 from visioncal.vision.targets import target_document
@@ -311,3 +327,178 @@ def _written(known: RunState) -> FloatArray:
     of_errors, model = rows[errors], known.robot_arm.model
     kept = slice(None) if model is None else model.is_kept
     return np.concatenate([rows[:12], rows[looks], *further, of_errors[kept]])
+
+
+def cell_of(known: RunState) -> CellResult:
+    """Puts together what is known of a whole cell by name when all steps have run."""
+    session, cell, solved, answer = known.session, known.cell, known.fitted, known.solved
+    placed = cell_edges(known)
+    kept = {
+        name: branch.parent
+        for name, branch in cell.tree.branches.items()
+        if name in solved.cell.tree.branches
+    }
+    parents = {frame: name.partition("_from_")[0] for frame, name in placed.items()}
+    return CellResult(
+        reference=cell.reference,
+        tree=kept | parents,
+        cameras={thing_name(name, "camera"): lens for name, lens in cameras_of(known).items()},
+        robots=_robots(known),
+        targets={
+            name or "target": target_document(plate) for name, plate in session.plates.items()
+        },
+        noise=answer.sigmas,
+        moved=answer.moved,
+        untied=tuple(Untied(name, untied_words(cell, name)) for name in solved.untied),
+        weakest=weakest_link(solved.cell, answer.last_edges),
+        details=_details(known),
+        joint_fit=fit_section(known),
+        uncertainty=CellUncertainty(
+            budget_mm={placed[frame]: mm for frame, mm in answer.budget_mm.items()},
+            noise_95=noise_intervals(known),
+        ),
+    )
+
+
+def cell_edges(known: RunState) -> dict[str, str]:
+    """The names of a whole cell's edges by the frames that they place."""
+    branches = known.solved.problem.tree.branches
+    named = known.solved.versions.values()
+    return {
+        version.name: f"{branches[version.key].parent}_from_{version.name}" for version in named
+    }
+
+
+def _robots(known: RunState) -> dict[str, RobotResult]:
+    session, solved = known.session, known.fitted
+    models = session.robot_documents
+    found = {
+        robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
+        for name in session.robots
+    }
+    for name in solved.arms:
+        found[name] = RobotResult(found[name].model, **vars(arm_sections(known, name)))
+    return found
+
+
+def arm_sections(known: RunState, robot: str) -> ArmSections:
+    """What was found of a robot's arm."""
+    solved, answer, first = known.fitted, known.solved, dict[int, int]()
+    for row in solved.cell.rows:
+        first.setdefault(row.station, row.view)
+    stops = stops_of(answer.problem, robot)
+    found = answer.arms[robot]
+    return solved.arms[robot].at(stops).result(found, [first[index] for index in stops.tolist()])
+
+
+def _details(known: RunState) -> CellDetails:
+    """What was found of clocks."""
+    return CellDetails({key.words: at.result() for key, at in known.solved.clocks(known).items()})
+
+
+def noise_intervals(known: RunState) -> dict[str, Intervals]:
+    """95 % intervals of the levels of robots, as the noise names them."""
+    pairs = zip(known.solved.problem.robots, known.solved.intervals, strict=True)
+    return {
+        robot: {
+            "translation_mm": _ends(1e3 * shift_m),
+            "rotation_deg": _ends(np.rad2deg(turn_rad)),
+        }
+        for robot, (turn_rad, shift_m) in pairs
+    }
+
+
+def _ends(interval: FloatArray) -> tuple[float, float]:
+    """The ends of an interval."""
+    low, high = interval.tolist()
+    return low, high
+
+
+def cameras_of(known: RunState) -> dict[str, CameraResult]:
+    """The cameras by their frames, as the fit has them, with their covariance.
+
+    A camera's covariance, the edges', and that of both together are blocks of one matrix. Given
+    intrinsics of which only a part is uncertain, the matrix and not the distortion, have zeros for
+    the rest.
+    """
+    solved, covariance, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
+    seen, looks = solved.seen, solved.looks
+    # Measured poses do without a camera; whoever looks through it later does not.
+    found = {
+        frame: CameraResult(camera, estimated=False)
+        for name, table in known.session.cameras.items()
+        if (frame := frame_name("camera", name)) in solved.cell.tree.branches
+        and (camera := table.stated) is not None
+    }
+    if seen is None or looks is None:
+        return found | dict(known.lenses)
+    for name, scene in known.scenes.items():
+        lens = looks.lens_of(name)
+        free = np.isin(lens, seen.free)
+        estimated = scene.estimated or bool(np.isin(lens, seen.moving).any())
+        found[name] = CameraResult(looks.camera(name), estimated)
+        if free.any():
+            at = solved.columns_of(lens[free])
+            own, shared = np.zeros((len(lens),) * 2), np.zeros((len(lens), edges))
+            own[np.ix_(free, free)] = covariance[np.ix_(at, at)]
+            shared[free] = covariance[at, :edges]
+            found[name] = CameraResult(looks.camera(name), estimated, own, shared)
+        found[name] = replace(found[name], field=lens_field_of(solved, name, covariance, edges))
+    return found
+
+
+def fit_section(known: RunState) -> CellJointFit:
+    """The unknowns of the fit of a whole cell, with their covariance."""
+    solved, covariance, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
+    seen, looks = solved.seen, solved.looks
+    if seen is None or looks is None:
+        return CellJointFit(cameras={}, targets={}, covariance=covariance[:edges, :edges])
+    columns = [*range(edges), *solved.columns_of(seen.free).tolist()]
+    return CellJointFit(
+        cameras={
+            thing_name(name, "camera"): _among(seen.free, at) for name, at in looks.lenses.items()
+        },
+        targets={name: _among(seen.free, shape) for name, shape in _shapes(known).items()},
+        covariance=covariance[np.ix_(columns, columns)],
+    )
+
+
+def shapes_of(known: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
+    """The boards and the rigs as they were found to be, by name; exact rigs are left out."""
+    solved, covariance = known.fitted, known.solved.covariance
+    seen, looks = solved.seen, solved.looks
+    boards, rigs = dict[str, BoardResult](), dict[str, RigResult]()
+    if seen is None or looks is None:
+        return boards, rigs
+    every = np.zeros(len(looks.values))
+    every[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
+    shapes = zip(_shapes(known).items(), known.session.boards.items(), looks.corners, strict=True)
+    for (name, mine), (plate, target), corners in shapes:
+        if frame_name("target", plate) not in solved.part.tree.branches:
+            continue
+        values, sigmas, free = looks.values[mine], every[mine], _among(seen.free, mine)
+        if target.kind != "points":
+            boards[name] = BoardResult(
+                shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
+                sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in free},
+                estimated=tuple(BOARD_NAMES[at] for at in _among(seen.moving, mine)),
+                bend_mm=1e3 * float(np.ptp(corners[:, 2])),
+            )
+        elif free:
+            rigs[name] = RigResult(shape=values.reshape(-1, 3), sigma=sigmas.reshape(-1, 3))
+    return boards, rigs
+
+
+def _shapes(known: RunState) -> dict[str, slice]:
+    """Where each target's shape stands among the values of lenses and boards."""
+    looks = known.fitted.looks
+    if looks is None:
+        return {}
+    targets = tuple(known.session.boards.values())
+    names = tuple(name or "target" for name in known.session.plates) or ("target",)
+    return dict(zip(names, shape_slices(targets, looks.boards.start), strict=True))
+
+
+def _among(places: IntArray, mine: slice) -> tuple[int, ...]:
+    """Which values of a lens or a target are among some, from its own first on."""
+    return tuple(int(value) for value in within(places, mine) - mine.start)

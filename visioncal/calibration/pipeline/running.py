@@ -1,31 +1,42 @@
-"""Taking a session of any cell, of one camera and one robot or of many, through all steps."""
+"""Taking a session of any cell, one camera and robot or many, to result and evidence."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypedDict, Unpack
 
+import numpy as np
+
+from visioncal.calibration.pipeline.answer import held_back
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.judging import poor_motion
 from visioncal.calibration.pipeline.reading_hints import is_suspect, misreadings, reading_hint
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.pipeline.view_evidence import view_evidence
 from visioncal.calibration.stages.cause_ranking import with_misread, with_other_board
+from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.handeye import SOLVER_NAMES
 from visioncal.calibration.stages.kinematics import check_level
-from visioncal.calibration.stages.next_views_hint import of_arm_that_cannot_tilt, with_proposal
 from visioncal.calibration.stages.pictures import because, unseen_cause
+from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import CONVENTIONS, Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Progress
+from visioncal.core.types import Corners, FloatArray, Progress
 from visioncal.core.verdict import Finding
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
+from visioncal.session.observations import Observation
+from visioncal.vision.targets import first_corners
+
+# Advice to add stops or views of any kind; of the first, those that are about the arm.
+_ADD = re.compile(r"\bAdd (?:stops|views|\d+ or more)\b")
+_OR_MEASURED = re.compile(r".*Where the arm cannot tilt, (measure that offset for \S+)\..*")
+_ARM = re.compile(r"\bAdd (?:stops|views in which the arm)\b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,3 +190,95 @@ def _with_reading(known: RunState, seen: RunState | None, hint: Finding | None) 
     if hint is None:
         return known
     return replace(known, verdict=with_misread(known.verdict, hint))
+
+
+def view_evidence(known: RunState) -> tuple[ViewEvidence, ...]:
+    """Collects what was seen and computed of each view."""
+    solved, state = known.fitted, known.solved.state
+    held = held_back(solved, known)
+    problems = [(solved.cell.rows, solved.poses, solved.agreed.problem)]
+    problems += [] if held is None else [(held.rows, held.views, held.problem)]
+    found = dict[int, ViewEvidence]()
+    for rows, views, problem in problems:
+        poses = zip(problem.measured(state), problem.predicted(state), strict=True)
+        for row, view, (measured, predicted) in zip(rows, views, poses, strict=True):
+            px = None
+            if view.corners is not None:
+                px = _predicted(known, row.seer, predicted, view.corners)
+            found[row.view] = ViewEvidence(row.view, view.corners, px, None, measured)
+    stood = {observation.view.number: observation for observation in known.timed.observations}
+    return tuple(
+        _evidence(known, view.number, found.get(view.number), stood.get(view.number))
+        for view in known.session.views
+    )
+
+
+def _evidence(
+    known: RunState, view: int, found: ViewEvidence | None, row: Observation | None
+) -> ViewEvidence:
+    if found is None:
+        poses = known.poses.get(view)
+        found = ViewEvidence(
+            view,
+            known.corners.get(view) if poses is None else poses.corners,
+            cam_from_target=None if poses is None else poses.cam_from_target[0],
+        )
+    corners = None if found.corners is None else _own_numbers(known, found.corners)
+    return replace(found, corners=corners, base_from_flange=_flange(known, view, row))
+
+
+def _flange(known: RunState, view: int, row: Observation | None) -> FloatArray | None:
+    """(4, 4) where the robot stood: by the calibrated arm where there is one."""
+    if row is not None and len(row.robots) == 1:
+        arm = known.fitted.arms.get(robot_key(next(iter(row.robots))))
+        if arm is not None and arm.stood[row.station]:
+            return np.asarray(arm.poses[row.station])
+    return known.base_from_flange.get(view)
+
+
+def _own_numbers(known: RunState, corners: Corners) -> Corners:
+    """The corners of a view by their numbers on its own board, again."""
+    if len(known.session.boards) < 2 or not len(corners.ids):
+        return corners
+    starts = first_corners(tuple(known.session.boards.values()))
+    return replace(corners, ids=corners.ids - int(starts[starts <= corners.ids[0]][-1]))
+
+
+def _predicted(
+    known: RunState, seer: str, cam_from_target: FloatArray, corners: Corners
+) -> FloatArray | None:
+    looks = known.fitted.looks
+    if looks is None or seer not in looks.problems:
+        return None
+    positions = looks.points[corners.ids]
+    return predict_corners(looks.camera(seer), cam_from_target, positions)
+
+
+def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...]:
+    """Points to `visioncal plan` behind the first advice to add views; once is enough.
+
+    Args:
+        sentences: Advice, reasons of a verdict; changed is the first that asks for views.
+        modelled: Whether the robot's model is known, without which no stop can be proposed.
+    """
+    for at, sentence in enumerate(sentences):
+        if _ADD.search(sentence):
+            pointed = f"{sentence} {_proposal(' '.join(sentences), modelled)}"
+            return (*sentences[:at], pointed, *sentences[at + 1 :])
+    return tuple(sentences)
+
+
+def of_arm_that_cannot_tilt(advice: str) -> str:
+    """The same advice without views that no such arm can reach, where a measured offset helps."""
+    words = r"This arm cannot tilt: \1, as z_m and sigma_m in session.toml."
+    return _OR_MEASURED.sub(words, advice)
+
+
+def _proposal(words: str, modelled: bool) -> str:
+    if not modelled:
+        return (
+            "Once [robot] model in session.toml names the arm, visioncal plan SESSION --add 5 "
+            "proposes them."
+        )
+    purpose = " --for kinematics" if _ARM.search(words) else ""
+    return f"Let visioncal plan SESSION --add 5{purpose} propose them."

@@ -19,12 +19,7 @@ from visioncal.calibration.stages.kinematics import (
 )
 from visioncal.calibration.stages.loads import check_elastic, check_poses
 from visioncal.calibration.stages.reported_poses import moved_arm
-from visioncal.calibration.stages.thermal import (
-    Heat,
-    drift_result,
-    find_drift,
-    heating,
-)
+from visioncal.calibration.stages.thermal import Heat, drift_result, find_drift, heating
 from visioncal.calibration.stages.thermal_fit import ThermalFit, ThermalStops
 from visioncal.core.choices import Convention
 from visioncal.core.transforms import distances, invert, mean_transform

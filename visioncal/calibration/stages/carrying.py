@@ -10,13 +10,7 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.workspace import postures
-from visioncal.results.arm import (
-    CarriedRegion,
-    CarriesOver,
-    JointFunction,
-    JointFunctions,
-    Region,
-)
+from visioncal.results.arm import CarriedRegion, CarriesOver, JointFunction, JointFunctions, Region
 
 # What real arms of a metre's reach err by in another session, beyond what one session shows of
 # them: warmth, wear, another mount [m per m of reach]. Of a UR10, 0.15 to 0.2 mm after months.

@@ -13,11 +13,7 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors
 from visioncal.estimation.armmodel import COMPLIANCE, WEIGHT, ArmModel
-from visioncal.estimation.joint_functions import (
-    JointFunctions,
-    find_joint_functions,
-    most_orders,
-)
+from visioncal.estimation.joint_functions import JointFunctions, find_joint_functions, most_orders
 from visioncal.estimation.kinematics import (
     LEVELS,
     ArmTrials,

@@ -14,12 +14,7 @@ from visioncal.core.files import did_you_mean, some_of
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Rejection
-from visioncal.estimation.positions import (
-    Mounting,
-    Places,
-    find_mounting,
-    residuals,
-)
+from visioncal.estimation.positions import Mounting, Places, find_mounting, residuals
 from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
 from visioncal.session.instruments import Instrument, instrument_names, stated_instrument

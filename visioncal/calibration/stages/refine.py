@@ -11,12 +11,7 @@ from visioncal.calibration.stages.side import FramesSide
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Corners, FloatArray, IntArray
-from visioncal.estimation.appearance import (
-    Appearance,
-    Compressed,
-    LensBoardParameters,
-    compress,
-)
+from visioncal.estimation.appearance import Appearance, Compressed, LensBoardParameters, compress
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import (

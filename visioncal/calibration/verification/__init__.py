@@ -1,8 +1,7 @@
 """Whether a calibration still holds, what has changed if not, and when to calibrate again."""
 
 from visioncal.calibration.verification.check import Check, Suspect, verify
-from visioncal.calibration.verification.document import to_document
-from visioncal.calibration.verification.messages import verdict_of
+from visioncal.calibration.verification.messages import to_document, verdict_of
 from visioncal.calibration.verification.policy import (
     Outcome,
     Trigger,

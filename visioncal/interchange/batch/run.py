@@ -23,13 +23,7 @@ from visioncal.interchange.batch.work import Options, jobs_of
 from visioncal.interchange.batch.workers import rows_of
 from visioncal.interchange.outputs import CALIBRATION
 from visioncal.results import Calibration
-from visioncal.results.fleet import (
-    FleetRow,
-    camera_edge,
-    cell_figures,
-    with_changes,
-    with_outliers,
-)
+from visioncal.results.fleet import FleetRow, camera_edge, cell_figures, with_changes, with_outliers
 from visioncal.simulation import CAMERAS, CellOptions, read_truth, simulate, write_session
 from visioncal.simulation.options import TARGETS
 

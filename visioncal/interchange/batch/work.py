@@ -12,12 +12,7 @@ from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import natural, read_text, write_atomically
 from visioncal.core.version import __version__
-from visioncal.interchange.outputs import (
-    CALIBRATION,
-    REPORT,
-    Written,
-    write_outputs,
-)
+from visioncal.interchange.outputs import CALIBRATION, REPORT, Written, write_outputs
 from visioncal.results import Calibration
 from visioncal.results.fleet import FleetRow, row_of
 from visioncal.session import Session

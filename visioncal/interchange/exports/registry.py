@@ -13,12 +13,7 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified
 from visioncal.interchange.exports.arm import ArmFormat, select_arm
 from visioncal.interchange.exports.armfiles import ARMS, write_dynamics
-from visioncal.interchange.exports.content import (
-    Content,
-    ExportFormat,
-    OfTransforms,
-    Selection,
-)
+from visioncal.interchange.exports.content import Content, ExportFormat, OfTransforms, Selection
 from visioncal.interchange.exports.controllers import CONTROLLERS
 from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR, OAK
 from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID

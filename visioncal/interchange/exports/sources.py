@@ -8,14 +8,7 @@ from typing import Literal, TypeAlias
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
 from visioncal.core.types import Mount
-from visioncal.results import (
-    Calibration,
-    CameraResult,
-    Edge,
-    Frame,
-    FrameFile,
-    Verdict,
-)
+from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 
 Source: TypeAlias = Calibration | FrameFile
 Kind: TypeAlias = Literal["tool", "fixture"]

@@ -7,11 +7,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.session import Session
-from visioncal.session.columns import (
-    INSTRUMENT_POSITION,
-    INSTRUMENT_QUATERNION,
-    MEASURED_CAM_POSE,
-)
+from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION, MEASURED_CAM_POSE
 
 # What a view shows; the rest of its row says where the robot stood.
 _SHOWN = ("image", *MEASURED_CAM_POSE, *INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION)

@@ -11,13 +11,7 @@ import cv2
 import tomli_w
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import (
-    flush_folder,
-    named_errors,
-    read_bytes,
-    read_toml,
-    write_atomically,
-)
+from visioncal.core.files import flush_folder, named_errors, read_bytes, read_toml, write_atomically
 from visioncal.core.temporary_files import remove_abandoned
 from visioncal.core.version import __version__
 from visioncal.live.capture.facts import CaptureFacts, view_of

@@ -6,9 +6,8 @@ from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.written import MotionPlan
 from visioncal.live.planning.messages import accuracy_words, looks_note, plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
-from visioncal.present.recording.motions import MotionPart, MotionPreview
-from visioncal.present.recording.obstacles import Obstacle
-from visioncal.present.recording.preview import Preview, PreviewStop
+from visioncal.present.recording.arm import Obstacle
+from visioncal.present.recording.preview import MotionPart, MotionPreview, Preview, PreviewStop
 
 # Samples a second that are drawn: sweeps are long, and slow.
 _EXCITATION_HZ, _SWEEPS_HZ = 20.0, 5.0

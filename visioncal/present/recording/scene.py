@@ -9,8 +9,9 @@ import rerun as rr
 
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present import parts
+from visioncal.present.cellmap import pairs, places, sigma_words, spans
 from visioncal.present.placements import target_frames
-from visioncal.present.recording import board, colours, network, paths
+from visioncal.present.recording import board, colours, paths
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.overlays import image_frames, log_image_frames
@@ -31,6 +32,9 @@ _AXES = {paths.BASE_FRAME: 2.0, paths.FLANGE_FRAME: 1.0}
 _OTHER_AXES, _TOOL_AXES = 0.7, 0.5
 # The views that are not the current one, drawn as small frusta or boards.
 SMALL_FRUSTUM = 0.05
+
+# The height of the bodies' names, and the drawing's units [px].
+_BODY_HEIGHT, _ACROSS_PX, _DOWN_PX = 3.6, 110.0, 120.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +117,7 @@ class SceneDrawing:
         if calibration.cell is not None:
             axes = rr.TransformAxes3D(2.0 * _AXIS * self.size_m, show_frame=False)
             stream.log(paths.CELL, rr.CoordinateFrame(paths.CELL_FRAME), axes, static=True)
-            network.log_network(stream, calibration)
+            log_network(stream, calibration)
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
         """Logs where everything is in each view.
@@ -407,3 +411,29 @@ def _send_strips(
     lines = rr.LineStrips3D.columns(strips=[array for some in strips.values() for array in some])
     parts = lines.partition([len(strip) for strip in strips.values()])
     send_rows(stream, entity, strips, [*parts, *more])
+
+
+def log_network(stream: rr.RecordingStream, calibration: Calibration) -> None:
+    """Draws the network as a graph: frames with their sigmas, and who saw whom."""
+    nodes: dict[str, tuple[float, float]] = {}
+    tree = calibration.tree
+    for body, (left, right) in spans(tree).items():
+        nodes[body] = (0.5 * (left + right), _BODY_HEIGHT)
+    nodes |= places(tree)
+    words = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
+    words[paths.CELL_FRAME] = f"the frame of {tree.reference}"
+    labels = [f"{node}\n{words.get(node) or sigma_words(tree, node)}" for node in nodes]
+    bodies = {paths.CELL_FRAME, *tree.flanges}
+    seen = [(pair.seer, pair.seen) for pair in pairs(calibration.views) if pair.used]
+    hangs = [(tree.parents[node], node) for node in nodes if node != paths.CELL_FRAME]
+    stream.log(
+        paths.NETWORK,
+        rr.GraphNodes(
+            list(nodes),
+            positions=[(_ACROSS_PX * x, -_DOWN_PX * y) for x, y in nodes.values()],
+            labels=labels,
+            colors=[colours.LINK if node in bodies else colours.USED for node in nodes],
+        ),
+        rr.GraphEdges([*hangs, *seen], graph_type="undirected"),
+        static=True,
+    )

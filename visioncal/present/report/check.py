@@ -7,8 +7,7 @@ from markupsafe import Markup
 
 from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check
-from visioncal.calibration.verification.document import listed_suspects
-from visioncal.calibration.verification.messages import thing
+from visioncal.calibration.verification.messages import listed_suspects, thing
 from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray

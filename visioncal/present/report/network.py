@@ -7,14 +7,7 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
-from visioncal.present.cellmap import (
-    SeenPair,
-    pairs,
-    places,
-    sigma_words,
-    spans,
-    weakest_frame,
-)
+from visioncal.present.cellmap import SeenPair, pairs, places, sigma_words, spans, weakest_frame
 from visioncal.present.facts import DEGREE
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Box, Panel, Scale

@@ -1,4 +1,4 @@
-"""The report's plots: residuals by view and by joint angle, coverage of image and orientations."""
+"""The report's plots: residuals by view and by joint angle, coverage; frames."""
 
 import base64
 from collections.abc import Callable, Collection, Sequence
@@ -19,7 +19,7 @@ from visioncal.present.report import bars, svg
 from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
 from visioncal.present.report.bars import Bar
 from visioncal.present.report.svg import Figure
-from visioncal.results import Calibration, Rms, ViewResult
+from visioncal.results import Calibration, Frame, Observation, Rms, ViewResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.views import rms_of
 from visioncal.session import Session
@@ -36,6 +36,13 @@ _WIDTH_IN, _ROW_IN = 9.2, 1.25
 _ROOM, _KEPT_PERCENT = 1.3, 95.0
 # How wide a point is.
 _DASH_PT = 2.4
+
+_FRAME_WIDTH_IN, _FRAME_HEIGHT_IN = 5.0, 1.7
+# More characters than this below the bars run into each other, so their labels stand upright.
+_MOST_CHARACTERS, _LONGEST = 36, 12
+_MOST_LABELS = 24
+# Mean width of a letter.
+_LETTER_IN = 0.068
 
 
 @dataclass(frozen=True)
@@ -309,3 +316,31 @@ def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -
     entries = [(sign, colour, f"target {name}") for name, colour in _AXES]
     figure.legend(upper[-1].right, 12.0, entries)
     return figure.inline("Residuals of the used views over each joint's angle")
+
+
+def frame_plot(name: str, frame: Frame) -> Markup:
+    """Bars of what each observation is off; the wrong ones in red."""
+    if all(observation.residual_mm is None for observation in frame.observations):
+        return Markup("")
+    labels = [_short(observation.name) for observation in frame.observations]
+    upright = sum(map(len, labels)) > _MOST_CHARACTERS
+    shown = [
+        Bar(label, observation.residual_mm, observation.used, _colour_of_thing(observation))
+        for label, observation in zip(labels, frame.observations, strict=True)
+    ]
+    below_in = 0.25 + _LETTER_IN * max(map(len, labels)) if upright else 0.3
+    figure = Figure(_FRAME_WIDTH_IN, _FRAME_HEIGHT_IN + (0.4 if upright else 0.0))
+    ((box,),) = boxes(figure, 1, 1, Margins(0.65, 0.65, below_in))
+    bars.draw(figure, box, shown, frame.rms_mm, _MOST_LABELS, titles=("", "off by [mm]"),
+              turned=upright)  # fmt: skip
+    return figure.inline(f"Bars: what each observation of {name} is off")
+
+
+def _colour_of_thing(observation: Observation) -> str:
+    if not observation.used:
+        return svg.BAD
+    return svg.CHECK if observation.reason else svg.ACCENT
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"

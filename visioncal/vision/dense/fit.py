@@ -27,7 +27,7 @@ import numpy.typing as npt
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.dense.blur import DRAWN_PX, Blur, transfer
 from visioncal.vision.dense.library import ONE_TORCH_THREAD, library
-from visioncal.vision.dense.prints import Print, board_places
+from visioncal.vision.dense.shown import Print, board_places
 from visioncal.vision.finders.maps import maps_about
 
 if TYPE_CHECKING:
