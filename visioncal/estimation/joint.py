@@ -377,10 +377,15 @@ class Scores:
         among[self.columns] = np.isin(self.places, moving)
         return float(self.gradient @ covariance_among(self.information, among) @ self.gradient)
 
-    def asked_for(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
-        """By how much (k,) held values would move if they were free, and its (k, k) covariance."""
+    def asked_for(self, places: IntArray, moving: IntArray) -> tuple[FloatArray, FloatArray]:
+        """By how much (k,) held values would move if they were free, and its (k, k) covariance.
+
+        Args:
+            places: Which values.
+            moving: Those that are free beside them.
+        """
         among = self.moving.copy()
-        among[self.columns] |= np.isin(self.places, places)
+        among[self.columns] = np.isin(self.places, np.union1d(moving, places))
         covariance = covariance_among(self.information, among)
         at = self.columns.start + np.searchsorted(self.places, places)
         return -covariance[at] @ self.gradient, covariance[np.ix_(at, at)]

@@ -201,15 +201,25 @@ def _doubted(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     scales = np.array(
         [value for board in looks.printed for value in looks.scale_of(board)], dtype=int
     )
+    held = [
+        name
+        for name, problem in looks.problems.items()
+        if not problem.scene.estimated
+        and problem.scene.matrix_sigma_px is None
+        and problem.scene.mode == "auto"
+        and problem.has_spare_corners
+        and not np.isin(looks.lens_of(name), fitted.moving).any()
+    ]
+    if not held:
+        return fitted
+    scores = Scores.of(
+        side, fitted, np.concatenate([scales, *(looks.lens_of(name)[:4] for name in held)])
+    )
     doubts = {}
-    for name, problem in looks.problems.items():
-        scene, lens = problem.scene, looks.lens_of(name)
-        is_exact = not scene.estimated and scene.matrix_sigma_px is None and scene.mode == "auto"
-        if not is_exact or not problem.has_spare_corners or np.isin(lens, fitted.moving).any():
-            continue
-        focal_px, sigma = looks.values[lens[:2]], lens_prior(scene)
-        asked_of = np.append(lens[:4], scales)
-        step, covariance = Scores.of(side, fitted, asked_of).asked_for(asked_of)
+    for name in held:
+        problem, lens = looks.problems[name], looks.lens_of(name)
+        focal_px, sigma = looks.values[lens[:2]], lens_prior(problem.scene)
+        step, covariance = scores.asked_for(np.append(lens[:4], scales), fitted.moving)
         step, covariance = step[:4], covariance[:4, :4]
         # Both focal lengths have one factor: what parts them shows, and is not in doubt.
         factors = np.zeros((4, 3))
