@@ -11,6 +11,7 @@ The points of a rig are where its table has them, or near there, each by what it
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -20,6 +21,7 @@ from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
 from visioncal.estimation.lens_field import Coefficients, LensLevels, breathing_columns, field_modes
+from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.variance import Knowledge
@@ -185,6 +187,11 @@ class Compressed:
     residuals: FloatArray
     by_field: FloatArray
     coefficients: Coefficients | None = None
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """(v, 6, 6) covariances of the poses."""
+        return covariance_from(self.information)
 
     @property
     def field_freedom(self) -> float:

@@ -125,6 +125,7 @@ def settle(
     moving: IntArray,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None = None,
+    before: LinearisedCorners | None = None,
 ) -> ConvergedFit:
     """Linearises and fits in turn, until the values stay where they are.
 
@@ -134,6 +135,7 @@ def settle(
         moving: Places of the values that the fit moves.
         frames: Where to start.
         others: The values of all other effects to start from; where they were linearised if None.
+        before: Where corners were linearised before; see `CameraParameters.seen`.
 
     Raises:
         ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
@@ -141,7 +143,7 @@ def settle(
     try:
         # Numbers that run away overflow before they fail.
         with np.errstate(over="ignore", invalid="ignore"):
-            return _settled(side, _fitted(side, looks.seen(moving), frames, others))
+            return _settled(side, _fitted(side, looks.seen(moving, before), frames, others))
     except np.linalg.LinAlgError as error:
         raise ConvergenceError(
             "hand-eye: no frames explain both the robot's poses and what the camera saw: the fit "
@@ -156,7 +158,9 @@ def again(
     fitted: ConvergedFit, side: Side, moving: IntArray, looks: CameraParameters | None = None
 ) -> ConvergedFit:
     """Settles once more from an answer, with other values free, or by other priors."""
-    return settle(looks or fitted.looks, side, moving, fitted.frames, fitted.others)
+    return settle(
+        looks or fitted.looks, side, moving, fitted.frames, fitted.others, before=fitted.seen
+    )
 
 
 def _settled(side: Side, fitted: ConvergedFit) -> ConvergedFit:

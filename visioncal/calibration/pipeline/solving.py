@@ -309,7 +309,7 @@ def _at_rest(found: Solved) -> Solved:
             found = replace(found, agreed=_with_effects(found.agreed, others))
         else:
             side, seen = found.side, found.seen
-            fitted = settle_looks(seen.looks, side, seen.moving, found.frames)
+            fitted = settle_looks(seen.looks, side, seen.moving, found.frames, before=seen)
             if turn == 0:  # What the arm did wrong may have passed for the lens's doing.
                 looks = fitted.looks.with_levels(lens_levels(side, fitted))
                 fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)

@@ -133,13 +133,13 @@ def _equally_weighed(
     estimating = erring.freed(freely=False)
     if all(error.is_estimated for error in erring.errors):
         return answer, estimating
-    fitted = settle(answer.looks, estimating, answer.moving, answer.frames)
+    fitted = settle(answer.looks, estimating, answer.moving, answer.frames, before=answer.seen)
     found = estimating.with_errors(fitted)
     # Errors that were less than significant under the stated lenses may be it under these.
     if [error.is_estimated for error in found.errors] != [
         error.is_estimated for error in estimating.errors
     ]:
-        fitted = settle(fitted.looks, found, fitted.moving, fitted.frames)
+        fitted = settle(fitted.looks, found, fitted.moving, fitted.frames, before=fitted.seen)
     return fitted, found
 
 
@@ -246,7 +246,7 @@ def _still_asked_for(erring: Side, stated: ConvergedFit, answer: ConvergedFit) -
     """The fit with errors of arms free, and of what was set free before what is still asked for."""
     # Before, noise was as large as these errors: what they had passed for is as stated again, and
     # what really is another is clear now.
-    wide = settle(answer.looks, erring, answer.moving, answer.frames)
+    wide = settle(answer.looks, erring, answer.moving, answer.frames, before=answer.seen)
     looks = answer.looks
     freed = [looks.shape_of(index) for index in looks.printed] + [
         looks.lens_of(problem) for problem in looks.problems

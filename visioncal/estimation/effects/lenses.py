@@ -15,7 +15,6 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parts import Effect
 from visioncal.estimation.scene import CornerProblem
 from visioncal.estimation.variance import Knowledge
@@ -227,13 +226,22 @@ class CameraParameters:
         values[free] = found
         return replace(self, values=values)
 
-    def seen(self, moving: IntArray) -> "LinearisedCorners":
-        """Compresses all corners, (f,) values being free."""
+    def seen(
+        self, moving: IntArray, before: "LinearisedCorners | None" = None
+    ) -> "LinearisedCorners":
+        """Compresses all corners, (f,) values being free.
+
+        Args:
+            moving: Places of these values.
+            before: Where they were linearised before: what a camera's corners say there holds where
+                neither its lens, boards, poses nor weights have changed since.
+        """
         found, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
         gradient = np.zeros(len(self.values))
         for name, problem in self.problems.items():
-            compressed, places = self.compressed(name), self.places(name)
+            compressed = None if before is None else before.still(self, name)
+            compressed, places = compressed or self.compressed(name), self.places(name)
             sigma = problem.sigma_px(compressed, np.flatnonzero(np.isin(places, moving)))
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
@@ -317,12 +325,24 @@ class LinearisedCorners:
         """The same with other values moving, or with other priors."""
         return replace(self, moving=np.sort(moving), looks=looks or self.looks)
 
+    def still(self, looks: CameraParameters, name: str) -> Compressed | None:
+        """What one camera's corners say, if other parameters have it alike; else None."""
+        mine, there = self.looks.problems[name], looks.problems[name]
+        places = looks.places(name)
+        is_alike = (
+            there.stack is mine.stack
+            and there.levels == mine.levels
+            and looks.poses is self.looks.poses
+            and np.array_equal(looks.values[places], self.looks.values[places])
+        )
+        return self.compressed[list(looks.problems).index(name)] if is_alike else None
+
     @property
     def covariance(self) -> FloatArray:
         """Covariances (v, 6, 6) of all views' poses."""
         return np.concatenate(
             [
-                floored_sigma_px(sigma) ** 2 * covariance_from(compressed.information)
+                floored_sigma_px(sigma) ** 2 * compressed.covariance
                 for compressed, sigma in zip(self.compressed, self.sigmas_px, strict=True)
             ]
         )
@@ -330,12 +350,13 @@ class LinearisedCorners:
     @property
     def by_free(self) -> FloatArray:
         """How all views' poses (v, 6, f) move with the free values."""
-        parts = []
+        found = np.zeros((len(self.views), 6, len(self.free)))
         for name, compressed in zip(self.looks.problems, self.compressed, strict=True):
-            every = np.zeros((len(compressed.by_shared), 6, len(self.looks.values)))
-            every[:, :, self.looks.places(name)] = compressed.by_shared
-            parts.append(every[:, :, self.free])
-        return np.concatenate(parts)
+            places = self.looks.places(name)
+            own = np.isin(self.free, places)
+            columns = np.searchsorted(places, self.free[own])
+            found[self.looks.rows(name), :, own] = compressed.by_shared[:, :, columns]
+        return found
 
     @cached_property
     def by_field(self) -> FloatArray:
