@@ -184,6 +184,24 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     assert ids(judge(met)) == ["moved_slowly"]
 
 
+def test_a_sigma_far_beyond_its_limit_is_the_cause_of_a_bad_result() -> None:
+    spread = np.diag(np.repeat([1e-6, 4e-4], 3) ** 2)[None]
+    picks = (Picks("cam", "robot", {"look": spread}, np.inf, 0.5),)
+    place = PointAccuracy("cam", {"pixels": 4.0, "total": 4.0}, 7.0)
+    bad = replace(SOUND, picks=picks, worst=directions(4e-3), places=(place, place))
+    verdict = judge(bad)
+    assert verdict.status == "bad"
+    # What picks err by is within the limits, and no reason for it.
+    assert ids(verdict) == ["weak_motion"]
+    assert verdict.reasons[0].startswith("Weakly determined by the motion")
+    assert ids(judge(replace(bad, worst=directions(1e-4)))) == ["place"]
+    # A mistake that is found is likelier, and a need asks for what picks err by.
+    drifting = judge(replace(bad, warnings=(DRIFT,)))
+    assert "moved_slowly" in ids(drifting)
+    assert "weak_motion" not in ids(drifting)
+    assert ids(judge(replace(bad, need=Need(0.5)))) == ["robot_noise"]
+
+
 def test_poses_that_are_misread_explain_the_rest() -> None:
     before = judge(changed(SOUND, warnings=(DRIFT,)))
     after = with_misread(

@@ -116,6 +116,10 @@ LOOK = Remedy(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )
 
+# Sigmas that have a limit of their own, what others come from first, and how likely mistakes are
+# that come before them.
+_SIGMAS, _LIKELIER = ("weak_motion", "place", "workspace"), 0.5
+
 # What helps where the size of a board limits a result.
 TILTED = Remedy("Add views tilted by 30 to 45 degrees.")
 MEASURE_BOARD = Remedy(
@@ -199,6 +203,9 @@ def ranked(
         left_out_mm: By how much left-out views disagree [mm].
     """
     found = _tested(doubts, left_out_mm)
+    if met is None and (deciding := _deciding(found)) is not None:
+        rest = (finding for finding in found if finding is not deciding)
+        return (replace(deciding, probability=1.0 - _FACT), *rest)
     unmet = met is not None and met.probability < NeedLimits.probability[0]
     too_large = met is None and any(
         pick.good_for_mm > CalibrationLimits.sigma_mm[0] for pick in picks
@@ -213,6 +220,15 @@ def ranked(
         known |= {*_OF_ROBOT} if "measured_turns" in known else set()
         found += [source for source in _sources(picks, met, more) if source.kind not in known]
     return tuple(_with_weak_motion(_with_joints_at_hand(found), more))
+
+
+def _deciding(found: Sequence[Finding]) -> Finding | None:
+    """What alone makes a result bad: a sigma far beyond its limit, where no mistake is likelier."""
+    sigmas = [finding for finding in found if finding.kind in _SIGMAS]
+    likelier = any(finding.probability >= _LIKELIER for finding in found)
+    if likelier or not any(finding.is_fatal for finding in sigmas):
+        return None
+    return min(sigmas, key=lambda finding: _SIGMAS.index(finding.kind))
 
 
 def _with_weak_motion(found: Sequence[Finding], more: Remedy | None) -> Sequence[Finding]:
