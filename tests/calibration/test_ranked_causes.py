@@ -35,6 +35,7 @@ from visioncal.results import Rms
 from visioncal.results.parts import VerdictForm
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
+from visioncal.vision.targets import load_target
 
 EXCHANGED = Finding(
     "exchanged_views",
@@ -46,7 +47,9 @@ POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanob
 FIELD = Finding("lens_field", "The lens departs.", mahalanobis_sq=300.0, up_to_mm=0.08)
 DRIFT = Finding("moved_slowly", "Residuals drift with time.")
 MEASURED = MeasuredScale(0, 4.7e-3, 6e-4, 8e-4)
-SIZE = scale_found("board", 0.03, MEASURED, replace(MEASURED, scale=4e-3, sigma=9e-4))
+SIZE = scale_found(
+    "board", load_target("charuco_9x6_30mm"), MEASURED, replace(MEASURED, scale=4e-3, sigma=9e-4)
+)
 
 
 def chi2_chance(square: float) -> float:
@@ -135,6 +138,20 @@ def test_a_held_lens_that_is_wrong_is_no_arm_that_errs() -> None:
     assert ids(verdict)[0] == "lens"
     # It is the first reason, too, before how large the errors are.
     assert verdict.reasons[0] == held.words
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "written"),
+    [
+        ("charuco_9x6_30mm", "squares of 30.14 mm, not of 30 mm", "square_m = 0.03014 in"),
+        ("aprilgrid_6x4_32mm", "tags of 32.15 mm, not of 32 mm", "size_m = 0.03215 in"),
+        ("apriltag_36h11_id0_120mm", "a side of 120.6 mm, not of 120 mm", "size_m = 0.1206 in"),
+    ],
+)
+def test_another_size_is_said_by_what_the_targets_file_calls_it(name, said, written) -> None:
+    found = scale_found("board", load_target(name), MEASURED, MEASURED)
+    assert said in found.words
+    assert written in found.do.words
 
 
 def test_what_nothing_explains_is_the_cause_itself() -> None:

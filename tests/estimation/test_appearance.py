@@ -183,6 +183,7 @@ def test_a_board_within_what_is_stated_is_measured_and_not_accused(mount):
     (sentence,) = [reason for reason in known.verdict.reasons if "robot's motion" in reason]
     assert "% larger than stated" in sentence
     assert "The stated size allows this (to within 0.1 %)" in sentence
+    assert "mm" not in sentence
     assert known.verdict.status == "good"
     assert mahalanobis_sq(cell, known) < UNLIKELY
 

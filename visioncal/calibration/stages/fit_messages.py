@@ -82,7 +82,7 @@ def found_of_looks(
             written = replace(
                 measured, scale=float(looks.values[place]), sigma=float(covariance[at, at] ** 0.5)
             )
-            yield scale_found(called, target.square_m, measured, written)
+            yield scale_found(called, target, measured, written)
         if _moved(fitted, looks.shape_of(board)):
             yield _shape_found(fitted, board, called)
 
@@ -109,35 +109,46 @@ def _noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> It
     )
 
 
+# What square_m is of a target that has no squares, and its name in the target's file.
+_SIDES = {
+    "aprilgrid": ("tags", "size_m"),
+    "marker": ("a side", "size_m"),
+    "circles": ("a distance of rows", "square_m"),
+}
+
+
 def scale_found(
-    board: str, square_m: float, measured: MeasuredScale, written: MeasuredScale
+    board: str, target: Target, measured: MeasuredScale, written: MeasuredScale
 ) -> Finding:
     """Words another size than the file states; a note where that allows it.
 
     Args:
         board: What the board is called.
-        square_m: The stated side of its squares [m].
+        target: It, as stated.
         measured: What the robot's motion says.
         written: What the result has, with all that counts beside the noise.
     """
-    side, share = 1e3 * square_m, f"{figure(100 * measured.stated_sigma)} %"
-    sized = (
+    side, share = 1e3 * target.square_m, f"{figure(100 * measured.stated_sigma)} %"
+    what, key = _SIDES.get(target.kind, ("squares", "square_m"))
+    size = (
         f"By the robot's motion the {board} is "
         f"{figure(100 * abs(written.scale))} % "
         f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "
-        f"{figure(100 * written.sigma)} %): squares of {side * (1 + written.scale):.4g} mm, "
-        f"not of {side:.4g} mm"
+        f"{figure(100 * written.sigma)} %)"
     )
     if not measured.contradicts:
-        allowed = f"{sized}. The stated size allows this (to within {share})."
+        allowed = f"{size}. The stated size allows this (to within {share})."
         return Finding(NOTE, f"{allowed} The result goes by both.")
+    side_found = side * (1 + written.scale)
     return Finding(
         "board_size",
-        f"{sized} (stated to within {share}). The result takes the robot's scale; if the board is "
-        "right, the arm's model is off by as much.",
+        f"{size}: {what} of {side_found:.4g} mm, not of {side:.4g} mm (stated to within {share}). "
+        "The result takes the robot's scale; if the board is right, the arm's model is off by as "
+        "much.",
         Remedy(
-            "Measure the board over many squares. If the robot is right, write square_m = "
-            f"{1e-3 * side * (1 + written.scale):.4g} in the board's .toml; else check the arm.",
+            f"Measure the board over {'many squares' if what == 'squares' else 'its whole width'}. "
+            f"If the robot is right, write {key} = {1e-3 * side_found:.4g} in the board's .toml; "
+            "else check the arm.",
             CALIBRATE,
         ),
         mahalanobis_sq=measured.scale**2 / (measured.sigma**2 + measured.stated_sigma**2),
