@@ -317,4 +317,18 @@ def test_a_robot_that_nobody_knows_is_named_with_what_to_correct(cell):
     found = visioncal.doctor(cell).findings[0]
     assert found.kind == "misread_joints"
     assert "There is no robot named 'ur10ee'. Did you mean ur10e" in found.words
-    assert found.do.words == "Correct [robot] model in session.toml."
+    assert found.do.words.startswith("Correct [robot] model in session.toml")
+    # Without poses there is no result, and that is why.
+    rewritten(cell, lambda rows: [row.update(dict.fromkeys(POSE, "")) for row in rows])
+    with pytest.raises(DataError) as caught:
+        visioncal.calibrate(cell)
+    assert caught.value.message.startswith("session.toml: robot.model: There is no robot named")
+    assert caught.value.next_step == found.do.words
+
+
+def test_an_unknown_name_is_told_with_where_to_delete_it(cell):
+    document = cell / "session.toml"
+    document.write_text("munt = 1\n" + document.read_text("utf-8"), "utf-8")
+    (found,) = [finding for finding in visioncal.calibrate(cell).verdict.findings if finding.do]
+    assert found.words.startswith("session.toml: munt is not a known field")
+    assert found.do.words == "In session.toml, correct or delete munt."

@@ -469,6 +469,9 @@ def test_all_wrong_fields_are_named_at_once(folder: Path) -> None:
 
 CSV_REFUSALS = [
     ("view,", "number,", "header: the column view, .*, is missing"),
+    ("view,", "View,", "header: the column view, .*, is missing; View may be meant: names are"),
+    (",x_m,y_m,z_m,qx,qy,qz,qw,", ",x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,w,", "in rx_deg,ry_deg,rz"),
+    ("0.6,0,0.3,0.6,0,0,0.8", "0,6,0,0,3,0,6,0,0,0,8", "line 3: it has 17 .* decimal commas"),
     (",note", ",role", r"column role is there twice \(columns 3 and 13\)"),
     (",note", ",", "column 13 has no name"),
     (",qw,", ",w,", "the columns x_m, .* lack qw"),
@@ -521,13 +524,39 @@ def test_a_shared_column_that_names_two_cameras_is_refused(folder: Path) -> None
     assert "names first, " in refusal(folder).message
 
 
-def test_ten_wrong_rows_are_named_and_the_rest_counted(folder: Path) -> None:
+def test_many_rows_that_are_wrong_alike_are_counted(folder: Path) -> None:
     rows = [f"{k},,,images/a.png,never,,,,,,,,\n" for k in range(14)]
     (folder / "views.csv").write_text(HEADER + "\n" + "".join(rows))
     error = refusal(folder)
-    assert len(error.culprits) == 10
+    assert error.culprits == ("views.csv, line 2, column stamp_s",)
     assert "line 2, column stamp_s: 'never'" in error.message
-    assert error.message.endswith("And 4 more of the kind.")
+    assert error.message.endswith("And 13 more alike, up to views.csv, line 15.")
+
+
+def test_what_is_wrong_alike_in_many_rows_is_said_once(folder: Path) -> None:
+    rows = [f"{k},,,images/{k}.bmp,1,,,,,,,,\n" for k in range(12)]
+    (folder / "views.csv").write_text(HEADER + "\n" + "".join(rows) + "x,,,a.png,1,,,,,,,,\n")
+    error = refusal(folder)
+    lines = error.message.splitlines()
+    assert len(lines) == len(error.culprits) == 2
+    assert "line 2, column image: the image 'images/0.bmp'" in lines[0]
+    assert lines[0].endswith("And 11 more alike, up to views.csv, line 13.")
+    assert "line 14, column view: 'x' is no whole number" in lines[1]
+
+
+def test_a_table_without_a_column_of_images_is_said_to_lack_it(folder: Path) -> None:
+    (folder / "views.csv").write_text("view,x_m,y_m,z_m,qx,qy,qz,qw\n" + "1,0,0,1,0,0,0,1\n")
+    error = refusal(folder)
+    assert "there is no such column" in error.message
+    assert "column image" in error.next_step
+
+
+def test_a_table_without_a_header_row_is_told_to_have_one(folder: Path) -> None:
+    text = (folder / "views.csv").read_text()
+    (folder / "views.csv").write_text("0,images/a.png,0.1,0,0.3,0,0,0,1\n" + text)
+    error = refusal(folder)
+    assert "names of the columns are needed" in error.message
+    assert "view,image,x_m" in error.next_step
 
 
 def test_lines_are_counted_through_quoted_line_breaks(folder: Path) -> None:
@@ -611,7 +640,12 @@ WARNINGS = [
     ("session.toml", "ur10e", "kuka", "robot.model: There is no robot named 'kuka'"),
     ("session.toml", "[robot]", "[prior.flange_to_cam]\nz_m=1\nsigma_m=1\n[robot]", "flange_from"),
     ("views.csv", "note", "stamps_s", "stamps_s .* kept as text. Did you mean stamp_s"),
-    ("views.csv", "note", "q1_deg", "q1_deg .* kept as text. Did you mean q1_rad"),
+    (
+        "views.csv",
+        "note",
+        "q1_deg",
+        "q1_deg are kept as text: angles of joints are read in radians",
+    ),
 ]
 
 

@@ -52,7 +52,9 @@ def write_generation(
     taken = [folder / name for name in names if (folder / name).is_dir()]
     if taken:
         raise DataError(
-            f"{taken[0]} is a folder, where a file is to be written.", culprits=[str(taken[0])]
+            f"{taken[0]} is a folder, where a file is to be written.",
+            culprits=[str(taken[0])],
+            next_step="Move it away, or name another folder with -o.",
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)

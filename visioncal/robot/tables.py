@@ -18,6 +18,8 @@ from visioncal.robot.chain import Chain, joint_function, joint_tables, number_li
 # The offset is theta_offset_rad or d_m.
 _FUNCTION_KEYS = ("", "gear_ratio", "sine_rad", "cosine_rad")
 _POSE_KEYS = ("xyz_m", "rpy_rad")
+# No link is as long [m]; offsets along axes that are nearly parallel are any number.
+_LONGEST_M = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +266,15 @@ def _across(row: DocumentTable, convention: Convention) -> tuple[float, float, f
             next_step='Leave it out, or write convention = "hayati".',
         )
     beta = row.number("beta_rad", 0.0)
-    return row.number("a_m"), row.number("alpha_rad"), beta, float(parallel)
+    length_m = row.number("a_m")
+    if abs(length_m) > _LONGEST_M:
+        raise row.refuse(
+            "a_m",
+            length_m,
+            f"a number of metres, under {_LONGEST_M:g},",
+            "It looks like millimetres: multiply a_m and d_m of all joints by 0.001.",
+        )
+    return length_m, row.number("alpha_rad"), beta, float(parallel)
 
 
 def _flange(row: DocumentTable, convention: Convention) -> tuple[FloatArray, FloatArray]:

@@ -27,7 +27,7 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
         (
             "target",
             declaration.target or declaration.targets or None,
-            'target = "charuco_9x6_30mm"',
+            'target = "charuco_9x6_30mm", or the name or .toml of your board',
         ),
         ("camera", declaration.camera or declaration.cameras or None, "[camera]"),
     ):

@@ -33,6 +33,12 @@ ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
     ("a", "b", "c"): ("euler-ZYX-deg",),
     ("w", "p", "r"): ("euler-xyz-deg",),
     ("roll", "pitch", "yaw"): ("euler-xyz-rad", "euler-xyz-deg"),
+    ("rx_deg", "ry_deg", "rz_deg"): ("euler-xyz-deg", "rotation-vector-deg"),
+    ("rx_rad", "ry_rad", "rz_rad"): ("rotation-vector", "euler-xyz-rad"),
+    ("a_deg", "b_deg", "c_deg"): ("euler-ZYX-deg",),
+    ("w_deg", "p_deg", "r_deg"): ("euler-xyz-deg",),
+    ("roll_deg", "pitch_deg", "yaw_deg"): ("euler-xyz-deg",),
+    ("roll_rad", "pitch_rad", "yaw_rad"): ("euler-xyz-rad",),
 }
 # Columns of positions in a unit that their names do not state.
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("x_mm", "y_mm", "z_mm"))
@@ -48,7 +54,7 @@ _PLAIN_NUMBERS = frozenset(
     }
 )
 _NUMBERED = re.compile(r"(q[1-9]\d*_rad|tau[1-9]\d*_nm|current[1-9]\d*_a|temp[1-9]\d*_c)", re.ASCII)
-_JOINT = re.compile(r"q([1-9][0-9]*)_rad")
+_JOINT, _JOINT_DEG = re.compile(r"q([1-9][0-9]*)_rad"), re.compile(r"q[1-9][0-9]*_deg")
 _TEXTS = frozenset(
     {"view", "stop", "role", "image", "point", "group", "approach"}
     | {"camera", "robot", "target", "instrument"}
@@ -123,12 +129,21 @@ def check_header(columns: Sequence[str], where: str) -> None:
         DataError: A name is empty or there twice, `view` is missing, the joints have gaps, or a
             pose lacks some of its columns.
     """
+    if sum(_is_cell(name) for name in columns) > len(columns) / 2:
+        raise DataError(
+            f"{where}: its first line has numbers, {', '.join(columns)[:80]!r}, and the names of "
+            "the columns are needed.",
+            culprits=[where],
+            next_step=f"Begin it with a line of names, as view,image,{','.join(POSE)}.",
+        )
     problems = list(_header_problems(columns))
-    if not problems:
-        return
     spelt = {name.lower(): name for name in columns}
     places = position_columns(columns)
     turned = next((rotation for rotation in ROTATIONS if spelt.keys() >= set(rotation)), None)
+    # Columns of a program's own are no poses where those that are needed are there, too.
+    has_state = bool(set(POSE) & set(columns) or joint_columns(columns))
+    if not problems and (has_state or places is None or turned is None):
+        return
     if turned is not None and not set(QUATERNION) & set(columns):
         names = ",".join(spelt[word] for word in turned)
         raise DataError(
@@ -158,6 +173,11 @@ def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
     )
 
 
+def _is_cell(name: str) -> bool:
+    """Whether a name is a number or a file's, as cells are, and names of columns are not."""
+    return re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?|.*\.(png|jpe?g|tiff?)", name, re.I) is not None
+
+
 def _header_problems(columns: Sequence[str]) -> Iterator[str]:
     for place, name in enumerate(columns, start=1):
         if not name:
@@ -166,7 +186,10 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
             first = columns.index(name) + 1
             yield f"column {name} is there twice (columns {first} and {place}): delete one"
     if "view" not in columns:
-        yield "the column view, a whole number that names each row, is missing"
+        yield (
+            "the column view, a whole number that names each row, is missing"
+            f"{_spelt_otherwise(columns, ['view'])}"
+        )
     joints = joint_columns(columns)
     wanted = [f"q{number}_rad" for number in range(1, len(joints) + 1)]
     gaps = [name for name in wanted if name not in joints]
@@ -191,9 +214,17 @@ def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
 def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
     """Words a hint for every unknown column that looks like a known one misspelt."""
     known = _TEXTS | _PLAIN_NUMBERS | {f"q{number}_rad" for number in range(1, 8)}
+    degrees = [name for name in columns if _JOINT_DEG.fullmatch(name)]
+    if degrees:
+        yield (
+            f"{where}: {', '.join(degrees)} are kept as text: angles of joints are read in "
+            "radians, as q1_rad, q2_rad and so on. Multiply by pi / 180."
+        )
     for name in columns:
         # Not target_id: more words are another thing.
-        is_other = name in known or is_number(name) or re.split(r"[_.]", name)[0] in known
+        is_other = (
+            name in (*known, *degrees) or is_number(name) or re.split(r"[_.]", name)[0] in known
+        )
         meant = name.replace("_deg", "_rad")
         if hint := "" if is_other else did_you_mean(meant, known, _MISSPELT):
             yield f"{where}: column {name} is not a known one and is kept as text. {hint}"

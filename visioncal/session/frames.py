@@ -268,7 +268,8 @@ class _DeclaredTree:
                 f'views.csv: no row says where the robot is, which mount = "{mount}" needs.',
                 culprits=["views.csv: x_m", "views.csv: q1_rad"],
                 next_step="Give each row the flange's pose, as x_m, y_m, z_m, qx, qy, qz, qw, or "
-                "the joints' angles, as q1_rad, q2_rad and so on with [robot] in session.toml.",
+                "the joints' angles, as q1_rad, q2_rad and so on with [robot] in session.toml; or "
+                "its time, as stamp_s, and the poses by their times in streams/robot.csv.",
             )
         places = [*(frame_name("flange", robot) for robot in self.robots), CELL]
         example = "\n".join(f'{name} = "{places[0]}"' for name in missing)

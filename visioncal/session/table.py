@@ -4,6 +4,7 @@ import csv
 import io
 import math
 import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -32,6 +33,10 @@ _SHOWN_PROBLEMS = 10
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]*")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
+_DECIMAL = re.compile(r"[+-]?[0-9]*\.[0-9]+([eE][+-]?[0-9]+)?")
+# What differs between problems of one kind: values that are quoted, and numbers.
+_VALUES = re.compile(r"'[^']*'|[0-9.]+")
+_LINE = re.compile(r", line ([0-9]+)")
 
 _T = TypeVar("_T")
 
@@ -278,14 +283,38 @@ def problems_error(problems: Sequence[TableProblem]) -> DataError:
     own = {problem.step for problem in problems}
     if len(own) == 1:
         step = own.pop() or step
-    shown = problems[:_SHOWN_PROBLEMS]
-    more = len(problems) - len(shown)
-    lines = [f"{problem.place}: {problem.words}." for problem in shown]
-    if more:
-        lines.append(f"And {more} more of the kind.")
-    return DataError(
-        "\n".join(lines), culprits=[problem.place for problem in shown], next_step=step
-    )
+    if len(problems) <= _SHOWN_PROBLEMS:
+        lines = [f"{problem.place}: {problem.words}." for problem in problems]
+        return DataError(
+            "\n".join(lines), culprits=[problem.place for problem in problems], next_step=step
+        )
+    kinds: dict[tuple[str, str], list[TableProblem]] = defaultdict(list)
+    for problem in problems:
+        column = problem.place.partition(", column ")[2]
+        kinds[column, _VALUES.sub("", problem.words)].append(problem)
+    shown = list(kinds.values())[:_SHOWN_PROBLEMS]
+    lines = [_line_of(alike) for alike in shown]
+    if len(kinds) > len(shown):
+        lines.append(f"And {len(kinds) - len(shown)} more of other kinds.")
+    named = [alike[0] for alike in shown] if all(map(_is_run, shown)) else problems
+    culprits = [problem.place for problem in named[:_SHOWN_PROBLEMS]]
+    return DataError("\n".join(lines), culprits=culprits, next_step=step)
+
+
+def _line_of(alike: Sequence[TableProblem]) -> str:
+    """Words problems of one kind in one column: the first, and how many more there are."""
+    words = f"{alike[0].place}: {alike[0].words}."
+    if len(alike) == 1:
+        return words
+    last = alike[-1].place.partition(", column ")[0]
+    return f"{words} And {len(alike) - 1} more alike, up to {last}."
+
+
+def _is_run(alike: Sequence[TableProblem]) -> bool:
+    """Whether problems are those of all lines from the first to the last."""
+    lines = [found for problem in alike if (found := _LINE.search(problem.place))]
+    numbers = [int(found[1]) for found in lines]
+    return len(numbers) == len(alike) and numbers[-1] - numbers[0] == len(alike) - 1
 
 
 @dataclass(frozen=True)
@@ -304,11 +333,20 @@ class _RowReader:
     def view(self) -> View | None:
         """Reads the row; None where it is so wrong that its problems are all there is."""
         if len(self.row.cells) != len(self.columns):
-            self.report(
-                "",
+            words = (
                 f"it has {len(self.row.cells)} fields, but the header has {len(self.columns)} "
-                "columns",
+                "columns"
             )
+            step = ""
+            if len(self.row.cells) > len(self.columns) and not any(
+                _DECIMAL.fullmatch(cell.strip()) for cell in self.row.cells
+            ):
+                words += "; decimal commas may be the cause"
+                step = (
+                    "Write decimal points; or separate the cells of all lines by semicolons, and "
+                    "decimal commas are read, too."
+                )
+            self.report("", words, step=step)
             return None
         cells = dict(zip(self.columns, self.row.cells, strict=True))
         if not cells["view"].strip():
@@ -329,7 +367,13 @@ class _RowReader:
         stands = {"x_m", "q1_rad"} & numbers.keys() and stop is not None and "robot" in text
         observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text or stands
         if not image and not observed and not self.with_corners and not self.problems:
-            self.report("image", "it is empty, and the row has neither cft_* nor meas_* nor point")
+            absent = "it is empty" if "image" in self.columns else "there is no such column"
+            self.report(
+                "image",
+                f"{absent}, and the row has neither cft_* nor meas_* nor point",
+                step="Write the path of each row's image into column image, or the corners of "
+                "another detector into corners.csv.",
+            )
         if role == "intrinsics" and not self.problems:
             self._check_lens_alone(image or "", numbers)
         if number is None:

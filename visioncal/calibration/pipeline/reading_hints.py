@@ -68,6 +68,10 @@ _UNPAIRED = Remedy(
     "Look how rows and images were paired: files sorted by name (10 before 2), rows sorted anew, "
     "views.csv of another run. Write into column image which file belongs to each row."
 )
+_UNPAIRED_JOINTS = Remedy(
+    "Look first whether [robot] model in session.toml is this arm, through which the joint angles "
+    f"become poses. {_UNPAIRED.words}"
+)
 _BESIDE_JOINTS = Remedy(
     "Look for exchanged columns and shifted rows among x_m to qw in views.csv; or delete these "
     "columns, and the poses are those of the joint angles.",
@@ -192,7 +196,8 @@ def _unpaired(seen: RunState) -> Finding | None:
         "The robot's poses are not those of the images: of all pairs of views, robot and camera "
         f"turn alike in {percent(share)}, and in {percent(by_chance)} if rows are shuffled."
     )
-    return Finding(_MISREAD, words, _UNPAIRED)
+    is_reported = numbers_in(seen.session, POSE).there.any()
+    return Finding(_MISREAD, words, _UNPAIRED if is_reported else _UNPAIRED_JOINTS)
 
 
 def _turns(poses: FloatArray) -> FloatArray:

@@ -40,8 +40,9 @@ class Stage:
     run: Callable[[RunState], RunState]
 
 
-# How warnings about the robot's model begin.
-_OF_MODEL = "session.toml: robot.model:"
+# How warnings about the robot's model begin, and how those about unknown names are told.
+_OF_MODEL, _UNKNOWN_NAMES = "session.toml: robot.model:", ("is ignored", "was not read")
+_MODEL_STEP = "Correct [robot] model in session.toml, or the file that it names."
 
 
 def _read_robot(known: RunState) -> RunState:
@@ -90,9 +91,12 @@ def _not_used(known: RunState) -> Iterator[Finding]:
 
 def _suspicious(warning: str) -> Finding:
     """What is suspicious about a session; a robot that nobody knows costs its joint angles."""
-    if not warning.startswith(_OF_MODEL):
-        return Finding("remark", warning)
-    return Finding("misread_joints", warning, Remedy("Correct [robot] model in session.toml."))
+    if warning.startswith(_OF_MODEL):
+        return Finding("misread_joints", warning, Remedy(_MODEL_STEP))
+    file, _, rest = warning.partition(": ")
+    is_unknown = any(words in warning for words in _UNKNOWN_NAMES)
+    step = Remedy(f"In {file}, correct or delete {rest.partition(' ')[0]}.") if is_unknown else None
+    return Finding("remark", warning, step)
 
 
 def _without_times(session: Session) -> str:
@@ -115,11 +119,15 @@ def _reported(known: RunState) -> RunState:
     if matched is not None and matched.misread:
         check_asked(known.level, can=False, misread=matched.misread)
     if not known.base_from_flange:
+        said = known.session.warnings
+        of_model = [warning for warning in said if warning.startswith(_OF_MODEL)]
         raise DataError(
-            f"session {known.session.name!r}: no view has a pose of the robot.",
+            " ".join(
+                [*of_model, f"session {known.session.name!r}: no view has a pose of the robot."]
+            ),
             culprits=known.lost_views,
             next_step=_without_times(known.session)
-            or " ".join(known.session.warnings)
+            or (_MODEL_STEP if of_model else " ".join(said))
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
     views = tuple(known.base_from_flange)
