@@ -139,10 +139,10 @@ def test_without_a_model_poses_give_the_frames_alone(tmp_path):
     assert list(result.transforms) == ["base_from_instrument", "flange_from_probe"]
     assert result.arm is None
     places = np.array([[point.x_m, point.y_m, point.z_m] for point in result.points])
-    # Known to 0.012 mm each, by what the result says of them.
+    # Readings know them to 0.012 mm each; what an arm may do wrong from stop to stop adds as much.
     assert places == pytest.approx(np.array(THREE), abs=5e-5)
     assert [point.point for point in result.points] == ["a", "b", "c"]
-    assert all(point.sigma_mm < 0.02 for point in result.points)
+    assert all(point.sigma_mm < 0.024 for point in result.points)
 
 
 @PROBE_FIRST

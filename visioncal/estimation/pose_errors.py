@@ -11,6 +11,7 @@ their restricted likelihood (Bayesian model averaging; Hoeting et al. 1999), and
     posture     Gaussian processes over the posture, one of the flange and one of the base, over a
                 short or a long range (Rasmussen and Williams 2006)
     time        an Ornstein-Uhlenbeck process over the stops, of a short or a long memory
+    drift       the flange and the base move evenly from the first stop to the last
     both        the likeliest two of these
 
 The answer stays that of white noise; its covariance is theirs.
@@ -34,9 +35,17 @@ from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA
 
 # Postures are as far apart by so much of a place as by a radian of a direction [m].
 _REACH_M = 0.5
-# Ranges of the processes over the posture [rad], and memories of those over time [stops].
-_RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0)
-_PRIOR = {"white": 1 / 4, "basis": 1 / 4, "posture": 1 / 4, "time": 3 / 16, "both": 1 / 16}
+# Ranges of the processes over the posture [rad], and memories of those over time [stops]. One
+# longer than a session shows as wandering whose whole size is open: a hundred stands for it.
+_RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
+_PRIOR = {
+    "white": 1 / 4,
+    "basis": 1 / 4,
+    "posture": 1 / 4,
+    "time": 1 / 8,
+    "drift": 1 / 16,
+    "both": 1 / 16,
+}
 # Models of less weight are left out.
 _NO_WEIGHT = 1e-4
 # Fewer stops have hardly more residuals than the edges and the noise take.
@@ -127,7 +136,9 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     if problem.is_combined:
         scatter = likelihood.maximised(_scatter(len(stood), white.white))
         independent = [replace(model, prior=_PRIOR["white"] / 2) for model in (white, scatter)]
-    models = [*independent, *map(likelihood.maximised, _models(poses[stood], white.white))]
+    seen = np.searchsorted(stood, observed)
+    others = _models(poses[stood], white.white, seen)
+    models = [*independent, *map(likelihood.maximised, others)]
     likeliest = [
         max((model for model in models if model.kind == kind), key=lambda model: model.evidence)
         for kind in ("posture", "time")
@@ -137,7 +148,9 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     logs = np.array([model.evidence for model in models])
     shares = np.exp(logs - logs.max())
     unlikely = min(model.value + len(model.processes) for model in independent)
-    gain = 2.0 * float(logs.max() + np.log(shares.sum()) + unlikely)
+    # A drift has its own test, and is no error of the arm.
+    of_arm = [value for value, model in zip(logs, models, strict=True) if model.kind != "drift"]
+    gain = 2.0 * float(np.logaddexp.reduce(of_arm) + unlikely)
     weights = np.where(shares / shares.sum() > _NO_WEIGHT, shares, 0.0)
     weights /= weights.sum()
     pairs = [pair for pair in zip(models, weights.tolist(), strict=True) if pair[1]]
@@ -150,9 +163,7 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
         [process for process in processes if process.lasts is lasts] for lasts in (False, True)
     ]
     most = _MOST_COLUMNS // 6 // max(sum(map(bool, kinds)), 1)
-    by_posture, in_time = (
-        _columns(some, len(stood), np.searchsorted(stood, observed), most) for some in kinds
-    )
+    by_posture, in_time = (_columns(some, len(stood), seen, most) for some in kinds)
     squares = sum((weight * model.white**2 for model, weight in pairs), by_posture[1] + in_time[1])
     columns, lasting = np.concatenate([by_posture[0], in_time[0]], axis=2), in_time[0].shape[2]
     basis = np.zeros((len(poses), 6, columns.shape[2]))
@@ -223,8 +234,14 @@ def _scatter(count: int, white: FloatArray) -> _Model:
     return _Model("scatter", _PRIOR["white"], (process,), white)
 
 
-def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:
-    """All models but independent noise, and both kinds of processes at once."""
+def _models(poses: FloatArray, white: FloatArray, seen: IntArray) -> Iterator[_Model]:
+    """All models but independent noise, and both kinds of processes at once.
+
+    Args:
+        poses: (s, 4, 4) all postures at which the robot stood.
+        white: (2,) the noise, of rotation [rad] and place [m].
+        seen: Those at which something was observed.
+    """
     flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (len(poses), 6, 6))
     level = float(np.sqrt(np.mean(np.square(white / TWIST_UNITS[[0, 3]]))))
     base = level * adjoint(invert(poses)) * TWIST_UNITS
@@ -241,6 +258,9 @@ def _models(poses: FloatArray, white: FloatArray) -> Iterator[_Model]:
         kernel = np.exp(-np.abs(order[:, None] - order) / memory)
         process = _Process(kernel, flange, _BEGINS, lasts=True)
         yield _Model("time", _PRIOR["time"] / len(_MEMORIES), (process,), white)
+    evenly = (order - seen.mean()) / seen.std()
+    process = _Process(np.outer(evenly, evenly), both, _BEGINS, lasts=True)
+    yield _Model("drift", _PRIOR["drift"], (process,), white)
 
 
 def _squared_distances(poses: FloatArray) -> FloatArray:
