@@ -68,6 +68,7 @@ def write(
     more: str = "",
     has_corners: Callable[[int], bool] = lambda _: True,
     noise_px: float = 0.1,
+    reported: Callable[[list[RigidTransform]], list[RigidTransform]] = list,
 ) -> Path:
     """Writes a session with corners.csv; the robot has noise of 0.03 mm.
 
@@ -78,6 +79,7 @@ def write(
         more: Further tables of session.toml.
         has_corners: Whether a view has rows in corners.csv.
         noise_px: Of the corners' coordinates.
+        reported: What the controller makes of the flange's poses.
     """
     rng = np.random.default_rng(5)
     folder.mkdir()
@@ -88,8 +90,10 @@ def write(
     inner = np.mgrid[1:COLUMNS, 1:ROWS].T.reshape(-1, 2) * SQUARE_M
     points = np.c_[inner, np.zeros(len(inner))]
     views, corners = ["view,x_m,y_m,z_m,qx,qy,qz,qw"], ["view,point,u_px,v_px"]
-    for view, stop in enumerate(stops):
-        flange = BASE_FROM_TARGET * stop.cam_from_target.inv() * stop.flange_from_cam.inv()
+    flanges = [
+        BASE_FROM_TARGET * stop.cam_from_target.inv() * stop.flange_from_cam.inv() for stop in stops
+    ]
+    for view, (stop, flange) in enumerate(zip(stops, reported(flanges), strict=True)):
         numbers = [*flange.translation, *flange.rotation.as_quat()]
         views.append(",".join(map(repr, [view, *map(float, numbers)])))
         off = RigidTransform.from_exp_coords(rng.normal(size=6) * np.repeat([5e-5, 3e-5], 3))
@@ -180,3 +184,76 @@ def test_an_autofocus_is_no_lens_that_changed_midway(tmp_path, count):
     stops = with_lens(looks(count), longer)
     first = visioncal.calibrate(write(tmp_path / "focus", stops, noise_px=0.02)).verdict.causes[0]
     assert first.words.startswith("The lens changes its focal length by")
+
+
+def said_first(folder: Path) -> str:
+    """What calibrating says first; also where the rows that are right determine nothing."""
+    try:
+        return visioncal.calibrate(folder).verdict.top[0]
+    except visioncal.VisioncalError as error:
+        return str(error)
+
+
+def as_wxyz(pose: RigidTransform) -> RigidTransform:
+    """What a quaternion w, x, y, z is where x, y, z, w are read."""
+    turn = Rotation.from_quat(np.roll(pose.rotation.as_quat(), 1))
+    return RigidTransform.from_components(pose.translation, turn)
+
+
+def as_inverse(pose: RigidTransform) -> RigidTransform:
+    return pose.inv()
+
+
+@pytest.mark.parametrize("since", [7, 13])
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [(as_wxyz, "rotations as a quaternion w, x, y, z"), (as_inverse, "poses inverse")],
+)
+def test_poses_that_are_written_otherwise_from_some_view_on_are_named(
+    tmp_path, written, words, since
+):
+    folder = write(
+        tmp_path / "mixed",
+        looks(20),
+        reported=lambda poses: [*poses[:since], *map(written, poses[since:])],
+    )
+    said = f"From view {since} on, the robot's poses are not those of the others: with the robot's "
+    first = visioncal.doctor(folder).findings[0]
+    assert first.words.startswith(f"{said}{words}")
+    assert f"rows {since} to 19 of views.csv" in first.do.words
+    assert f"{said}{words}" in said_first(folder)
+
+
+@pytest.mark.parametrize("since", [9, 14])
+def test_poses_that_are_a_row_late_from_some_view_on_are_named(tmp_path, since):
+    def repeated(poses):
+        return [*poses[:since], *poses[since - 1 : -1]]
+
+    folder = write(tmp_path / "late", looks(20), reported=repeated)
+    first = visioncal.doctor(folder).findings[0]
+    assert first.words.startswith(f"From view {since} on, the robot's poses are not those of")
+    assert "the robot's pose of a view one row after it" in first.words
+    assert first.words in said_first(folder)
+    assert f"In rows {since} to 19 of views.csv, move the poses up by one row" in first.do.words
+    # As it says:
+    header, *rows = (folder / "views.csv").read_text().splitlines()
+    cells = [row.split(",", 1) for row in rows]
+    moved = [*cells[:since], *([cells[at][0], cells[at + 1][1]] for at in range(since, 19))]
+    (folder / "views.csv").write_text("\n".join([header, *map(",".join, moved)]) + "\n")
+    assert visioncal.calibrate(folder).verdict.status == "good"
+
+
+def test_rows_in_millimetres_are_said_to_be_some(tmp_path):
+    def in_mm(poses):
+        return [
+            *poses[:9],
+            *(
+                RigidTransform.from_components(1e3 * at.translation, at.rotation)
+                for at in poses[9:]
+            ),
+        ]
+
+    findings = visioncal.doctor(write(tmp_path / "mm", looks(20), reported=in_mm)).findings
+    (all_rows,) = (finding.words for finding in findings if finding.kind == "remark")
+    assert "in 11 of 20 rows. It looks like millimetres" in all_rows
+    assert all_rows.endswith("multiply these columns by 0.001 there.")

@@ -74,14 +74,20 @@ def view_warnings(views: Sequence[View]) -> Iterator[str]:
             for view in views
             if names[0] in view.numbers
         ]
-        far = float(np.median(norms)) if norms else 0.0
-        if far > _FAR_M:
+        far = [norm for norm in norms if norm > _FAR_M]
+        if 2 * len(far) > len(norms):
+            away, some = float(np.median(far)), ""
+            if len(far) < len(norms):
+                some = f" in {len(far)} of {len(norms)} rows"
             unit = (
-                "It looks like millimetres: multiply these columns by 0.001."
-                if far > _SURELY_MM
+                f"It looks like millimetres: multiply these columns by 0.001{some and ' there'}."
+                if away > _SURELY_MM
                 else "Metres are needed, and these are inches, centimetres or millimetres."
             )
-            yield f"views.csv: the median length of ({', '.join(names)}) is {far:.4g} m. {unit}"
+            yield (
+                f"views.csv: the median length of ({', '.join(names)}) is {away:.4g} m{some}. "
+                f"{unit}"
+            )
     angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]
     if angles and float(np.median(angles)) > _WIDE_RAD:
         yield (

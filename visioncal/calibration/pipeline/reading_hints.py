@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.guess import Candidate, guess_reading
+from visioncal.calibration.guess.changed_rows import changed_rows
 from visioncal.calibration.guess.given import FEWEST_ROWS, Recording, closes
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
@@ -88,9 +89,9 @@ def reading_hint(seen: RunState) -> Finding | None:
     Returns:
         It, with the command that applies it; None where no reading stands out.
     """
-    still = _unrecorded(seen)
-    if still is not None:
-        return still
+    hint = _unrecorded(seen) or _changed_midway(seen)
+    if hint is not None:
+        return hint
     try:
         guess = guess_seen(seen)
     except VisioncalError:
@@ -157,6 +158,37 @@ def _unrecorded(seen: RunState) -> Finding | None:
         f"the recorded {wrong} are not those of the views."
     )
     return Finding(_MISREAD, words, _UNRECORDED)
+
+
+def _changed_midway(seen: RunState) -> Finding | None:
+    """Says that the robot's poses are read otherwise from some view on."""
+    seen = replace(seen, poses=seen.poses_of_one_board)
+    recording = Recording(
+        at_times(seen), camera_numbers(seen), seen.session.mount, is_measured=bool(seen.corners)
+    )
+    found = changed_rows(recording)
+    if found is None:
+        return None
+    numbers = [view.number for view in seen.session.views]
+    views = tuple(numbers[row] for row in found.rows)
+    when, others = f"From view {views[0]} on", "before them"
+    if not found.is_behind:
+        when, others = f"Up to view {views[-1]}", "behind them"
+    words = (
+        f"{when}, the robot's poses are not those of the others: with {' and '.join(found.words)}, "
+        f"these views fit the ones {others}, and as declared they do not."
+    )
+    rows = f"rows {views[0]} to {views[-1]} of views.csv"
+    shift = found.reading.shift
+    step = (
+        f"In {rows}, move the poses {'up' if shift > 0 else 'down'} by "
+        f"{'one row' if abs(shift) == 1 else f'{abs(shift)} rows'}, delete rows that are left "
+        "without a pose, and look why an image or a pose is missing there."
+        if shift
+        else f"Correct the poses in {rows} (base_from_flange in metres, quaternion x, y, z, w), or "
+        "delete these rows; and look what was set up anew in between."
+    )
+    return Finding(_MISREAD, words, Remedy(step, CALIBRATE), views)
 
 
 def _one_position(seen: RunState) -> Finding | None:

@@ -429,7 +429,7 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
             details += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             details += others[0].reason
         words = f"{len(lost)} of {count_all} views are not used{details}."
-        words_do = "Look at the first of them, and repeat what is missing."
+        words_do = "Correct the first of them and those like it, or repeat what is missing."
         step = Remedy(words_do, look_at(others[0].view)) if others else None
         views, is_fatal = tuple(rejection.view for rejection in lost), share > limits.lost_share[1]
         # Those that disagree have a finding of their own.
