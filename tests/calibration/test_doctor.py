@@ -82,6 +82,17 @@ def test_rows_that_no_image_shows_are_counted(sound, tmp_path):
     assert "rows of squares" not in str(visioncal.doctor(sound))
 
 
+def test_images_that_are_named_without_their_folder_are_found_in_it(sound, tmp_path):
+    folder = tmp_path / "bare"
+    shutil.copytree(sound, folder)
+    table = folder / "views.csv"
+    table.write_text(table.read_text("utf-8").replace("images/", ""), "utf-8")
+    first = visioncal.doctor(folder).findings[0]
+    assert first.kind == "missing_images"
+    assert "; there is images/000.png instead." in first.words
+    assert first.do.words == "In views.csv, write images/ before the images' names."
+
+
 def test_markers_too_small_to_read_are_no_mirror_and_no_other_board(tmp_path):
     """Its squares are seen, and look alike in a mirror."""
     plain = BROKEN["semicolons"].options

@@ -76,10 +76,10 @@ def _missing(session: Session) -> Iterator[Finding]:
     names = [view.image for view in missing]
     are = "image is" if len(with_image) == 1 else "images are"
     words = f"{len(missing)} of {len(with_image)} {are} missing: {some_of(names, _LISTED)}"
-    old, new = _renamed(session, names)
-    if old:
-        words = f"{words}; there is {names[0].replace(old, new)} instead."
-        step = Remedy(f"In views.csv, replace {old} by {new}.")
+    there, renaming = _renamed(session, names)
+    if there:
+        words = f"{words}; there is {there} instead."
+        step = Remedy(renaming)
     else:
         words = f"{words}."
         rows = ", ".join(str(view.number) for view in missing)
@@ -114,20 +114,20 @@ def _empty_rows(session: Session) -> Iterator[Finding]:
 
 
 def _renamed(session: Session, names: Sequence[str]) -> tuple[str, str]:
-    """What to replace in the names of images by what, so that all are there; empty if nothing."""
+    """Where the first image is, and what to replace so that all are there; empty if nothing."""
     store = session.images
     if not isinstance(store, FolderImages):
         return "", ""
     first = Path(names[0])
     pairs = [(first.suffix, item) for item in (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))]
-    if first.parent != Path():
-        folder = f"{first.parent.as_posix()}/"
-        others = sorted(f"{path.name}/" for path in store.folder.iterdir() if path.is_dir())
-        pairs += [(folder, other) for other in (*others, "")]
+    others = sorted(f"{path.name}/" for path in store.folder.iterdir() if path.is_dir())
+    folder = "" if first.parent == Path() else f"{first.parent.as_posix()}/"
+    pairs += [(folder, other) for other in (*others, "")]
     for old, new in pairs:
-        changed = [name.replace(old, new) for name in names]
+        changed = [name.replace(old, new) if old else f"{new}{name}" for name in names]
         if old != new and all(store.exists(name) for name in changed):
-            return old, new
+            step = f"replace {old} by {new}" if old else f"write {new} before the images' names"
+            return changed[0], f"In views.csv, {step}."
     return "", ""
 
 
