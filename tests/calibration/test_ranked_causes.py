@@ -342,6 +342,17 @@ def test_rows_that_were_shuffled_are_named(mount, shuffled, named):
     assert verdict.status == ("bad" if named else "check")
 
 
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_exchanged_rows_are_named_of_a_board_that_looks_the_same_turned(mount):
+    """Of the two poses that each image allows, the one that fits its own row best was taken."""
+    target = replace(load_target("checkerboard_9x6_25mm"), rows=7)
+    cell = simulate(CellOptions(target=target, mount=mount, views=14, seed=1))
+    order = np.arange(14)
+    order[[3, 7]] = 7, 3
+    verdict = calibrate(session_of(cell, cell.robot.base_from_flange[order])).verdict
+    assert verdict.reasons[0].startswith("Views 3 and 7 are exchanged")
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_rows_paired_crosswise_are_named(seed):
     """Each pair of views that are exchanged turns as it should, which shuffled rows do not."""

@@ -19,6 +19,8 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Remedy, exchanging, look_at
 from visioncal.estimation.moves import common_change
 from visioncal.results import Moved
+from visioncal.session.frames import frame_name
+from visioncal.vision.targets import rotation_transforms
 
 # A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
@@ -428,7 +430,11 @@ def residuals(solved: Solved) -> FloatArray:
 def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
     """The other stations that observations fit; see `other_stops`."""
     agreed = solved.agreed
-    return other_stops(agreed.problem, agreed.used, agreed.fit, out, agreed.moves)
+    turns = {
+        frame_name("target", name): rotation_transforms(target)
+        for name, target in solved.cell.session.boards.items()
+    }
+    return other_stops(agreed.problem, agreed.used, agreed.fit, out, agreed.moves, turns)
 
 
 def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:

@@ -3,11 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from types import MappingProxyType
 
 import numpy as np
 
 from visioncal.calibration.stages.pose_ambiguity import CLEAR_RATIO
 from visioncal.core.quantiles import chi2_limit
+from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
@@ -19,7 +21,12 @@ _CHANCE, _NEAR = 1e-3, 4.0
 
 
 def other_stops(
-    problem: Problem, used: Mask, fit: Solution, out: IntArray, moves: Sequence[Move] = ()
+    problem: Problem,
+    used: Mask,
+    fit: Solution,
+    out: IntArray,
+    moves: Sequence[Move] = (),
+    turns: Mapping[str, FloatArray] = MappingProxyType({}),
 ) -> dict[int, list[int]]:
     """The other stops that observations fit which do not fit their own, best first.
 
@@ -29,6 +36,7 @@ def other_stops(
         fit: The unknowns and the noise.
         out: Observations that are left out.
         moves: What moved between stops.
+        turns: (k, 4, 4) `target_from_turned` of targets that look the same turned, by frame.
     """
     seen = problem.observations
     # Between the last stop before a move and the first one after it, either may be true.
@@ -39,8 +47,15 @@ def other_stops(
     }
     found = {}
     for at in out.tolist():
-        squares = np.minimum(
-            *(_squares_by_stop(problem, fit, at, moves, starts) for starts in (late, early))
+        # Of a target that looks the same turned, the pose was taken that fits its own stop best.
+        alike = turns.get(seen.observed[at].partition("@")[0], np.eye(4)[None])
+        squares = np.min(
+            [
+                _squares_by_stop(problem, fit, at, moves, starts, turn)
+                for starts in (late, early)
+                for turn in alike
+            ],
+            axis=0,
         )
         # Stops in one posture are no others: what fits one of them fits its own as well, or nearly.
         limit = min(_NEAR * chi2_limit(_CHANCE, 6), squares[seen.stops[at]] / CLEAR_RATIO**2)
@@ -51,7 +66,12 @@ def other_stops(
 
 
 def _squares_by_stop(
-    problem: Problem, fit: Solution, at: int, moves: Sequence[Move], starts: Mapping[str, int]
+    problem: Problem,
+    fit: Solution,
+    at: int,
+    moves: Sequence[Move],
+    starts: Mapping[str, int],
+    turn: FloatArray,
 ) -> FloatArray:
     """Squared distances (s,) of an observation from what is predicted at every stop."""
     # Infinite where a robot's pose is not known, or where no robot has a part in it. What moved is
@@ -60,15 +80,18 @@ def _squares_by_stop(
     stops = np.arange(max(map(len, problem.poses.values()), default=0))
     repeated = np.full(len(stops), at)
     observer, observed = (pair[at].partition("@")[0] for pair in (seen.observers, seen.observed))
+    taken, turned = seen.take(repeated), adjoint(invert(turn))
     here = replace(
-        seen.take(repeated),
+        taken,
         observers=(observer,) * len(stops),
         observed=(observed,) * len(stops),
         stops=stops,
+        measured=taken.measured @ turn,
+        covariance=turned @ taken.covariance @ turned.T,
     )
     for move in moves:
         here = here.renamed(move.frame, move.twin, stops >= starts[move.twin])
-    effects = tuple(effect.take(repeated) for effect in problem.effects)
+    effects = tuple(effect.take(repeated).carried(turned) for effect in problem.effects)
     there = replace(problem, observations=here, effects=effects)
     known, squares = _known(there), np.full(len(stops), np.inf)
     if known.any() and any(step.robot for group in there.groups for step in group.path):
