@@ -146,6 +146,15 @@ def test_a_payload_is_weighed(seed):
     assert (np.abs(found.centre_m - LOAD.centre_m) < 4.0 * found.centre_sigma_m).all()
     assert found.consistent
     assert found.document()["inertia_kg_m2"][0] == pytest.approx(0.012, rel=0.3)
+    # Weighing knows a mass as well as gravity, and its centre better.
+    document = {**identified.robot.document, "gravity_m_s2": [0.0, 0.0, -9.80665]}
+    stated = replace(identified, robot=Robot.from_document(document))
+    surer = estimate_payload(stated, loaded_streams(stated, world.full))
+    assert surer.mass_kg == pytest.approx(found.mass_kg)
+    assert found.mass_sigma_kg**2 - surer.mass_sigma_kg**2 == pytest.approx(
+        (5e-4 * found.mass_kg) ** 2
+    )
+    assert surer.centre_sigma_m == pytest.approx(found.centre_sigma_m)
     # The arm that carries it holds it.
     q = world.done["check"].q[::500]
     more = ArmDynamics.of(identified).carrying(found.body).gravity(q)

@@ -267,7 +267,7 @@ def _cleaned(
     torques[spikes] = around[spikes]
     for what, wrong, done in (
         ("at rest on an extreme value (saturated)", flat, "what rests on them is left out"),
-        ("far off from their neighbours", spikes, "these are used in their place"),
+        ("far off from their neighbours", spikes, "the median around is used in their place"),
     ):
         if wrong.any():
             joints = [f"tau{at + 1} ({n} times)" for at, n in enumerate(wrong.sum(axis=0)) if n]

@@ -30,6 +30,9 @@ _WORST = 0.5
 # How much of the variance of their gains the drives of an arm have in common: of the 12 % of
 # GAIN_SIGMA a mean of 11 % is alike in all joints [-].
 _ALIKE = 0.8
+# Weighing knows a mass as well as gravity: where that is not stated, it is within such a standard
+# deviation of the standard value where people live [-].
+_GRAVITY_SIGMA = 5e-4
 _HOW = "Drive the exciting trajectory of visioncal dynamics plan with the payload on the flange."
 # A gain that is known no better than to this share of itself counts as not determined [-].
 _WORST_GAIN = 0.1
@@ -152,7 +155,8 @@ def estimate_payload(
     of_gains = _of_gains(loaded, fit, gain_sigma)
     found = Payload(
         fit.values[:10],
-        (fit.covariance + _of_arm(identified, loaded, fit) + of_gains)[:10, :10],
+        (fit.covariance + _of_arm(identified, loaded, fit) + of_gains)[:10, :10]
+        + _of_gravity(identified, fit),
         rms_of(np.concatenate(fit.residuals), np.concatenate([block.used for block in fit.blocks])),
         float(np.sqrt(of_gains[0, 0])),
     )
@@ -192,6 +196,14 @@ def _of_arm(identified: Identified, loaded: Sequence[Conditioned], fit: Regressi
     taken = np.linalg.solve(information, cross)
     kept = slice(base.rank)
     return np.asarray(taken @ identified.covariance[kept, kept] @ taken.T)
+
+
+def _of_gravity(identified: Identified, fit: Regression) -> FloatArray:
+    """(10, 10) what gravity that is not stated adds: to the mass and, alike, to its moments."""
+    weighed = np.zeros(10)
+    if "gravity_m_s2" not in identified.robot.document:
+        weighed[:4] = _GRAVITY_SIGMA * fit.values[:4]
+    return np.outer(weighed, weighed)
 
 
 def _of_gains(loaded: Sequence[Conditioned], fit: Regression, sigma: float) -> FloatArray:
