@@ -9,8 +9,7 @@ from support.moved_arms import changed, robot_with_bodies
 
 from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identified import Identified
-from visioncal.dynamics.identify import Options
-from visioncal.dynamics.lag import find_lag
+from visioncal.dynamics.identify import Options, find_lag
 from visioncal.dynamics.reading import read_recorded
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import nominal_dynamics, real_dynamics

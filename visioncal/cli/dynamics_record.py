@@ -36,7 +36,7 @@ def dynamics_record_command(
     from visioncal.cli.console import messages, say
     from visioncal.core.interrupts import ended_like_ctrl_c
     from visioncal.live.capture.motions import record_motion
-    from visioncal.live.drivers.ur_motion import UrMotion
+    from visioncal.live.drivers.ur import UrMotion
     from visioncal.session import STREAMS, check_stream
 
     kind, _, host = arm.partition(":")

@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.framing import FrameOptions, TouchOptions
+from visioncal.cli.framing import Asked, FrameOptions, PointOption, TouchOptions, place_frame
 from visioncal.cli.options import AsJson, PartOptions
-from visioncal.cli.target_in_images import Asked, PointOption, place_frame
 
 # Help does not wait for them.
 if TYPE_CHECKING:

@@ -99,7 +99,8 @@ def _report(check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict") -
     console = answers()
     word, colour = ("pass", "green") if check.passed else ("fail", "red")
     name = escape(check.seen.known.session.name)
-    console.print(f"[bold {colour}]{word}[/]  {name} against {escape(_named(check))}")
+    against = escape(f"{check.calibration.session_name}, {check.calibration.created}")
+    console.print(f"[bold {colour}]{word}[/]  {name} against {against}")
     for line in (*verdict.top, *verdict.rest, *check.seen.warnings):
         console.print(f"  - {escape(line)}")
     print_steps(verdict.next_steps)
@@ -109,7 +110,3 @@ def _report(check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict") -
         words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)
         if words:
             console.print(f"{begin}: {escape(words)}")
-
-
-def _named(check: "Check") -> str:
-    return f"{check.calibration.session_name}, {check.calibration.created}"

@@ -41,8 +41,9 @@ def matched(value: float, sigma: float) -> str:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Writes a value with so many decimals."""
-    return _without_negative_zero(f"{value:.{decimals}f}")
+    """Writes a value with so many decimals, and nothing as no negative zero."""
+    text = f"{value:.{decimals}f}"
+    return text[1:] if text.startswith("-") and not text.strip("-0.") else text
 
 
 def signed(value: float, decimals: int) -> str:
@@ -65,7 +66,3 @@ def significant(value: float | None, digits: int = 2) -> str:
         return f"<{_SMALLEST}"
     exponent = int(f"{value:.{digits - 1}e}".partition("e")[2])
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
-
-
-def _without_negative_zero(text: str) -> str:
-    return text[1:] if text.startswith("-") and not text.strip("-0.") else text

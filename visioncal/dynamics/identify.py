@@ -1,16 +1,23 @@
-"""Dynamic identification: from streams of motion and torque to the parameters of an arm."""
+"""Dynamic identification: from streams of motion and torque to the parameters of an arm.
+
+Torques that are filtered, or stamped by another clock, lag the angles. One number for all streams
+is sought by what the best fit leaves, and made exact by Gauss and Newton's steps, with the torques'
+derivative as one more column.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from visioncal.dynamics.base import BaseModel, check_identifiable, check_turning
+from visioncal.core.limits import DynamicsLimits
+from visioncal.core.types import FloatArray, Mask
+from visioncal.dynamics.base import BaseModel, check_identifiable, check_turning, null_space
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.consistent import fit_consistent
 from visioncal.dynamics.convention_hypotheses import check_mistakes
-from visioncal.dynamics.identified import Identified, StreamFacts
+from visioncal.dynamics.identified import Identified, Lag, StreamFacts
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of, spread_of
 from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
@@ -18,6 +25,14 @@ from visioncal.robot import Robot
 
 # What speeds are known to after filtering; joints are through it in no time [rad/s].
 SLOW_RAD_S = 1e-4
+
+_LIMITS = DynamicsLimits()
+# Lags are sought up to this one, so many to a period of the cut-off, by so many torques [s].
+_LARGEST_S, _PER_PERIOD, _ROWS = 0.25, 16, 20_000
+# A lag is one that differs from zero by so many sigmas, where the fit leaves of the torques' range
+# no more than this share in the median of the joints: no lag mends what else is wrong.
+_SIGMAS, _LEFT = 5.0, 0.3
+_ROUNDS, _SETTLED = 5, 0.1
 
 
 @dataclass(frozen=True)
@@ -117,3 +132,122 @@ def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts,
             streams, fit.blocks, fit.residuals, fit.sigmas, strict=True
         )
     )
+
+
+def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms) -> Lag | None:
+    """Estimates the lag of the torques of an arm's motions.
+
+    Args:
+        robot: The arm.
+        streams: Its motions, with torques that lag alike.
+        terms: What joints have of their own. Rotors count, too, where the motion allows: a lag of
+            viscous friction would else stand for them.
+
+    Returns:
+        The lag; None where there is none that is clear and matters, or the motion tells none.
+    """
+    for rotors in (True, terms.motor_inertia):
+        model = DynamicModel(robot, replace(terms, motor_inertia=rotors))
+        base = BaseModel.reduce(model)
+        blocks = [block_of(base, stream) for stream in streams]
+        if not null_space(base, blocks):
+            break
+    else:
+        return None
+    try:
+        return _found(streams, blocks)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _found(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> Lag | None:
+    lag_s = _nearest(streams, blocks)
+    if lag_s is None:
+        return None
+    for _ in range(_ROUNDS):
+        lagged = [_lagged(*pair, lag_s) for pair in zip(streams, blocks, strict=True)]
+        fit = regress(lagged)
+        change, sigma = float(fit.values[-1]), float(np.sqrt(fit.covariance[-1, -1]))
+        lag_s -= change
+        if abs(change) < _SETTLED * sigma or abs(lag_s) > _LARGEST_S:
+            break
+    found = Lag(lag_s, sigma, _share(fit, lag_s))
+    left = [
+        rms_of(residual, block.used) / spread_of(block.y, block.used)
+        for residual, block in zip(fit.residuals, fit.blocks, strict=True)
+    ]
+    clear = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and found.share > _LIMITS.slight_share
+    return found if clear and np.median(left) < _LEFT else None
+
+
+def _nearest(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> float | None:
+    """The lag on a grid by which the best fit leaves least [s]; None where samples are too few."""
+    step_s = 1.0 / (_PER_PERIOD * max(stream.cutoff_hz for stream in streams))
+    many = int(_LARGEST_S / step_s)
+    lags = step_s * np.arange(-many, many + 1)
+    rows, torques, joints = [], [], []
+    total = sum(block.y.size for block in blocks)
+    for stream, block in zip(streams, blocks, strict=True):
+        used = block.used & _inside(stream, _LARGEST_S)[:, None]
+        used[np.arange(len(used)) % max(total // _ROWS, 1) > 0] = False
+        sizes = np.maximum(spread_of(block.y, used), 1e-12)
+        rows.append((block.x / sizes[:, None])[used])
+        torques.append(np.stack([(_torques(stream, lag) / sizes)[used] for lag in lags], axis=1))
+        joints.append(np.nonzero(used)[1])
+    x, y, joint = np.concatenate(rows), np.concatenate(torques), np.concatenate(joints)
+    if len(x) < 2 * x.shape[1]:
+        return None
+    directions = np.linalg.qr(x / np.maximum(np.linalg.norm(x, axis=0), 1e-12))[0]
+    left = (y - directions @ (directions.T @ y)) ** 2
+    # The likelihood of joints each with a noise of its own.
+    cost = np.zeros(len(lags))
+    for one in np.unique(joint):
+        of = joint == one
+        cost += of.sum() * np.log(np.maximum(left[of].sum(axis=0), 1e-12))
+    return float(lags[np.argmin(cost)])
+
+
+def _lagged(stream: Conditioned, block: NoiseBlock, lag_s: float) -> NoiseBlock:
+    """The block with its torques taken so much later, and their derivative as one more column."""
+    step_s = 1.0 / stream.rate_hz
+    y, before, after = (
+        _torques(stream, value) for value in (lag_s, lag_s - step_s, lag_s + step_s)
+    )
+    slope = (after - before) / (2.0 * step_s)
+    used = block.used & _inside(stream, abs(lag_s) + step_s)[:, None]
+    return NoiseBlock(
+        np.concatenate([block.x, slope[:, :, None]], axis=2), y, used, block.correlation
+    )
+
+
+def _torques(stream: Conditioned, lag_s: float) -> FloatArray:
+    """(k, n) filtered torques of so much later, summed over the samples that count now [N m]."""
+    parts = []
+    for piece in stream.pieces:
+        times_s = piece.measured.motion.times_s
+        later = [
+            np.interp(times_s + lag_s, times_s, column) for column in piece.measured.torques_nm.T
+        ]
+        parts.append(piece.lowpass(np.stack(later, axis=1), piece.there))
+    return np.concatenate(parts)
+
+
+def _inside(stream: Conditioned, lag_s: float) -> Mask:
+    """(k,) which filtered samples rest on recorded torques, whichever way they lag [s]."""
+    parts = []
+    for piece in stream.pieces:
+        ends_s = piece.measured.motion.times_s[[0, -1]] + np.array([1.0, -1.0]) * (
+            piece.lowpass.half / stream.rate_hz + lag_s
+        )
+        parts.append((piece.times_s >= ends_s[0]) & (piece.times_s <= ends_s[1]))
+    return np.concatenate(parts)
+
+
+def _share(fit: Regression, lag_s: float) -> float:
+    """The most that a lag changes of a joint's torques, over their range."""
+    shares = [
+        rms_of(lag_s * block.x[:, :, -1], block.used)
+        / np.maximum(spread_of(block.y, block.used), 1e-12)
+        for block in fit.blocks
+    ]
+    return float(np.max(shares))

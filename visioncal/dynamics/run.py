@@ -12,8 +12,7 @@ from visioncal.core.threads import on_one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.identified import Identified, Lag
-from visioncal.dynamics.identify import Identification, Options, identify
-from visioncal.dynamics.lag import find_lag
+from visioncal.dynamics.identify import Identification, Options, find_lag, identify
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
 from visioncal.dynamics.validate import Prediction, friction_of_known, predict, validate
 from visioncal.robot import Robot

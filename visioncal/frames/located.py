@@ -46,7 +46,8 @@ class Located:
     def budget_mm(self) -> dict[str, float]:
         """Standard deviation of the place by source, and their `total` [mm]."""
         every = {**self.parts, "total": self.covariance}
-        return {name: _length_mm(covariance) for name, covariance in every.items()}
+        squares = {name: max(np.trace(covariance), 0.0) for name, covariance in every.items()}
+        return {name: float(1e3 * np.sqrt(square)) for name, square in squares.items()}
 
     @property
     def largest(self) -> str:
@@ -92,7 +93,3 @@ def _quantile95(count: float, freedom: float) -> float:
     """Of the mean of so many squared errors, in units of a variance with that much freedom."""
     # Beyond, F does not differ from chi-square, and its series lose digits.
     return float(f_limit(0.05, count, min(freedom, 1e6)))
-
-
-def _length_mm(covariance: FloatArray) -> float:
-    return float(1e3 * np.sqrt(max(np.trace(covariance), 0.0)))

@@ -186,7 +186,8 @@ def doubts(
             f"All {count} images are of one stop of the robot, whose error they share: nothing "
             "checks it. Take others, from other sides."
         )
-    elif _is_torn(found):
+    elif found.agrees.all() and np.any(found.mahalanobis_sq > found.limit):
+        # Images stayed in although they contradict each other.
         worst = int(np.where(found.agrees, found.mahalanobis_sq, -1.0).argmax())
         yield (
             f"The images disagree, by up to {_distance(found, worst)}, and with {count} of them "
@@ -199,13 +200,6 @@ def doubts(
         )
     if found.rival is not None:
         yield _rival_words(found, looks, thing)
-
-
-def _is_torn(found: ImageInliers) -> bool:
-    """Whether images stayed in although they contradict each other."""
-    return bool(np.any((found.mahalanobis_sq > found.limit)[found.agrees])) and bool(
-        found.agrees.all()
-    )
 
 
 def _distance(found: ImageInliers, at: int) -> str:

@@ -280,7 +280,10 @@ def _squared_distance(difference: FloatArray, covariance: FloatArray) -> float:
 
 
 def _lens_change(a: CameraResult | None, b: CameraResult | None, limit: float) -> LensChange | None:
-    if a is None or b is None or not _are_of_one_kind(a.camera, b.camera):
+    if a is None or b is None:
+        return None
+    kinds = [(lens.model, lens.resolution, lens.distortion.size) for lens in (a.camera, b.camera)]
+    if kinds[0] != kinds[1]:
         return None
     first, second = intrinsics(a.camera), intrinsics(b.camera)
     change = LensChange(intrinsics_names(a.camera), first, second)
@@ -290,10 +293,6 @@ def _lens_change(a: CameraResult | None, b: CameraResult | None, limit: float) -
     squared = _squared_distance(second - first, covariance)
     significance = Significance(float(chdtrc(len(first), squared)), limit)
     return replace(change, sigmas=np.sqrt(np.diag(covariance)), significance=significance)
-
-
-def _are_of_one_kind(a: Camera, b: Camera) -> bool:
-    return (a.model, a.resolution, a.distortion.size) == (b.model, b.resolution, b.distortion.size)
 
 
 def intrinsics_names(camera: Camera) -> tuple[str, ...]:

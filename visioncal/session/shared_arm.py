@@ -114,7 +114,9 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
                 own["stamp_s"] = repr(view.stamp_s + later_s)
             rows.append([own.get(column, view.cell(column)) for column in columns])
         if session.corner_table is not None:
-            tables.append(_moved(session.corner_table, views, name))
+            table = session.corner_table
+            mine = (name,) * len(table)
+            tables.append(replace(table, views=table.views + views, targets=mine))
         views += 1 + max((view.number for view in session.views), default=0)
         stops += 1 + max((view.stop or 0 for view in session.views), default=0)
         until_s = max([until_s, *(stamp + later_s for stamp in _stamps(session.views))])
@@ -190,10 +192,6 @@ def _later(session: Session, until_s: float) -> float:
     """By how much its times are moved to come after those before [s]."""
     stamps = _stamps(session.views)
     return until_s + _BETWEEN_S - min(stamps) if stamps and min(stamps) <= until_s else 0.0
-
-
-def _moved(table: CornerTable, views: int, target: str) -> CornerTable:
-    return replace(table, views=table.views + views, targets=(target,) * len(table))
 
 
 def _stacked(tables: Sequence[CornerTable]) -> CornerTable:

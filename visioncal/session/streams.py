@@ -15,10 +15,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, read_text_inside, sha256, some_of, write_atomically
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.session import columns as known
+from visioncal.session.table import NUMBER
 
 FOLDER, STAMP = "streams", "stamp_s"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 # Rounding to four digits leaves a unit quaternion's norm within this of 1, as in views.csv.
 _NORM_TOLERANCE = 1e-3
 # Samples farther apart than so many times the usual, and than so much [s], have others missing
@@ -222,7 +222,7 @@ def numbered_rows(
 
 
 def _number(cell: str) -> float:
-    return float(cell) if _NUMBER.fullmatch(cell) else np.nan
+    return float(cell) if NUMBER.fullmatch(cell) else np.nan
 
 
 def write_stream(stream: Stream) -> str:

@@ -4,7 +4,7 @@ The keys are the fields of `NetworkOptions` and of what it holds; `[targets.NAME
 """
 
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
@@ -143,7 +143,11 @@ class _Reader:
                 culprits=[f"{label}: {unknown[0]}"],
                 next_step=did_you_mean(unknown[0], known),
             )
-        needed = {field.name for field in fields(kind) if _has_no_default(field)}
+        needed = {
+            field.name
+            for field in fields(kind)
+            if field.default is MISSING and field.default_factory is MISSING
+        }
         table = DocumentTable(row, label)
         values: dict[str, Any] = {
             key: self._value(table, key, hint, kind, path)
@@ -196,7 +200,3 @@ def _number(table: DocumentTable, key: str) -> float:
     if key not in _SIGNED and value < 0.0:
         raise table.refuse(key, value, "a number of 0 or more")
     return value
-
-
-def _has_no_default(field: Field[Any]) -> bool:
-    return field.default is MISSING and field.default_factory is MISSING

@@ -32,7 +32,7 @@ def sentence(
             f"declared, the chain closes to {_figures(declared)}{others and f'; {others}'}. Add "
             "views tilted about different axes."
         )
-    if not declared.closes or any(_is_far_better(rival, declared) for rival in rivals):
+    if not declared.closes or any(STANDS_OUT * rival.score < declared.score for rival in rivals):
         return (
             "No reading that was tried stands out: as declared, the chain closes to "
             f"{_figures(declared)}{others and f'; {others}'}."
@@ -41,10 +41,6 @@ def sentence(
         f"The poses fit as declared: the chain closes to {_figures(declared)}; "
         f"{others or 'no other reading comes near'}."
     )
-
-
-def _is_far_better(candidate: Candidate, declared: Candidate) -> bool:
-    return STANDS_OUT * candidate.score < declared.score
 
 
 def _found(declared: Candidate, best: Candidate) -> str:

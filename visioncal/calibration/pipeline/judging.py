@@ -13,7 +13,6 @@ from visioncal.calibration.pipeline.fault_messages import moved_found
 from visioncal.calibration.pipeline.lens_fields import errors_found, lens_changes
 from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.distance_scale import distance_scale, measured_turns
@@ -325,7 +324,7 @@ def _arms(answer: Answer) -> list[JudgedArm]:
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     found = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
-        noise, numbers = answer.sigmas[robot], answer.arms[robot].numbers
+        noise, numbers, arm = answer.sigmas[robot], answer.arms[robot].numbers, solved.arms[robot]
         known = not problem.is_combined
         surely = (1e3 * float(intervals[1, 0]), float(np.rad2deg(intervals[0, 0])))
         found.append(
@@ -334,19 +333,15 @@ def _arms(answer: Answer) -> list[JudgedArm]:
                 noise["translation_mm"] if known else None,
                 noise["rotation_deg"] if known else None,
                 surely if known else None,
-                errs=_errs(solved.arms[robot]),
+                errs=arm.errors is not None and arm.errors.is_significant,
                 workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
                 modelled=robot in modelled,
-                by_functions=solved.arms[robot].has_functions,
-                can_tilt=solved.arms[robot].can_tilt,
+                by_functions=arm.has_functions,
+                can_tilt=arm.can_tilt,
                 name=robot if len(problem.robots) > 1 else "",
             )
         )
     return found
-
-
-def _errs(arm: RobotArm) -> bool:
-    return arm.errors is not None and arm.errors.is_significant
 
 
 def poor_motion(known: RunState) -> Finding | None:
@@ -411,12 +406,6 @@ def _motion(cell: Cell, part: Problem, frame: str) -> str:
     return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
 
 
-def _worst_direction(cell: Cell, frame: str, edge: Edge) -> Direction:
-    """The direction of a frame that is known worst, in the axes of the frame that it hangs on."""
-    found = _directions(cell, frame, edge)
-    return max(found, key=lambda value: value.sigma / value.limit)
-
-
 def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
     """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
     found = edge_directions(edge.matrix, edge.covariance, *_names(cell.tree, frame))
@@ -430,7 +419,7 @@ def _more(cell: Cell, frame: str) -> str:
     others = sorted({row.seen if row.seer == frame else row.seer for row in rows})
     if not others:
         return "Add stops at which its robot turns about two axes or more."
-    if frame.startswith("target") and len(others) == 1 and frame not in _carried(cell):
+    if frame.startswith("target") and len(others) == 1 and cell.tree.body(frame) == cell.tree.root:
         return (
             f"Let another camera than {others[0]} see {frame}, too, or measure its squares and "
             "state square_sigma_m."
@@ -441,17 +430,12 @@ def _more(cell: Cell, frame: str) -> str:
     )
 
 
-def _carried(cell: Cell) -> set[str]:
-    """The frames that robots carry."""
-    return {branch for branch in cell.tree.branches if cell.tree.body(branch) != cell.tree.root}
-
-
 def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
     """Names the link of the cell that is known worst, and what it rests on."""
     if not edges:
         return ""
     name, edge = max(edges.items(), key=lambda pair: pair[1].sigma_mm)
-    worst = _worst_direction(cell, name, edge)
+    worst = max(_directions(cell, name, edge), key=lambda value: value.sigma / value.limit)
     return (
         f"The weakest link is {name}: sigma {figure(edge.sigma_mm)} mm and "
         f"{figure(edge.sigma_deg)} deg, most of it in {worst.words}. {_resting(cell, name)}"

@@ -166,11 +166,8 @@ def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
     tied = cell.tied()
     lost = tuple(branch for branch in cell.tree.branches if branch not in tied)
     untied_robots(cell, lost)
-    return _without_frames(cell, lost), tuple(name for name in lost if not _is_flange(cell, name))
-
-
-def _is_flange(cell: Cell, frame: str) -> bool:
-    return bool(cell.tree.branches[frame].robot)
+    branches = cell.tree.branches
+    return _without_frames(cell, lost), tuple(name for name in lost if not branches[name].robot)
 
 
 def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:

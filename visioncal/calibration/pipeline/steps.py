@@ -157,10 +157,6 @@ def _readings(known: RunState) -> RunState:
     return replace(known, poses={**known.poses, **poses})
 
 
-def _detect(known: RunState) -> RunState:
-    return detect_targets(known, known.found_before)
-
-
 def _clock(known: RunState) -> RunState:
     """Gives views that have a time alone the robot's poses out of its stream."""
     return _reported(set_clocks(known)) if waits_for_clock(known.session) else known
@@ -194,7 +190,7 @@ def _judge(known: RunState) -> RunState:
 STAGES: tuple[Stage, ...] = (
     Stage("robot", _read_robot),
     Stage("readings", _readings),
-    Stage("detect", _detect),
+    Stage("detect", lambda known: detect_targets(known, known.found_before)),
     Stage("intrinsics", estimate_lenses),
     Stage("pnp", locate_targets),
     Stage("clock", _clock),

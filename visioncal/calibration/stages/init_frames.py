@@ -109,11 +109,12 @@ def _solved(
         yield Relation(pair.seer, pair.seen, matrix, sigma_m, sighted.turns_of(pair.seen))
     if len(pair.robots) != 1:
         return
+    mount: Mount = "eye-in-hand" if pair.robots[0].is_up else "eye-to-hand"
     # Where the earliest views do not agree by half, perhaps all do.
     for mine in (rows, pair.rows) if len(rows) < len(pair.rows) else (rows,):
         if len(mine) < FEWEST:
             continue
-        found = hand_eye(*_parted(poses, sighted, pair, mine), _mount(pair))
+        found = hand_eye(*_parted(poses, sighted, pair, mine), mount)
         if found is not None:
             yield from _both(tree, sighted, pair, *found)
             return
@@ -150,10 +151,6 @@ def _parted(
     (step,) = pair.robots
     robot = poses[step.robot][sighted.stops[rows]]
     return robot if step.is_up else invert(robot), sighted.candidates.take(rows)
-
-
-def _mount(pair: FramePair) -> Mount:
-    return "eye-in-hand" if pair.robots[0].is_up else "eye-to-hand"
 
 
 @dataclass(frozen=True, eq=False)

@@ -205,7 +205,8 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
     there = [view for view in unseen if view.image and session.images.exists(view.image)]
     shown: tuple[View, Identity] | None = None
     hard: Finding | None = None
-    for view in _some(there):
+    # A few views from all over the session.
+    for view in there[:: max(len(there) // _LOOKED_AT, 1)][:_LOOKED_AT]:
         image = decode_image(session.images.read(view.image))
         if isinstance(image, str):
             continue
@@ -297,7 +298,11 @@ def _is(found: Identity, target: Target) -> bool:
 
 def _another(view: View, found: Identity, declared: Target) -> Finding:
     shipped = (load_target(name) for name in target_names())
-    mine = [target.name for target in shipped if _is(found, target) and _as_large(target, declared)]
+    mine = [
+        target.name
+        for target in shipped
+        if _is(found, target) and abs(target.square_m / declared.square_m - 1.0) < _SAME_SIZE
+    ]
     if mine:
         step = Remedy(f'In session.toml, write target = "{mine[0]}".')
     else:
@@ -381,10 +386,6 @@ def _made_from(view: View, declared: Target) -> str:
     )
 
 
-def _as_large(one: Target, other: Target) -> bool:
-    return abs(one.square_m / other.square_m - 1.0) < _SAME_SIZE
-
-
 def _mirrored(view: View) -> Finding:
     return Finding(
         _MIRRORED,
@@ -407,8 +408,3 @@ def _blurred(view: View, why: str, views: Sequence[View]) -> Finding:
         Remedy("Focus the lens, expose for a shorter time with more light, and record again."),
         tuple(other.number for other in views),
     )
-
-
-def _some(views: Sequence[View]) -> Sequence[View]:
-    """A few views from all over the session."""
-    return views[:: max(len(views) // _LOOKED_AT, 1)][:_LOOKED_AT]

@@ -60,14 +60,6 @@ def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
     return said
 
 
-def _write_table(content: ArmContent) -> str:
-    return table_toml(content.table, "visioncal", _notes(content))
-
-
-def _warn_table(content: ArmContent) -> tuple[str, ...]:
-    return (*_left_out(content), *_far(content.table))
-
-
 def _far(table: DHTable) -> tuple[str, ...]:
     far = int(np.argmax(np.abs(table.d_m)))
     if abs(table.d_m[far]) < _FAR_M:
@@ -173,9 +165,9 @@ ROBOT_URDF = ArmFormat(
 ROBOT_DH = ArmFormat(
     "robot-dh",
     "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati [m, rad]",
-    _write_table,
+    lambda content: table_toml(content.table, "visioncal", _notes(content)),
     takes=frozenset({"convention", "with-corrections"}),
-    warn=_warn_table,
+    warn=lambda content: (*_left_out(content), *_far(content.table)),
     holds="links",
 )
 UR_KINEMATICS = ArmFormat(

@@ -236,12 +236,6 @@ def rows(matrix: FloatArray) -> list[list[float]]:
     return [numbers(row) for row in matrix]
 
 
-def fixed(value: float, decimals: int) -> str:
-    """Writes a number without an exponent, which not every robot's language reads."""
-    text = f"{value:.{decimals}f}"
-    return text[1:] if text.startswith("-") and not text.strip("-0.") else text
-
-
 def comments(mark: str, lines: Iterable[str]) -> str:
     """Writes lines as comments, each behind `mark`; no text can end its comment early."""
     return "".join(f"{mark} {one_line(line)}\n" for line in lines)

@@ -12,7 +12,8 @@ from typing import Literal
 
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.errors import DataError
-from visioncal.interchange.exports.content import Content, ExportFormat, comments, fixed
+from visioncal.core.number_format import fixed
+from visioncal.interchange.exports.content import Content, ExportFormat, comments
 from visioncal.interchange.exports.robots import abb_pose, kuka_frame, pose_texts, ur_pose
 
 _NO_POSE = "[[0,0,0],[1,0,0,0]]"

@@ -1,7 +1,5 @@
 """A transform as a 4x4 matrix: plain text, OpenCV's storage, Zivid's file."""
 
-from collections.abc import Sequence
-
 import cv2
 
 from visioncal.core.files import one_line
@@ -15,10 +13,6 @@ def _write_text(content: Content) -> str:
     lines = [" ".join(map(repr, row)) for row in rows(content.matrix)]
     notes = comments("#", content.notes)
     return notes + "\n".join(lines) + "\n"
-
-
-def _write_texts(contents: Sequence[Content]) -> str:
-    return "".join(map(_write_text, contents))
 
 
 def _write_opencv(content: Content) -> str:
@@ -56,7 +50,7 @@ TEXT = ExportFormat(
     "text",
     "the 4x4 matrix as text, as numpy.loadtxt reads it [m]",
     _write_text,
-    write_all=_write_texts,
+    write_all=lambda contents: "".join(map(_write_text, contents)),
 )
 OPENCV = ExportFormat(
     "opencv",

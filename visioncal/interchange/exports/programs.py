@@ -11,7 +11,8 @@ from typing import Literal
 
 from visioncal.core.conventions import POSE_FORMS, write_pose
 from visioncal.core.errors import DataError
-from visioncal.interchange.exports.content import Content, ExportFormat, fixed
+from visioncal.core.number_format import fixed
+from visioncal.interchange.exports.content import Content, ExportFormat
 
 # The last position register of a controller as it is delivered.
 REGISTER = 100

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from functools import partial
 
 from visioncal.core.conventions import POSE_FORMS, PoseForm, write_pose
+from visioncal.core.number_format import fixed
 from visioncal.core.types import FloatArray
-from visioncal.interchange.exports.content import Content, ExportFormat, comments, fixed
+from visioncal.interchange.exports.content import Content, ExportFormat, comments
 
 # A nanometre and 2e-10 rad, which is a nanometre at five metres.
 _DECIMALS = {"m": 9, "mm": 6}

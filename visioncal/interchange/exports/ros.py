@@ -38,10 +38,6 @@ _MEANINGS: Mapping[str, str] = {
 _NUMBERS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 
 
-def _write_urdf(content: Content) -> str:
-    return _write_urdf_all([content])
-
-
 def _write_urdf_all(contents: Sequence[Content]) -> str:
     """Writes a document that `xacro:include` takes in, with the children's links and the joints.
 
@@ -76,7 +72,7 @@ def _urdf_joint(content: Content) -> str:
 URDF = ExportFormat(
     "urdf",
     "a link and a fixed joint for a URDF or xacro [m, rad about fixed x, y, z]",
-    _write_urdf,
+    lambda content: _write_urdf_all([content]),
     frames=ROS_FRAMES,
     write_all=_write_urdf_all,
 )
@@ -222,17 +218,13 @@ def _write_easy_handeye2(content: Content) -> str:
     return comments("#", [*_ros_notes(content), use]) + yaml_text(document)
 
 
-def _write_transforms(contents: Sequence[Content]) -> str:
-    """Writes a document of YAML for each transform."""
-    return "---\n".join(map(_write_transform, contents))
-
-
 ROS = ExportFormat(
     "ros",
     "YAML with the fields of ROS 2's TransformStamped [m, quaternion x, y, z, w]",
     _write_transform,
     frames=ROS_FRAMES,
-    write_all=_write_transforms,
+    # A document of YAML for each transform.
+    write_all=lambda contents: "---\n".join(map(_write_transform, contents)),
 )
 EASY_HANDEYE = ExportFormat(
     "easy-handeye",

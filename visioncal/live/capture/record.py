@@ -238,9 +238,10 @@ class CheckedPaths:
         route = ordered(self.plan.cell, here, stop.q[None])
         if route.unreachable:
             (obstacle,) = route.unreachable.values()
+            stands = ", ".join(f"{value:.0f}" for value in np.rad2deg(here))
             raise DataError(
                 f"view {stop.view}: no clear way leads there from where the arm stands "
-                f"({_deg(here)}): in the way are {obstacle}.",
+                f"({stands} deg): in the way are {obstacle}.",
                 culprits=[f"view {stop.view}"],
                 next_step="Bring the arm near to the plan's first stop by hand, or plan anew with "
                 "--start-joints as it stands.",
@@ -262,7 +263,3 @@ class CheckedPaths:
 
 def _there(here: FloatArray, posture: FloatArray) -> bool:
     return here.shape == posture.shape and bool(np.abs(here - posture).max() < _THERE_RAD)
-
-
-def _deg(q: FloatArray) -> str:
-    return ", ".join(f"{value:.0f}" for value in np.rad2deg(q)) + " deg"

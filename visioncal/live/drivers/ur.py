@@ -13,7 +13,7 @@ from visioncal.core.errors import DriverError
 from visioncal.core.transforms import compose, invert
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers.extras import client_library
-from visioncal.live.drivers.protocols import ArmState
+from visioncal.live.drivers.protocols import ArmState, JointSample
 from visioncal.live.drivers.stopwatch import Stopwatch
 from visioncal.live.drivers.ur_line import Line
 from visioncal.live.drivers.ur_net import (
@@ -43,6 +43,9 @@ _BRAKE_RAD_S2 = 4.0
 _STILL_RAD_S = 1e-3
 # What the client lets pass.
 _MOST_RAD_S, _MOST_RAD_S2 = 3.14, 40.0
+
+# States a second of the e-Series and of the CB3, by PolyScope's major version.
+_RATES_HZ = {3: 125.0, 5: 500.0}
 
 
 class UrArm:
@@ -330,3 +333,52 @@ def _matrix(pose: list[float]) -> FloatArray:
     numbers = np.array(pose)
     form = ROTATION_FORMS[POSE_FORMS["ur"].rotation]
     return compose(form.read(numbers[None, 3:])[0], numbers[:3])
+
+
+class UrMotion:
+    """The joints of a UR, which is only watched: who moves it is not asked.
+
+    Args:
+        host: The controller's address.
+
+    Raises:
+        DriverError: The client library is missing, or the host is unreachable or no UR.
+    """
+
+    def __init__(self, host: str) -> None:
+        receive = client_library("rtde_receive", _EXTRA)
+        address = resolve(host)
+        condition = check_controller(address, moves=False)
+        self.name = f"{condition.model} at {host}"
+        self.model = condition.model.lower()
+        self.rate_hz = _RATES_HZ[condition.version[0]]
+        self._states = StateStream(receive, address, condition.version, self.rate_hz)
+
+    def sample(self) -> JointSample:
+        """Waits for the next state that the controller sends.
+
+        Raises:
+            DriverError: None comes for 0.8 s, or the arm was stopped.
+        """
+        client = self._states.client
+        while True:
+            stamp_s = self._states.wait()
+            q, dq, currents = client.getActualQ(), client.getActualQd(), client.getActualCurrent()
+            # Another state that came in between would mix with this one.
+            if client.getTimestamp() == stamp_s:
+                break
+        if self._states.safety not in ("normal", "reduced"):
+            raise DriverError(
+                f"The {self.name} is stopped: {self._states.safety}.",
+                culprits=[self.name],
+                next_step="See the pendant, and record the motion again from its beginning.",
+            )
+        return JointSample(stamp_s, np.array(q), np.array(dq), np.array(currents))
+
+    def close(self) -> None:
+        """Lets go of it."""
+        keep(self._states.client)
+        # A client whose controller is gone may not return at all.
+        going = threading.Thread(target=self._states.client.disconnect, daemon=True)
+        going.start()
+        going.join(_CLOSE_S)

@@ -79,7 +79,7 @@ def chosen(
     with one_blas_thread():
         # A wish that is met already needs no stop.
         state = Selection.of(tuple(reduced(world, criterion) for world in worlds), criterion)
-        while len(state.rows) < count and not _enough(state, wish):
+        while len(state.rows) < count and not (wish and state.accuracy.meets(wish)):
             state = state.with_one(state.best_to_add())
         state = _exchanged(state)
         if wish is not None:
@@ -135,10 +135,6 @@ def _words(accuracy: Accuracy, wish: Wish) -> str:
 
 def _wished(wish: Wish) -> str:
     return _words(Accuracy(wish.mm or 0.0, wish.deg or 0.0), wish)
-
-
-def _enough(state: Selection, wish: Wish | None) -> bool:
-    return wish is not None and state.accuracy.meets(wish)
 
 
 def _check(worlds: Sequence[World], count: int, criterion: str) -> None:

@@ -132,7 +132,8 @@ def program_of(plan: Plan) -> str:
 def _heading(plan: Plan) -> Iterator[str]:
     cell = plan.cell
     yield f"visioncal {__version__}: {len(plan.stops)} stops for {plan.request.purpose.name}"
-    yield _ascii(f"Robot {cell.robot.name}, {cell.mount}, board {cell.target.name}.")
+    heading = one_line(f"Robot {cell.robot.name}, {cell.mount}, board {cell.target.name}.")
+    yield heading.encode("ascii", "replace").decode()
     yield "Look at plan.rrd first, then run it at reduced speed, with a hand on the stop button."
     yield "The ways were looked at with capsules for the arm and with what was declared of the"
     yield "cell: floor, boxes, board, camera. Cables, grippers and people are not known to it."
@@ -156,10 +157,6 @@ def _stop_lines(stop: PlannedStop) -> Iterator[str]:
 def _move(q: FloatArray, words: str) -> str:
     joints = ", ".join(f"{value:.6f}" for value in q)
     return f"movej([{joints}], a=acceleration, v=speed)  # {words}"
-
-
-def _ascii(text: str) -> str:
-    return one_line(text).encode("ascii", "replace").decode()
 
 
 def _accuracy(found: Accuracy) -> dict[str, Any]:

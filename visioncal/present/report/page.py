@@ -93,18 +93,15 @@ def _pictures(
     seen = {view.view: view for view in evidence}
     views = calibration.views
     extremes = _extremes(views, seen)
-    magnify = _magnification(calibration, [seen[view.view] for _, view in extremes])
+    # One factor for all pictures, so that they can be compared.
+    shown = [seen[view.view] for _, view in extremes]
+    magnify = magnification(shown, parts.image_width(calibration) or 0)
     pictures = None if session is None else _Pictures(session, seen)
     return {
         "used_pictures": pictures.of_used(extremes, magnify) if pictures else [],
         "rejected_pictures": pictures.of_rejected(views) if pictures else [],
         "magnify": magnify,
     }
-
-
-def _magnification(calibration: Calibration, shown: Sequence[ViewEvidence]) -> int:
-    """One factor for all pictures, so that they can be compared."""
-    return magnification(shown, parts.image_width(calibration) or 0)
 
 
 def _extremes(

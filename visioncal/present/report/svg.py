@@ -94,7 +94,7 @@ class Figure:
         Args:
             x: Where it is [points].
             y: Likewise.
-            words: What it says.
+            words: What it says; markup as it is.
             size: Of its letters [points].
             colour: Theirs.
             anchor: Which end is at `x`: `start`, `middle` or `end`.
@@ -102,26 +102,12 @@ class Figure:
             turned: Whether it reads upwards.
             bold: Whether it is bold.
         """
-        self._text(x, y, str(escape(words)), size, colour, anchor, rise, turned, bold)
-
-    def _text(
-        self,
-        x: float,
-        y: float,
-        markup: str,
-        size: float,
-        colour: str,
-        anchor: str,
-        rise: str = "baseline",
-        turned: bool = False,
-        bold: bool = False,
-    ) -> None:
         shift = _RISES[rise] * size
         turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
         weight = ";font-weight:bold" if bold else ""
         style = f"font-size:{size:.3g}px;fill:{colour};text-anchor:{anchor}{weight}"
         place = f'x="{x:.1f}" y="{y + shift:.1f}"'
-        self._parts.append(f'<text {place}{turn} style="{style}">{markup}</text>')
+        self._parts.append(f'<text {place}{turn} style="{style}">{escape(words)}</text>')
 
     def legend(
         self, x: float, y: float, entries: Sequence[tuple[str, str, str]], anchor: str = "end"
@@ -138,7 +124,9 @@ class Figure:
             f'<tspan style="fill:{colour}">{sign}</tspan> {escape(words)}'
             for sign, colour, words in entries
         )
-        self._text(x, y, "\N{NO-BREAK SPACE}\N{NO-BREAK SPACE} ".join(parts), SMALL, INK, anchor)
+        # All words are escaped.
+        words = Markup("\N{NO-BREAK SPACE}\N{NO-BREAK SPACE} ".join(parts))
+        self.text(x, y, words, size=SMALL, anchor=anchor)
 
     def image(self, left: float, top: float, width: float, height: float, uri: str) -> None:
         """Adds a bitmap that is stretched to a box [points]."""

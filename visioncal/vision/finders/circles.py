@@ -89,7 +89,8 @@ def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
                     misfit=True,
                 )
             return DetectedCorners(np.arange(len(circles.px)), circles.px)
-    wanted = f"{_layout(target.asymmetric)} grid of {target.columns} x {target.rows} circles"
+    layout = "asymmetric" if target.asymmetric else "symmetric"
+    wanted = f"{layout} grid of {target.columns} x {target.rows} circles"
     if not seen:
         return NotFound(f"no board: no {wanted} is seen")
     found = seen[0]
@@ -98,10 +99,6 @@ def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
         f"and the target is {_article(target.asymmetric)} one of {target.columns} x {target.rows}",
         misfit=True,
     )
-
-
-def _layout(asymmetric: bool) -> str:
-    return "asymmetric" if asymmetric else "symmetric"
 
 
 def _article(asymmetric: bool) -> str:
