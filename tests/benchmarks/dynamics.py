@@ -20,11 +20,10 @@ from support.moved_arms import recorded, robot_with_bodies, true_base
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.base import BaseModel
-from visioncal.dynamics.conditioning import Conditioned, Piece, condition
+from visioncal.dynamics.conditioning import Conditioned, LowPass, Piece, condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.identify import SLOW_RAD_S, Identification, Options, identify
 from visioncal.dynamics.limits import Share, allowed_motion
-from visioncal.dynamics.lowpass import LowPass
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import JointMotion, Measured
 from visioncal.dynamics.reading import RecordedSamples

@@ -34,8 +34,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.estimation.features import fit_features
-from visioncal.estimation.pointfit import fit_points
-from visioncal.estimation.pointpairs import PointPairs
+from visioncal.estimation.pointfit import PointPairs, fit_points
 
 COUNTS, SEEDS = (3, 4, 6, 12), few(300, 3)
 EVEN_M, SLIPS_M = 1e-4, (1e-3, 3e-3)

@@ -22,12 +22,11 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.live.planning.candidates import candidates
-from visioncal.live.planning.design import chosen
+from visioncal.live.planning.design import CRITERIA, chosen
 from visioncal.live.planning.information import WORLDS as SAMPLE
 from visioncal.live.planning.information import World, worlds_of
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.live.planning.recorded import Begun, begin
-from visioncal.live.planning.selection import CRITERIA
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
 WORLDS = 20

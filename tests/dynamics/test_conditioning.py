@@ -5,8 +5,7 @@ import pytest
 from support.moved_arms import changed
 
 from visioncal.core.errors import DataError
-from visioncal.dynamics.conditioning import condition
-from visioncal.dynamics.lowpass import LowPass
+from visioncal.dynamics.conditioning import LowPass, condition
 from visioncal.dynamics.reading import read_recorded
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import drive_torques, real_dynamics

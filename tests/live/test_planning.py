@@ -15,12 +15,11 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Box
-from visioncal.live.planning.design import chosen, shortfall
+from visioncal.live.planning.design import CRITERIA, chosen, shortfall
 from visioncal.live.planning.information import stop_factors, worlds_of
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 from visioncal.live.planning.recorded import RoughEdges, begin
-from visioncal.live.planning.selection import CRITERIA
 from visioncal.live.planning.visibility import sight_of
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, Second, fine_camera, simulate

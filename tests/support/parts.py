@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
 from visioncal.estimation.features import FeatureTouches
-from visioncal.estimation.pointpairs import PointPairs
+from visioncal.estimation.pointfit import PointPairs
 
 # Derivatives by central differences are exact to 1e-8 at this step, of lengths near a metre.
 _STEP = 1e-6

@@ -40,9 +40,8 @@ from visioncal.live.planning.messages import summary_of
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.written import plan_document
-from visioncal.live.rehearsal.bench import Bench
+from visioncal.live.rehearsal.bench import Bench, FaultInjection
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
-from visioncal.live.rehearsal.fault_injection import FaultInjection
 from visioncal.live.rehearsal.witness import EdgeCheck, Pace, Witness, explained, pace_of
 from visioncal.results import Calibration
 from visioncal.results.arm import NOMINAL

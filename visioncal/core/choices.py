@@ -22,7 +22,7 @@ MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
 # What observes whom: a camera on the flange, one that stands still, or a measuring instrument that
 # stands still and reads a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
-# By what stops of a plan are chosen; `live.planning.selection` says what each is.
+# By what stops of a plan are chosen; `live.planning.design` says what each is.
 Criterion: TypeAlias = Literal["I", "D", "A", "E", "O1"]
 # What `convert` reads, and `export` writes, in the order of their registries.
 FOREIGN_NAMES = (

@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, some_of
 from visioncal.core.types import FloatArray
-from visioncal.estimation.pointpairs import PointPairs
+from visioncal.estimation.pointfit import PointPairs
 
 
 @dataclass(frozen=True, eq=False)

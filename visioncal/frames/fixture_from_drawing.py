@@ -9,8 +9,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import Mask
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.placing import assumed_words, counted_noise_m
-from visioncal.estimation.pointfit import FixturePlacement, PointFit, fit_points
-from visioncal.estimation.pointpairs import PointPairs
+from visioncal.estimation.pointfit import FixturePlacement, PointFit, PointPairs, fit_points
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_fit import FixtureFit, Setting, fixture_frame
 from visioncal.frames.measured import MeasuredPoints

@@ -12,7 +12,7 @@ from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.core.verdict import remarks
-from visioncal.estimation.pointpairs import FEWEST_POINTS
+from visioncal.estimation.pointfit import FEWEST_POINTS
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_fit import Setting, Words

@@ -37,15 +37,18 @@ from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
 from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.tables import DHTable, table_document, table_from_document
 from visioncal.robot.torques import body_regressor, joint_torques, momenta, torque_regressor
-from visioncal.robot.urdfs import corrected_tip, corrected_urdf, weighed_urdf, with_inertias
 from visioncal.robot.weights import WeightFunctions
 from visioncal.robot.writing import (
+    corrected_tip,
+    corrected_urdf,
     fit_links,
     small_urdf,
     table_toml,
     unwritten,
     ur_flange,
     ur_kinematics_yaml,
+    weighed_urdf,
+    with_inertias,
     without_functions,
 )
 

@@ -11,8 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, Progress
 from visioncal.live.planning.cell import PlanCell, collisions_of
-from visioncal.live.planning.shade import Shade
-from visioncal.live.planning.visibility import sight_of
+from visioncal.live.planning.visibility import Shade, sight_of
 from visioncal.robot import Robot
 from visioncal.robot.atlas import Atlas
 from visioncal.robot.collision import Collisions

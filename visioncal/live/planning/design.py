@@ -1,7 +1,22 @@
-"""Choosing the most informative stops: experimental design by greedy start and exchange."""
+"""Choosing the most informative stops: experimental design by greedy start and exchange.
 
-from collections.abc import Sequence
+Criteria (Atkinson, Donev and Tobias 2007, chapter 10; Borm and Menq 1991 for O1), each as a mean
+over the worlds in which the plan must be good:
+
+    I   mean variance of the places that count
+    D   determinant of the unknowns' covariance
+    A   mean variance of the unknowns, each in its own unit
+    E   largest variance of a combination of unknowns, of those that the candidates determine
+    O1  geometric mean of the stacked Jacobian's singular values, over the root of the stops
+
+A stop adds six rows, so that its effect on a covariance C is a correction of rank six (Woodbury):
+`C - C F^T (1 + F C F^T)^-1 F C`, for all candidates F in a few products.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import get_args
 
 import numpy as np
 
@@ -9,13 +24,268 @@ from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import IntArray
+from visioncal.core.types import FloatArray, IntArray
+from visioncal.estimation.linalg import covariance_root, gram
 from visioncal.live.planning.accuracy import Accuracy, Wish
 from visioncal.live.planning.information import World
-from visioncal.live.planning.selection import CRITERIA, Selection, reduced
 
 # An exchange must gain this share; so many of them a stop are enough.
 _GAIN, _EXCHANGES = 1e-4, 1.0
+
+CRITERIA: tuple[str, ...] = get_args(Criterion)
+
+# Directions of which all candidates together take less than this share of the variance are left
+# aside: that changes no figure.
+_NULL = 1e-9
+# Singular values under this share of the largest are no directions that a stop could determine.
+_LEAST_SHARE = 1e-7
+# For O1 next to nothing is known beforehand.
+_LITTLE = 1e-4
+# The largest variance is a peak, and not smooth: so many of the most promising stops are tried,
+# where the promise is the drop of the mean variance raised to this power.
+_TRIED, _POWER = 12, 6
+
+
+@dataclass(frozen=True, eq=False)
+class Variance:
+    """A variance as a function of a covariance C: `trace(roots C roots^T) + rest`.
+
+    Attributes:
+        roots: (s, r).
+        rest: The share of the directions that nobody determines.
+    """
+
+    roots: FloatArray
+    rest: float
+
+    def of(self, covariance: FloatArray) -> float:
+        """The variance with an (r, r) covariance."""
+        return float(np.sum((self.roots @ covariance) * self.roots)) + self.rest
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """A world in coordinates in which what is known beforehand is the identity.
+
+    Attributes:
+        factors: (k, 6, r) of the information of candidates or recorded stops.
+        start: (r, r) information without any candidate.
+        counted: What counts for the criterion.
+        place: The variance of the place that the accuracy is stated of [m^2].
+        turn: The same for the rotation [rad^2].
+        determined: (r, t) directions that the candidates determine well enough to count for O1.
+        watched: (r, r) of edges and arm in their units, as far as the candidates determine them;
+            the largest variance among them counts for E.
+        misfit: (k, 6, a) and
+        gradient: (r, a) by errors of the arm that a fit takes for noise; see `World`.
+    """
+
+    factors: FloatArray
+    start: FloatArray
+    counted: Variance
+    place: Variance
+    turn: Variance
+    determined: FloatArray
+    watched: FloatArray
+    misfit: FloatArray
+    gradient: FloatArray
+
+
+def reduced(world: World, criterion: Criterion) -> Reduced:
+    """Puts a world into the coordinates in which stops are chosen by a criterion."""
+    prior = world.prior * (_LITTLE if criterion == "O1" else 1.0)
+    size = len(prior)
+    # theta = out @ phi, and phi has the identity for a prior. What corners determine of a rational
+    # lens is singular to rounding.
+    out = covariance_root(prior)
+    factors = (world.factors.reshape(-1, size) @ out).reshape(-1, 6, size)
+    rows = factors.reshape(-1, size)
+    recorded = out.T @ world.recorded @ out
+    values, vectors = np.linalg.eigh(rows.T @ rows + recorded)
+    basis = vectors[:, values > _NULL]
+    share = values[values > _NULL]
+    # Lens and board are in the way of what is wanted, and not wanted themselves.
+    inverse = 1.0 / world.units
+    inverse[12 : 12 + world.looks] = 0.0
+    wanted = np.diag(inverse**2) / (size - world.looks) if criterion == "A" else world.counted
+
+    def seen(square: FloatArray) -> Variance:
+        turned = out.T @ square @ out
+        inner = basis.T @ turned @ basis
+        return Variance(_square_root(inner), float(np.trace(turned) - np.trace(inner)))
+
+    watched = np.linalg.qr(inverse[:, None] * (out @ basis) * (share > 1.0)).R
+    return Reduced(
+        factors @ basis,
+        np.eye(len(share)) + basis.T @ recorded @ basis,
+        seen(wanted),
+        seen(world.place),
+        seen(world.turn),
+        np.eye(len(share))[:, share > _LEAST_SHARE**2 * share.max(initial=0.0)],
+        watched,
+        world.misfit,
+        basis.T @ (out.T @ world.gradient),
+    )
+
+
+def _square_root(square: FloatArray) -> FloatArray:
+    """(s, r) whose square is a non-negative (r, r)."""
+    values, vectors = np.linalg.eigh(square)
+    kept = values > _NULL**2 * values.max(initial=0.0)
+    return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Some chosen candidates, and their information in each world.
+
+    Attributes:
+        problem: The worlds.
+        criterion: What makes stops good.
+        rows: The chosen ones.
+        information: (r, r) by world.
+        pulls: (r, a) by world, how the gradient moves with errors that a fit takes for noise.
+    """
+
+    problem: tuple[Reduced, ...]
+    criterion: Criterion
+    rows: tuple[int, ...]
+    information: tuple[FloatArray, ...]
+    pulls: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(cls, problem: tuple[Reduced, ...], criterion: Criterion) -> "Selection":
+        """No candidates, but what is recorded."""
+        starts, pulls = ((item.start for item in problem), (item.gradient for item in problem))
+        return cls(problem, criterion, (), tuple(starts), tuple(pulls))
+
+    @cached_property
+    def spreads(self) -> tuple[FloatArray, ...]:
+        """(r, r) covariance by world, of noise alone."""
+        return tuple(np.asarray(np.linalg.inv(array), dtype=float) for array in self.information)
+
+    def with_one(self, row: int) -> "Selection":
+        """Takes one more candidate."""
+        return self._changed((*self.rows, row), [row], 1.0)
+
+    def without(self, row: int) -> "Selection":
+        """Leaves one out."""
+        return self._changed(tuple(index for index in self.rows if index != row), [row], -1.0)
+
+    def with_all(self) -> "Selection":
+        """Takes all candidates."""
+        rest = self.left
+        return self._changed((*self.rows, *rest), rest, 1.0)
+
+    @property
+    def left(self) -> list[int]:
+        """The candidates that are not taken."""
+        taken = set(self.rows)
+        return [index for index in range(len(self.problem[0].factors)) if index not in taken]
+
+    def _changed(self, rows: tuple[int, ...], by: list[int], sign: float) -> "Selection":
+        added = [(item.factors[by], item.misfit[by]) for item in self.problem]
+        information = tuple(
+            before + sign * gram(factors, factors)
+            for before, (factors, _) in zip(self.information, added, strict=True)
+        )
+        pulls = tuple(
+            before + sign * gram(factors, misfit)
+            for before, (factors, misfit) in zip(self.pulls, added, strict=True)
+        )
+        return Selection(self.problem, self.criterion, rows, information, pulls)
+
+    @cached_property
+    def value(self) -> float:
+        """What is minimised: a mean variance over the worlds, above zero."""
+        return float(np.mean([self._value(*world) for world in self._worlds()]))
+
+    def _value(self, world: Reduced, covariance: FloatArray) -> float:
+        if self.criterion in ("I", "A"):
+            return world.counted.of(covariance)
+        if self.criterion == "E":
+            return float(np.linalg.eigvalsh(_watched(world, covariance)).max(initial=0.0))
+        return float(np.exp(np.linalg.slogdet(covariance)[1] / max(len(covariance), 1)))
+
+    def _worlds(self) -> Iterator[tuple[Reduced, FloatArray]]:
+        answers = (
+            spread @ gradient for spread, gradient in zip(self.spreads, self.pulls, strict=True)
+        )
+        totals = (spread + off @ off.T for spread, off in zip(self.spreads, answers, strict=True))
+        return zip(self.problem, totals, strict=True)
+
+    @property
+    def figure(self) -> float:
+        """The criterion's value as it is reported."""
+        if self.criterion == "I":
+            return 1e3 * float(np.sqrt(self.value))
+        if self.criterion != "O1":
+            return float(np.sqrt(self.value))
+        # What little is known beforehand is no part of the Jacobian.
+        volumes = [
+            np.linalg.slogdet(world.determined.T @ (array - np.eye(len(array))) @ world.determined)
+            for world, array in zip(self.problem, self.information, strict=True)
+        ]
+        mean = [
+            np.exp(value / (2 * max(world.determined.shape[1], 1))) if sign > 0 else 0.0
+            for world, (sign, value) in zip(self.problem, volumes, strict=True)
+        ]
+        return float(np.mean(mean)) / float(np.sqrt(max(len(self.rows), 1)))
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """What is predicted."""
+        place = np.mean([world.place.of(covariance) for world, covariance in self._worlds()])
+        turn = np.mean([world.turn.of(covariance) for world, covariance in self._worlds()])
+        return Accuracy.of(float(place), float(turn))
+
+    def best_to_add(self) -> int:
+        """The candidate that would lessen the value most."""
+        return self._best(self.left, 1.0)
+
+    def least(self) -> int:
+        """The one of those taken without which the value would rise least."""
+        return self._best(list(self.rows), -1.0)
+
+    def _best(self, rows: list[int], sign: float) -> int:
+        gains: FloatArray = np.mean(
+            [
+                self._gains(*pair, rows, sign)
+                for pair in zip(self.problem, self.spreads, strict=True)
+            ],
+            axis=0,
+        )
+        if self.criterion != "E":
+            return rows[int(np.argmax(gains))]
+        promising: list[int] = [rows[index] for index in np.argsort(-gains)[:_TRIED].tolist()]
+        then = [self.with_one(index) if sign > 0 else self.without(index) for index in promising]
+        values = [selection.value for selection in then]
+        return promising[int(np.argmin(values))]
+
+    def _gains(
+        self, world: Reduced, covariance: FloatArray, rows: list[int], sign: float
+    ) -> FloatArray:
+        """How much smaller the value would be with each of (k,) rows more, or less."""
+        factors = world.factors[rows]
+        carried = factors @ covariance
+        changed = np.eye(6) + sign * carried @ np.swapaxes(factors, 1, 2)
+        if self.criterion in ("D", "O1"):
+            return np.asarray(np.linalg.slogdet(changed)[1])
+        roots = world.counted.roots if self.criterion != "E" else _peak(world, covariance)
+        moved = carried @ roots.T
+        squares = moved @ np.swapaxes(moved, 1, 2)
+        return np.asarray(sign * np.trace(np.linalg.solve(changed, squares), axis1=1, axis2=2))
+
+
+def _watched(world: Reduced, covariance: FloatArray) -> FloatArray:
+    return np.asarray(world.watched @ covariance @ world.watched.T)
+
+
+def _peak(world: Reduced, covariance: FloatArray) -> FloatArray:
+    """(r, r) roots of the slope of the mean of a high power of the variances."""
+    values, vectors = np.linalg.eigh(_watched(world, covariance))
+    weights = (np.maximum(values, 0.0) / values[-1]) ** (_POWER - 1)
+    return np.asarray(np.sqrt(weights)[:, None] * (vectors.T @ world.watched))
 
 
 @dataclass(frozen=True, eq=False)
