@@ -35,6 +35,7 @@ class Stop:
     cam_from_target: RigidTransform
     flange_from_cam: RigidTransform = FLANGE_FROM_CAM
     matrix: tuple[float, float, float, float] = MATRIX
+    size: float = 1.0
 
 
 def looks(count: int, seed: int = 1) -> list[Stop]:
@@ -101,7 +102,7 @@ def write(
         fx, fy, cx, cy = stop.matrix
         lens = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         turn, place = seen.rotation.as_rotvec(), seen.translation
-        px, _ = cv2.projectPoints(points, turn, place, lens, np.array(DISTORTION))
+        px, _ = cv2.projectPoints(stop.size * points, turn, place, lens, np.array(DISTORTION))
         noise = rng.normal(0.0, noise_px, (len(points), 2))
         for point, (u_px, v_px) in enumerate(px[:, 0] + noise):
             if has_corners(view):
@@ -257,3 +258,20 @@ def test_rows_in_millimetres_are_said_to_be_some(tmp_path):
     (all_rows,) = (finding.words for finding in findings if finding.kind == "remark")
     assert "in 11 of 20 rows. It looks like millimetres" in all_rows
     assert all_rows.endswith("multiply these columns by 0.001 there.")
+
+
+@pytest.mark.parametrize("since", [9, 14])
+@pytest.mark.parametrize("size", [25 / 30, 1.01])
+def test_a_board_that_was_exchanged_midway_is_no_thing_that_moved(tmp_path, size, since):
+    stops = looks(19)
+    stops[since:] = [replace(stop, size=size) for stop in stops[since:]]
+    first = visioncal.calibrate(write(tmp_path / "board", stops)).verdict.causes[0]
+    # Of unlike parts, the views of the smaller one are left out.
+    assert first.kind == ("board_changed" if since == 9 else "something_moved")
+    found = re.search(
+        rf"from view {since} on.* (\S+) % {'larger' if size > 1 else 'smaller'}", first.words
+    )
+    # Its sigma is an eighth of it: each half is known by the noise of both.
+    assert 1e-2 * float(found.group(1)) == pytest.approx(abs(size - 1.0), rel=0.25)
+    assert "target is another one" in first.words
+    assert "Measure both prints" in first.do.words

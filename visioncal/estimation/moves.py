@@ -1,4 +1,4 @@
-"""What moved while a whole cell was looked at: a board that slipped, a camera that was bumped.
+"""What moved or changed while a cell was looked at: a camera that was bumped, another board.
 
 From some stop on, all that has to do with the frame asks for the same other place of it. A large
 move is found by how many observations it explains that nothing else does; a slight one, which hides
@@ -8,7 +8,6 @@ in the noise of each, by Rao's score test of a step at every stop (as Page 1955 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -47,6 +46,8 @@ _RIVAL_SHARE = 0.9
 _RIVAL_GAIN, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 # A step that the other unknowns take up to this share of its information is no step of its own.
 _TAKEN = 1e-6
+# Sizes of boards that are exchanged differ by such shares.
+_SHARES = (1e-3, 1e-2, 1e-1)
 # Noise is left, however much a step explains.
 _MOST_EXPLAINED = 0.99
 
@@ -90,6 +91,25 @@ class Slip:
     stop: int
     step_rad: float
     sigma_rad: float
+    mahalanobis_sq: float
+
+
+@dataclass(frozen=True, eq=False)
+class Resized:
+    """A board that has another size from some stop on, as where a print was exchanged.
+
+    Attributes:
+        frame: The board, as the problem knows it.
+        stop: The first stop with the other size.
+        share: By how much larger it is from then on.
+        sigma: How well that is known.
+        mahalanobis_sq: The evidence for it.
+    """
+
+    frame: str
+    stop: int
+    share: float
+    sigma: float
     mahalanobis_sq: float
 
 
@@ -386,6 +406,30 @@ def common_change(
     return middle @ exp(mean), squares < limit
 
 
+def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mask] | None:
+    """The other size of a board that some observations ask for together.
+
+    Args:
+        problem: All n observations.
+        fit: The unknowns and the noise, by others.
+        some: (n,) which observations.
+
+    Returns:
+        By which share it is larger, and for each of them whether noise explains what is left; None
+        where they are not of one board.
+    """
+    pairs = zip(problem.observations.observed, some.tolist(), strict=True)
+    board, *others = {frame for frame, mine in pairs if mine}
+    if others or not board.startswith("target"):
+        return None
+    away = problem.measured(fit.state)[some, :3, 3]
+    there = problem.predicted(fit.state)[some, :3, 3]
+    share = float(np.median(np.sum(there * away, axis=1) / np.sum(away**2, axis=1))) - 1.0
+    wider = problem.with_effects([*problem.effects, _of_size(problem, fit, board, some)])
+    resized = replace(fit, state=State(fit.state.edges, np.append(fit.state.values, share)))
+    return share, explained_by_noise(wider, resized, len(problem))[some]
+
+
 def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move | None:
     """The most significant step of a frame at any stop; None where noise explains all of them.
 
@@ -434,23 +478,97 @@ def slipped_joint(
             its n joints.
     """
     joints = [(robot, at) for robot, offset in offsets.items() for at in range(offset.shape[2])]
-    if not joints:
-        return None
-    columns = problem.size + np.arange(len(joints))[:, None]
     between = [_between(problem, rows_of(problem, robot)) for robot, _ in joints]
-    tried = len(joints) * (int(problem.observations.stops.max()) + 1)
+    found = _most_significant(problem, fit, _of_joints(offsets), between)
+    if found is None:
+        return None
+    robot, joint = joints[found.which]
+    return Slip(robot, joint, found.stop, found.step, found.sigma, found.mahalanobis_sq)
+
+
+def resized_board(problem: Problem, fit: Solution) -> Resized | None:
+    """The most significant step of a board's size at any stop; None where noise explains all.
+
+    Args:
+        problem: The observations that agree.
+        fit: The unknowns and the noise.
+    """
+    boards = [frame for frame in problem.unknown if frame.startswith("target")]
+    effects = [_of_size(problem, fit, board) for board in boards]
+    between = [_between(problem, problem.observations.involves(board)) for board in boards]
+    found = _most_significant(problem, fit, effects, between)
+    if found is None:
+        return None
+    return Resized(boards[found.which], found.stop, found.step, found.sigma, found.mahalanobis_sq)
+
+
+@dataclass(frozen=True)
+class _ValueStep:
+    """A step of one of several values at a stop, with its sigma and the evidence for it."""
+
+    which: int
+    stop: int
+    step: float
+    sigma: float
+    mahalanobis_sq: float
+
+
+def _most_significant(
+    problem: Problem, fit: Solution, effects: Sequence[Effect], between: Sequence[IntArray]
+) -> _ValueStep | None:
+    """The most significant step of a value of some effects; None where noise explains all.
+
+    Args:
+        problem: The observations that agree.
+        fit: The unknowns and the noise.
+        effects: The effects, which the problem does not have.
+        between: The stops at which each of their values may step.
+    """
+    count = len(between)
+    if not count:
+        return None
+    columns = problem.size + np.arange(count)[:, None]
+    tried = count * (int(problem.observations.stops.max()) + 1)
     freedom = _residual_freedom(problem, fit)
     best, limit = None, float(f_limit(_FALSE_MOVE / tried, 1, freedom))
-    for scored in _scored(problem, fit, columns, between, offsets):
+    for scored in _scored(problem, fit, columns, between, effects):
         alone, own = scored.alone[:, 0, 0], scored.own[:, 0, 0]
         squares = np.where(own > _TAKEN * alone, scored.squares, 0.0)
         tested = _beside_itself(squares, freedom, 1)
         place = int(tested.argmax())
         if tested[place] > limit:
-            limit, (robot, joint) = tested[place], joints[scored.seen[place]]
-            step_rad, sigma_rad = float(scored.steps[place, 0]), float(own[place] ** -0.5)
-            best = Slip(robot, joint, scored.stop, step_rad, sigma_rad, float(squares[place]))
+            limit = tested[place]
+            step, sigma = float(scored.steps[place, 0]), float(own[place] ** -0.5)
+            which = int(scored.seen[place])
+            best = _ValueStep(which, scored.stop, step, sigma, float(squares[place]))
     return best
+
+
+def _of_joints(offsets: Mapping[str, FloatArray]) -> list[Effect]:
+    """Offsets of joints, by robot."""
+    return [
+        Effect.free(
+            f"offsets of {robot}", _nothing(offset.shape[2]), flange_jacobian={robot: offset}
+        )
+        for robot, offset in offsets.items()
+    ]
+
+
+def _of_size(problem: Problem, fit: Solution, board: str, some: Mask | None = None) -> Effect:
+    """The size of a board in (n,) some observations: a larger one is farther off by as much."""
+    seen = problem.observations
+    mine = np.array([frame == board for frame in seen.observed])
+    mine &= True if some is None else some
+    measured = problem.measured(fit.state)
+    by_size = np.zeros((len(seen), 6, 1))
+    away = np.swapaxes(measured[:, :3, :3], 1, 2) @ measured[:, :3, 3:]
+    by_size[:, 3:] = np.where(mine[:, None, None], away, 0.0)
+    return Effect.free(f"size of {board}", _nothing(1), by_size)
+
+
+def _nothing(count: int) -> Knowledge:
+    """Knowledge of so many values of which nothing is known."""
+    return Knowledge(np.zeros((count, count)), np.zeros(count))
 
 
 def _beside_itself(squares: FloatArray, freedom: float, numbers: int) -> FloatArray:
@@ -475,35 +593,52 @@ def log_gain(problem: Problem, fit: Solution, mahalanobis_sq: float) -> float:
     return -freedom * float(np.log1p(-share))
 
 
-def evidence_gain(problem: Problem, fit: Solution, move: Move) -> tuple[float, Problem, Solution]:
-    """Twice the logarithm of a move's Bayes factor: by a fit with it, whose noise is its own.
+def with_step(problem: Problem, fit: Solution, step: Move | Resized) -> tuple[Problem, Solution]:
+    """The problem in which something is otherwise from some stop on, and its fit."""
+    if isinstance(step, Move):
+        wider, start = moved(problem, fit, step)
+    else:
+        effect = _of_size(problem, fit, step.frame, problem.observations.stops >= step.stop)
+        wider = problem.with_effects([*problem.effects, effect])
+        values = np.append(fit.state.values, step.share)
+        start = replace(fit, state=State(fit.state.edges, values))
+    return wider, fit_problem(wider, start.state, start.noise)
+
+
+def evidence_gain(
+    problem: Problem, fit: Solution, step: Move | Resized
+) -> tuple[float, Problem, Solution]:
+    """Twice the logarithm of a step's Bayes factor: by a fit with it, whose noise is its own.
 
     `log_gain` has one level of noise for rotations and places. A camera that was pushed is in that
     of places alone, of which the score has no more than a half.
 
     Args:
         problem: The observations.
-        fit: The unknowns and the noise, without the move.
-        move: What moved.
+        fit: The unknowns and the noise, without the step.
+        step: What is otherwise from some stop on.
 
     Returns:
-        The gain, and the problem with the move and its fit.
+        The gain, and the problem with the step and its fit.
     """
-    wider, start = moved(problem, fit, move)
-    there = fit_problem(wider, start.state, start.noise)
+    wider, there = with_step(problem, fit, step)
     # Of sensors' levels the likelihood knows one share: they are the same for both.
     before, after = (
         robot_likelihood(part, state, there.noise).least_unlikely
         for part, state in ((problem, fit.state), (wider, there.state))
     )
     known = fitted_covariance(wider, there.state, there.noise)
-    change, covariance = _fitted_change(wider, there, known, move)
     # Restricted likelihood integrates over a change of any size, all as likely; these come in all
     # orders of magnitude.
-    units = np.repeat([TURN_PER_M, 1.0], 3)
+    if isinstance(step, Move):
+        change, covariance = _fitted_change(wider, there, known, step)
+        sizes, units = SIZES_M, np.repeat([TURN_PER_M, 1.0], 3)
+    else:
+        change, covariance = there.state.values[-1:], known[-1:, -1:]
+        sizes, units = _SHARES, np.ones(1)
     likely = []
-    for size_m in SIZES_M:
-        total = covariance + np.diag((size_m * units) ** 2)
+    for size in sizes:
+        total = covariance + np.diag((size * units) ** 2)
         square = float(change @ np.linalg.solve(total, change))
         likely.append(-0.5 * (float(np.linalg.slogdet(total)[1]) + square))
     prior = float(np.logaddexp.reduce(likely) - np.log(len(likely)))
@@ -511,7 +646,10 @@ def evidence_gain(problem: Problem, fit: Solution, move: Move) -> tuple[float, P
 
 
 def step_covariance(
-    problem: Problem, fit: Solution, step: Move | Slip, offsets: Mapping[str, FloatArray]
+    problem: Problem,
+    fit: Solution,
+    step: Move | Slip | Resized,
+    offsets: Mapping[str, FloatArray],
 ) -> FloatArray:
     """What a step that a fit does not have adds to its covariance (p, p).
 
@@ -524,15 +662,17 @@ def step_covariance(
         step: What moved at once.
         offsets: As of `slipped_joint`.
     """
-    after, places = np.zeros(problem.size), np.array([step.stop])
+    after, places, effects = np.zeros(problem.size), np.array([step.stop]), list[Effect]()
     if isinstance(step, Move):
         columns = np.r_[problem.edge_columns(step.frame)]
         change = after[columns] = log(step.change)
-        offsets = {}
+    elif isinstance(step, Resized):
+        effects = [_of_size(problem, fit, step.frame)]
+        columns, change = np.array([problem.size]), np.array([step.share])
     else:
-        offsets = {step.robot: offsets[step.robot]}
+        effects = _of_joints({step.robot: offsets[step.robot]})
         columns, change = np.array([problem.size + step.joint]), np.array([step.step_rad])
-    (found,) = _scored(problem, fit, columns[None], [places], offsets)
+    (found,) = _scored(problem, fit, columns[None], [places], effects)
     before = found.following[0] @ change
     return (np.outer(before, before) + np.outer(before + after, before + after)) / 2.0
 
@@ -565,27 +705,19 @@ def _scored(
     fit: Solution,
     columns: IntArray,
     between: Sequence[IntArray],
-    offsets: Mapping[str, FloatArray] = MappingProxyType({}),
+    effects: Sequence[Effect] = (),
 ) -> Iterator[_Scored]:
     """The steps of some unknowns at the stops at which they may be, the last first.
 
     Args:
         problem: The observations.
         fit: The unknowns and the noise.
-        columns: (u, c) the columns of each; those of joints' offsets are behind the problem's.
+        columns: (u, c) the columns of each; those of `effects` are behind the problem's.
         between: The stops at which each may step.
-        offsets: As of `slipped_joint`.
+        effects: What the problem does not have.
     """
     errors, size = RepeatErrors.of(problem, fit), problem.size
-    free = [
-        Effect.free(
-            f"offsets of {robot}",
-            Knowledge(np.zeros((offset.shape[2],) * 2), np.zeros(offset.shape[2])),
-            flange_jacobian={robot: offset},
-        )
-        for robot, offset in offsets.items()
-    ]
-    wider = problem.with_effects([*problem.effects, *free])
+    wider = problem.with_effects([*problem.effects, *effects])
     values = np.append(fit.state.values, np.zeros(wider.size - size))
     there = replace(fit, state=State(fit.state.edges, values))
     seen: dict[int, list[int]] = defaultdict(list)

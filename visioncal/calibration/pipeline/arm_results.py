@@ -17,7 +17,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.moves import Move, Slip, moved, step_covariance
+from visioncal.estimation.moves import Slip, step_covariance, with_step
 from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.parts import State
 from visioncal.estimation.pose_errors import find_pose_errors
@@ -26,7 +26,6 @@ from visioncal.estimation.residual_tests import inflation
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
-    fit_problem,
     held_shift,
     robot_likelihood,
 )
@@ -265,12 +264,11 @@ def beside_steps(
     fit: Solution,
     found: Mapping[str, ResidualTest],
 ) -> Mapping[str, RobotArm]:
-    """Weighs these errors beside a frame that moved at once, which counts by itself.
+    """Weighs these errors beside what moved or changed at once, which counts by itself.
 
     Processes over time and postures would explain a step, too.
     """
     step = next((test.step for test in found.values() if test.step), None)
-    if not isinstance(step, Move) or all(arm.is_modelled for arm in arms.values()):
+    if step is None or isinstance(step, Slip) or all(arm.is_modelled for arm in arms.values()):
         return arms
-    apart, start = moved(problem, fit, step)
-    return with_pose_errors(arms, apart, fit_problem(apart, start.state, start.noise))
+    return with_pose_errors(arms, *with_step(problem, fit, step))

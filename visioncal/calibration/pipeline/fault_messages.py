@@ -17,7 +17,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Remedy, exchanging, look_at
-from visioncal.estimation.moves import common_change
+from visioncal.estimation.moves import common_change, common_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
@@ -197,13 +197,11 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
         return
     steps = _common_steps(solved, run)
     if not steps:
+        yield from _other_boards(solved, run, is_behind=run is after)
         return
     (frame, change), *rivals = steps
     edge = agreed.fit.state.edges[problem.unknown[frame]]
-    if run is after:
-        when = f"from view {rows[int(run[0])].view} on"
-    else:
-        when = f"before view {rows[int(order[used[0]])].view}"
+    when = _when(solved, run, is_behind=run is after)
     moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
     moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
     step = Remedy("Fasten what moved, and calibrate the views before and after it apart.")
@@ -229,6 +227,36 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
         mahalanobis_sq=run_evidence(len(run), len(rows)),
     )
     yield PoseFault(found, tuple(out), f"{when}, something had moved")
+
+
+def _other_boards(solved: Solved, run: IntArray, *, is_behind: bool) -> Iterator[PoseFault]:
+    """Views at one end that a board of another size explains."""
+    agreed, out = solved.agreed, np.sort(run).tolist()
+    some = np.isin(np.arange(len(agreed.used)), run)
+    found = common_size(agreed.problem, agreed.fit, some)
+    if found is None or not found[1].all():
+        return
+    when = _when(solved, run, is_behind=is_behind)
+    words = (
+        f"{_views(solved, out)} were left out: {when}, as they agree, the target is another one, "
+        f"{figure(100.0 * abs(found[0]))} % {'larger' if found[0] > 0.0 else 'smaller'} than that "
+        "of the other views."
+    )
+    step = Remedy("Measure both prints, take one of them for all views, and record again.")
+    evidence = run_evidence(len(run), len(agreed.used))
+    views = _numbers(solved, out)
+    fault = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
+    yield PoseFault(fault, tuple(out), f"{when}, the target was another one")
+
+
+def _when(solved: Solved, run: IntArray, *, is_behind: bool) -> str:
+    """Since when views at one end, or until when, in the order of their stops."""
+    rows = solved.cell.rows
+    if is_behind:
+        return f"from view {rows[int(run[0])].view} on"
+    last = rows[int(run[-1])].station
+    behind = min((row for row in rows if row.station > last), key=lambda row: row.station)
+    return f"before view {behind.view}"
 
 
 def _common_steps(solved: Solved, run: IntArray) -> list[tuple[str, FloatArray]]:

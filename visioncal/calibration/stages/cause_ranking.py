@@ -84,6 +84,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "moved_slowly": Evidence(1e-4, _CHAIN),
     "moved_at_once": Evidence(1e-4, _CHAIN),
     "joint_slipped": Evidence(1e-4, _CHAIN),
+    "board_changed": Evidence(1e-4, _CHAIN),
     "clock_changed": Evidence(1e-4, _CHAIN),
     "correlated_errors": Evidence(1e-4, _CHAIN),
     "arm_errors": Evidence(1e-4, _CHAIN),
@@ -94,8 +95,8 @@ EVIDENCE: Mapping[str, Evidence] = {
     "unexplained": Evidence(_REMARK, _CHAIN),
 }
 LENS_CHANGED = "lens_changed"
-MOVED_FRAME = "moved_at_once"
-MOVED_AT_ONCE = (MOVED_FRAME, "joint_slipped")
+MOVED_FRAME, BOARD_CHANGED = "moved_at_once", "board_changed"
+MOVED_AT_ONCE = (MOVED_FRAME, "joint_slipped", BOARD_CHANGED)
 OF_CHAIN = frozenset(kind for kind, evidence in EVIDENCE.items() if evidence.misfit == _CHAIN)
 _MOVED = ("moved_slowly", *MOVED_AT_ONCE)
 _OF_ROBOT = ("arm_errors", "robot_noise", "robot_noise_of_pick")
@@ -311,6 +312,8 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
         arm = first.get("arm_errors")
         if arm and (first.keys() & {*MOVED_AT_ONCE} or max(moved) > arm.mahalanobis_sq):
             feigned.add("arm_errors")
+    if BOARD_CHANGED in first:
+        feigned |= {"board_size", "board_shape"}
     if "clock_changed" in first:
         feigned |= {*_MOVED, "arm_errors", "correlated_errors"}
     if LENS_CHANGED in first:

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS
+from visioncal.calibration.stages.cause_ranking import BOARD_CHANGED, MOVED_FRAME, NO_JOINTS
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
@@ -14,9 +15,11 @@ from visioncal.core.verdict import PLAN, Finding, Remedy
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
 from visioncal.estimation.moves import (
     Move,
+    Resized,
     Slip,
     evidence_gain,
     log_gain,
+    resized_board,
     slight_move,
     slipped_joint,
 )
@@ -25,6 +28,8 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.solve import Solution
 
+# What may be otherwise from some stop on.
+Step: TypeAlias = Move | Slip | Resized
 _THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
 # Fewer stops than this leave no residuals to be tested.
 _FEWEST_STOPS = 6
@@ -46,8 +51,8 @@ class ResidualTest:
 
     alike: Neighbours | None
     moved: Drift | None
-    step: Move | Slip | None = None
-    rival: Move | Slip | None = None
+    step: Step | None = None
+    rival: Step | None = None
 
 
 def misfits(
@@ -70,15 +75,17 @@ def misfits(
     slipped = slipped_joint(
         problem, fit, {robot: offsets[robot] for robot in robots if robot in offsets}
     )
+    resized = resized_board(problem, fit) if robots else None
     found: dict[str, ResidualTest] = {}
     for robot in robots:
         fitted = (problem, fit.state, fit.noise, robot)
         crept, arm = drift(*fitted), errors.get(robot)
         alike = None if arm else neighbours(*fitted)
-        steps = _steps(problem, fit, (slight, slipped), crept)
+        steps = _steps(problem, fit, (slight, slipped, resized), crept)
         # What a process over postures or time explains as well is no motion.
         if arm:
-            steps = [*_beside_errors(problem, fit, steps, arm, robot)]
+            beside = [*_beside_errors(problem, fit, steps, arm, robot)]
+            steps = sorted(beside, key=lambda step: -step.mahalanobis_sq)
         if arm and crept and crept.mahalanobis_sq < arm.gain:
             crept = None
         if steps:
@@ -94,15 +101,15 @@ def misfits(
 def _steps(
     problem: Problem,
     fit: Solution,
-    found: tuple[Move | None, Slip | None],
+    found: Sequence[Step | None],
     crept: Drift | None,
-) -> list[Move | Slip]:
+) -> list[Step]:
     """What moved at once, where that explains the residuals better than a creep from end to end."""
-    # A joint's has one number where a frame's has six, of which each must gain by as much as
-    # the Bayesian information criterion asks for (Schwarz 1978).
+    # A joint's or a size's has one number where a frame's has six, of which each must gain by as
+    # much as the Bayesian information criterion asks for (Schwarz 1978).
     price = _price(problem)
     each = float(np.log(problem.observations.directions.sum()))
-    likely: list[tuple[float, Move | Slip]] = []
+    likely: list[tuple[float, Step]] = []
     least = log_gain(problem, fit, crept.mahalanobis_sq) if crept else 0.0
     for move in found:
         gain = log_gain(problem, fit, move.mahalanobis_sq) - price if move else -np.inf
@@ -120,8 +127,8 @@ def _price(problem: Problem) -> float:
 
 
 def _beside_errors(
-    problem: Problem, fit: Solution, steps: Sequence[Move | Slip], arm: ArmErrors, robot: str
-) -> Iterator[Move | Slip]:
+    problem: Problem, fit: Solution, steps: Sequence[Step], arm: ArmErrors, robot: str
+) -> Iterator[Step]:
     """The steps that a robot's errors do not explain, with what they gain beside these."""
     for step in steps:
         if isinstance(step, Slip):
@@ -192,35 +199,36 @@ def doubts(
 
 
 def _at_once(
-    step: Move | Slip,
-    rival: Move | Slip | None,
+    step: Step,
+    rival: Step | None,
     from_when: Callable[[int], str],
     joint: Callable[[Slip], str],
 ) -> Finding:
     """Says what moved at once, and what may have in its place."""
-    is_joint = isinstance(step, Slip)
     instead = (
         f" Or else, as these views leave it open: {_step_words(rival, from_when, joint)}."
         if rival
         else ""
     )
+    kind, between, do = MOVED_FRAME, "both places", ""
     if isinstance(step, Slip):
+        kind, between = "joint_slipped", "before and after"
         do = "Look whether the joint keeps its zero"
+    elif isinstance(step, Resized):
+        kind, between = BOARD_CHANGED, "both boards"
+        do = "Measure both prints, take one of them for all views"
     else:
         thing = _THINGS.get(step.frame, step.frame)
         do = f"Fasten {thing[0].lower()}{thing[1:]}"
     return Finding(
-        "joint_slipped" if is_joint else MOVED_FRAME,
-        f"{_step_words(step, from_when, joint)}; the result is between "
-        f"{'before and after' if is_joint else 'both places'}.{instead}",
+        kind,
+        f"{_step_words(step, from_when, joint)}; the result is between {between}.{instead}",
         Remedy(f"{do}, and record again; or keep only the views before or after."),
         mahalanobis_sq=step.mahalanobis_sq,
     )
 
 
-def _step_words(
-    step: Move | Slip, from_when: Callable[[int], str], joint: Callable[[Slip], str]
-) -> str:
+def _step_words(step: Step, from_when: Callable[[int], str], joint: Callable[[Slip], str]) -> str:
     if isinstance(step, Slip):
         # What is to be added to a reading so that it is the joint's angle, the other way round.
         reads_deg, sigma_deg = (
@@ -232,9 +240,16 @@ def _step_words(
             f"{sign}{figure(abs(reads_deg))} deg (sigma {figure(sigma_deg)}) from what it read "
             "before, as where an encoder slipped or a zero was lost"
         )
+    thing = _THINGS.get(step.frame, step.frame)
+    if isinstance(step, Resized):
+        return (
+            f"{thing} is another one: {from_when(step.stop)}, it is "
+            f"{figure(100.0 * abs(step.share))} % {'larger' if step.share > 0.0 else 'smaller'} "
+            f"(sigma {figure(100.0 * step.sigma)} %) than before, by the robot's motion"
+        )
     shift_mm, turn_deg = pose_difference(np.eye(4), step.change)
     return (
-        f"{_THINGS.get(step.frame, step.frame)} moved at once: {from_when(step.stop)}, it is "
+        f"{thing} moved at once: {from_when(step.stop)}, it is "
         f"{figure(shift_mm)} mm and {figure(turn_deg)} deg from where it was"
     )
 
