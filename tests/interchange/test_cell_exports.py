@@ -108,7 +108,7 @@ def test_a_lens_is_that_of_the_camera_that_is_named():
         for name in ("top", "hand")
     }
     assert focal == {"top": 914.2, "hand": 563.0}
-    with pytest.raises(DataError, match="holds one camera; this alignment has cam_top, cam_hand"):
+    with pytest.raises(DataError, match="holds one camera; this cell has cam_top, cam_hand"):
         export(cell, "camera-info")
 
 

@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.results import Calibration, CameraResult, Edge, to_document
 from visioncal.results.compare import compare
-from visioncal.results.lens import ray_frame
+from visioncal.results.lens import ray_frame, refitted
 
 NAME = "flange_from_cam"
 SAMPLE = made_up(4).calibration
@@ -64,6 +64,18 @@ def test_two_lenses_of_one_camera_are_no_move():
     assert camera.moved_deg < 1e-6
     turned = {**SAMPLE.edges, NAME: Edge(edge.matrix @ exp(np.eye(6)[0] * 2e-2), edge.covariance)}
     assert compare(SAMPLE, replace(SAMPLE, edges=turned)).edges[0].rotation.is_change
+
+
+def test_what_other_lenses_leave_of_a_field_that_is_hardly_known_is_told():
+    lens = with_field(SAMPLE).camera
+    count = len(lens.field.coefficients)
+    # A tenth and nine tenths of its size are open, everywhere in the image.
+    well, hardly = (
+        refitted(replace(lens, field=replace(lens.field, root=share * np.eye(count))))
+        for share in (0.1, 0.9)
+    )
+    assert well.most_px > well.rms_px > 0.0
+    assert hardly.most_px == pytest.approx(well.most_px)
 
 
 def test_a_field_comes_back_from_its_file():

@@ -261,7 +261,9 @@ def refitted(lens: CameraResult) -> RefittedLens:
         step = np.linalg.lstsq(columns / scale, away, rcond=_DETERMINED)[0] / scale
         found = with_intrinsics(found, intrinsics(found) + np.pad(step, (0, size - len(step))))
     left = px - project(found, points)
-    most_px = float(np.abs(left[weights > _SEEN]).max(initial=0.0))
+    # Where little is known anywhere, what is known best counts.
+    well = weights > min(_SEEN, 0.5 * weights.max())
+    most_px = float(np.abs(left[well]).max())
     return RefittedLens(found, _rms(left, weights), most_px)
 
 

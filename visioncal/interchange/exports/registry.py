@@ -291,7 +291,7 @@ def _check_camera(form: ExportFormat, selection: Selection, there: Placements) -
         if there.lens is None:
             known = ", ".join(there.lenses) or "none"
             raise DataError(
-                f"{form.name} holds one camera; this alignment has {known}.",
+                f"{form.name} holds one camera; this cell has {known}.",
                 culprits=[form.name],
                 next_step="Name one with --camera." if there.lenses else "",
             )

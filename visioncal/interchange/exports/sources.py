@@ -196,7 +196,7 @@ def _of_cell(
         lens = lenses[_camera(lenses, camera)]
     frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
     by_name = {**edges, **frames}
-    return Placements(by_name, tuple(frames), "this alignment", None, lens, source, lenses)
+    return Placements(by_name, tuple(frames), "this cell", None, lens, source, lenses)
 
 
 def _camera(lenses: Mapping[str, CameraResult], camera: str | None) -> str:
@@ -207,7 +207,7 @@ def _camera(lenses: Mapping[str, CameraResult], camera: str | None) -> str:
         if frame in lenses:
             return frame
     raise DataError(
-        f"There is no camera {camera!r}; this alignment has {', '.join(known) or 'none'}.",
+        f"There is no camera {camera!r}; this cell has {', '.join(known) or 'none'}.",
         culprits=["--camera"],
         next_step=did_you_mean(camera, known),
     )
