@@ -16,9 +16,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
 from visioncal.estimation.parts import Noise
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture import touched_fixture
+from visioncal.frames.fixture import drawn_fixture, touched_fixture
 from visioncal.frames.fixture_fit import Setting
-from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.measured import Tool, touched_points
 from visioncal.frames.touches import TouchRows, check_lengths
 from visioncal.results import Edge, FrameFile, Verdict

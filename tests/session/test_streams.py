@@ -173,7 +173,7 @@ def test_a_stream_that_was_changed_is_named(
 ) -> None:
     session = kept_session().with_streams(kept_streams())
     with monkeypatch.context() as other:
-        other.setattr(codec, "stream_seal", lambda _: "0" * 64)
+        other.setattr(codec, "fact_seal", lambda _: "0" * 64)
         write_recording(tmp_path / "session.rrd", session, None, (), None)
     with pytest.raises(DataError, match="the stream robot cannot be read or was changed"):
         read_session(tmp_path / "session.rrd")

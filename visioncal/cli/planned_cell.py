@@ -1,6 +1,5 @@
 """The cell that a plan is for: from a robot and options, a session, or a calibration."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -11,14 +10,14 @@ from scipy.spatial.transform import Rotation
 from visioncal.cli.parsing import numbers_in, refuse_given, size_in
 from visioncal.cli.plan_options import PlanCellOptions
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence, read_bytes, some_of
+from visioncal.core.files import some_of
 from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, Progress
 from visioncal.estimation.parts import Noise
 from visioncal.interchange.formats.boards import target_named
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.outputs import CALIBRATION
-from visioncal.interchange.result_files import load_calibration, load_stored
+from visioncal.interchange.result_files import content_of, load_calibration, load_stored
 from visioncal.live.planning.cell import (
     TYPICAL_NOISE,
     TYPICAL_PX,
@@ -73,7 +72,7 @@ def find_source(name: str) -> Source:
 
         calibration, session = read_calibration(path), Session.load(path)
         return Source(f"recording {name}", calibration=calibration, session=session)
-    if (path / CALIBRATION).is_file() or _holds_a_result(path):
+    if (path / CALIBRATION).is_file() or "transforms" in content_of(path):
         stored = load_stored(path)
         return Source(f"calibration {name}", calibration=stored.calibration, session=stored.session)
     try:
@@ -182,17 +181,6 @@ def pose_of(words: str, option: str) -> FloatArray:
     return compose(turn, 1e-3 * np.array(numbers[:3]))
 
 
-def _holds_a_result(path: Path) -> bool:
-    """Tells a calibration.json from other files, such as an arm's."""
-    if absence(path) or path.suffix.lower() != ".json":
-        return False
-    try:
-        document = json.loads(read_bytes(path))
-    except (ValueError, RecursionError):
-        return False
-    return isinstance(document, dict) and "transforms" in document
-
-
 def _with_robot(session: Session, name: str) -> Session:
     document = {**session.document, "robot": {**session.document.get("robot", {}), "model": name}}
     return Session.assemble(
@@ -270,7 +258,7 @@ def _camera(words: str, resolution: str | None) -> Camera:
     if matrix is not None:
         return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
     path = Path(words)
-    if path.is_dir() or path.suffix.lower() == ".rrd" or _holds_a_result(path):
+    if path.is_dir() or path.suffix.lower() == ".rrd" or "transforms" in content_of(path):
         found = load_calibration(path, ANY, LENS).camera
         if found is None:
             raise DataError(

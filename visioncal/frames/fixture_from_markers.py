@@ -15,8 +15,8 @@ from visioncal.core.verdict import remarks
 from visioncal.estimation.pointfit import FEWEST_POINTS
 from visioncal.frames.camera_chain import Eye
 from visioncal.frames.drawing_points import NominalPoints
+from visioncal.frames.fixture import drawn_fixture
 from visioncal.frames.fixture_fit import Setting, Words
-from visioncal.frames.fixture_from_drawing import drawn_fixture
 from visioncal.frames.frame_from_images import camera_details, view_doubts
 from visioncal.frames.image_outliers import CandidateViews, ImageInliers, agreeing
 from visioncal.frames.measured import MeasuredPoints

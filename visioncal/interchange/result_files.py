@@ -122,7 +122,7 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
     from visioncal.dynamics import Identified
 
     file = path / DYNAMICS_FILE if alone and (path / DYNAMICS_FILE).is_file() else path
-    if "base" in _content(file) and "transforms" not in _content(file):
+    if "base" in content_of(file) and "transforms" not in content_of(file):
         return Identified.load(file)
     frames = path / FRAMES if alone else path
     if _holds_frames(frames):
@@ -132,11 +132,11 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
 
 def _holds_frames(path: Path) -> bool:
     """Tells a file of frames by its content: every calibration has transforms."""
-    document = _content(path)
+    document = content_of(path)
     return "frames" in document and "transforms" not in document
 
 
-def _content(path: Path) -> dict[str, object]:
+def content_of(path: Path) -> dict[str, object]:
     """The content of a JSON file; empty of what is none."""
     if path.suffix.lower() == ".rrd" or absence(path):
         return {}

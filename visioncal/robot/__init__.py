@@ -5,7 +5,6 @@ This is the only package that knows Pinocchio, and it imports it where a model i
 
 from visioncal.robot.chain import FUNCTION_NAMES, Chain
 from visioncal.robot.conversion import (
-    PARALLEL_RAD,
     convert_table,
     has_ur_axes,
     other_convention,
@@ -22,7 +21,6 @@ from visioncal.robot.files import (
     robot_names,
 )
 from visioncal.robot.inertia import (
-    INERTIA_KEY,
     PARAMETER_NAMES,
     Inertias,
     LogCholesky,
@@ -32,9 +30,9 @@ from visioncal.robot.inertia import (
     parameters_of,
     pseudo_inertias,
 )
-from visioncal.robot.loads import MASS_KEYS, Loads, Masses, bends, bent_joints
-from visioncal.robot.model import BODY_KEYS, LINK_KEYS, Robot
-from visioncal.robot.rates import RATE_KEYS, Rates
+from visioncal.robot.loads import Loads, Masses, bends, bent_joints
+from visioncal.robot.model import LINK_KEYS, Robot
+from visioncal.robot.rates import Rates
 from visioncal.robot.tables import DHTable, table_document, table_from_document
 from visioncal.robot.torques import body_regressor, joint_torques, momenta, torque_regressor
 from visioncal.robot.weights import WeightFunctions
@@ -53,14 +51,9 @@ from visioncal.robot.writing import (
 )
 
 __all__ = [
-    "BODY_KEYS",
     "FUNCTION_NAMES",
-    "INERTIA_KEY",
     "LINK_KEYS",
-    "MASS_KEYS",
-    "PARALLEL_RAD",
     "PARAMETER_NAMES",
-    "RATE_KEYS",
     "ROBOT_SUFFIXES",
     "Chain",
     "DHTable",

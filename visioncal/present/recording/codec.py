@@ -81,8 +81,8 @@ class Header:
             tomli_w.dumps(session.document),
             _to_json(session.target_document),
             _to_json(session.robot_document),
-            (*session.streams, *map(stream_seal, session.streams.values())),
-            "" if session.corner_table is None else corner_seal(session.corner_table),
+            (*session.streams, *map(fact_seal, session.streams.values())),
+            "" if session.corner_table is None else fact_seal(session.corner_table),
             images,
         )
 
@@ -183,9 +183,9 @@ def log_image(stream: rr.RecordingStream, name: str, image: bytes | None) -> Non
         stream.log(paths.IMAGE, rr.EncodedImage(contents=image, media_type=media_type))
 
 
-def stream_seal(stream: Stream) -> str:
-    """SHA-256 of a stream's columns and numbers."""
-    return sha256(json.dumps(stream.fact()).encode())
+def fact_seal(table: Stream | CornerTable) -> str:
+    """SHA-256 of what counts of a table."""
+    return sha256(json.dumps(table.fact()).encode())
 
 
 def log_samples(recording: rr.RecordingStream, name: str, samples: Stream) -> None:
@@ -196,11 +196,6 @@ def log_samples(recording: rr.RecordingStream, name: str, samples: Stream) -> No
         "values": pa.array(samples.values.ravel(), pa.float64()),
     }
     recording.log(paths.STREAMS, rr.DynamicArchetype(_STREAM, components=components))
-
-
-def corner_seal(corners: CornerTable) -> str:
-    """SHA-256 of the corners' rows."""
-    return sha256(json.dumps(corners.fact()).encode())
 
 
 def log_corners(recording: rr.RecordingStream, corners: CornerTable) -> None:

@@ -259,7 +259,7 @@ def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
     damaged = [
         name
         for name, seal in seals.items()
-        if name not in found or codec.stream_seal(found[name]) != seal
+        if name not in found or codec.fact_seal(found[name]) != seal
     ]
     if damaged:
         raise DataError(
@@ -278,7 +278,7 @@ def _corners_of(
     seal, found = records.header.corners, records.corners
     if not seal:
         return None
-    if found is None or codec.corner_seal(found) != seal:
+    if found is None or codec.fact_seal(found) != seal:
         raise DataError(
             f"{path} is damaged: the corners of its views cannot be read or were changed after it "
             "was written.",

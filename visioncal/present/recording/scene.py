@@ -16,8 +16,7 @@ from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.overlays import image_frames, log_image_frames
 from visioncal.present.recording.recorder import send_rows
-from visioncal.present.recording.uncertainty import Uncertainty
-from visioncal.present.recording.workspace import ArmPicture
+from visioncal.present.recording.workspace import ArmPicture, Uncertainty
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
