@@ -241,6 +241,8 @@ def test_two_exchanged_names_are_named():
     words = " ".join(frame.verdict.reasons)
     assert "it is where P3 is drawn: is its name exchanged?" in words
     assert "it is where P7 is drawn: is its name exchanged?" in words
+    (step,) = {finding.do.words for finding in frame.verdict.findings if finding.kind == "left_out"}
+    assert step.startswith("Correct the names of what is named")
     assert {observation.name for observation in frame.observations if not observation.used} == {
         "P3",
         "P7",

@@ -63,7 +63,7 @@ def test_a_fixture_without_rotation_says_whose_it_has_and_unknown_frames_list_it
     jig = placed.frame(placed.BASE_FROM_FIXTURE, oriented=False)
     cell = replace(CELL, frames={FIXTURE: jig})
     text = export(cell, "text", Selection("cam_top_from_jig"))
-    assert "rotation taken from the base_b, not measured" in text
+    assert "rotation taken from base_b, not measured" in text
     with pytest.raises(DataError, match=r"no frame 'jog'.* jig") as caught:
         export(cell, "text", Selection("base_a_from_jog"))
     assert "Did you mean jig" in caught.value.next_step

@@ -25,6 +25,7 @@ from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture_fit import FixtureFit, Setting, fixture_frame
 from visioncal.frames.measured import MeasuredPoints, Tool, touched_points
 from visioncal.frames.touches import TouchRows, robot_noise
+from visioncal.frames.verdicts import RENAMED
 from visioncal.results import Calibration, Frame
 from visioncal.robot import Robot
 
@@ -246,7 +247,7 @@ def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
         points = pairs.merged()
         for at in fit.numbering.moved.tolist():
             other = points.drawn_labels[fit.numbering.assignment[at]]
-            causes[points.labels[at]] = f"it is where {other} is drawn: is its name exchanged?"
+            causes[points.labels[at]] = f"it is where {other} is drawn{RENAMED}"
     return [causes[label] for label in pairs.labels]
 
 

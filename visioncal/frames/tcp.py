@@ -25,7 +25,14 @@ from visioncal.frames.touches import (
     refuse_copies,
     robot_noise,
 )
-from visioncal.frames.verdicts import disputed, noisy, off_words, placed_name, weak_directions
+from visioncal.frames.verdicts import (
+    RENAMED,
+    disputed,
+    noisy,
+    off_words,
+    placed_name,
+    weak_directions,
+)
 from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
 
@@ -159,7 +166,7 @@ def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
         return f"{words}: one of the touches that contradict each other"
     belongs = fit.belongs_to[at]
     if belongs is not None:
-        return f"{words}; it fits point {touches.names[belongs]!r}: is its name exchanged?"
+        return f"{words}; it fits point {touches.names[belongs]!r}{RENAMED}"
     return f"{words}: the tip had slipped, or the pose is of another moment"
 
 

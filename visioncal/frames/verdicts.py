@@ -11,6 +11,10 @@ from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 
+# How the reason ends of a touch that would be right by another name, and what to do about it.
+RENAMED = ": is its name exchanged?"
+_RENAME = "Correct the names of what is named; where they are right, touch it once more."
+
 
 def weak_directions(
     worst: Sequence[Direction],
@@ -51,9 +55,9 @@ def disputed(
         again: What to do about either, as a sentence.
     """
     for at in np.flatnonzero(~found.agrees).tolist():
-        end = "" if reasons[at].endswith("?") else "."
-        words = f"{names[at]} was left out: {reasons[at]}{end}"
-        yield Finding("left_out", words, Remedy(again, AGAIN))
+        renamed = reasons[at].endswith(RENAMED)
+        words = f"{names[at]} was left out: {reasons[at]}{'' if renamed else '.'}"
+        yield Finding("left_out", words, Remedy(_RENAME if renamed else again, AGAIN))
     if found.doubtful.any():
         some = some_of([names[at] for at in np.flatnonzero(found.doubtful).tolist()])
         words = f"{some} contradict each other, and which is wrong is not known: all are used."

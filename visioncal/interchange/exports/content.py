@@ -156,7 +156,8 @@ class Content:
         position = f"verdict {self.verdict.status}; sigma {self.edge.sigma_mm:.2g} mm"
         if self.rotation_of is None:
             return f"{position} and {self.edge.sigma_deg:.2g} deg"
-        return f"{position}; rotation taken from the {self.rotation_of}, not measured"
+        of = self.rotation_of if "_" in self.rotation_of else f"the {self.rotation_of}"
+        return f"{position}; rotation taken from {of}, not measured"
 
     @property
     def direction(self) -> str:
