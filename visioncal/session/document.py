@@ -282,15 +282,28 @@ def _several_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tu
             yield f"{plural}.{name}", "is a name of other than letters, digits and _ after a letter"
 
 
+def _coefficients_hint(model: str, distortion: Sequence[float]) -> str:
+    """What to write in the place of coefficients that are too many or too few for a model."""
+    counts, count = _COEFFICIENTS[model], len(distortion)
+    other = next((name for name in _COEFFICIENTS if count in _COEFFICIENTS[name]), None)
+    if count < max(counts):
+        padding = " (write 0 for those that are not used)"
+        return f'{padding}; {count} are those of "{other}"' if other else padding
+    if not any(distortion[max(counts) :]):
+        return f": leave out the last {count - max(counts)}, which are 0"
+    if other is not None:
+        return f'; {count} are those of "{other}"'
+    return ": delete matrix and distortion, and a lens of this model is estimated"
+
+
 def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str, str]]:
     counts = _COEFFICIENTS[camera.model]
     if camera.distortion is not None and len(camera.distortion) not in counts:
         needed = " or ".join(map(str, counts))
-        padding = " (write 0 for those that are not used)"
         yield (
             f"{path}.distortion",
             f'has {len(camera.distortion)} coefficients, but the "{camera.model}" model needs '
-            f"{needed}{padding if len(camera.distortion) < max(counts) else ''}",
+            f"{needed}{_coefficients_hint(camera.model, camera.distortion)}",
         )
     if camera.matrix is not None:
         if camera.distortion is None:
