@@ -46,6 +46,8 @@ RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
 _WHOLE_NUMBERS = ("point", "tag", "corner")
 # No rig of one cell is larger [m]: a larger number is in millimetres. A pose takes four points.
 _LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
+# Points whose second extent is a smaller share of the first lie on one line.
+_ON_ONE_LINE = 1e-6
 
 # Fewer do not determine a pose robustly; more do not fit a printable board.
 _MIN_SQUARES, _MAX_SQUARES = 3, 100
@@ -332,23 +334,13 @@ def _rig(table: DocumentTable, name: str) -> Target:
     try:
         values = np.array(lists, dtype=float)
     except (TypeError, ValueError):
-        values = np.zeros((0, 0))
-    if values.ndim != 2 or not np.isfinite(values).all():
-        raise table.refuse("points", "a table with gaps", "a finite number in every cell")
+        values = np.zeros(0)
+    for words, step in _rig_problems(names, values):
+        culprit = f"{table.label}: points"
+        raise DataError(f"{culprit}, its table, {words}.", culprits=[culprit], next_step=step)
     numbers, places_m = values[0], values[1:4].T
     sigmas_m = values[names.index("sigma_m")] if "sigma_m" in names else np.zeros(0)
-    if len(numbers) < _FEWEST_POINTS:
-        raise table.refuse("points", f"a table of {len(numbers)}", "four points or more")
-    repeated = sorted({int(number) for number in numbers if np.sum(numbers == number) > 1})
-    if repeated or (numbers != np.round(numbers)).any():
-        given = f"a table with point {repeated[0]} twice" if repeated else "a table"
-        raise table.refuse("points", given, "a whole number of its own for each point")
     extent_m = float(np.ptp(places_m, axis=0).max())
-    if not 0.0 < extent_m <= _LARGEST_RIG_M:
-        needed = f"a rig of up to {_LARGEST_RIG_M:g} m, in metres"
-        raise table.refuse("points", f"a table over {extent_m:g} m", needed)
-    if (sigmas_m <= 0).any():
-        raise table.refuse("points", f"sigma_m = {sigmas_m.min():g}", "sigmas above 0")
     return Target(
         name,
         "points",
@@ -361,6 +353,49 @@ def _rig(table: DocumentTable, name: str) -> Target:
         point_sigmas_m=tuple(sigmas_m.tolist()),
         **_tags_of_rig(table, columns),
     )
+
+
+def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[str, str]]:
+    """What is wrong with a table of points, and what to do.
+
+    Args:
+        names: Its columns, point, x_m, y_m and z_m first.
+        values: (columns, n) its cells; of another shape where the rows are uneven.
+    """
+    if values.ndim != 2:
+        yield "has rows of several lengths, or cells that are no numbers", "Fill in all cells."
+        return
+    for at, row in np.argwhere(~np.isfinite(values)).tolist():
+        yield (
+            f"has {values[at, row]:g} as {names[at]} of row {row + 1}",
+            "Write a finite number there, or delete the row.",
+        )
+    numbers, places_m = values[0].tolist(), values[1:4].T
+    if len(numbers) < _FEWEST_POINTS:
+        yield f"has {len(numbers)} points", "Give four points or more, which a camera needs."
+    for row, number in enumerate(numbers):
+        if number != round(number) or number in numbers[:row]:
+            again = " again" if number in numbers[:row] else ""
+            yield (
+                f"has {number:g}{again} as point of row {row + 1}",
+                "Give each point a whole number of its own.",
+            )
+    spread_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
+    if spread_m[1] <= _ON_ONE_LINE * spread_m[0]:
+        where = "on one line" if spread_m[0] > 0.0 else "in one place"
+        yield f"has all points {where}", "Give points beside these: no camera tells how they turn."
+    extent_m = float(np.ptp(places_m, axis=0).max())
+    if extent_m > _LARGEST_RIG_M:
+        yield (
+            f"reaches over {extent_m:g} m, and a rig over {_LARGEST_RIG_M:g} m at most",
+            "It looks like millimetres: multiply x_m, y_m, z_m and sigma_m by 0.001.",
+        )
+    for row, sigma_m in enumerate(values[4].tolist() if "sigma_m" in names else ()):
+        if sigma_m <= 0.0:
+            yield (
+                f"has {sigma_m:g} as sigma_m of row {row + 1}",
+                "Write metres above 0, or leave the column out where they are not known.",
+            )
 
 
 def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, Any]:

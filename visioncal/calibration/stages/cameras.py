@@ -231,13 +231,19 @@ def _refuse_mirrored(
     if found.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
         return
     has_images = any(view.image for view in seen.session.views if view.number in corners)
+    # No rig that was written down in a left-handed frame looks like itself.
+    rig = any(target.kind == "points" for target in targets)
+    left_handed = " Or one axis of the rig's table has the wrong sign." if rig else ""
     raise DataError(
         "The target is seen mirrored: its corners fit no pose as they are, and to "
         f"{figure(found.sigma_px)} px with left and right exchanged.",
-        next_step="Turn the images back (a flip in the camera's driver, or a mirror before the "
-        "lens), and calibrate anew."
-        if has_images
-        else COUNTED_BACKWARDS,
+        next_step=(
+            "Turn the images back (a flip in the camera's driver, or a mirror before the "
+            "lens), and calibrate anew."
+            if has_images
+            else COUNTED_BACKWARDS
+        )
+        + left_handed,
     )
 
 
