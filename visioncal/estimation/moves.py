@@ -430,20 +430,25 @@ def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mas
     return share, explained_by_noise(wider, resized, len(problem))[some]
 
 
-def slight_move(problem: Problem, fit: Solution, movable: Sequence[str]) -> Move | None:
+def slight_move(
+    problem: Problem, fit: Solution, movable: Sequence[str], *, kinds: int = 1
+) -> Move | None:
     """The most significant step of a frame at any stop; None where noise explains all of them.
 
     Args:
         problem: The observations that agree.
         fit: The unknowns and the noise.
         movable: Frames that may have moved.
+        kinds: Of how many kinds of residuals, rotations and places, it may be in one alone. The
+            noise of each is estimated apart: by one of two, a step has to explain half as much,
+            and noise explains it more often than is stated.
     """
     columns = np.array([np.r_[problem.edge_columns(name)] for name in movable]).reshape(-1, 6)
     tried = int(problem.observations.stops.max()) + 1
     spread = np.array([_spread_of_means(problem, name) for name in movable])
     between = [_between(problem, problem.observations.involves(name)) for name in movable]
-    freedom = _residual_freedom(problem, fit)
-    best, limit = None, _move_limit(problem, len(movable) * tried)
+    freedom = _residual_freedom(problem, fit) / kinds
+    best, limit = None, _move_limit(problem, len(movable) * tried, kinds)
     for scored in _scored(problem, fit, columns, between):
         values = scaled_values(scored.alone)
         clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
@@ -764,6 +769,6 @@ def _spread_of_means(problem: Problem, frame: str) -> FloatArray:
     return np.asarray(1.0 + (UNEVEN**2 - 1.0) * (mine.any() / np.maximum(shorter, 1)))
 
 
-def _move_limit(problem: Problem, tried: int) -> float:
-    freedom = max(0.5 * (6.0 * len(problem) - problem.size), 6.0)
+def _move_limit(problem: Problem, tried: int, kinds: int = 1) -> float:
+    freedom = max(0.5 * (6.0 * len(problem) - problem.size) / kinds, 6.0)
     return 6.0 * float(f_limit(_FALSE_MOVE / tried, 6, freedom))

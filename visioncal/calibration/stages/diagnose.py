@@ -71,7 +71,7 @@ def misfits(
     """
     robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= _FEWEST_STOPS]
     # Frames are those of all robots: what moved is sought once, and said once.
-    slight = slight_move(problem, fit, tuple(problem.unknown)) if robots else None
+    slight = _slight_move(problem, fit) if robots else None
     slipped = slipped_joint(
         problem, fit, {robot: offsets[robot] for robot in robots if robot in offsets}
     )
@@ -96,6 +96,20 @@ def misfits(
         else:
             found[robot] = ResidualTest(alike, crept)
     return found
+
+
+def _slight_move(problem: Problem, fit: Solution) -> Move | None:
+    """The most significant step of a frame; None where noise explains all of them."""
+    # A push is in the noise of places alone, and makes up most of it: no test by the noise of all
+    # residuals finds it beside few views.
+    frames = tuple(problem.unknown)
+    pushed = slight_move(problem, fit, frames, kinds=2)
+    if pushed is None:
+        return None
+    if (found := slight_move(problem, fit, frames)) is not None:
+        return found
+    gain, *_ = evidence_gain(problem, fit, pushed)
+    return pushed if gain - _price(problem) > _CLEARLY else None
 
 
 def _steps(
