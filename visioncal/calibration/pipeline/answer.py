@@ -29,10 +29,9 @@ from visioncal.calibration.stages.cell import Cell, ObservationRow
 from visioncal.calibration.stages.clock import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.diagnose import ResidualTest, misfits
-from visioncal.calibration.stages.image_delays import FoundDelay
 from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import ClockOffset
+from visioncal.calibration.stages.offset import ClockOffset, FoundDelay
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.pose_ambiguity import choose_by, chosen
 from visioncal.calibration.stages.validate import HeldOut, apart

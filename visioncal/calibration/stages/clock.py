@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.calibration.guess.joints import JointReading, declared_reading, unit_readings
-from visioncal.calibration.stages.image_delays import find_delays, straighten
 from visioncal.calibration.stages.motion import RobotMotion, at_rest, is_open, slow_and_new
 from visioncal.calibration.stages.offset import (
     FEWEST_VIEWS,
@@ -19,11 +18,13 @@ from visioncal.calibration.stages.offset import (
     ClockOffset,
     change_doubt,
     clock_words,
+    find_delays,
     no_offset,
     not_ascending,
     shared_times,
     speed_words,
     stated_doubts,
+    straighten,
     turning_doubt,
     why_undetermined,
 )

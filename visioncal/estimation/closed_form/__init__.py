@@ -1,21 +1,19 @@
 """Closed-form hand-eye solvers: a start for the joint fit, and a second opinion of it.
 
-`SOLVERS` names them all; each is one file. They take (m, 4, 4) robot poses `R_i` and
-`cam_from_target` poses `C_i` and solve `R_i @ X @ C_i = Z`; see `closed_form.handeye`.
-Motion too poor to determine X gives a finite and poor answer here; it is refused by name where
-the Fisher information is known.
+`SOLVERS` names them all; each is one file, those of linear systems together. They take (m, 4, 4)
+robot poses `R_i` and `cam_from_target` poses `C_i` and solve `R_i @ X @ C_i = Z`; see
+`closed_form.handeye`. Motion too poor to determine X gives a finite and poor answer here; it is
+refused by name where the Fisher information is known.
 """
 
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from visioncal.estimation.closed_form.andreff import andreff
 from visioncal.estimation.closed_form.daniilidis import daniilidis
 from visioncal.estimation.closed_form.handeye import HandEye, Solver
 from visioncal.estimation.closed_form.horaud import horaud
-from visioncal.estimation.closed_form.li import li
+from visioncal.estimation.closed_form.kronecker import andreff, li, shah
 from visioncal.estimation.closed_form.park import park
-from visioncal.estimation.closed_form.shah import shah
 from visioncal.estimation.closed_form.tsai import tsai
 
 SOLVERS: Mapping[str, Solver] = MappingProxyType(

@@ -1,4 +1,14 @@
-"""Linear equations in the entries of rotation matrices, shared by Shah, Andreff and Li.
+"""Linear equations in the entries of rotation matrices: the solvers of Andreff, Shah and Li.
+
+N. Andreff, R. Horaud, B. Espiau, "On-line hand-eye calibration", Second International Conference
+on 3-D Digital Imaging and Modeling, 1999: one linear system in X's entries.
+
+M. Shah, "Solving the robot-world/hand-eye calibration problem using the Kronecker product",
+Journal of Mechanisms and Robotics 5(3), 2013: both rotations as singular vectors of one sum.
+
+A. Li, L. Wang, D. Wu, "Simultaneous robot-world and hand-eye calibration using dual-quaternions
+and Kronecker product", International Journal of the Physical Sciences 5(10), 2010: one linear
+system in both unknowns' entries.
 
 vec() stacks the rows of a matrix, so that vec(R M C) = kron(R, C^T) vec(M).
 """
@@ -7,16 +17,83 @@ import numpy as np
 
 from visioncal.core.transforms import nearest_rotation
 from visioncal.core.types import FloatArray
+from visioncal.estimation.closed_form.handeye import HandEye, solver
+from visioncal.estimation.closed_form.translation import complete, mean_camera
 
 
-def turn_maps(robot: FloatArray, camera: FloatArray) -> FloatArray:
+@solver
+def andreff(robot: FloatArray, camera: FloatArray) -> HandEye:
+    """Solves the linear system of rotation and translation, then makes its rotation one.
+
+    A pair says (I - kron(A_R, B_R)) vec(R_X) = 0 and
+    kron(I, t_B^T) vec(R_X) + (I - A_R) t_X = t_A (eq. 10). Summed over all pairs both are the
+    scatter of what the views say about Z, so the pairs need not be formed: the second is that of
+    the places of one target point, half-way to the camera; see `closed_form.translation`.
+
+    The system is solved up to scale, with t_A times a free factor: solved as it stands it
+    collapses to R_X = 0 where the flange turns on the spot. The translation is solved for again
+    once R_X is a rotation, because it was fitted to a matrix that was not. One metre weighs
+    as much as one radian.
+    """
+    m = len(robot)
+    seen = camera[:, :3, :3] @ (0.5 * mean_camera(camera)) + camera[:, :3, 3]
+    rows = np.empty((m, 3, 13))
+    rows[:, :, :4] = robot[:, :3, :]
+    rows[:, :, 4:] = (robot[:, :3, :3, None] * seen[:, None, None, :]).reshape(m, 3, 9)
+    vector_x = _least_scatter(_turn_maps(robot, camera), rows)
+    return complete(robot, camera, _rotations(vector_x)[0])
+
+
+@solver
+def shah(robot: FloatArray, camera: FloatArray) -> HandEye:
+    """Solves for both rotations at once, then for both translations.
+
+    R_i R_X C_i = R_Z makes vec(R_X) and vec(R_Z) the singular vectors of
+    K = sum kron(R_i, C_i^T) that belong to its largest singular value, which is m without noise.
+    As the terms of K are orthogonal, m - |K x|^2 / m is their scatter at a unit vector x, and
+    the singular vector is where it is least. It is found as such, because the singular values
+    of K themselves are nearly equal where all tilts are small. Both vectors are then made
+    rotations by the orthogonal Procrustes solution.
+    """
+    maps = _turn_maps(robot, camera)
+    vector_x = _least_scatter(maps)
+    vector_z = (maps @ vector_x).sum(axis=0)
+    rotation_x, rotation_z = _rotations(np.array([vector_x, vector_z]))
+    return complete(robot, camera, rotation_x, rotation_z)
+
+
+@solver
+def li(robot: FloatArray, camera: FloatArray) -> HandEye:
+    """Solves the linear system of all four unknown parts, then makes its rotations true ones.
+
+    With D_i = inv(C_i) a view says kron(R_i, C_i^T) vec(R_X) = vec(R_Z) and
+    R_i t_X + t_i = R_Z d_i + t_Z (eq. 19, where A = R_i and B = D_i). R_X and the translations
+    are eliminated, which leaves 9 unknowns of the 24. As in `andreff`, the system is solved
+    up to scale and the translations once more when the rotations are known. One metre weighs
+    as much as one radian.
+    """
+    m = len(robot)
+    # -d_i: from the camera to the target's origin, in the target's axes.
+    origins = (camera[:, None, :3, 3] @ camera[:, :3, :3])[:, 0]
+    rows = np.zeros((m, 3, 13))
+    rows[:, :, :4] = robot[:, :3, :]
+    for axis in range(3):
+        rows[:, axis, 4 + 3 * axis : 7 + 3 * axis] = origins
+    to_x = _turn_maps(robot, camera).swapaxes(1, 2)
+    vector_z = _least_scatter(to_x, rows)
+    vector_x = (to_x @ vector_z).sum(axis=0)
+    rotation_x, rotation_z = _rotations(np.array([vector_x, vector_z]))
+    return complete(robot, camera, rotation_x, rotation_z)
+
+
+def _turn_maps(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """The (m, 9, 9) orthogonal matrices kron(R_i, C_i^T), which map vec(R_X) to vec(R_Z)."""
     turned = camera[:, :3, :3].swapaxes(1, 2)
     products = robot[:, :3, None, :3, None] * turned[:, None, :, None, :]
     return np.asarray(products.reshape(-1, 9, 9))
 
 
-def least_scatter(maps: FloatArray, rows: FloatArray | None = None) -> FloatArray:
+def _least_scatter(maps: FloatArray, rows: FloatArray | None = None) -> FloatArray:
     """Finds the entries, up to scale, about whose images the views agree best.
 
     The image is unknown, too, and is eliminated by centring; then other unknowns are by a QR
@@ -41,7 +118,7 @@ def least_scatter(maps: FloatArray, rows: FloatArray | None = None) -> FloatArra
     return np.asarray(np.linalg.svd(triangle[-9:, -9:])[2][-1])
 
 
-def rotations(vectors: FloatArray) -> FloatArray:
+def _rotations(vectors: FloatArray) -> FloatArray:
     """The (n, 3, 3) rotations nearest to matrices of which (n, 9) are multiples of either sign.
 
     All have the same sign; the first decides it.

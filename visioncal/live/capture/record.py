@@ -36,7 +36,6 @@ class Departure:
 
     Attributes:
         stops: The stops that have no view yet.
-        here: (n,) where the joints are [rad].
         first: The postures (n,) on the way to the first stop, its own last; empty where no stop is
             left.
         turn_rad: How far the joint turns that turns farthest on that way [rad].
@@ -44,7 +43,6 @@ class Departure:
     """
 
     stops: tuple[Stop, ...]
-    here: FloatArray
     first: tuple[FloatArray, ...]
     turn_rad: float
     duration_s: float
@@ -70,12 +68,12 @@ def departure(
     _check_model(cell, plan, here)
     stops = tuple(stop for stop in plan.stops if stop.view not in done)
     if not stops:
-        return Departure((), here, (), 0.0, 0.0)
+        return Departure((), (), 0.0, 0.0)
     first = CheckedPaths(plan).to(stops[0], here)
     way = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
     turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
     duration_s = JointPace.of(options).way_s(way) + _STOP_S * len(stops)
-    return Departure(stops, here, first, float(turns.max()), duration_s)
+    return Departure(stops, first, float(turns.max()), duration_s)
 
 
 def record(
