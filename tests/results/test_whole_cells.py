@@ -344,3 +344,27 @@ def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
     check = verify(session, found, camera="left", robot="b", target="plate_b")
     assert check.passed
     assert set(check.seen.known.reasons) < set(cell.wrong_views)
+
+
+def test_a_calibrated_arm_of_a_cell_is_checked_as_it_was_calibrated():
+    robots = tuple(replace(robot, offset_sigma_rad=3e-3) for robot in OPTIONS.robots)
+    session = recorded(simulate(replace(OPTIONS, robots=robots, stops=LATER + 8, seed=4)))
+    found = package.calibrate(part(session, 0, LATER))
+    assert {robot.arm.level for robot in found.cell.robots.values()} == {"offsets"}
+    later = part(session, LATER, LATER + 8)
+    for camera, robot, target in PAIRS:
+        # As by its nominal arm it would be off by millimetres.
+        check = verify(later, found, camera=camera, robot=robot, target=target)
+        assert check.passed, check.named
+    slipped = replace(
+        later,
+        views=tuple(
+            replace(view, numbers={**view.numbers, "q3_rad": view.numbers["q3_rad"] + 2e-3})
+            if "q3_rad" in view.numbers
+            else view
+            for view in later.views
+        ),
+    )
+    check = verify(slipped, found, camera="hand", robot="a", target="floor")
+    assert not check.passed
+    assert check.named[0].name == "joint 3"

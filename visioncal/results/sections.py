@@ -273,11 +273,13 @@ class CellJointFit(Section):
     Attributes:
         cameras: By name, which values of a camera's lens are among the unknowns.
         targets: By name, which values of a target's shape are.
+        arms: By name, the errors of each robot's arm that was calibrated along.
         covariance: (k, k) of the transforms, then of these.
     """
 
     cameras: Mapping[str, tuple[int, ...]]
     targets: Mapping[str, tuple[int, ...]]
+    arms: Mapping[str, FittedArm] = field(default_factory=dict)
     covariance: Covariance
 
 

@@ -189,7 +189,7 @@ def _intervals(cell: CellResult, chosen: Chosen) -> NoiseIntervals | None:
 
 
 def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointFit | None:
-    """What `verify` predicts with: both edges, and lens and board as far as they are free."""
+    """What `verify` predicts with: both edges, lens and board as far as they are free, the arm."""
     fit = cell.joint_fit
     if fit is None or not (chosen.camera and chosen.target):
         return None
@@ -207,10 +207,16 @@ def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointF
                 looks += [first + place for place in places]
                 columns += range(at, at + len(places))
             at += len(places)
+    own = chosen.robot or "robot"
+    for word, arm in fit.arms.items():
+        if word == own:
+            columns += range(at, at + len(arm.values))
+        at += len(arm.values)
     carried = block_diag(jacobian, np.eye(at)[columns][:, jacobian.shape[1] :])
     return JointFit(
         targets={"": cell.targets[target]} if target in cell.targets else {},
         boards=("",),
         looks=tuple(looks),
+        arm=fit.arms.get(own),
         covariance=carried @ fit.covariance @ carried.T,
     )

@@ -16,6 +16,7 @@ from visioncal.calibration.pipeline.lens_fields import lens_field_of
 from visioncal.calibration.pipeline.network_ties import untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.solved import within
+from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
 from visioncal.calibration.stages.need import need_met
@@ -250,7 +251,7 @@ def _joint_fit_of(known: RunState) -> JointFit | None:
         targets={name: target_document(board) for name, board in boards.items()},
         boards=tuple(names) or ("",),
         looks=() if seen is None else tuple(seen.free.tolist()),
-        arm=_fitted_arm(known),
+        arm=_fitted_arm(known, known.robot_arm),
         covariance=_covariance(known),
     )
 
@@ -265,9 +266,8 @@ def _conditions_of(known: RunState) -> dict[str, float]:
     }
 
 
-def _fitted_arm(known: RunState) -> FittedArm | None:
-    """The arm's errors: of what they are, and their estimates beside the stated arm."""
-    arm = known.robot_arm
+def _fitted_arm(known: RunState, arm: RobotArm) -> FittedArm | None:
+    """An arm's errors: of what they are, and their estimates beside the stated arm."""
     model, errors = arm.model, arm.errors
     if errors is None or not errors.of_links:
         return None
@@ -451,16 +451,38 @@ def fit_section(known: RunState) -> CellJointFit:
     """The unknowns of the fit of a whole cell, with their covariance."""
     solved, covariance, edges = known.fitted, known.solved.covariance, 6 * len(known.solved.edges)
     seen, looks = solved.seen, solved.looks
+    arms, of_arms = _calibrated_arms(known)
     if seen is None or looks is None:
-        return CellJointFit(cameras={}, targets={}, covariance=covariance[:edges, :edges])
-    columns = [*range(edges), *solved.columns_of(seen.free).tolist()]
+        columns = [*range(edges), *of_arms]
+        return CellJointFit(
+            cameras={}, targets={}, arms=arms, covariance=covariance[np.ix_(columns, columns)]
+        )
+    columns = [*range(edges), *solved.columns_of(seen.free).tolist(), *of_arms]
     return CellJointFit(
         cameras={
             thing_name(name, "camera"): _among(seen.free, at) for name, at in looks.lenses.items()
         },
         targets={name: _among(seen.free, shape) for name, shape in _shapes(known).items()},
+        arms=arms,
         covariance=covariance[np.ix_(columns, columns)],
     )
+
+
+def _calibrated_arms(known: RunState) -> tuple[dict[str, FittedArm], list[int]]:
+    """The errors of the arms that were calibrated along, by name, and their columns in the fit."""
+    arms, columns, effects = (
+        dict[str, FittedArm](),
+        list[int](),
+        known.solved.problem.effect_columns,
+    )
+    for robot, arm in known.fitted.arms.items():
+        fitted, name = _fitted_arm(known, arm), f"arm of {arm.robot}"
+        if fitted is None or arm.model is None or name not in effects:
+            continue
+        place = effects[name]
+        arms[robot or "robot"] = fitted
+        columns += np.arange(place.start, place.stop)[arm.model.is_kept].tolist()
+    return arms, columns
 
 
 def shapes_of(known: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
