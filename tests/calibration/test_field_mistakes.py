@@ -265,7 +265,12 @@ def test_rows_in_millimetres_are_said_to_be_some(tmp_path):
 def test_a_board_that_was_exchanged_midway_is_no_thing_that_moved(tmp_path, size, since):
     stops = looks(19)
     stops[since:] = [replace(stop, size=size) for stop in stops[since:]]
-    first = visioncal.calibrate(write(tmp_path / "board", stops)).verdict.causes[0]
+    folder = write(tmp_path / "board", stops)
+    if since == 14:
+        warned = visioncal.doctor(folder).findings[0]
+        assert "from view 14 to view 18, something stood elsewhere or was set" in warned.words
+        assert "visioncal calibrate" in warned.do.command
+    first = visioncal.calibrate(folder).verdict.causes[0]
     # Of unlike parts, the views of the smaller one are left out.
     assert first.kind == ("board_changed" if since == 9 else "something_moved")
     found = re.search(

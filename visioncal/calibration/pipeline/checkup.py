@@ -12,7 +12,8 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.cell import read_cell
+from visioncal.calibration.stages.cause_ranking import LEAST_RUN
+from visioncal.calibration.stages.cell import Cell, read_cell
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, by_reason
@@ -24,7 +25,7 @@ from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.shown import html_card
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.types import Camera, Mount, Progress
+from visioncal.core.types import Camera, Mask, Mount, Progress
 from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Remedy, with_paths
 from visioncal.session import Session
 from visioncal.vision.finders.board import hidden_corners
@@ -216,7 +217,18 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
         yield _refused("motion", error)
         return
     out = [row.view for row, used in zip(cell.rows, agreed.used.tolist(), strict=True) if not used]
-    if out:
+    if _is_run(cell, agreed.used):
+        yield Finding(
+            "something_moved",
+            f"Views {some_of([*map(str, out)])} disagree with the others, and follow each other: "
+            f"from view {out[0]} to view {out[-1]}, something stood elsewhere or was set up "
+            "otherwise.",
+            Remedy(
+                "Calibrate: the verdict says what it is, where one change explains it.", CALIBRATE
+            ),
+            tuple(out),
+        )
+    elif out:
         one = len(out) == 1
         rows = ", ".join(map(str, out))
         yield Finding(
@@ -251,6 +263,13 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
             "stated, the lens is not this camera's, or the poses are not of these images.",
             Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),
         )
+
+
+def _is_run(cell: Cell, used: Mask) -> bool:
+    """Whether the views that are left out are all at one end of the session, and not a few."""
+    order = np.argsort([row.station for row in cell.rows], kind="stable")
+    ends = np.count_nonzero(used[order][1:] != used[order][:-1])
+    return bool(ends == 1 and np.sum(~used) >= LEAST_RUN)
 
 
 def _lost(known: RunState) -> Iterator[Finding]:

@@ -341,6 +341,10 @@ def _chance(doubt: Finding) -> float:
     return min(max(float(chdtrc(1.0, square)), _LEAST_CHANCE), limit) if square else limit
 
 
+# So many views in a row are not left out by chance.
+LEAST_RUN = 3
+
+
 def run_evidence(count: int, of: int) -> float:
     """What it says that views which were left out follow each other, as a chi-square of one.
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import (
+    LEAST_RUN,
     MEASURE_BOARD,
     MOVED_AT_ONCE,
     NO_JOINTS,
@@ -35,8 +36,6 @@ _CAUSES: Mapping[Mount, str] = {
 # Limits of views whose poses were measured, over those of views with corners: of a board that is
 # seen squarely, sound ones are off by 8 times the median now and then.
 _UNEVEN = 1.5
-# So many views in a row are not left out by chance.
-_LEAST_RUN = 3
 # Kinds of findings about views that are left out.
 _LEFT_OUT = (EXCHANGED, "turned_images", "wrong_pose", "something_moved")
 # Views that disagree by less than so many times what their sensor's noise makes are explained: of a
@@ -239,7 +238,7 @@ def _run(pair: JudgedPair) -> str:
     compared = [view.view for view in pair.views if view.used or view.view in out]
     first = compared.index(out[0])
     end = first + len(out)
-    if len(out) < _LEAST_RUN or compared[first:end] != out or compared == out:
+    if len(out) < LEAST_RUN or compared[first:end] != out or compared == out:
         return ""
     when = f"from view {out[0]} on" if first else f"before view {compared[end]}"
     if first and end < len(compared):
