@@ -348,7 +348,8 @@ def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
 
 def test_a_calibrated_arm_of_a_cell_is_checked_as_it_was_calibrated():
     robots = tuple(replace(robot, offset_sigma_rad=3e-3) for robot in OPTIONS.robots)
-    session = recorded(simulate(replace(OPTIONS, robots=robots, stops=LATER + 8, seed=4)))
+    cell = simulate(replace(OPTIONS, robots=robots, stops=LATER + 8, seed=4))
+    session = recorded(cell)
     found = package.calibrate(part(session, 0, LATER))
     assert {robot.arm.level for robot in found.cell.robots.values()} == {"offsets"}
     later = part(session, LATER, LATER + 8)
@@ -356,6 +357,14 @@ def test_a_calibrated_arm_of_a_cell_is_checked_as_it_was_calibrated():
         # As by its nominal arm it would be off by millimetres.
         check = verify(later, found, camera=camera, robot=robot, target=target)
         assert check.passed, check.named
+    # A place has what is open of the arm, its first joint's zero above all, and no more.
+    floor_m = truth(cell, "base_a", "target_floor")[:3, 3]
+    picks = package.locate_views(later, found, camera="hand", robot="a", target="floor").found
+    for place in picks.values():
+        assert "arm" not in place.budget_mm
+        away = place.p_base - floor_m
+        # Chi-square of three exceeds this in one case of a thousand.
+        assert away @ np.linalg.solve(place.covariance, away) < 16.3
     slipped = replace(
         later,
         views=tuple(

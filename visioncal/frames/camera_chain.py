@@ -62,20 +62,21 @@ class LearntArm:
         # Functions of the joints are in no such covariance.
         if fit is None or not calibration.arm_is_calibrated or found is None or found.functions:
             return None
-        from visioncal.calibration.verification.calibration_prior import CalibrationPrior
+        from visioncal.calibration.verification.calibration_prior import fitted_model
 
-        prior = CalibrationPrior.of(calibration)
-        if prior.model is None or calibration.camera is None:
+        model = fitted_model(calibration.calibrated_robot, fit.arm)
+        if fit.arm is None or model is None or calibration.camera is None:
             return None
         lens_size = len(intrinsics(calibration.camera.camera))
-        free = [at for at in prior.looks if at < lens_size]
-        behind = 6 + 6 * len(prior.boards)
-        fitted = [*range(6), *(behind + prior.looks.index(at) for at in free)]
+        free = [at for at in fit.looks if at < lens_size]
+        # Behind the camera's edge is that of the first board, where there is one.
+        behind = 12 if fit.boards else 6
+        fitted = [*range(6), *(behind + fit.looks.index(at) for at in free)]
         kept = [*range(6), *(6 + at for at in free)]
-        arm = slice(behind + len(prior.looks), None)
+        arm = slice(len(fit.covariance) - len(fit.arm.values), None)
         # What was no unknown of the fit has to do with the arm only by way of what was.
         shares = camera[:, kept] @ np.linalg.pinv(camera[np.ix_(kept, kept)], hermitian=True)
-        return cls(prior.model, prior.covariance[arm, arm], shares @ prior.covariance[fitted, arm])
+        return cls(model, fit.covariance[arm, arm], shares @ fit.covariance[fitted, arm])
 
 
 @dataclass(frozen=True, eq=False)

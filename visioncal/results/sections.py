@@ -252,7 +252,7 @@ class JointFit(Section):
 
     Attributes:
         targets: What was printed, by name and as it is described.
-        boards: The names of the targets that the fit places.
+        boards: The names of the targets that the fit places; none of a camera and robot alone.
         looks: Which values of lens and targets are among the unknowns.
         arm: The errors of the arm; None where none were found.
         covariance: (k, k) of both transforms, of lens and targets, of where further targets lie

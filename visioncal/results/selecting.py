@@ -191,9 +191,9 @@ def _intervals(cell: CellResult, chosen: Chosen) -> NoiseIntervals | None:
 def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointFit | None:
     """What `verify` predicts with: both edges, lens and board as far as they are free, the arm."""
     fit = cell.joint_fit
-    if fit is None or not (chosen.camera and chosen.target):
+    if fit is None or not chosen.camera:
         return None
-    target = thing_name(chosen.target, "target")
+    target = thing_name(chosen.target, "target") if chosen.target else ""
     camera = thing_name(chosen.camera, "camera")
     lens_count = 0
     if (known := cell.lenses.get(chosen.camera)) is not None:
@@ -215,7 +215,7 @@ def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointF
     carried = block_diag(jacobian, np.eye(at)[columns][:, jacobian.shape[1] :])
     return JointFit(
         targets={"": cell.targets[target]} if target in cell.targets else {},
-        boards=("",),
+        boards=("",) if chosen.target else (),
         looks=tuple(looks),
         arm=fit.arms.get(own),
         covariance=carried @ fit.covariance @ carried.T,

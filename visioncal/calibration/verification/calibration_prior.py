@@ -167,7 +167,7 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
         jacobian @ fit.covariance @ jacobian.T,
         _looks(calibration, fit, targets),
         "none" if fit.arm is None else fit.arm.of,
-        _model(calibration.calibrated_robot, fit.arm),
+        fitted_model(calibration.calibrated_robot, fit.arm),
     )
 
 
@@ -218,7 +218,7 @@ def _jacobian(placed: FloatArray, looks: int, arm: int) -> FloatArray:
     return jacobian
 
 
-def _model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None:
+def fitted_model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None:
     """The arm's model at what was found, so that no errors are left to be added."""
     # Its geometry is in the arm; what goes by the loads of a stop is in the values.
     if fitted is None or fitted.of != "model" or arm is None:
