@@ -354,6 +354,14 @@ def test_exchanged_rows_are_named_of_a_board_that_looks_the_same_turned(mount):
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_six_rows_that_were_shuffled_are_named(seed):
+    cell = simulate(CellOptions(views=6, seed=seed))
+    verdict = calibrate(session_of(cell, cell.robot.base_from_flange[[3, 0, 4, 5, 1, 2]])).verdict
+    assert "poses are not those of the images" in verdict.top[0]
+    assert "rows and images were paired" in verdict.next_steps[0].words
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_rows_paired_crosswise_are_named(seed):
     """Each pair of views that are exchanged turns as it should, which shuffled rows do not."""
     cell = simulate(CellOptions(views=12, seed=seed))

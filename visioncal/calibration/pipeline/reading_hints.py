@@ -47,7 +47,7 @@ _ALIKE_DEG = 3.0
 # Rows are as good as shuffled where less than a third of them are those of their views: a ninth of
 # the pairs beyond those by chance; not of fewer rows, or of turns so small that chance makes more
 # of the pairs alike.
-_SHUFFLES, _PAIRS_IN_PLACE, _FEWEST_SHUFFLED, _MOST_BY_CHANCE = 200, 1.0 / 9.0, 8, 0.3
+_SHUFFLES, _PAIRS_IN_PLACE, _FEWEST_SHUFFLED, _MOST_BY_CHANCE = 200, 1.0 / 9.0, 6, 0.3
 
 # No copy mirrors sound poses unasked: another sign of y would look as good.
 _MIRRORED = Remedy(
