@@ -267,8 +267,21 @@ def test_translation_alone_is_refused(mount):
         x, z = some_edges(seed)
         robot = compose(np.tile(np.eye(3), (10, 1, 1)), some_motion(10, seed)[:, :3, 3])
         data = made_up(robot, x, z, seed=seed, mount=mount)
-        with pytest.raises(DegenerateError, match="differ in position only"):
+        with pytest.raises(DegenerateError, match="differ in position only") as caught:
             solved(data)
+        assert "measure that offset" not in caught.value.next_step
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_noise_of_a_translation_makes_no_offset_worth_measuring(mount):
+    for seed in range(6):
+        x, z = some_edges(seed)
+        moved = compose(np.tile(np.eye(3), (10, 1, 1)), some_motion(10, seed)[:, :3, 3])
+        rng = np.random.default_rng(seed)
+        noise = np.hstack([2e-4 * rng.normal(size=(10, 3)), np.zeros((10, 3))])
+        with pytest.raises(DegenerateError, match="differ in position only") as caught:
+            solved(made_up(moved @ exp(noise), x, z, seed=seed, mount=mount))
+        assert "measure that offset" not in caught.value.next_step
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

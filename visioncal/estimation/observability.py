@@ -256,7 +256,9 @@ def _scene(problem: Problem, mount: Mount) -> CellWords:
     def advice(frame: str, open_part: str) -> str:
         if frame in further:
             return f"Add views of {names[frame][0][4:]}, or take it out of the session."
-        return f"{_or_measured(mount, open_part)}{_advice(mount)}"
+        # One measured offset is of no help to a robot that does not turn at all.
+        is_turned = np.linalg.norm(_turns(robot_part(flange, mount)), axis=1).max() >= _STILL_RAD
+        return f"{_or_measured(mount, open_part) if is_turned else ''}{_advice(mount)}"
 
     return CellWords(title(mount), names, motion, advice, _UNDETERMINED[_sensor(mount)])
 
