@@ -98,6 +98,11 @@ def test_a_sound_cell_is_good_and_says_how_good(session):
     assert "offset along the cell's" in reason
 
 
+def test_poses_are_counted_by_robot_and_stop(session):
+    counts = [part for part in doctor(session).seen if "poses of" in part]
+    assert counts == [f"{CELL.stops} poses of robot {robot}" for robot in "ab"]
+
+
 def test_frames_that_take_up_a_calibrated_arms_zeros_are_no_doubt():
     slipped = RobotAt("b", CELL.robots[1].place_m, offset_sigma_rad=5e-3)
     found = align(

@@ -325,8 +325,11 @@ def _seen(known: RunState) -> Iterator[str]:
         edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
         yield f"the board in {len(look.corners)} {'images' if images else 'views'}{size}{edges}"
         yield from _unseen_rows(session, look)
-    if known.base_from_flange:
-        yield f"{len(known.base_from_flange)} poses of the robot"
+    for robot, reported in known.robots.items():
+        # Rows of one stop share them.
+        if poses := {pose.tobytes() for pose in reported.base_from_flange.values()}:
+            whose = f"robot {robot}" if len(known.robots) > 1 else "the robot"
+            yield f"{len(poses)} poses of {whose}"
     if session.streams:
         yield f"streams {some_of(list(session.streams))}"
 
