@@ -824,22 +824,20 @@ def equations_from(
         Each stop with what it and all after it say of these, (a, p + q) and (a,): what is known
         besides does not count.
     """
-    state, noise = solution.state, solution.noise
-    alone, shared = problem.covariance(noise), problem.error_covariance(noise)
-    linear, stops = problem.linear(state), problem.observations.stops
-    of = np.where(errors.jacobian.any(axis=(1, 2)), -1, problem.units[0])
+    state, stops = solution.state, problem.observations.stops
+    # What repeats share is an unknown here, and no noise.
+    apart, linear = replace(problem, with_repeats=False), problem.linear(state)
+    whitening = _Whitening.of(apart, solution.noise, linear.by_errors)
     residuals = linear.residuals + errors.jacobian @ errors.values
     every = np.concatenate([linear.jacobian, errors.jacobian, residuals[:, :, None]], axis=2)
     total = np.zeros((len(asked), every.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
         mine = np.flatnonzero(stops == stop)
-        for unit in np.unique(of[mine]).tolist():
-            rows = mine[of[mine] == unit]
-            # Observations may have no noise but that of the robot that they share.
-            covariance = block_diag(*alone[rows])
-            if unit >= 0:
-                jacobian = linear.by_errors[rows].reshape(-1, shared.shape[1])
-                covariance += jacobian @ shared[unit] @ jacobian.T
-            columns = every[rows].reshape(-1, every.shape[2])
-            total = total + np.linalg.solve(covariance, columns[:, asked]).T @ columns
+        rows, units = every[mine], whitening.units[mine]
+        total = total + gram(rows[:, :, asked], whitening.weights[mine] @ rows)
+        for unit in np.unique(units[units >= 0]).tolist():
+            together = units == unit
+            pulled = np.swapaxes(whitening.taken[mine[together]], 1, 2)
+            taken = gram(pulled, rows[together])
+            total -= taken[:, asked].T @ taken
         yield stop, total[:, :-1], total[:, -1]
