@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
+from support.commands import visioncal as run_command
 
 import visioncal
 from visioncal.core.errors import DegenerateError
@@ -143,7 +144,7 @@ def test_a_table_of_corners_that_was_cut_off_is_named(tmp_path):
     assert one.verdict.top[0].startswith("1 of 16 rows of views.csv observe nothing: view 4;")
 
 
-def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path):
+def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path, monkeypatch):
     bumped = FLANGE_FROM_CAM * RigidTransform.from_translation([0.0012, -0.0012, 0.0011])
     stops = looks(18)
     stops[9:] = [replace(stop, flange_from_cam=bumped) for stop in stops[9:]]
@@ -151,6 +152,20 @@ def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path):
     assert first.kind == "moved_at_once"
     assert first.words.startswith("The camera moved at once: from view 9 on, it is 1.9 mm and")
     assert "Another tool frame in the controller would look the same." in first.words
+    assert first.do.words.endswith("or calibrate the 9 views before it alone.")
+    options = ("calibrate", "bumped", "-o", "before", "--no-report", "--no-recording")
+    monkeypatch.chdir(tmp_path)
+    assert first.do.command == "visioncal calibrate SESSION -o NEW --views 0-8"
+    assert run_command(*options, "--views", "0-8").status == 0
+    alone = visioncal.Calibration.load(tmp_path / "before")
+    assert not alone.verdict.causes
+    assert [view.view for view in alone.views] == list(range(9))
+    away = (FLANGE_FROM_CAM.inv() * alone.transforms["flange_from_cam"]).translation
+    sigma_m = np.sqrt(np.trace(alone.covariance("flange_from_cam")[3:, 3:]))
+    # By chance one cell in a hundred is farther away.
+    assert np.linalg.norm(away) < 3.0 * sigma_m
+    refused = run_command(*options, "--views", "8-0")
+    assert (refused.status, "as 1-12,14" in refused.said) == (2, True)
 
 
 def with_lens(stops: Sequence[Stop], longer: Sequence[float], aside_px: float = 0.0) -> list[Stop]:

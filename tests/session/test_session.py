@@ -282,6 +282,22 @@ def test_nothing_is_overwritten_and_nothing_is_left_half_written(
     assert Session.load(tmp_path / "empty").digest() == session.digest()
 
 
+def test_some_views_alone_stay_as_they_were(folder: Path) -> None:
+    session = Session.load(folder)
+    some = session.only([7, 5])
+    assert [(view.number, view.stop, view.image) for view in some.views] == [
+        (7, 1, "images/a.png"),
+        (5, 2, "images/missing.png"),
+    ]
+    assert some.views[0].numbers == session.views[0].numbers
+    assert session.only([7, 3, 5]).digest() == session.digest()
+    with pytest.raises(DataError, match=r"views 1-2,9 of .* it has 3,5,7") as caught:
+        session.only([1, 2, 3, 9])
+    assert caught.value.culprits == ("1-2,9",)
+    with pytest.raises(DataError, match="no view"):
+        session.only([])
+
+
 def test_what_the_task_needs_is_read_and_can_be_asked_otherwise(
     folder: Path, tmp_path: Path
 ) -> None:

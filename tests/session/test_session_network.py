@@ -125,6 +125,13 @@ def test_rows_say_who_saw_what_while_which_robots_stood_how(folder):
     assert stations == [0, 0, 0, 1, 1, 1, 2]
 
 
+def test_some_views_alone_keep_the_robots_of_their_stops(folder):
+    found = Session.load(folder).only([0, 1, 2]).observations
+    assert [observation.view.number for observation in found] == [0, 1, 2]
+    assert {name: row.number for name, row in found[1].robots.items()} == {"a": 0, "b": 3}
+    assert not any(observation.lacks for observation in found)
+
+
 def test_a_row_with_another_pose_than_its_stop_is_of_a_state_of_its_own(folder):
     changed(folder, "views.csv", "1,0,,left,,plate,a.png,,,,,,,", f"1,0,,left,a,plate,a.png,{POSE}")
     assert not [warning for warning in Session.load(folder).warnings if "another pose" in warning]

@@ -25,6 +25,13 @@ def calibrate_command(
     need: NeedOptions,
     work: WorkOptions,
     out: OutFolder = Path("out"),
+    views: Annotated[
+        str | None,
+        typer.Option(
+            metavar="1-12,14",
+            help="These views alone, as those before or after something moved.",
+        ),
+    ] = None,
     solver: Annotated[
         SolverName,
         typer.Option(help="The joint fit, or a closed form by name; all are compared anyway."),
@@ -81,6 +88,7 @@ def calibrate_command(
     from visioncal.calibration.pipeline import run, run_dense
     from visioncal.calibration.pipeline.running import Asked
     from visioncal.cli.console import naming, report_written, say
+    from visioncal.cli.parsing import views_in
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
     from visioncal.interchange.merge_results import leftover
@@ -90,6 +98,8 @@ def calibrate_command(
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
     with naming(session, out):
         loaded = _joined([need.session(session) for session in sessions], shared=robot_shared)
+        if views is not None:
+            loaded = loaded.only(views_in(views, "--views"))
     asked = Asked(
         solver=solver,
         level=level,

@@ -62,6 +62,24 @@ def pair_in(words: str, option: str) -> tuple[int, int]:
     return numbers[0], numbers[1]
 
 
+def views_in(words: str, option: str) -> list[int]:
+    """Reads the numbers of views, written as 1-12,14.
+
+    Raises:
+        DataError: It is not whole numbers, or a range ends before it begins.
+    """
+    found: list[int] = []
+    for part in words.split(","):
+        ends = _whole_numbers(part.replace("-", ","))
+        if not 1 <= len(ends) <= 2 or ends[0] > ends[-1]:
+            raise DataError(
+                f"{option} is {words[:40]!r}; numbers of views are needed, as 1-12,14.",
+                culprits=[option],
+            )
+        found += range(ends[0], ends[-1] + 1)
+    return found
+
+
 def size_in(words: str) -> tuple[int, int]:
     """Reads the width and height of images [px], written as 1280,800 or 1280x800.
 

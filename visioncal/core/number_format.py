@@ -1,6 +1,7 @@
 """How figures are written: in sentences, and in tables beside what is uncertain of them."""
 
 import math
+from collections.abc import Iterable
 
 # Nobody acts on less, in millimetres, degrees or pixels: in sentences, and in tables.
 _LEAST, _SMALLEST = 1e-3, 1e-4
@@ -66,3 +67,14 @@ def significant(value: float | None, digits: int = 2) -> str:
         return f"<{_SMALLEST}"
     exponent = int(f"{value:.{digits - 1}e}".partition("e")[2])
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Writes whole numbers with runs drawn together: `1-4,7`."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ",".join(str(run[0]) + (f"-{run[-1]}" if len(run) > 1 else "") for run in runs)

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 import numpy as np
 
 from visioncal.core.codec import DROPPED, UNWRITTEN
-from visioncal.core.number_format import percent
+from visioncal.core.number_format import percent, ranges
 from visioncal.core.shown import html_card
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
@@ -47,6 +47,8 @@ GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW, VERIFY = "visioncal review OUT", "visioncal verify SESSION --against OUT"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
+# Fewer views are not worth a calibration of their own.
+FEWEST_ALONE = 6
 # The command line as it was typed, to which options are added.
 AGAIN = "AGAIN"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
@@ -80,6 +82,12 @@ def exchanging(first: int, second: int) -> str:
     """The command that calibrates with the images of two views exchanged."""
     fixed = CALIBRATE.replace("SESSION", "FIXED")
     return f"visioncal convert SESSION FIXED --exchange {first},{second} && {fixed}"
+
+
+def or_alone(words: str, views: Sequence[int]) -> Remedy:
+    """What to do, with the command that calibrates some views alone where they are enough."""
+    is_enough = len(views) >= FEWEST_ALONE
+    return Remedy(words, f"{CALIBRATE_ANEW} --views {ranges(views)}" if is_enough else "")
 
 
 READ_AGAIN = Remedy(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
+from visioncal.core.number_format import ranges
 from visioncal.session.boards import COLUMN as TARGET
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.columns import SELECTORS, is_number
@@ -72,6 +73,41 @@ def select(
         corners=None if table is None else table.of_views(tuple(rows)).without_targets(),
     )
     return found.with_streams(streams_of(session, chosen.robot))
+
+
+def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
+    """Takes some views out of a session, with the robots' rows at their stops; see `Session.only`.
+
+    Raises:
+        DataError: The session has no such view, or none is meant.
+    """
+    there = [view.number for view in session.views]
+    unknown = sorted(set(numbers) - set(there))
+    if unknown or not numbers:
+        missing = f"views {ranges(unknown)}" if unknown else "no view"
+        raise DataError(
+            f"{missing} of session {session.name!r} are asked for; it has {ranges(there)}.",
+            culprits=[ranges(unknown)] if unknown else [],
+            next_step="Name views of views.csv, as 1-12,14.",
+        )
+    stops = {view.stop for view in session.views if view.number in numbers} - {None}
+    kept = [
+        view
+        for view in session.views
+        if view.number in numbers
+        or (view.stop in stops and has_robot_state(view) and not is_seen(view))
+    ]
+    table = session.corner_table
+    found = session.assemble(
+        session.document,
+        session.columns,
+        [[view.cell(column) for column in session.columns] for view in kept],
+        session.images,
+        target_document=session.target_document,
+        robot_document=session.robot_document,
+        corners=None if table is None else table.of_views([view.number for view in kept]),
+    )
+    return found.with_streams(session.streams)
 
 
 def streams_of(session: "Session", robot: str) -> dict[str, Stream]:

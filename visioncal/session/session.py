@@ -42,7 +42,7 @@ from visioncal.session.kinds import (
 )
 from visioncal.session.observations import Observation, observations_of, stop_warnings
 from visioncal.session.saving import placed_files, write_folder
-from visioncal.session.selecting import select
+from visioncal.session.selecting import keep_views, select
 from visioncal.session.streams import (
     FOLDER,
     Stream,
@@ -296,6 +296,20 @@ class Session:
             DataError: There is no such thing, several are meant, or this robot does not part these.
         """
         return select(self, Choice(camera, robot, target))
+
+    @typed
+    def only(self, views: Sequence[int]) -> "Session":
+        """Returns the session of some views alone, as those before something moved.
+
+        Of a whole cell, the rows of robots at their stops stay, too.
+
+        Args:
+            views: Their numbers.
+
+        Raises:
+            DataError: The session has no such view, or none is meant.
+        """
+        return keep_views(self, views)
 
     def with_streams(self, streams: Mapping[str, Stream]) -> "Session":
         """Returns the session with streams beside its views, in the order of their names.

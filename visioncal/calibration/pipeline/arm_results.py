@@ -130,9 +130,9 @@ def doubts_of_arms(
     found: Mapping[str, ResidualTest],
     results: Mapping[str, ArmFound],
     asked: str,
-    from_when: Callable[[int], str],
+    cell: Cell,
 ) -> Iterator[Finding]:
-    """Finds what speaks against the robots; `from_when` words a stop in the session's numbers."""
+    """Finds what speaks against the robots."""
 
     def joint(slip: Slip) -> str:
         matched = arms[slip.robot].matched
@@ -142,7 +142,7 @@ def doubts_of_arms(
         return words if len(arms) == 1 else f"{words} of robot {slip.robot}"
 
     for robot, arm in arms.items():
-        mine = _doubts(arm, found.get(robot), asked, from_when, joint)
+        mine = _doubts(arm, found.get(robot), asked, cell, joint)
         for finding in (*mine, *results[robot].doubts()):
             yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_called(arms, robot))
 
@@ -160,7 +160,7 @@ def _doubts(
     arm: RobotArm,
     found: ResidualTest | None,
     asked: str,
-    from_when: Callable[[int], str],
+    cell: Cell,
     joint: Callable[[Slip], str],
 ) -> Iterator[Finding]:
     if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
@@ -176,7 +176,7 @@ def _doubts(
     if found is not None:
         calibrated = arm.model is not None
         aside = "" if arm.heat is None else arm.heat.set_aside
-        for doubt in diagnose.doubts(found, arm.errors, from_when, joint, calibrated=calibrated):
+        for doubt in diagnose.doubts(found, arm.errors, cell, joint, calibrated=calibrated):
             if doubt.kind == "moved_slowly" and aside:
                 words = f"Whether the arm drifts with its temperature was not looked for: {aside}."
                 yield replace(doubt, words=f"{doubt.words} {words}")

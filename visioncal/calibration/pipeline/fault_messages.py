@@ -16,7 +16,15 @@ from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.core.verdict import CALIBRATE, EXCHANGED, Finding, Remedy, exchanging, look_at
+from visioncal.core.verdict import (
+    CALIBRATE,
+    EXCHANGED,
+    Finding,
+    Remedy,
+    exchanging,
+    look_at,
+    or_alone,
+)
 from visioncal.estimation.moves import common_change, common_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
@@ -204,7 +212,8 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     when = _when(solved, run, is_behind=run is after)
     moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
     moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
-    step = Remedy("Fasten what moved, and calibrate the views before and after it apart.")
+    out = np.sort(run).tolist()
+    words = "Fasten what moved, and calibrate the views before and after it apart."
     on_flange = problem.tree.body(frame) != problem.tree.root
     if on_flange or len(problem.robots) == 1:
         which = "tool" if on_flange else "base"
@@ -213,11 +222,11 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
             f", or the controller reported another {which} frame, {figure(other_mm)} mm and "
             f"{figure(other_deg)} deg from that of the other views"
         )
-        step = Remedy(
+        words = (
             f"Look which {which} frame was active in the controller, and set the same one for all "
             "views; or fasten what moved, and calibrate the views before and after it apart."
         )
-    out = np.sort(run).tolist()
+    step = or_alone(words, _numbers(solved, out))
     words = f"{_views(solved, out)} were left out: {when}, as they agree, {moved}."
     found = Finding(
         "something_moved",

@@ -59,7 +59,7 @@ def findings_of(known: RunState) -> Findings:
     of_arms = [
         _with_alike(doubt, known)
         for doubt in doubts_of_arms(
-            solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell.from_when
+            solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell
         )
     ]
     if any(warning.kind == "measured_turns" for warning in warnings):

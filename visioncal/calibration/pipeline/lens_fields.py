@@ -173,15 +173,14 @@ def lens_changes(solved: Solved) -> Iterator[Finding]:
         step = lens_step(stack, looks.camera(name), poses, order)
         if step is None:
             continue
-        first = solved.cell.from_when(stations[stack.views[int(order[step.first])]])
+        first = stations[stack.views[int(order[step.first])]]
         of = "The lens" if len(looks.problems) == 1 else f"The lens of {name}"
         yield Finding(
             LENS_CHANGED,
-            f"{of} changed: {first}, {_step_words(step)}, by the corners alone; the result is "
-            "between both lenses.",
-            Remedy(
-                "Switch off autofocus and image stabilisation, fasten zoom and focus rings, and "
-                "record again; or keep only the views before or after."
+            f"{of} changed: {solved.cell.from_when(first)}, {_step_words(step)}, by the corners "
+            "alone; the result is between both lenses.",
+            solved.cell.or_apart(
+                "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
             ),
             mahalanobis_sq=step.gain,
         )

@@ -12,6 +12,7 @@ from visioncal.calibration.stages.priors import priors_of
 from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mount
+from visioncal.core.verdict import FEWEST_ALONE, Remedy, or_alone
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.parts import FramePrior
 from visioncal.estimation.tree import Branch, Tree
@@ -66,6 +67,22 @@ class Cell:
         if "stop" in self.session.columns:
             return f"from stop {self.stops[station]} on"
         return f"from view {self.stops[station]} on"
+
+    def or_apart(self, do: str, station: int) -> Remedy:
+        """To do something and record again, or to calibrate the longer part of the session alone.
+
+        Args:
+            do: What to do, in the imperative.
+            station: Where the later part begins.
+        """
+        parts: dict[str, list[int]] = {"before": [], "after": []}
+        for row in (*self.rows, *self.held):
+            parts["before" if row.station < station else "after"].append(row.view)
+        where, views = max(parts.items(), key=lambda part: len(part[1]))
+        if len(views) < FEWEST_ALONE:
+            return Remedy(f"{do}, and record again.")
+        words = f"{do}, and record again; or calibrate the {len(views)} views {where} it alone."
+        return or_alone(words, views)
 
     @property
     def mount(self) -> Mount | None:

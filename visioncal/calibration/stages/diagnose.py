@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import BOARD_CHANGED, MOVED_FRAME, NO_JOINTS
+from visioncal.calibration.stages.cell import Cell
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
@@ -159,7 +160,7 @@ def _beside_errors(
 def doubts(
     found: ResidualTest,
     arm: ArmErrors | None,
-    from_when: Callable[[int], str],
+    cell: Cell,
     joint: Callable[[Slip], str],
     *,
     calibrated: bool,
@@ -169,7 +170,7 @@ def doubts(
     Args:
         found: What the residuals show.
         arm: The errors of an arm whose joints are not known.
-        from_when: Words a stop of the fit in the session's own numbers.
+        cell: What the session calls its stops.
         joint: Words a joint of a robot.
         calibrated: Whether the arm was.
     """
@@ -194,7 +195,7 @@ def doubts(
     if arm is not None and arm.is_significant and arm.look is not None:
         yield _of_looks(arm, *(np.sqrt(3.0) * arm.look).tolist())
     if found.step is not None:
-        yield _at_once(found.step, found.rival, from_when, joint)
+        yield _at_once(found.step, found.rival, cell, joint)
     if moved is not None:
         yield Finding(
             "moved_slowly",
@@ -215,12 +216,12 @@ def doubts(
 def _at_once(
     step: Step,
     rival: Step | None,
-    from_when: Callable[[int], str],
+    cell: Cell,
     joint: Callable[[Slip], str],
 ) -> Finding:
     """Says what moved at once, and what may have in its place."""
     instead = (
-        f" Or else, as these views leave it open: {_step_words(rival, from_when, joint)}."
+        f" Or else, as these views leave it open: {_step_words(rival, cell, joint)}."
         if rival
         else ""
     )
@@ -236,13 +237,13 @@ def _at_once(
         do = f"Fasten {thing[0].lower()}{thing[1:]}"
     return Finding(
         kind,
-        f"{_step_words(step, from_when, joint)}; the result is between {between}.{instead}",
-        Remedy(f"{do}, and record again; or keep only the views before or after."),
+        f"{_step_words(step, cell, joint)}; the result is between {between}.{instead}",
+        cell.or_apart(do, step.stop),
         mahalanobis_sq=step.mahalanobis_sq,
     )
 
 
-def _step_words(step: Step, from_when: Callable[[int], str], joint: Callable[[Slip], str]) -> str:
+def _step_words(step: Step, cell: Cell, joint: Callable[[Slip], str]) -> str:
     if isinstance(step, Slip):
         # What is to be added to a reading so that it is the joint's angle, the other way round.
         reads_deg, sigma_deg = (
@@ -250,20 +251,20 @@ def _step_words(step: Step, from_when: Callable[[int], str], joint: Callable[[Sl
         )
         sign = "+" if reads_deg > 0.0 else "-"
         return (
-            f"The offset of {joint(step)} steps: {from_when(step.stop)}, it reads "
+            f"The offset of {joint(step)} steps: {cell.from_when(step.stop)}, it reads "
             f"{sign}{figure(abs(reads_deg))} deg (sigma {figure(sigma_deg)}) from what it read "
             "before, as where an encoder slipped or a zero was lost"
         )
     thing = _THINGS.get(step.frame, step.frame)
     if isinstance(step, Resized):
         return (
-            f"{thing} is another one: {from_when(step.stop)}, it is "
+            f"{thing} is another one: {cell.from_when(step.stop)}, it is "
             f"{figure(100.0 * abs(step.share))} % {'larger' if step.share > 0.0 else 'smaller'} "
             f"(sigma {figure(100.0 * step.sigma)} %) than before, by the robot's motion"
         )
     shift_mm, turn_deg = pose_difference(np.eye(4), step.change)
     return (
-        f"{thing} moved at once: {from_when(step.stop)}, it is "
+        f"{thing} moved at once: {cell.from_when(step.stop)}, it is "
         f"{figure(shift_mm)} mm and {figure(turn_deg)} deg from where it was"
     )
 

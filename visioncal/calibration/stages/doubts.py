@@ -17,7 +17,7 @@ from visioncal.calibration.stages.judged import Findings, JudgedArm, JudgedPair,
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure
 from visioncal.core.types import Mount
-from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Remedy, look_at
+from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Remedy, look_at, or_alone
 from visioncal.results import Rms, ViewResult
 
 # Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
@@ -212,7 +212,7 @@ def _disagreement_doubts(pair: JudgedPair) -> Iterator[Finding]:
         named, them, rows = f"views {', '.join(map(str, views))}", "them", "their rows"
         words = f"V{named[1:]} were left out. View {views[0]} {out[0].reason}.{run}"
     step = (
-        Remedy("Fasten what moved, and calibrate the views before and after it apart.")
+        or_alone("Fasten what moved, and calibrate the views before and after it apart.", views)
         if run
         else Remedy(
             f"Compare image and pose of {named}: record {them} again, or in views.csv, delete "
