@@ -437,6 +437,66 @@ def test_few_stops_are_said_to_be_few():
         aligned(simulate(NetworkOptions(stops=2)))
 
 
+def four_axes_beside_six(b_turns_rad, prior):
+    """A session in which one camera sees boards on two arms, and where base b is in base a.
+
+    Args:
+        b_turns_rad: (s, 3) rotation vectors of flange b.
+        prior: What session.toml has of `flange_b_from_target_plate_b`.
+    """
+    rng = np.random.default_rng(4)
+    bases = {"a": np.eye(4), "b": exp(np.array([[0.01, -0.02, 1.2, 1.0, 0.4, 0.03]]))[0]}
+    cell_from_top = exp(np.array([[3.0, 0.1, 0.0, 0.5, 0.2, 1.6]]))[0]
+    plates = {name: exp(np.array([[0.05, 0.0, 0.4, 0.05, 0.02, 0.03]]))[0] for name in bases}
+    columns = ("camera", "stop", "target", "robot", *POSE, *(f"cft_{name}" for name in POSE))
+    rows = []
+    for stop, turn in enumerate(b_turns_rad):
+        turns = {"a": rng.uniform(-0.6, 0.6, 3), "b": turn}
+        for name, base in bases.items():
+            flange = exp(np.array([[*turns[name], *rng.uniform(-0.2, 0.2, 3)]]))[0]
+            seen = invert(cell_from_top) @ base @ flange @ plates[name]
+            seen = seen @ exp(rng.normal(0.0, 1e-4, (1, 6)))[0]
+            row = pose_row(flange) | {f"cft_{key}": at for key, at in pose_row(seen).items()}
+            row |= {"camera": "top", "stop": stop, "target": f"plate_{name}", "robot": name}
+            rows.append([str(len(rows)), *(str(row[column]) for column in columns)])
+    frames = {"cam_top": "cell"} | {f"target_plate_{name}": f"flange_{name}" for name in bases}
+    document = {
+        "schema": 1,
+        "name": "two arms",
+        "robots": {name: {} for name in bases},
+        "cameras": {"top": {"resolution": [640, 480]}},
+        "targets": {f"plate_{name}": "charuco_9x6_30mm" for name in bases},
+        "frames": frames,
+        "prior": {"flange_b_from_target_plate_b": prior} if prior else {},
+    }
+    return Session.assemble(document, ("view", *columns), rows, {}), bases["b"]
+
+
+# Eight stops about one axis are fewer than what a start needs to find the turn about it by noise.
+ABOUT_Z = np.array([[0.0, 0.0, angle] for angle in np.linspace(-2.0, 2.0, 8)])
+
+
+def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
+    session, base_b = four_axes_beside_six(ABOUT_Z, {"z_m": 0.03, "sigma_m": 1e-4})
+    edge = align(session).between("base_a", "base_b")
+    away = log(invert(base_b) @ edge.matrix)
+    # Chi-square of 6 beyond 22 is 0.1 %.
+    assert away @ np.linalg.solve(edge.covariance, away) < 22.0
+    assert edge.sigma_mm < 1.0
+
+
+def test_what_an_arm_that_hardly_turns_is_advised_to_do():
+    with pytest.raises(DegenerateError, match="nothing ties base_b to base_a") as caught:
+        align(four_axes_beside_six(ABOUT_Z, None)[0])
+    assert "for [prior.flange_b_from_target_plate_b]" in caught.value.next_step
+    with pytest.raises(DegenerateError, match="differ in position only") as caught:
+        align(four_axes_beside_six(np.zeros((8, 3)), None)[0])
+    assert caught.value.next_step == (
+        "To tie base_b: add 3 or more stops in which flange_b is tilted by 20 to 40 degrees about "
+        "different axes, not only about one."
+    )
+
+
 def one_camera(cell):
     return cell_session(cell, "cell", seen="poses")
 

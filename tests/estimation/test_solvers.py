@@ -28,7 +28,7 @@ from support.worlds import (
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
-from visioncal.estimation.closed_form import SOLVERS, HandEye, Solver
+from visioncal.estimation.closed_form import SOLVERS, HandEye, Solver, lone_axis
 from visioncal.estimation.closed_form.pairs import rotation_pairs
 from visioncal.estimation.closed_form.translation import complete
 
@@ -277,6 +277,26 @@ def test_what_one_axis_leaves_open_is_zero(solver: Solver):
         # The solver finds the axis from the noisy turns: 0.3 mrad over turns of 0.6 rad, over
         # sqrt(12) views, tilts it by less than 1 mrad against a component across it of metres.
         assert abs(solver(noisy.robot, noisy.camera).x[:3, 3] @ axis) < 0.01
+
+
+@pytest.mark.parametrize("rise_m", [0.0, 0.1])
+def test_what_the_robot_moves_by_determines_the_turn_about_a_lone_axis(rise_m: float):
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        angles, moves = rng.uniform(-2.5, 2.5, 8), rng.uniform(-0.15, 0.15, (8, 3))
+        moves[:, 2] *= rise_m / 0.15
+        robot = np.array(
+            [
+                rigid(turn(np.array([0.0, 0.0, angle])), np.array([0.4, 0.0, 0.5]) + move)
+                for angle, move in zip(angles, moves, strict=True)
+            ]
+        )
+        x, z = any_x(rng, 0.1), any_x(rng, 0.5)
+        camera = np.linalg.inv(robot @ x) @ z
+        found = lone_axis(robot, camera)
+        # Exact data: only rounding is left.
+        assert turn_error(found.x, x) < 1e-9
+        np.testing.assert_allclose(found.x[:3, 3], [*x[:2, 3], 0.0], atol=1e-9)
 
 
 @all_solvers

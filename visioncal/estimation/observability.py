@@ -463,6 +463,12 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
     return f"the {stops} turn by at most {figure(largest)} deg, and {about_second}"
 
 
+def turns_about_two_axes(robot: FloatArray) -> bool:
+    """Whether a robot's part of a chain (m, 4, 4), m of two or more, turns about two axes."""
+    turns = _turns(robot)
+    return bool(np.linalg.norm(turns, axis=1).max() >= _STILL_RAD) and not _lone_axis(turns)[2]
+
+
 def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, str]:
     """What leaves a calibration open whatever else is known, and what to do; empty where nothing.
 
@@ -471,8 +477,7 @@ def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, 
         mount: Where the camera is.
     """
     robot = robot_part(base_from_flange, mount)
-    turns = _turns(robot)
-    if np.linalg.norm(turns, axis=1).max() >= _STILL_RAD and not _lone_axis(turns)[2]:
+    if turns_about_two_axes(robot):
         return "", ""
     views = f"{len(robot)} views with poses"
     words = motion_words(robot, base_from_flange, views, f"the {_frame(mount)}")

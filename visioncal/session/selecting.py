@@ -57,7 +57,13 @@ def select(
     if "camera" not in needs:
         chosen = replace(chosen, camera="", target="")
     rows = dict(_rows(session, chosen))
-    columns = tuple(column for column in session.columns if column not in (*SELECTORS, TARGET))
+    # Columns of other robots alone, as the joints of one with more axes, are none of its rows.
+    filled = {name for _, numbers in rows.values() for name in numbers}
+    columns = tuple(
+        column
+        for column in session.columns
+        if column not in (*SELECTORS, TARGET) and (column in filled or not _is_of_robots(column))
+    )
     cells = [
         [_cell(row, robot_row, column) for column in columns] for row, robot_row in rows.values()
     ]
@@ -146,9 +152,13 @@ def _rows(
 
 
 def _cell(view: View, robot_row: Mapping[str, float], column: str) -> str:
-    if is_number(column) and not column.startswith(_NOT_OF_ROBOTS):
+    if _is_of_robots(column):
         return repr(float(robot_row[column])) if column in robot_row else ""
     return view.cell(column)
+
+
+def _is_of_robots(column: str) -> bool:
+    return is_number(column) and not column.startswith(_NOT_OF_ROBOTS)
 
 
 def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
@@ -163,7 +173,7 @@ def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
         ("target", chosen.target.partition("_")[2]),
     ):
         table = _table(session.document, kind, name)
-        if table:
+        if table is not None:
             given[kind] = table
     clock = declaration.clocks.get(chosen.camera.partition("_")[2])
     if clock is not None:

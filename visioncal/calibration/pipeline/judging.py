@@ -11,7 +11,7 @@ from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_
 from visioncal.calibration.pipeline.budget import columns_of_boards, middles_moved, middles_of
 from visioncal.calibration.pipeline.fault_messages import moved_found
 from visioncal.calibration.pipeline.lens_fields import errors_found, lens_changes
-from visioncal.calibration.pipeline.network_ties import robot_motion, untied_words
+from visioncal.calibration.pipeline.network_ties import or_measured, robot_motion, untied_words
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
@@ -379,9 +379,11 @@ def check_answer(known: RunState) -> None:
             return f"all {count} observations of it disagree with the rest of the cell"
         return _motion(cell, part, frame)
 
-    def advice(frame: str, _: str) -> str:
+    def advice(frame: str, culprit: str) -> str:
         if part.through(frame).any() or not len(lost):
-            return _more(cell, frame)
+            flanges = (flange for flange in part.tree.flanges.values() if part.through(flange).any())
+            measured = or_measured(cell, next(flanges, "")) if "offset along" in culprit else ""
+            return f"{_more(cell, frame)} {measured}".rstrip()
         return (
             "Look whether the board that ties it has the stated size, and whether images and poses "
             "belong together."

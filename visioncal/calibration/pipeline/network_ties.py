@@ -9,7 +9,12 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.files import some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
-from visioncal.estimation.observability import motion_words, open_offset
+from visioncal.estimation.observability import (
+    FEWEST_VIEWS,
+    motion_words,
+    open_offset,
+    turns_about_two_axes,
+)
 
 
 def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
@@ -50,15 +55,31 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
         parts = [part for base in bases if base in lost and (part := _open_part(cell, base))]
         if parts:
             why += f", which does not determine {' and '.join(parts)}"
-            words = [
-                f"Add 3 or more stops in which {flange} is tilted by 20 to 40 degrees about "
-                "different axes, not only about one."
-                for flange in flanges
-            ]
+        words = [
+            f"To tie {base}: {tilt}" if base in lost and (tilt := _tilting(cell, base)) else other
+            for base, other in zip(bases, words, strict=True)
+        ]
     raise DegenerateError(
         f"cell: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
         culprits=parts or untied,
         next_step=" ".join(words),
+    )
+
+
+def or_measured(cell: Cell, flange: str) -> str:
+    """A further advice for an arm that cannot tilt and leaves an offset open; empty for none.
+
+    Args:
+        cell: The cell.
+        flange: The flange of the arm, of which it is.
+    """
+    ends = (end for row in cell.rows for end in (row.seer, row.seen))
+    carried = next((end for end in ends if cell.tree.body(end) == flange), "")
+    if not carried:
+        return ""
+    return (
+        f"Where the arm cannot tilt, measure how far {carried} is from {flange} along that axis, "
+        f"for [prior.{flange}_from_{carried}]."
     )
 
 
@@ -68,6 +89,20 @@ def _open_part(cell: Cell, base: str) -> str:
     if len(stations) < 2:
         return ""
     return open_offset(invert(cell.poses[_robot_on(cell, base)][stations]), base, base)
+
+
+def _tilting(cell: Cell, base: str) -> str:
+    """Advice to tilt a robot that was observed often enough; empty where it was tilted."""
+    stations, robot = _stations(cell, base), _robot_on(cell, base)
+    if len(stations) < FEWEST_VIEWS or turns_about_two_axes(invert(cell.poses[robot][stations])):
+        return ""
+    flange = cell.tree.flanges[robot]
+    words = (
+        f"add {FEWEST_VIEWS} or more stops in which {flange} is tilted by 20 to 40 degrees about "
+        "different axes, not only about one."
+    )
+    measured = or_measured(cell, flange) if _open_part(cell, base) else ""
+    return f"{words} {measured}".rstrip()
 
 
 def _robot_on(cell: Cell, base: str) -> str:

@@ -21,7 +21,7 @@ from visioncal.calibration.stages.pairwise import (
     Candidates,
     common_transform,
     hand_eye,
-    trimmed,
+    partial_hand_eye,
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.pose_ambiguity import chosen, has_rival, settled
@@ -64,7 +64,8 @@ def init_network(
         sighted: What was seen.
         priors: Where frames were measured to be.
     """
-    growth = Growth(tree, poses, sighted, _pairs(tree, sighted), ())
+    measured = frozenset(name for prior in priors for name in (prior.first, prior.second))
+    growth = Growth(tree, poses, sighted, _pairs(tree, sighted), (), measured)
     relations = [*_known(tree), *mounted_points(growth)]
     for prior in priors:
         if prior.matrix is not None:
@@ -125,8 +126,8 @@ def _loose(growth: Growth) -> Iterator[Relation]:
     pairs = [pair for pair in growth.oriented if len(pair.robots) == 1 and len(pair.rows) >= FEWEST]
     if pairs:
         pair = max(pairs, key=lambda value: len(value.rows))
-        found = trimmed(*_parted(growth.poses, growth.sighted, pair, pair.rows))[1]
-        yield from _both(growth.tree, growth.sighted, pair, (found.x, found.z), (np.inf, np.inf))
+        x, z, _ = partial_hand_eye(*_parted(growth.poses, growth.sighted, pair, pair.rows))
+        yield from _both(growth.tree, growth.sighted, pair, (x, z), (np.inf, np.inf))
 
 
 def _both(

@@ -26,7 +26,14 @@ from visioncal.calibration.stages.pair_observations import (
     factors_of,
     product_of,
 )
-from visioncal.calibration.stages.pairwise import FEWEST, Candidates, common_transform, hand_eye
+from visioncal.calibration.stages.pairwise import (
+    AGREE_M,
+    FEWEST,
+    Candidates,
+    common_transform,
+    hand_eye,
+    partial_hand_eye,
+)
 from visioncal.calibration.stages.pose_ambiguity import CLEAR_RATIO
 from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray
@@ -106,6 +113,7 @@ def _grown(growth: Growth, chosen: Sequence[int]) -> _Grown:
         or [*_implied(growth, placed)]
         or [*placed_by_points(growth, placed)]
         or [*_parted(growth, placed)]
+        or [*_parted(growth, placed, partly=True)]
     ):
         # What a turned board places comes last: others may come by a way that is certain.
         name, matrices, _ = min(options, key=lambda pair: (len(pair[1]), pair[2]))
@@ -160,9 +168,13 @@ def _implied(
 
 
 def _parted(
-    growth: Growth, placed: Mapping[str, FloatArray]
+    growth: Growth, placed: Mapping[str, FloatArray], *, partly: bool = False
 ) -> Iterator[tuple[str, FloatArray, float]]:
-    """Frames that are one of two that robots part, of all that some views have to do with."""
+    """Frames that are one of two that robots part, of all that some views have to do with.
+
+    Where the motion determines them in part, a prior about them may determine the rest: these are
+    found with `partly`, and the fit decides.
+    """
     # Views say `before * u * between * v * after = seen`, u and v being unknown: a hand-eye
     # calibration with `between^-1` for its robot. Where three are unknown, two arms part them.
     for pair in growth.oriented:
@@ -183,12 +195,17 @@ def _parted(
         ]
         there = growth.sighted.candidates.take(rows).carried(invert(parts[0]), invert(parts[-1]))
         if len(open_ones) == 2:
-            found = hand_eye(invert(parts[1]), there, "eye-in-hand")
+            robot, found = invert(parts[1]), None
+            if not partly:
+                found = hand_eye(robot, there, "eye-in-hand")
+            elif growth.measured & ({step.frame for step in pair.way} - placed.keys()):
+                *edges, typical_m = partial_hand_eye(robot, there)
+                found = None if typical_m > AGREE_M else (edges, (np.inf, np.inf))
             if found is not None:
                 (u_inverse, v), (sigma_u, sigma_v) = found
                 yield _as_placed(factors[open_ones[0]], invert(u_inverse), sigma_u)
                 yield _as_placed(factors[open_ones[1]], v, sigma_v)
-        elif (middle := _between_arms(parts[1], parts[2], there)) is not None:
+        elif not partly and (middle := _between_arms(parts[1], parts[2], there)) is not None:
             yield _as_placed(factors[open_ones[1]], *middle)
 
 

@@ -96,6 +96,7 @@ class Growth:
         sighted: What was seen.
         pairs: The same by pairs of frames.
         relations: What pairs say by themselves.
+        measured: The frames that a prior is about.
     """
 
     tree: Tree
@@ -103,6 +104,7 @@ class Growth:
     sighted: Sighted
     pairs: Sequence[FramePair]
     relations: Sequence[Relation]
+    measured: frozenset[str] = frozenset()
 
     @property
     def oriented(self) -> tuple[FramePair, ...]:

@@ -11,7 +11,7 @@ from visioncal.core.transforms import invert, mean_transform, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
-from visioncal.estimation.closed_form import SOLVERS
+from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
@@ -90,7 +90,13 @@ class Parted:
         return np.asarray(self.away.argmin(axis=1))
 
 
-def parted(robot: FloatArray, candidates: Candidates, rows: IntArray, picks: IntArray) -> Parted:
+def parted(
+    robot: FloatArray,
+    candidates: Candidates,
+    rows: IntArray,
+    picks: IntArray,
+    solver: Solver = SOLVERS["park"],
+) -> Parted:
     """Solves for both edges by one candidate each of some views.
 
     Args:
@@ -98,17 +104,21 @@ def parted(robot: FloatArray, candidates: Candidates, rows: IntArray, picks: Int
         candidates: What each view allows.
         rows: The views to solve from.
         picks: Their candidates.
+        solver: The closed form.
     """
-    found = SOLVERS["park"](robot[rows], candidates.poses[rows, picks])
+    found = solver(robot[rows], candidates.poses[rows, picks])
     return Parted(found.x, found.z, candidates.distances(invert(robot @ found.x) @ found.z))
 
 
-def trimmed(robot: FloatArray, candidates: Candidates) -> tuple[Mask, Parted]:
+def trimmed(
+    robot: FloatArray, candidates: Candidates, solver: Solver = SOLVERS["park"]
+) -> tuple[Mask, Parted]:
     """Both edges by the better half of the views, whichever candidates these take.
 
     Args:
         robot: (m, 4, 4) the robot's part of the chain.
         candidates: What each view allows.
+        solver: The closed form.
 
     Returns:
         (m,) mask of that half, and the edges.
@@ -116,10 +126,10 @@ def trimmed(robot: FloatArray, candidates: Candidates) -> tuple[Mask, Parted]:
 
     def solve(mask: Mask, at: Parted) -> Parted:
         rows = np.flatnonzero(mask)
-        return parted(robot, candidates, rows, at.picks[rows])
+        return parted(robot, candidates, rows, at.picks[rows], solver)
 
     return trimmed_start(
-        (parted(robot, candidates, *start) for start in _starts(candidates)),
+        (parted(robot, candidates, *start, solver) for start in _starts(candidates)),
         lambda item: np.asarray(item.away.min(axis=1)),
         solve,
         max(len(robot) // 2 + 1, FEWEST),
@@ -180,6 +190,26 @@ def hand_eye(
     worse = max(typical / _USUAL.robots[0, 1], 1.0)
     known = worse * float(x), worse * float(z)
     return None if max(x, z) > _WORST_M else ((found.x, found.z), known)
+
+
+def partial_hand_eye(
+    robot: FloatArray, candidates: Candidates
+) -> tuple[FloatArray, FloatArray, float]:
+    """Both edges of `robot * x * camera = z` as far as the motion of m views determines them.
+
+    Args:
+        robot: (m, 4, 4) the robot's part of the chain.
+        candidates: What each view allows of the camera's.
+
+    Returns:
+        (4, 4) x and z, and how far the better half of the views is from them on average [m].
+    """
+    found = []
+    for solver in (SOLVERS["park"], lone_axis):
+        half, edges = trimmed(robot, candidates, solver)
+        found.append((float(edges.away.min(axis=1)[half].mean()), edges))
+    typical, edges = min(found, key=lambda pair: pair[0])
+    return edges.x, edges.z, typical
 
 
 def _starts(candidates: Candidates) -> Iterator[tuple[IntArray, IntArray]]:

@@ -1,6 +1,7 @@
 """Closed-form hand-eye solvers: a start for the joint fit, and a second opinion of it.
 
-`SOLVERS` names them all; each is one file, those of linear systems together. They take (m, 4, 4)
+`SOLVERS` names those of any motion, and `lone_axis` is for turns about one axis; each is one file,
+those of linear systems together. They take (m, 4, 4)
 robot poses `R_i` and `cam_from_target` poses `C_i` and solve `R_i @ X @ C_i = Z`; see
 `closed_form.handeye`. Motion too poor to determine X gives a finite and poor answer here; it is
 refused by name where the Fisher information is known.
@@ -13,6 +14,7 @@ from visioncal.estimation.closed_form.daniilidis import daniilidis
 from visioncal.estimation.closed_form.handeye import HandEye, Solver
 from visioncal.estimation.closed_form.horaud import horaud
 from visioncal.estimation.closed_form.kronecker import andreff, li, shah
+from visioncal.estimation.closed_form.lone_axis import lone_axis
 from visioncal.estimation.closed_form.park import park
 from visioncal.estimation.closed_form.tsai import tsai
 
@@ -28,4 +30,4 @@ SOLVERS: Mapping[str, Solver] = MappingProxyType(
     }
 )
 
-__all__ = ["SOLVERS", "HandEye", "Solver"]
+__all__ = ["SOLVERS", "HandEye", "Solver", "lone_axis"]
