@@ -381,8 +381,9 @@ def check_answer(known: RunState) -> None:
 
     def advice(frame: str, culprit: str) -> str:
         if part.through(frame).any() or not len(lost):
-            flanges = (flange for flange in part.tree.flanges.values() if part.through(flange).any())
-            measured = or_measured(cell, next(flanges, "")) if "offset along" in culprit else ""
+            flanges = part.tree.flanges.values()
+            by_way = [name for name in flanges if part.through(name)[part.through(frame)].any()]
+            measured = or_measured(cell, by_way[0]) if by_way and "offset along" in culprit else ""
             return f"{_more(cell, frame)} {measured}".rstrip()
         return (
             "Look whether the board that ties it has the stated size, and whether images and poses "

@@ -199,8 +199,8 @@ def _parted(
             if not partly:
                 found = hand_eye(robot, there, "eye-in-hand")
             elif growth.measured & ({step.frame for step in pair.way} - placed.keys()):
-                *edges, typical_m = partial_hand_eye(robot, there)
-                found = None if typical_m > AGREE_M else (edges, (np.inf, np.inf))
+                x, z, typical_m = partial_hand_eye(robot, there)
+                found = None if typical_m > AGREE_M else ((x, z), (np.inf, np.inf))
             if found is not None:
                 (u_inverse, v), (sigma_u, sigma_v) = found
                 yield _as_placed(factors[open_ones[0]], invert(u_inverse), sigma_u)
