@@ -157,7 +157,7 @@ def test_another_size_is_said_by_what_the_targets_file_calls_it(name, said, writ
 def test_what_nothing_explains_is_the_cause_itself() -> None:
     (only,) = judge(changed(SOUND, away_mm=1.0)).causes
     assert (only.kind, only.probability) == ("unexplained", 1.0)
-    assert "measure the board" in only.do.words
+    assert "a board of another size than stated (measure it" in only.do.words
 
 
 @pytest.mark.parametrize(

@@ -472,28 +472,19 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
         found_mm, found_deg = arm.surely or (arm.away_mm, arm.away_deg)
         beyond = max(arm.away_mm / limits.robot_mm, arm.away_deg / limits.robot_deg)
         if max(found_mm / limits.robot_mm, found_deg / limits.robot_deg) > 1.0:
-            cause, step = (
-                (
-                    "the instrument reads worse than is stated of it, was moved, or the arm's "
-                    "model is off by as much.",
-                    Remedy("Read a few stops twice to see how well readings repeat."),
-                )
-                if findings.mount == "instrument"
-                else (
-                    "the board is of another size than stated, or warped, the intrinsics are not "
-                    "this camera's, the arm's model is off by as much, or poses were read before "
-                    "the arm stood still.",
-                    Remedy(
-                        "Stand still before each image, and read one pose twice to see how well it "
-                        "repeats; measure the board over many squares; check the lens and the "
-                        "arm's model."
-                    ),
-                )
-            )
             words = (
                 f"The residuals would take a flange that is off by {figure(arm.away_mm)} mm and "
-                f"{figure(arm.away_deg)} deg from stop to stop; arms repeat to 0.1 mm. More likely "
-                f"{cause}"
+                f"{figure(arm.away_deg)} deg from stop to stop; arms repeat to 0.1 mm."
+            )
+            step = Remedy(
+                "Read a few stops twice to see how well readings repeat; more likely than the "
+                "arm's noise are an instrument that reads worse than stated or was moved, or a "
+                "model of the arm that is off by as much."
+                if findings.mount == "instrument"
+                else "Look for what is likelier than noise of the arm: a board of another size "
+                "than stated (measure it over many squares) or warped, intrinsics that are not "
+                "this camera's, a model of the arm that is off by as much, or poses that were read "
+                "before the arm stood still (read one twice to see how well it repeats)."
             )
             until_mm = 10.0 * beyond * limits.robot_mm
             yield Finding("unexplained", words, step, until_mm=until_mm).of(_robot(arm))
