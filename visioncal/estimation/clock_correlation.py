@@ -176,19 +176,17 @@ class _Turning:
     def sigma_s(self, lag: int) -> float:
         """Standard deviation of an offset [s]: angles are off by noise, and change with it."""
         inside, turned = self.by_robot(lag)
-        sides = [self.by_robot(lag + name) for name in (-1, 1)]
+        sides = [self.by_robot(lag + side) for side in (-1, 1)]
         both = sides[0][0] & sides[1][0] & inside
-        early, late = (array[both[there]] for there, array in sides)
+        early, late = (angles[both[known]] for known, angles in sides)
         slope = (late - early) / (2.0 * _STEP_S)
         off = self.by_camera[both] - turned[both[inside]]
         information = float(np.sum((slope - slope.mean()) ** 2)) if len(slope) else 0.0
         if not information > 0.0:
             return np.inf
         # Pairs that share a stretch of time err alike.
-        covariance = float(
-            np.sqrt(np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / information)
-        )
-        return float(np.hypot(covariance, _LEAST_SIGMA_S))
+        variance = np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / information
+        return float(np.hypot(np.sqrt(variance), _LEAST_SIGMA_S))
 
 
 def _steps(stamps_s: FloatArray) -> IntArray:

@@ -80,8 +80,7 @@ def _range_of(robot: Robot, q: FloatArray, joint: int, span: float) -> FloatArra
     lower, upper = (limit[joint] for limit in turning_range(robot))
     middle = 0.5 * (q[:, joint].min() + q[:, joint].max())
     order = np.random.default_rng(joint).permutation(len(q))
-    covariance = q.copy()
-    covariance[:, joint] = np.clip(middle + span * np.linspace(-0.5, 0.5, len(q)), lower, upper)[
-        order
-    ]
-    return covariance
+    widened = q.copy()
+    evenly = np.clip(middle + span * np.linspace(-0.5, 0.5, len(q)), lower, upper)
+    widened[:, joint] = evenly[order]
+    return widened

@@ -339,9 +339,9 @@ def _null_direction(
     null: FloatArray, problem: Problem, state: State, scene: CellWords
 ) -> tuple[str, str]:
     """The first frame that (p, k) null directions leave open, and what of it."""
-    for frame, at in problem.unknown.items():
-        turn, start = state.edges[at][:3, :3], problem.edge_columns(frame).start
-        rotation, translation = (turn @ null[start + name : start + name + 3] for name in (0, 3))
+    for frame, edge in problem.unknown.items():
+        turn, start = state.edges[edge][:3, :3], problem.edge_columns(frame).start
+        rotation, translation = (turn @ null[start + at : start + at + 3] for at in (0, 3))
         parts = [
             _open_part(scene.names[frame], directions, is_rotation)
             for directions, is_rotation in ((translation, False), (rotation, True))

@@ -85,8 +85,8 @@ def _flattened(points: FloatArray) -> FloatArray | None:
     if not points[:, 2].any():
         return points
     middle = points.mean(axis=0)
-    _, covariance, axes = np.linalg.svd(points - middle, full_matrices=False)
-    if covariance[2] > _FLAT * covariance[1]:
+    _, extents, axes = np.linalg.svd(points - middle, full_matrices=False)
+    if extents[2] > _FLAT * extents[1]:
         return None
     return np.asarray(points - np.outer((points - middle) @ axes[2], axes[2]))
 

@@ -204,9 +204,9 @@ class Problem:
             by_sensor[unit] = np.einsum("mij,mjk->ik", shares, self.by_sensor[rows])
             if not self.is_combined:
                 covariance[unit] = mean
-                jacobian = self.by_sensor[rows] - by_sensor[unit]
-                weighted = np.swapaxes(jacobian, 1, 2) @ weights
-                information += np.sum(weighted @ jacobian, axis=0)
+                apart = self.by_sensor[rows] - by_sensor[unit]
+                weighted = np.swapaxes(apart, 1, 2) @ weights
+                information += np.sum(weighted @ apart, axis=0)
                 gradient += np.einsum("mij,mj->i", weighted, away - shift)
         effects, at = [], 0
         for effect in self.effects:

@@ -113,8 +113,8 @@ def common_errors(
         return LensField(1.0, 0.0, 0.0, is_significant=False)
     sums = np.stack(
         [
-            np.bincount(cell[rows], (shares * residuals[:, name])[rows], len(counts))
-            for name in (0, 1)
+            np.bincount(cell[rows], (shares * residuals[:, axis])[rows], len(counts))
+            for axis in (0, 1)
         ],
         axis=1,
     )

@@ -59,7 +59,7 @@ def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
         shown: What each view shows from where, by its number; alike where that is the same.
     """
     counts = Counter(shown.values())
-    return {view: 1.0 / counts[hashable] for view, hashable in shown.items()}
+    return {view: 1.0 / counts[what] for view, what in shown.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class CornerProblem:
             positions,
             boards_basis(scene.targets),
             np.concatenate([lens_prior(scene), *priors]),
-            np.array([shares.get(corner, 1.0) for corner in corners]),
+            np.array([shares.get(view, 1.0) for view in corners]),
         )
 
     def with_levels(self, levels: LensLevels) -> "CornerProblem":

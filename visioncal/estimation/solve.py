@@ -278,10 +278,10 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
         order = np.argsort(of[rows], kind="stable")
         units, first = np.unique(of[rows[order]], return_index=True)
         by_errors = linear.by_errors[rows[order]]
-        jacobian = np.swapaxes(by_errors, 1, 2)
-        own[units] += np.add.reduceat(jacobian @ weights[order] @ by_errors, first)
+        turned = np.swapaxes(by_errors, 1, 2)
+        own[units] += np.add.reduceat(turned @ weights[order] @ by_errors, first)
         of_both = np.ix_(units, np.arange(width), columns)
-        cross[of_both] += np.add.reduceat(jacobian @ weighted[order], first)
+        cross[of_both] += np.add.reduceat(turned @ weighted[order], first)
     joined = np.setdiff1d(np.arange(len(members)), of[alone])
     inverse[joined], blind[joined] = _pseudo_inverse(own[joined])
     answer[joined] = inverse[joined] @ cross[joined]

@@ -92,7 +92,7 @@ class Tree:
         kept = {
             name: branch
             for name, branch in self.branches.items()
-            if not any(word in frames for word in self.above(name))
+            if not any(above in frames for above in self.above(name))
         }
         return replace(self, branches=kept)
 

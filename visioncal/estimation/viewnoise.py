@@ -33,14 +33,14 @@ def weights_by_view(squares: FloatArray, freedom: FloatArray) -> FloatArray | No
         return None
     # Logarithms of the views' variances, without bias, and their own variances.
     logs = np.log(squares / 2.0) - digamma(freedom / 2.0)
-    covariance = polygamma(1, freedom / 2.0)
-    about = logs - np.average(logs, weights=1.0 / covariance)
-    if np.sum(about**2 / covariance) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
+    by_chance = polygamma(1, freedom / 2.0)
+    about = logs - np.average(logs, weights=1.0 / by_chance)
+    if np.sum(about**2 / by_chance) < chi2_limit(_FALSE_ALARM, len(logs) - 1):
         return None
     # Few sessions have such views, and `locate` need not wait a tenth of a second for this import.
     from scipy.optimize import brentq
 
-    between = float(np.clip(np.var(logs, ddof=1) - np.mean(covariance), *_BETWEEN))
+    between = float(np.clip(np.var(logs, ddof=1) - np.mean(by_chance), *_BETWEEN))
     half = float(np.exp(brentq(lambda value: polygamma(1, np.exp(value)) - between, *_LOGS)))
     scale = np.exp(np.mean(logs) + digamma(half))
     variances = (scale + squares / 2.0) / (half + freedom / 2.0)

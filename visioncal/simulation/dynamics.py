@@ -163,11 +163,11 @@ def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False
 
 def _off(body: LinkBody, share: float, rng: np.random.Generator) -> LinkBody:
     kg = body.kg * np.exp(share * rng.standard_normal())
-    covariance = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
+    second_moments = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
     stretch = np.sqrt(kg / body.kg) * (np.eye(3) + 0.5 * share * rng.standard_normal((3, 3)))
-    covariance = stretch @ covariance @ stretch.T
+    second_moments = stretch @ second_moments @ stretch.T
     centre = body.centre_m + 0.01 * rng.standard_normal(3)
-    return LinkBody(float(kg), centre, np.trace(covariance) * np.eye(3) - covariance)
+    return LinkBody(float(kg), centre, np.trace(second_moments) * np.eye(3) - second_moments)
 
 
 def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:

@@ -180,7 +180,7 @@ def _tags(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
     scale = texels / unit_m(target)
     low = np.array(pattern_box(target)[:2])
     for at in range(0, len(target.points_m), 4):
-        corner, beside = (np.array(target.points_m[at + name])[:2] for name in (0, 1))
+        corner, beside = (np.array(target.points_m[at + next_to])[:2] for next_to in (0, 1))
         cells = _modules(target, target.point_tags[at][0]) == 0
         _stamp(dark, cells, scale * (corner - low), scale * (beside - corner)[0] / len(cells))
     return dark

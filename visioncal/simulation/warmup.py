@@ -34,10 +34,10 @@ class Round:
         """(m,) times [s], and which of the first views is looked at."""
         stamps = list(self.pace_s * np.arange(self.first))
         shown = list(range(self.first))
-        covariance = np.linspace(0, self.first - 1, self.references).astype(int).tolist()
+        again = np.linspace(0, self.first - 1, self.references).astype(int).tolist()
         for begin in np.arange(self.every_s, 60.0 * self.minutes, self.every_s):
             stamps += list(begin + self.pace_s * np.arange(self.references))
-            shown += covariance
+            shown += again
         return np.array(stamps), shown
 
 

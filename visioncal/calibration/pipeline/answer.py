@@ -156,7 +156,7 @@ class Answer:
     def budget_mm(self) -> dict[str, dict[str, float]]:
         """Sigmas of each frame's place in its parent, by the frame and by source [mm]."""
         found = budget_mm(self.solved, self.beside)
-        return {self.versions[key].name: mapping for key, mapping in found.items()}
+        return {self.versions[key].name: sigmas for key, sigmas in found.items()}
 
     @cached_property
     def intervals(self) -> FloatArray:
@@ -289,7 +289,7 @@ def _views(
 
 def _known(figures: FloatArray) -> list[float | None]:
     """Figures, None in the place of those that are not known."""
-    return [figure if np.isfinite(figure) else None for figure in figures.tolist()]
+    return [value if np.isfinite(value) else None for value in figures.tolist()]
 
 
 def _away(solved: Solved) -> FloatArray:

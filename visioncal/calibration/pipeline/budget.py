@@ -56,7 +56,7 @@ def budget_mm(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, dic
     for key in part.unknown:
         at = part.edge_columns(key).start
         place = slice(at + 3, at + 6)
-        found[key] = {name: 1e3 * _root_trace(part[place, place]) for name, part in parts.items()}
+        found[key] = {name: 1e3 * _root_trace(own[place, place]) for name, own in parts.items()}
     return found
 
 

@@ -116,7 +116,7 @@ def to_document(checkup: Checkup) -> dict[str, object]:
 def _of(found: Finding, session: Path | str) -> Finding:
     if found.do is None:
         return found
-    words, command = (with_paths(name, session) for name in (found.do.words, found.do.command))
+    words, command = (with_paths(text, session) for text in (found.do.words, found.do.command))
     return replace(found, do=Remedy(words, command))
 
 

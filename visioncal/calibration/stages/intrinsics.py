@@ -254,11 +254,11 @@ def _causes(fit: BundleFit) -> Iterator[Finding]:
             until_mm=0.0,
         )
     distance = np.linalg.norm(poses[:, :3, 3], axis=1)
-    covariance = distance.max() / distance.min()
-    if covariance < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
+    spread = distance.max() / distance.min()
+    if spread < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
         yield Finding(
             "weak_lens",
-            f"All views are from one distance (within {100 * (covariance - 1):.0f} %).",
+            f"All views are from one distance (within {100 * (spread - 1):.0f} %).",
             Remedy("Vary the distance of the views."),
             until_mm=0.0,
         )

@@ -173,7 +173,7 @@ def _with_rivals(
             mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px
         )
         fits = (best, other) if rival else (best,)
-        covariance = [
+        covariances = [
             turned @ spread[at] @ np.swapaxes(turned, 1, 2) for spread in spreads[: len(fits)]
         ]
         views.append(
@@ -182,7 +182,7 @@ def _with_rivals(
                 _surviving(stack, at),
                 np.concatenate([pose_fit.cam_from_target[at] @ turns for pose_fit in fits]),
                 tuple(range(len(turns))) * len(fits),
-                np.concatenate(covariance),
+                np.concatenate(covariances),
                 np.zeros((len(turns) * len(fits), 6, 0)),
                 board,
                 int(firsts[board]),

@@ -72,11 +72,11 @@ def complete(
     places[:, :, 0] += robot[:, :3, 3]
 
     mean_turn, mean_place = turns.sum(axis=0) / m, places.sum(axis=0) / m
-    covariance = (turns - mean_turn).reshape(3 * m, 3)
+    deviations = (turns - mean_turn).reshape(3 * m, 3)
     scatter = (places - mean_place).reshape(3 * m, 2)
     cut = m * _SMALLEST_TURN_RAD**2
-    shifts = -smallest_solution(covariance.T @ covariance, covariance.T @ scatter, cut)
-    step = _steadiest_step(scatter + covariance @ shifts)
+    shifts = -smallest_solution(deviations.T @ deviations, deviations.T @ scatter, cut)
+    step = _steadiest_step(scatter + deviations @ shifts)
 
     translation_x = shifts[:, 0] + step * shifts[:, 1]
     if rotation_z is None:

@@ -172,7 +172,7 @@ class CameraParameters:
 
     def with_sizes(self, scales: Mapping[int, float]) -> "CameraParameters":
         """The same, printed boards being larger than stated by some shares, free from the start."""
-        places = [int(self.scale_of(scale)[0]) for scale in scales]
+        places = [int(self.scale_of(board)[0]) for board in scales]
         unstated = replace(self.without_prior(places), resized=tuple(scales))
         return unstated.with_values(np.array(places), np.array([*scales.values()]))
 

@@ -240,15 +240,15 @@ class _Patches:
         centre = np.rint(start).astype(int)
         # A map is smooth: quartics through 5 x 5 of its values are as good as all.
         nodes = np.cos(np.pi * (np.arange(5) + 0.5) / 5)
-        covariance = np.vander(2 * places / size, 5) @ np.linalg.inv(np.vander(nodes, 5))
+        interpolation = np.vander(2 * places / size, 5) @ np.linalg.inv(np.vander(nodes, 5))
         grid = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2) * size / 2
         values = on_board(centre[:, None] + grid).reshape(-1, 5, 5, 2)
 
         def tensor(array: npt.NDArray[Any]) -> "Tensor":
             return torch.as_tensor(array, dtype=torch.float32, device=scene.pixels.device)
 
-        covariance, corners = tensor(covariance), tensor(scene.board[chosen])
-        x, y = (covariance @ tensor(values[..., axis]) @ covariance.T for axis in (0, 1))
+        interpolation, corners = tensor(interpolation), tensor(scene.board[chosen])
+        x, y = (interpolation @ tensor(values[..., axis]) @ interpolation.T for axis in (0, 1))
         widths = tensor(DRAWN_PX * np.linalg.norm(normals, axis=2))[:, :, None, None]
         board_x, board_y = (
             value + corners[:, axis, None, None] for axis, value in enumerate((x, y))
@@ -339,7 +339,7 @@ class _Patches:
         found[:, 1:] *= (1.0 + q * (1.0 - 2.0 * light))[:, None]
         jacobian = torch.as_tensor(self.jacobian, dtype=torch.float32, device=self.grey.device)
         plane = torch.einsum("nlk,nkw->nlkw", jacobian, self.off)
-        offset, gain = (plane[:, name, 0, None, :] + plane[:, name, 1, :, None] for name in (0, 1))
+        offset, gain = (plane[:, of, 0, None, :] + plane[:, of, 1, :, None] for of in (0, 1))
         parts = [torch.ones_like(light), toned, found[:, 1], found[:, 2]]
         if blurs:
             parts += [*found[:, 3:].unbind(dim=1), light * (1.0 - light)]

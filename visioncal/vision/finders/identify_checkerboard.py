@@ -161,7 +161,7 @@ def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
 def _side_px(plane: Plane, extent: _Extent) -> float:
     """The median side of a board's squares [px]."""
     px = plane.to_px(extent.corners()).reshape(*extent.size[::-1], 2)
-    sides = [np.linalg.norm(np.diff(px, axis=name), axis=2).ravel() for name in (0, 1)]
+    sides = [np.linalg.norm(np.diff(px, axis=axis), axis=2).ravel() for axis in (0, 1)]
     return float(np.median(np.concatenate(sides)))
 
 
