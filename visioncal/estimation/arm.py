@@ -28,8 +28,8 @@ TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
 # Twice the gain in log-likelihood that noise gives in one session of ten thousand, and in one of
 # twenty: chi-square of one degree of freedom.
 SIGNIFICANT, _LIKELY = 15.1, 3.84
-# The size that is sought begins here, and is none below the other [rad].
-_START, _NOTHING = 1e-3, 1e-6
+# Sizes below are none [rad].
+_NOTHING = 1e-6
 # Fewer stops have hardly more residuals than the edges and the noise take.
 _FEWEST_STOPS = 6
 # Positions and directions change over about so much when an arm's posture does [m].
@@ -137,7 +137,12 @@ def pose_basis(base_from_flange: FloatArray) -> FloatArray:
 
 
 def find_arm_errors(
-    likelihood: RobotLikelihood, robot: int, basis: FloatArray, *, of_links: bool
+    likelihood: RobotLikelihood,
+    robot: int,
+    basis: FloatArray,
+    *,
+    of_links: bool,
+    least: float | None = None,
 ) -> ArmErrors | None:
     """Estimates the size of the errors of one robot's arm, where they are significant.
 
@@ -146,20 +151,25 @@ def find_arm_errors(
         robot: The robot, by its place among them.
         basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
         of_links: Whether it is of this arm's links.
+        least: What they have to gain over white noise; None for what makes them likelier, or of
+            links for any gain at all.
 
     Returns:
-        The errors; None where white noise explains the residuals about as well: of links, where it
-        does so at least as well.
+        The errors; None where they gain no more than that.
     """
     # An arm whose links all look like its frames, as one with parallel axes, has no columns.
     stops, size = likelihood.stops[(likelihood.members == robot).any(axis=1)], basis.shape[2]
     if len(np.unique(stops)) < _FEWEST_STOPS or not size:
         return None
-    levels, unlikely = likelihood.white
+    levels, start = likelihood.start_beside(robot, basis)
+    if start <= _NOTHING:
+        return None
     widened = likelihood.beside(robot, basis)
-    # Every arm's links err: their size counts however little noise alone is less likely.
-    least = 0.0 if of_links else _LIKELY
-    sigma, value = _most_likely_size(widened, size, levels, unlikely - 0.5 * least)
+    if least is None:
+        # Every arm's links err: their size counts however little noise alone is less likely.
+        least = 0.0 if of_links else _LIKELY
+    unlikely = likelihood.white[1]
+    sigma, value = _most_likely_size(widened, size, levels, start, unlikely - 0.5 * least)
     gain = 2.0 * (unlikely - value)
     if gain <= least:
         return None
@@ -167,7 +177,7 @@ def find_arm_errors(
 
 
 def _most_likely_size(
-    likelihood: RobotLikelihood, size: int, levels: FloatArray, enough: float
+    likelihood: RobotLikelihood, size: int, levels: FloatArray, start: float, enough: float
 ) -> tuple[float, float]:
     """The most likely size of the last unknowns as random effects, beside the robots' levels."""
     # They are observed to be zero, in units of their own, as one more component of the variance.
@@ -193,7 +203,7 @@ def _most_likely_size(
         components=Components(np.concatenate([components.known, rest]), parts),
     )
     sigmas, value = grown.most_likely(
-        np.append(levels, _START),
+        np.append(levels, start),
         np.append(np.repeat(likelihood.seen, 2), True),
         np.append(np.full(levels.size, LEAST_SIGMA), _NOTHING),
         enough=enough,

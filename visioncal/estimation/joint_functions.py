@@ -10,7 +10,7 @@ restricted likelihood with log-normal priors, the length on a grid (Gilmour, Tho
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, lapack
@@ -23,10 +23,20 @@ from visioncal.estimation.linalg import gram, weighted_gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_likelihood
-from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Knowledge, Likely, most_likely
+from visioncal.estimation.variance import (
+    LEAST_SIGMA,
+    MOST_SIGMA,
+    Knowledge,
+    Likely,
+    Weighed,
+    most_likely,
+)
 
 # Twice the gain in log-likelihood over the same arm without them.
 SIGNIFICANT = 20.0
+# With all other sizes as they are without functions, these show at least such a share of that: of
+# functions that are just significant, half of it or more.
+_LEAST_SHARE = 0.25
 # Lengths that are tried [rad], the longest first, and how many lengths' inverses of harmonics are
 # carried: beyond, three thousandths of the variance are left.
 _LENGTHS_RAD, _CARRIED = (0.5, 0.25, 0.12, 0.06, 0.03), 3.0
@@ -121,14 +131,18 @@ def find_joint_functions(
     without = plain.most_likely(plain.start())
     if without is None:
         return None
-    chosen, best, worse = None, without, 0
+    # The longest length has no longer one to be worse than.
+    chosen, best, worse, weighed = None, without, -1, plain.weighed(without)
     for length in _LENGTHS_RAD:
         arm = _ArmLikelihood.of(nominal, place, bases, _Waves.of(harmonics, length), torque_nm)
         # Of what seems not to gain enough, the rest of the way does not matter.
-        found = arm.most_likely(
-            np.append(best.logs[: len(without.logs)], np.log(_START_RAD)),
-            without.value - 0.5 * SIGNIFICANT,
-        )
+        _, gain = weighed.likely_size(arm.functions, arm.mine)
+        found = None
+        if 2.0 * gain > _LEAST_SHARE * SIGNIFICANT:
+            found = arm.most_likely(
+                np.append(best.logs[: len(without.logs)], np.log(_START_RAD)),
+                without.value - 0.5 * SIGNIFICANT,
+            )
         if found is None or (chosen is not None and found.value > best.value):
             worse += 1
         else:
@@ -244,6 +258,28 @@ class _ArmLikelihood:
     def random(self) -> slice:
         """The places of the arm's errors among the unknowns."""
         return slice(self.others.shape[2], None)
+
+    @property
+    def functions(self) -> FloatArray:
+        """(m, 6 w, q) how what units say moves with the process, for a size of one."""
+        return np.asarray(self.own[:, :, self.random] * np.sqrt(self.shares[:, -1]))
+
+    def weighed(self, step: "_SizesAt") -> Weighed:
+        """What units say, weighed by the levels and sizes of some step."""
+        components, known = self.nominal.components, self.known
+        levels, count = len(components.parts), self.others.shape[2]
+        jacobian = np.zeros((*self.nominal.reduced.errors.shape, self.own.shape[2]))
+        jacobian[self.mine], jacobian[~self.mine, :, :count] = self.own, self.others
+        information = known.information.copy()
+        random = np.arange(count, len(information))
+        information[random, random] += 1.0 / (self.shares @ np.exp(2.0 * step.logs[levels:]))
+        return Weighed.of(
+            self.nominal.reduced.errors,
+            jacobian,
+            components,
+            replace(known, information=information),
+            step.logs[:levels],
+        )
 
     def springs_of(self, step: "_SizesAt") -> FloatArray:
         """(n,) the compliances at some step; none without any."""

@@ -13,7 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask
-from visioncal.estimation.arm import ArmErrors, find_arm_errors, rows_of
+from visioncal.estimation.arm import SIGNIFICANT, ArmErrors, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
@@ -100,7 +100,9 @@ class ArmTrials:
     noise: Noise | None = None
     _fits: dict[tuple[ArmErrors, ...], Solution] = field(default_factory=dict)
     _likely: dict[tuple[ArmErrors, ...], RobotLikelihood] = field(default_factory=dict)
-    _found: dict[tuple[int, tuple[ArmErrors, ...]], ArmErrors | None] = field(default_factory=dict)
+    _found: dict[tuple[int, float, tuple[ArmErrors, ...]], ArmErrors | None] = field(
+        default_factory=dict
+    )
 
     def erring(self, errors: Mapping[str, ArmErrors]) -> Problem:
         """The observations with errors of the arm among the unknowns."""
@@ -117,18 +119,24 @@ class ArmTrials:
             self._fits[key] = fit_problem(problem, start, noise)
         return self._fits[key]
 
-    def found(self, among: Mapping[str, ArmErrors], basis: FloatArray) -> ArmErrors | None:
-        """Looks for errors of one more block by its columns, which stay as long as this."""
+    def found(
+        self, among: Mapping[str, ArmErrors], basis: FloatArray, least: float = 0.0
+    ) -> ArmErrors | None:
+        """Looks for errors of one more block that gain more than the least.
+
+        Its columns stay as long as this.
+        """
         known = tuple(among.values())
-        if (id(basis), known) not in self._found:
+        key = id(basis), least, known
+        if key not in self._found:
             fit = self.fitted(among)
             if known not in self._likely:
                 self._likely[known] = robot_likelihood(self.erring(among), fit.state, fit.noise)
             place = self.problem.robots.index(self.robot)
-            self._found[id(basis), known] = find_arm_errors(
-                self._likely[known], place, basis, of_links=True
+            self._found[key] = find_arm_errors(
+                self._likely[known], place, basis, of_links=True, least=least
             )
-        return self._found[id(basis), known]
+        return self._found[key]
 
     def level(self, errors: Mapping[str, ArmErrors], gain: float) -> LevelFit:
         """Puts a level's fit together."""
@@ -168,8 +176,8 @@ def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
     while len(errors) > count:
         count = len(errors)
         for name in (name for name in blocks.names if name in arm.bases and name not in errors):
-            found = arm.found(errors, arm.bases[name])
-            if found is not None and found.is_significant:
+            found = arm.found(errors, arm.bases[name], SIGNIFICANT)
+            if found is not None:
                 gain += found.gain
                 errors = without_springs(arm, errors | {name: found})
     if blocks.own and not errors.keys() & set(blocks.own):

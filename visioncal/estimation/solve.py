@@ -1,7 +1,7 @@
 """Solving a problem: Levenberg-Marquardt on all unknowns, and the noise's levels by REML."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Self
 
@@ -33,6 +33,7 @@ from visioncal.estimation.variance import (
     Components,
     Knowledge,
     RatioPrior,
+    Weighed,
     estimate_sigmas,
 )
 
@@ -48,6 +49,8 @@ RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
 _START_SIGMA = 5e-4
 # Where they are sought again, it is never from nothing, which no residuals would lift them from.
 _ABOVE_NOTHING = 2e-5
+# Shares of the levels of rotation and translation that may be left beside errors of an arm.
+_LOWER = ((1.0, 1.0), (1.0, 0.25), (0.25, 1.0), (0.25, 0.25))
 # A sensor may be this much better or worse than is said of it, at the most.
 _SENSOR_RANGE = (1e-3, 1e4)
 # Levels below this are none [rad and m].
@@ -461,6 +464,9 @@ class RobotLikelihood:
     members: IntArray
     stops: IntArray
     before: FloatArray
+    _weighed: dict[int, tuple[tuple[FloatArray, Weighed], ...]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     @cached_property
     def seen(self) -> Mask:
@@ -519,6 +525,39 @@ class RobotLikelihood:
     def white(self) -> tuple[FloatArray, float]:
         """The levels (r, 2) from above, and the negative logarithm of their likelihood."""
         return self._levels(np.maximum(self.rms, _START_SIGMA) * np.ones_like(self.before))
+
+    def start_beside(self, robot: int, moves: FloatArray) -> tuple[FloatArray, float]:
+        """Where to seek the levels beside random effects of a robot's flange, all of one size.
+
+        Effects may make up for most of what the robot's levels are without them, of rotation, of
+        translation, or of both: the likeliest of these cases is taken.
+
+        Args:
+            robot: The robot, by its place.
+            moves: (s, 6, k) by stop, how its flange moves with the effects.
+
+        Returns:
+            The levels (r, 2), and the size of the effects; zero where none is likelier.
+        """
+        mine, moved = (self.members == robot).any(axis=1), self.moved(robot, moves)
+        start, least = (self.white[0], 0.0), np.inf
+        for levels, weighed in self._weighed_about(robot):
+            size, gain = weighed.likely_size(moved, mine)
+            if weighed.value - gain < least and (gain > 0.0 or least == np.inf):
+                start, least = (levels, size), weighed.value - gain
+        return start
+
+    def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, Weighed], ...]:
+        """What units say, weighed by `white`, and by lower levels of one robot."""
+        if robot not in self._weighed:
+            lower = np.ones((len(_LOWER), *self.before.shape))
+            lower[:, robot] = _LOWER
+            every = np.maximum(self.white[0] * lower, LEAST_SIGMA)
+            given = self.reduced.errors, self.jacobian, self.components, self.known
+            self._weighed[robot] = tuple(
+                (levels, Weighed.of(*given, np.log(levels.ravel()))) for levels in every
+            )
+        return self._weighed[robot]
 
     @property
     def least_unlikely(self) -> float:

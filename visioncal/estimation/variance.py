@@ -28,6 +28,9 @@ _SURELY, _SHORT_STEP = 3.0, 0.5
 # and how far and how exactly it is followed, in logarithms.
 _SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
 
+# Logarithms of sizes of random effects that are compared lie so far apart.
+_SIZE_STEP = 0.2
+
 # Logarithms of the ratio of a value's variance to that of its measurement; and a share of a
 # measurement that is not worth following.
 _LIKELY_RANGE, _FOLLOWED = (-7.0, 12.0), 1e-2
@@ -304,7 +307,7 @@ def profile_interval(
 
 
 @dataclass(frozen=True, eq=False)
-class _Weighed:
+class Weighed:
     """Residuals (m, d) weighed by some sigmas, and what the parameters leave of them.
 
     Attributes:
@@ -331,7 +334,7 @@ class _Weighed:
         components: Components,
         known: Knowledge,
         logs: FloatArray,
-    ) -> "_Weighed":
+    ) -> "Weighed":
         """Weighs them by some logarithms of the sigmas; see `estimate_sigmas`."""
         sigmas = np.exp(logs)
         total = components.total(sigmas)
@@ -349,6 +352,32 @@ class _Weighed:
             + best @ (known.information @ best - 2 * known.gradient)
         )
         return cls(sigmas, weights, weighted, root, pulled, value)
+
+    def likely_size(self, moved: FloatArray, among: Mask) -> tuple[float, float]:
+        """The most likely size of more random effects, all of one size, beside these sigmas.
+
+        With the sigmas as they are, the likelihood of a size is a sum over the eigenvalues of the
+        effects' information.
+
+        Args:
+            moved: (n, d, q) how some residuals move with the effects.
+            among: (m,) which these are; no other moves.
+
+        Returns:
+            The size within a tenth, and by how much the log-likelihood grows with it; zero where
+            none is likelier.
+        """
+        taken = self.root.T @ gram(self.weighted[among], moved)
+        information = gram(moved, self.weights[among] @ moved) - taken.T @ taken
+        values, vectors = np.linalg.eigh(information)
+        squares = (gram(moved, self.pulled[among]) @ vectors) ** 2
+        sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
+        added = 1.0 + sizes**2 * np.maximum(values, 0.0)
+        unlikely = 0.5 * np.sum(np.log(added) - sizes**2 * squares / added, axis=1)
+        best = int(np.argmin(unlikely))
+        return (
+            (float(sizes[best, 0]), -float(unlikely[best])) if unlikely[best] < 0.0 else (0.0, 0.0)
+        )
 
 
 def _leaning(prior: RatioPrior, logs: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -368,7 +397,7 @@ def likelihood(
     prior: RatioPrior | None,
 ) -> Likely:
     """The restricted likelihood of some logarithms of the sigmas; see `estimate_sigmas`."""
-    found, columns = _Weighed.of(residuals, jacobian, components, known, logs), jacobian.shape[-1]
+    found, columns = Weighed.of(residuals, jacobian, components, known, logs), jacobian.shape[-1]
     weights, weighted, pulled = found.weights, found.weighted, found.pulled
     # How the residuals' covariance grows with the logarithm of each sigma.
     growth = 2 * found.sigmas[:, None, None] ** 2 * components.parts
