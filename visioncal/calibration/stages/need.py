@@ -178,10 +178,20 @@ def picks_of(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
         for step in group.path:
             if step.robot:
                 pairs.setdefault((observer, step.robot), []).extend(group.rows.tolist())
+    off = {robot: _off_by_arm(fitted, robot) for robot in {robot for _, robot in pairs}}
     return tuple(
-        _picks(_part(fitted, sorted(rows)), camera, robot, need)
+        _picks(_part(fitted, sorted(rows)), camera, robot, off[robot], need)
         for (camera, robot), rows in pairs.items()
     )
+
+
+def _off_by_arm(fitted: PickInputs, robot: str) -> FloatArray | None:
+    """By how much (p, q) a fit is off with each error of an arm that it takes for noise."""
+    arm = fitted.arms.get(robot)
+    if arm is None or arm.model is not None or arm.errors is None or arm.errors.is_estimated:
+        return None
+    state, noise = fitted.fit.state, fitted.fit.noise
+    return arm.errors.sigma * misfit_jacobian(fitted.whole, state, noise, robot, arm.errors)
 
 
 def _part(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
@@ -192,7 +202,9 @@ def _part(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
     return replace(fitted, problem=fitted.problem.subset(chosen), held_out=kept)
 
 
-def _picks(fitted: PickInputs, camera: str, robot: str, need: Need | None) -> Picks:
+def _picks(
+    fitted: PickInputs, camera: str, robot: str, off: FloatArray | None, need: Need | None
+) -> Picks:
     """Picks of what one camera sees by one robot, from the observations that it parts."""
     problem, state, noise = fitted.problem, fitted.fit.state, fitted.fit.noise
     seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
@@ -203,7 +215,7 @@ def _picks(fitted: PickInputs, camera: str, robot: str, need: Need | None) -> Pi
     carries = np.array([_is_between(problem, observer, base, robot) for observer in seen.observers])
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
-    unfitted = None if errors is None or errors.is_estimated else errors
+    unfitted = None if off is None else errors
     whole = calibrated or (unfitted is not None and (unfitted.of_links or unfitted.is_significant))
     if whole:
         # The whole chain, in the targets' frames: the noise of its flanges is in it.
@@ -215,8 +227,7 @@ def _picks(fitted: PickInputs, camera: str, robot: str, need: Need | None) -> Pi
     linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
     turned, at = adjoint(in_base), problem.robots.index(robot)
     white = again = noise.robots[at]
-    if unfitted is not None:
-        off = unfitted.sigma * misfit_jacobian(fitted.whole, state, noise, robot, unfitted)
+    if unfitted is not None and off is not None:
         covariance = covariance - off @ off.T
         by_posture, in_time = _left_by_arm(fitted, robot, unfitted, off)
         if not whole:
