@@ -151,7 +151,7 @@ def test_parts_of_the_image_that_were_never_visited_are_named():
     alone = estimate_intrinsics(middle, [cell.options.target], (width, height), "brown")
     (empty,) = (warning for warning in alone.warnings if warning.kind == EMPTY_IMAGE)
     assert "in the upper left, upper right, lower left and lower right of the image" in empty.words
-    assert "into those parts" in empty.do.words
+    assert "into the upper left, upper right, lower left and lower right of" in empty.do.words
 
 
 def test_two_views_are_too_few():

@@ -1,6 +1,7 @@
 """Commands on a whole cell: any of its cameras, robots and targets, against the truth."""
 
 import json
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -70,6 +71,16 @@ def test_a_camera_that_was_pushed_is_named_by_its_own_pair_alone(place, bumped):
     assert seen.status == 3
     assert "The camera moved by" in seen.out
     done("verify", bumped, *against, "--camera", "hand", "--target", "floor")
+
+
+def test_a_check_of_one_pair_names_it_in_the_command_that_it_advises(place):
+    cell = simulate(replace(OPTIONS, moved=(Moved("target_floor", LATER, shift_m=0.01),)))
+    part(recorded(cell), LATER, OPTIONS.stops).save(place / "floor-moved")
+    names = ("--camera", "hand", "--target", "floor")
+    seen = visioncal("verify", place / "floor-moved", "--against", place / "out", *names)
+    assert seen.status == 3
+    (advised,) = (line for line in seen.out.splitlines() if "--board-moved" in line)
+    assert visioncal(*shlex.split(advised)[1:]).status == 0
 
 
 @pytest.mark.parametrize(("camera", "robot"), [("left", "a"), ("left", "b"), ("hand", "a")])

@@ -1,6 +1,7 @@
 """`visioncal verify`."""
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -81,7 +82,7 @@ def verify_command(
         check = verify(loaded, calibration, board_placed_anew=board_moved, progress=progress)
     facts = facts_of(loaded, calibration, failed=not check.passed, collision=collision)
     fired = outcomes(triggers, facts)
-    verdict = verdict_of(check).with_paths(session, against)
+    verdict = verdict_of(check).with_paths(session, against, ["visioncal", *sys.argv[1:]])
     document = json.dumps(to_document(check, fired, verdict), indent=2, allow_nan=False) + "\n"
     written = (
         Written(()) if output is None else write_check(output, check, fired, verdict, document)

@@ -45,7 +45,7 @@ SOURCES = ("calibration", "unmeasured_board", "robot_noise", "robot_noise_of_pic
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
-REVIEW, VERIFY = "visioncal review OUT", "visioncal verify SESSION --against OUT"
+REVIEW = "visioncal review OUT"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
 # Fewer views are not worth a calibration of their own.
 FEWEST_ALONE = 6

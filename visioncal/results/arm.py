@@ -198,7 +198,7 @@ class CarriesOver:
     def words(self) -> str:
         """All this in a sentence or two."""
         worse = [_WHERE[region.region] for region in self.regions if not region.better]
-        where = f"; {listed(worse)} it is no better than as stated" if worse else ""
+        where = f"; {listed(worse)} it is not clearly better than as stated" if worse else ""
         return (
             f"Where it was measured, the calibrated arm errs by {figure(self.measured_mm)} mm (the "
             f"stated arm by {figure(self.measured_nominal_mm)} mm). Elsewhere "

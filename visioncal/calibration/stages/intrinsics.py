@@ -231,12 +231,11 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
     empty = _unvisited(stack, fit.camera.resolution)
     if empty:
         places = " and ".join(filter(None, [", ".join(empty[:-1]), empty[-1]]))
-        parts = "that part" if len(empty) == 1 else "those parts"
         yield Finding(
             EMPTY_IMAGE,
             f"No corner was ever seen in the {places} of the image, so the lens is extrapolated "
             "there.",
-            Remedy(f"In some views, move the target into {parts} of the image."),
+            Remedy(f"In some views, move the target into the {places} of the image."),
             # What is needed is needed where the views looked, or at a declared place.
             until_mm=0.0,
         )

@@ -23,7 +23,7 @@ from visioncal.core.limits import CheckLimits
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import AGREEMENT, CALIBRATE_ANEW, PLAN, VERIFY, Finding, Remedy, Verdict
+from visioncal.core.verdict import AGAIN, AGREEMENT, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
 from visioncal.estimation.null_space import joint_words, listed
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
@@ -45,7 +45,7 @@ _NEXT = {
     CAMERA: Remedy(f"Fasten the camera, and {_ANEW}", CALIBRATE_ANEW),
     BOARD: Remedy(
         "Put the board back; if it was moved on purpose, verify without its place.",
-        f"{VERIFY} --board-moved",
+        f"{AGAIN} --board-moved",
     ),
     BOTH: Remedy(f"Fasten both, and {_ANEW}", CALIBRATE_ANEW),
     SIZE: _ANOTHER_BOARD,
@@ -62,11 +62,11 @@ _NEXT = {
     NOISE: Remedy(
         "Look for play in mounts and joints, and whether the robot stood still at each image; "
         "then verify again.",
-        VERIFY,
+        AGAIN,
     ),
 }
 _WRONG_VIEW = Remedy(
-    "Take that stop again, whose image and pose do not belong together; then verify again.", VERIFY
+    "Take that stop again, whose image and pose do not belong together; then verify again.", AGAIN
 )
 
 SCHEMA = 1

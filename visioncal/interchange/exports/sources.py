@@ -101,13 +101,14 @@ class Placements:
         if len(self.frames) == 1 and self.cell is None:
             return self.frames[0]
         if self.cell is not None:
-            tree = self.cell.tree
-            known = list(tree.parents)
+            known = list(self.cell.tree.parents)
+            # No robot is between the ends of a transform that the cell itself has.
+            example = next((name for name in self.by_name if "_from_cam" in name), "")
+            example = example or next(reversed(self.by_name))
             raise DataError(
                 f"{self.words.capitalize()} has {', '.join(known)}: which is meant is not said.",
                 culprits=["--edge"],
-                next_step=f"Name two of them, as --edge {tree.reference}_from_{known[-1]}; "
-                "or all: --edge all.",
+                next_step=f"Name two of them, as --edge {example}; or all: --edge all.",
             )
         raise DataError(
             f"{self.words.capitalize()} has {', '.join(self.frames) or 'no frames'}: which one is "
