@@ -247,6 +247,35 @@ def test_what_is_written_wrongly_is_told_before_what_is_missing(option, said, tm
     assert f"error: {option} is " in done.err
 
 
+def folding_arm(folder: Path) -> Path:
+    """An arm of six axes whose joints turn so far that it can fold back onto its own base."""
+    rows = [
+        (0.15, 0.5, 0.45, 0.0),
+        (0.6, 0.0, 0.0, 0.5),
+        (0.12, 0.5, 0.0, 0.0),
+        (0.0, -0.5, 0.64, 0.0),
+        (0.0, 0.5, 0.0, 0.0),
+        (0.0, 0.0, 0.1, 0.0),
+    ]
+    joints = [
+        f'[[joint]]\nname = "j{at}"\na_m = {a}\nalpha_rad = {alpha * np.pi}\nd_m = {d}\n'
+        f"theta_offset_rad = {theta * np.pi}\nlower_deg = -166.0\nupper_deg = 166.0\n"
+        for at, (a, alpha, d, theta) in enumerate(rows, 1)
+    ]
+    arm = folder / "arm.toml"
+    arm.write_text("\n".join(['schema = 1\ntip = "flange"\nconvention = "standard"\n', *joints]))
+    return arm
+
+
+@pytest.mark.slow
+def test_stops_are_exchanged_until_an_arm_that_folds_far_back_has_a_way(tmp_path):
+    cell = {"cam": "50 -30 60 4 -3 88", "board": "550 50 0 180 0 20", "candidates": "1500"}
+    more = ("--for", "kinematics", "--stops", 8, "--guess-mm", 10)
+    done = plan(folding_arm(tmp_path), tmp_path / "plan", *more, **cell)
+    assert done.status == 0, done.err
+    assert "stops were exchanged for want of a safe way" in done.out
+
+
 def test_a_wish_beyond_the_candidates_is_told_and_the_plan_written(tmp_path):
     out = tmp_path / "out"
     done = plan("ur5e", out, "--stops", 4, "--wish-mm", "0.0001")

@@ -87,7 +87,12 @@ def touch_test_command(
     calibration = named_result(calibration, "-c", "touch-test: the calibration to prove")
     known = load_result(calibration)
     if known.cell is not None:
-        raise DataError("touch-test is for one camera and one robot.", culprits=["-c"])
+        raise DataError(
+            f"touch-test is for one camera and one robot, and {calibration} is of a whole cell.",
+            culprits=["-c"],
+            next_step=f"Let visioncal locate {session} -c {calibration} --camera NAME --robot NAME "
+            "say where the board is, touch it there, and compare.",
+        )
     has_tools = any(frame.startswith("flange_from_") for frame in known.frames)
     is_bare = tool == "none" or (tool is None and not has_tools)
     if not (is_bare or has_tools):

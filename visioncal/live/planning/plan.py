@@ -26,8 +26,9 @@ from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun
 from visioncal.robot import Robot
 
-# Stops without a safe way to them are chosen anew so often; then a plan goes without them.
-_ROUNDS = 4
+# Stops without a safe way to them are chosen anew so often: an arm that folds far back needs up to
+# six rounds for 8 to 30 stops.
+_ROUNDS = 12
 
 # A direction this close to the optical axis is called by it; another axis is named besides where
 # the direction has this share of it.
@@ -236,7 +237,12 @@ class _Planning:
             if not route.unreachable:
                 return design, route, tuple(given_up)
             given_up += route.unreachable.values()
-            left = np.setdiff1d(left, design.rows[list(route.unreachable)])
+            lost = design.rows[list(route.unreachable)]
+            reached = np.setdiff1d(design.rows, lost)
+            if turn and len(reached):
+                # One by one they would be exchanged for others of the same part of the workspace.
+                lost = self._nearer(left, lost, reached)
+            left = np.setdiff1d(left, lost)
         obstacles = tuple(dict.fromkeys(given_up))
         raise DataError(
             f"plan: no safe way through {self.request.count} stops was found in {_ROUNDS} choices; "
@@ -244,6 +250,14 @@ class _Planning:
             culprits=obstacles,
             next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",
         )
+
+    def _nearer(self, left: IntArray, lost: IntArray, reached: IntArray) -> IntArray:
+        """The candidates, of some, whose joints are nearer to lost stops than to any reached."""
+        to_lost, to_reached = (
+            np.linalg.norm(self.found.q[left][:, None] - self.found.q[rows], axis=2).min(axis=1)
+            for rows in (lost, reached)
+        )
+        return left[to_lost < to_reached]
 
     def _enough(self, left: IntArray) -> Design:
         """The fewest of some candidates that meet wish and need, or as many as are allowed."""
