@@ -104,7 +104,7 @@ class Placements:
             known = list(self.cell.tree.parents)
             # No robot is between the ends of a transform that the cell itself has.
             example = next((name for name in self.by_name if "_from_cam" in name), "")
-            example = example or next(reversed(self.by_name))
+            example = example or list(self.by_name)[-1]
             raise DataError(
                 f"{self.words.capitalize()} has {', '.join(known)}: which is meant is not said.",
                 culprits=["--edge"],

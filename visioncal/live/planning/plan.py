@@ -257,7 +257,7 @@ class _Planning:
             np.linalg.norm(self.found.q[left][:, None] - self.found.q[rows], axis=2).min(axis=1)
             for rows in (lost, reached)
         )
-        return left[to_lost < to_reached]
+        return np.asarray(left[to_lost < to_reached])
 
     def _enough(self, left: IntArray) -> Design:
         """The fewest of some candidates that meet wish and need, or as many as are allowed."""
