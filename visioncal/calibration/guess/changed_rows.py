@@ -111,8 +111,10 @@ def _explains(recording: Recording, tried: Hypothesis, fit: Fit, rows: IntArray)
     """Whether some rows, read so, close the chain of the others."""
     robot, camera = (side[rows] for side in tried.chain(recording.robot, recording.camera))
     there = np.isfinite(robot).all(axis=(1, 2))
-    # A shift leaves as many rows without a partner.
-    if there.sum() < max(_FEWEST, len(rows) - abs(tried.shift)):
+    if not there.any():
         return False
     away = distances(robot[there], camera[there], fit.lever, (fit.x, fit.z)).away
-    return bool(np.mean(away < CLOSING_SCORE) >= _MOST)
+    # A shift leaves as many rows without a partner: at the end of the table where images are lost,
+    # and where it begins where poses are.
+    paired = len(rows) - abs(tried.shift)
+    return bool(np.sum(away < CLOSING_SCORE) >= max(_FEWEST, _MOST * paired))
