@@ -259,6 +259,23 @@ def test_a_pose_that_is_missing_midway_is_named(tmp_path, since):
     assert visioncal.calibrate(folder).verdict.status == "good"
 
 
+def test_millimetres_come_first_where_more_than_the_unit_is_wrong(tmp_path):
+    def in_mm_and_of_a_tool_midway(poses):
+        tool = pose([0.0, 0.01, 0.04], 6.0, -11.0, 17.0)
+        of_tool = [*poses[:9], *(flange * tool for flange in poses[9:])]
+        return [
+            RigidTransform.from_components(1e3 * flange.translation, flange.rotation)
+            for flange in of_tool
+        ]
+
+    folder = write(tmp_path / "mm", looks(18), STATED_LENS, reported=in_mm_and_of_a_tool_midway)
+    first, *rest = visioncal.doctor(folder).findings
+    assert "It looks like millimetres: multiply these columns by 0.001." in first.words
+    assert first.words.endswith("do not agree either: something else is wrong, too.")
+    assert not rest
+    assert first.words in said_first(folder)
+
+
 @pytest.mark.parametrize("since", [9, 14])
 def test_poses_that_are_a_row_late_from_some_view_on_are_named(tmp_path, since):
     def repeated(poses):

@@ -266,6 +266,7 @@ def test_both_have_to_hold() -> None:
         ({"stops": 8}, 0.0),
         ({"away_mm": 1.0}, 10.0),
         ({"away_deg": 0.1}, 10.0),
+        ({"held_out": Rms(3.0, 0.1), "away_mm": 1.0}, 10.0),
         ({"warnings": remarks(["It is upside down."])}, np.inf),
         ({"pixel_px": 4.0}, np.inf),
     ],

@@ -66,28 +66,37 @@ def check_times(views: Sequence[View]) -> None:
             raise DataError(f"{place}: {wrong}.", culprits=[place])
 
 
+def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
+    """What looks like another unit than metres in most rows; empty where nothing does.
+
+    Args:
+        views: The rows.
+        names: The columns of a position.
+    """
+    norms = [
+        float(np.linalg.norm([view.numbers[name] for name in names]))
+        for view in views
+        if names[0] in view.numbers
+    ]
+    far = [norm for norm in norms if norm > _FAR_M]
+    if 2 * len(far) <= len(norms):
+        return ""
+    away, some = float(np.median(far)), ""
+    if len(far) < len(norms):
+        some = f" in {len(far)} of {len(norms)} rows"
+    unit = (
+        f"It looks like millimetres: multiply these columns by 0.001{some and ' there'}."
+        if away > _SURELY_MM
+        else "Metres are needed, and these are inches, centimetres or millimetres."
+    )
+    return f"views.csv: the median length of ({', '.join(names)}) is {away:.4g} m{some}. {unit}"
+
+
 def view_warnings(views: Sequence[View]) -> Iterator[str]:
     """Words what looks like another unit, or like a row that was copied."""
     for names in (known.POSITION, known.MEASURED_CAM_POSE[:3]):
-        norms = [
-            float(np.linalg.norm([view.numbers[name] for name in names]))
-            for view in views
-            if names[0] in view.numbers
-        ]
-        far = [norm for norm in norms if norm > _FAR_M]
-        if 2 * len(far) > len(norms):
-            away, some = float(np.median(far)), ""
-            if len(far) < len(norms):
-                some = f" in {len(far)} of {len(norms)} rows"
-            unit = (
-                f"It looks like millimetres: multiply these columns by 0.001{some and ' there'}."
-                if away > _SURELY_MM
-                else "Metres are needed, and these are inches, centimetres or millimetres."
-            )
-            yield (
-                f"views.csv: the median length of ({', '.join(names)}) is {away:.4g} m{some}. "
-                f"{unit}"
-            )
+        if words := unit_warning(views, names):
+            yield words
     angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]
     if angles and float(np.median(angles)) > _WIDE_RAD:
         yield (

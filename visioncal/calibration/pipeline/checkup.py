@@ -148,7 +148,12 @@ def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding
     if error is not None and cause is None:
         yield _refused("refused", error)
     said = () if cause is None else (cause.kind,)
-    warned = [warning for warning in known.warnings if warning.kind not in (*_NO_FAULT, *said)]
+    warned = [
+        warning
+        for warning in known.warnings
+        if warning.kind not in (*_NO_FAULT, *said)
+        and (hint is None or warning.words not in hint.words)
+    ]
     is_said = "other_lens" in {finding.kind for finding in warned}
     lens = [] if error is not None or is_said else list(_lenses(known))
     yield from sorted([*lens, *warned], key=lambda value: value.do is None)

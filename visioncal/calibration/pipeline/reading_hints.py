@@ -34,7 +34,8 @@ from visioncal.core.verdict import CALIBRATE, GUESS_AND_CALIBRATE, READ_AGAIN, F
 from visioncal.estimation.chain import robot_part
 from visioncal.robot import Robot
 from visioncal.session import Session
-from visioncal.session.columns import POSE
+from visioncal.session.checks import unit_warning
+from visioncal.session.columns import POSE, POSITION
 
 _MISREAD = "misread_poses"
 # A robot that turns by less stands, a target that turns by more does not, ambiguous poses aside
@@ -64,6 +65,15 @@ _UNRECORDED = Remedy(
     "Look how the poses were recorded: a logger that repeats one pose, or that writes positions as "
     "0, 0, 0 or rotations as 0, 0, 0, 1, gives no calibration. Record them again, at the same time "
     "as the images."
+)
+_NOT_ALONE = (
+    "With this unit alone, robot, camera and target do not agree either: something else is wrong, "
+    "too."
+)
+_UNIT_FIRST = Remedy(
+    "Write x_m, y_m and z_m of views.csv in metres, and calibrate again: what else is wrong is "
+    "said then.",
+    CALIBRATE,
 )
 _UNPAIRED = Remedy(
     "Look how rows and images were paired: files sorted by name (10 before 2), rows sorted anew, "
@@ -101,7 +111,7 @@ def reading_hint(seen: RunState) -> Finding | None:
         if guess.declared.closes:
             return None
         beside = _poses_beside_joints(seen, guess.declared)
-        return beside or _one_position(seen) or _unpaired(seen)
+        return beside or _one_position(seen) or _other_unit(seen) or _unpaired(seen)
     best, views = guess.best, seen.session.views
     is_mirrored = best.hypothesis.robot.signs == "mirror"
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
@@ -201,6 +211,12 @@ def _one_position(seen: RunState) -> Finding | None:
         "the recorded positions are not those of the views."
     )
     return Finding(_MISREAD, words, _UNRECORDED) if is_one else None
+
+
+def _other_unit(seen: RunState) -> Finding | None:
+    """Says that the robot's positions are in another unit, which alone explains nothing."""
+    words = unit_warning(seen.session.views, POSITION)
+    return Finding(_MISREAD, f"{words} {_NOT_ALONE}", _UNIT_FIRST) if words else None
 
 
 def _unpaired(seen: RunState) -> Finding | None:

@@ -169,6 +169,7 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
         replace(finding, probability=finding.probability / (1.0 + odds), do=None)
         for finding in verdict.findings
         if finding.kind not in (GOOD_FOR, *SOURCES, *_BY_THE_CHAIN)
+        and finding.words not in found.words
     )
     return replace(verdict, findings=(replace(found, probability=odds / (1.0 + odds)), *rest))
 
@@ -193,6 +194,7 @@ def ranked(
     *,
     more: Remedy | None = None,
     left_out_mm: float = 0.0,
+    is_scattered: bool = False,
 ) -> tuple[Finding, ...]:
     """Doubts with how likely each is the cause, and the sources of errors that are too large.
 
@@ -202,6 +204,7 @@ def ranked(
         met: What is needed, and how likely it is met; None where nothing is.
         more: What makes the calibration less uncertain.
         left_out_mm: By how much left-out views disagree [mm].
+        is_scattered: Whether that is more than a sound cell's do.
     """
     found = _tested(doubts, left_out_mm)
     if met is None and (deciding := _deciding(found)) is not None:
@@ -211,7 +214,8 @@ def ranked(
     too_large = met is None and any(
         pick.good_for_mm > CalibrationLimits.sigma_mm[0] for pick in picks
     )
-    if picks and (unmet or (too_large and any(doubt.until_mm == 0.0 for doubt in doubts))):
+    sized = is_scattered or any(doubt.until_mm == 0.0 for doubt in doubts)
+    if picks and (unmet or (too_large and sized)):
         known = {finding.kind for finding in found if finding.probability}
         # What moved is in the arm's errors by posture and time, too, which are no cause then.
         known |= {"arm_errors"} if known & {*_MOVED, LENS_CHANGED} else set()

@@ -46,7 +46,13 @@ _OF_NOISE = 1.5
 def doubts_of(findings: Findings) -> list[Finding]:
     """All that speaks against a result, in the order in which it is looked for."""
     limits = CalibrationLimits()
+    robots = list(_robot_doubts(findings, limits))
     scatter = list(_scatter_doubts(findings, limits))
+    if scatter:
+        # They are the measure then. Views that disagree do not make the robot's error smaller.
+        least = max((doubt.until_mm for doubt in robots), default=0.0)
+        scatter = [replace(doubt, until_mm=max(doubt.until_mm, least)) for doubt in scatter]
+        robots = []
     pairs, sensors = findings.pairs, findings.sensors
     return [
         *scatter,
@@ -62,7 +68,7 @@ def doubts_of(findings: Findings) -> list[Finding]:
         *_stop_doubts(findings, limits),
         *(doubt for sensor in sensors for doubt in _lost_doubts(sensor, limits)),
         *(doubt for sensor in sensors for doubt in _noise_doubts(sensor, limits)),
-        *([] if scatter else _robot_doubts(findings, limits)),
+        *robots,
         *(
             _warned(warning, findings)
             for warning in findings.warnings

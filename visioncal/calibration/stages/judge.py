@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import is_negligible, ranked
-from visioncal.calibration.stages.doubts import doubts_of, helping
+from visioncal.calibration.stages.doubts import doubts_of, helping, is_scattered
 from visioncal.calibration.stages.judged import Findings
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.limits import NeedLimits
@@ -62,6 +62,7 @@ def judge(findings: Findings) -> Verdict:
             met,
             more=helping(findings),
             left_out_mm=findings.held_out.mm,
+            is_scattered=is_scattered(findings),
         )
     said = list(ordered)
     if met is None:
