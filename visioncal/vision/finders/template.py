@@ -36,8 +36,9 @@ along with the blur, because ink spreads.
 """
 
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields, replace
+from threading import Lock
 from typing import Self, TypeAlias
 
 import cv2
@@ -82,6 +83,9 @@ _MOST_RADIUS_PX = 20.0
 _NODES = 6
 # Bounds memory and time where corners are many.
 _MOST_PIXELS = 600_000
+# Of so few corners, one image is worked on at a time: numpy hands the interpreter over at each of
+# some thousand operations, which between threads takes longer than the operations.
+_FEW, _ALONE = 100, Lock()
 # Corners that measure the blur, and what it starts from and stays above [px].
 _BLUR_SAMPLE, _BLUR_START_PX, _BLUR_LEAST_PX = 30, 1.5, 0.5
 # Most turns, for the blur and for the corners, the change of the blur that ends them, as a
@@ -431,7 +435,8 @@ def _placed(image: Image, pattern: _Pattern, board: FloatArray, px: FloatArray) 
     part = np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]])
     flat = all(np.linalg.matrix_rank(array - array.mean(axis=0)) == 2 for array in (board, px))
     # Corners that cannot be fitted may lead to anything; they are sorted out afterwards.
-    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
+    alone = _ALONE if len(px) <= _FEW else nullcontext()
+    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"), alone:
         if len(px) >= _FEWEST and flat and part.size:
             refined = _refined(part, pattern, board, px - low, axis)
             return replace(refined, px=refined.px + low)
