@@ -12,7 +12,7 @@ from visioncal.cli.correct import CorrectOptions
 from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, did_you_mean, some_of, write_atomically
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.result_files import load_calibration
@@ -160,7 +160,7 @@ def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, 
     """The rows that are not reached: where they stand, and why not."""
     for row in np.flatnonzero(~corrected.reached):
         off_mm, off_deg = 1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row])
-        near = f"the nearest posture leaves {figure(off_mm)} mm and {figure(off_deg)} deg"
+        near = f"the nearest posture leaves {mm_and_deg(off_mm, off_deg)}"
         beyond = corrected.beyond[row]
         why = (
             f"reached only with {some_of(beyond)} beyond its limits; within them "
@@ -248,8 +248,8 @@ def _report(
     mm, deg = columns["moved_mm"][rows], columns["moved_deg"][rows]
     words = (
         f"{len(rows)} of {len(rows) + len(lost)} targets corrected: moved by "
-        f"{figure(float(np.median(mm)))} mm and {figure(float(np.median(deg)))} deg (median), by "
-        f"up to {figure(float(mm.max()))} mm and {figure(float(deg.max()))} deg"
+        f"{mm_and_deg(float(np.median(mm)), float(np.median(deg)))} (median), by "
+        f"up to {mm_and_deg(float(mm.max()), float(deg.max()))}"
     )
     if "sigma_mm" in columns:
         words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"

@@ -15,7 +15,7 @@ from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.pose_options import RobotPoseOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.interchange.outputs import RECORDING, Written
 
@@ -261,7 +261,7 @@ def _report_before(place: FrameLocation, frame: "Frame") -> None:
     before = None if place.result is None else place.result.frames.get(place.name)
     if before is not None:
         mm, deg = pose_difference(before.edge.matrix, frame.edge.matrix)
-        say(f"it replaces the one of {before.created}, {figure(mm)} mm and {figure(deg)} deg away")
+        say(f"it replaces the one of {before.created}, {mm_and_deg(mm, deg)} away")
 
 
 @dataclass(frozen=True)

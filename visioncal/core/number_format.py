@@ -20,6 +20,11 @@ def figure(value: float) -> str:
     return text.rstrip("0").rstrip(".") if decimals else text
 
 
+def mm_and_deg(mm: float, deg: float) -> str:
+    """Writes how far something is off, or known: `0.12 mm and 0.02 deg`."""
+    return f"{figure(mm)} mm and {figure(deg)} deg"
+
+
 def percent(probability: float) -> str:
     """Writes a probability; none is certain."""
     if probability > 0.99:

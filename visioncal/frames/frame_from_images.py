@@ -11,7 +11,7 @@ from visioncal.calibration.stages.observed import by_reason
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.limits import ImageFrameLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
 from visioncal.estimation.observability import Direction
@@ -236,7 +236,7 @@ def _observations(session: Session, placed: _PlacedTarget) -> Iterator[Observati
             continue
         at = places[number]
         away_mm, agrees = float(placed.seen.away_mm[at]), bool(placed.seen.agrees[at])
-        away = f"{figure(away_mm)} mm and {figure(float(placed.seen.away_deg[at]))} deg"
+        away = mm_and_deg(away_mm, float(placed.seen.away_deg[at]))
         reason = "" if agrees else f"it puts the target {away} from where the others do"
         yield Observation(str(number), agrees, reason, residual_mm=away_mm)
 
@@ -244,8 +244,8 @@ def _observations(session: Session, placed: _PlacedTarget) -> Iterator[Observati
 def _praise(placed: _PlacedTarget) -> str:
     seen, worst = placed.seen, placed.worst[0]
     return (
-        f"{int(seen.agrees.sum())} images agree to {figure(seen.rms_mm)} mm and "
-        f"{figure(seen.rms_deg)} deg (rms), and {worst.words}, the worst direction, is known to "
+        f"{int(seen.agrees.sum())} images agree to {mm_and_deg(seen.rms_mm, seen.rms_deg)} (rms), "
+        f"and {worst.words}, the worst direction, is known to "
         f"{figure(1e3 * worst.sigma)} mm."
     )
 

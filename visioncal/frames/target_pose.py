@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from visioncal.core.arguments import typed
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, compose, invert, pose_difference
 from visioncal.core.types import FloatArray, Mask, Target
@@ -206,13 +206,13 @@ def _distance(found: ImageInliers, at: int) -> str:
     away = found.away[at]
     millimetres = 1e3 * float(np.linalg.norm(away[3:]))
     degrees = float(np.rad2deg(np.linalg.norm(away[:3])))
-    return f"{figure(millimetres)} mm and {figure(degrees)} deg"
+    return mm_and_deg(millimetres, degrees)
 
 
 def _rival_words(found: ImageInliers, looks: Sequence[SeenTarget], thing: str) -> str:
     rival = np.eye(4) if found.rival is None else found.rival
     millimetres, degrees = pose_difference(found.mean.matrix, rival)
-    away = f"{figure(millimetres)} mm and {figure(degrees)} deg away"
+    away = f"{mm_and_deg(millimetres, degrees)} away"
     if any(len(set(look.turns)) > 1 for look in looks):
         return (
             f"The {thing} looks the same when it is turned: it may as well be {away}. Use a board "

@@ -20,7 +20,7 @@ from visioncal.calibration.guess.joints import (
     with_zero,
 )
 from visioncal.calibration.guess.search import thinned
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import mm_and_deg
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
@@ -69,7 +69,7 @@ class FittedJoints:
     def figures(self) -> str:
         """How well the rows that agree best are explained, in words."""
         shift, angle = self.fit.rms
-        return f"{figure(1e3 * shift)} mm and {figure(np.rad2deg(angle))} deg"
+        return mm_and_deg(1e3 * shift, np.rad2deg(angle))
 
     @property
     def out(self) -> IntArray:

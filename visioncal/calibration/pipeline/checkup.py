@@ -11,7 +11,7 @@ from visioncal.calibration.pipeline.reading_hints import misreadings, reading_hi
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import known_at_first
 from visioncal.calibration.pipeline.solving import first_inliers
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cause_ranking import LEAST_RUN
 from visioncal.calibration.stages.cell import Cell, read_cell
 from visioncal.calibration.stages.image_size import other_images
@@ -22,7 +22,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.shown import html_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mask, Mount, Progress
@@ -30,8 +30,6 @@ from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Remedy, with_pat
 from visioncal.session import Session
 from visioncal.vision.finders.board import hidden_corners
 
-# What is looked at; what comes after is the fit.
-_LAST = "joints"
 # A lens is estimated by corners all over the image: so many of these parts of it need some.
 _PARTS, _LEAST_PARTS = 4, 7
 # So many images that show where a row should be, without it, are no chance.
@@ -122,13 +120,12 @@ def _of(found: Finding, session: Path | str) -> Finding:
 
 def _looked(known: RunState) -> tuple[RunState, VisioncalError | None]:
     """Takes a session through the steps before the fit, as far as they go."""
-    for at, stage in enumerate(STAGES):
+    stages = stages_before("solve")
+    for at, stage in enumerate(stages):
         if known.progress is not None:
-            known.progress(stage.name, at, len(STAGES))
+            known.progress(stage.name, at, len(stages))
         try:
             known = stage.run(known)
-            if stage.name == _LAST:
-                break
         except VisioncalError as error:
             return known, error
     return known, None
@@ -263,7 +260,7 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
     if 1e3 * metres > _MOST_MM:
         yield Finding(
             "scatter",
-            f"The views disagree by {figure(1e3 * metres)} mm and {figure(np.rad2deg(rad))} deg "
+            f"The views disagree by {mm_and_deg(1e3 * metres, np.rad2deg(rad))} "
             "from stop to stop, and arms repeat to 0.1 mm: the board is of another size than "
             "stated, the lens is not this camera's, or the poses are not of these images.",
             Remedy("Calibrate: the verdict weighs the causes.", CALIBRATE),

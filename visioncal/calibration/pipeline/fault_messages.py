@@ -13,7 +13,7 @@ from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import apart
 from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import (
@@ -139,7 +139,7 @@ def moved_found(moved: Moved) -> Finding:
     return Finding(
         "moved_frame",
         f"{moved.frame} {what} between stops {moved.last_stop} and {moved.first_stop}, by "
-        f"{figure(moved.shift_mm)} mm and {figure(moved.turn_deg)} deg{rivals}. The result has "
+        f"{mm_and_deg(moved.shift_mm, moved.turn_deg)}{rivals}. The result has "
         f"{moved.frame} where it stood last, and as {moved.before} where it stood before.",
         Remedy(f"Fasten {moved.frame}, and record again."),
     )
@@ -219,8 +219,8 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
         which = "tool" if on_flange else "base"
         other_mm, other_deg = pose_difference(np.eye(4), edge @ change @ invert(edge))
         moved += (
-            f", or the controller reported another {which} frame, {figure(other_mm)} mm and "
-            f"{figure(other_deg)} deg from that of the other views"
+            f", or the controller reported another {which} frame, "
+            f"{mm_and_deg(other_mm, other_deg)} from that of the other views"
         )
         words = (
             f"Look which {which} frame was active in the controller, and set the same one for all "
@@ -290,7 +290,7 @@ def _thing(frame: str) -> str:
 
 def _elsewhere(change: FloatArray) -> str:
     shift_mm, turn_deg = pose_difference(np.eye(4), change)
-    return f"{figure(shift_mm)} mm and {figure(turn_deg)} deg elsewhere"
+    return f"{mm_and_deg(shift_mm, turn_deg)} elsewhere"
 
 
 def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
@@ -355,7 +355,7 @@ def _moved_by(solved: Solved, base: str, rows: IntArray, of: FloatArray | None =
     mean = mean_transform(asked)
     shift_mm, turn_deg = pose_difference(np.eye(4), mean)
     scatter_mm = 1e3 * float(np.median(distances(asked, mean)[0]))
-    return f"{figure(shift_mm)} mm and {figure(turn_deg)} deg" * (scatter_mm < _ALIKE * shift_mm)
+    return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
 
 
 def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:

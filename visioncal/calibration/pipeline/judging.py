@@ -27,7 +27,7 @@ from visioncal.calibration.stages.need import PickInputs, picks_of
 from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import NOTE, Finding, Remedy
@@ -440,8 +440,8 @@ def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
     name, edge = max(edges.items(), key=lambda pair: pair[1].sigma_mm)
     worst = max(_directions(cell, name, edge), key=lambda value: value.sigma / value.limit)
     return (
-        f"The weakest link is {name}: sigma {figure(edge.sigma_mm)} mm and "
-        f"{figure(edge.sigma_deg)} deg, most of it in {worst.words}. {_resting(cell, name)}"
+        f"The weakest link is {name}: sigma {mm_and_deg(edge.sigma_mm, edge.sigma_deg)}, most of "
+        f"it in {worst.words}. {_resting(cell, name)}"
     )
 
 

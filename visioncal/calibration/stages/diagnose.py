@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import BOARD_CHANGED, MOVED_FRAME, NO_JOINTS
 from visioncal.calibration.stages.cell import Cell
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import PLAN, Finding, Remedy
@@ -176,9 +176,7 @@ def doubts(
     """
     alike, moved = found.alike, found.moved
     if arm is not None and arm.is_significant and not calibrated and arm.of_links:
-        size = (
-            f"{figure(1e3 * LEVER_M * arm.sigma)} mm and {figure(float(np.rad2deg(arm.sigma)))} deg"
-        )
+        size = mm_and_deg(1e3 * LEVER_M * arm.sigma, float(np.rad2deg(arm.sigma)))
         yield Finding(
             "arm_errors",
             f"Residuals follow the arm's posture (likelihood ratio {arm.gain:.0f}, noise stays "
@@ -265,12 +263,12 @@ def _step_words(step: Step, cell: Cell, joint: Callable[[Slip], str]) -> str:
     shift_mm, turn_deg = pose_difference(np.eye(4), step.change)
     return (
         f"{thing} moved at once: {cell.from_when(step.stop)}, it is "
-        f"{figure(shift_mm)} mm and {figure(turn_deg)} deg from where it was"
+        f"{mm_and_deg(shift_mm, turn_deg)} from where it was"
     )
 
 
 def _size(shift_m: float, turn_rad: float) -> str:
-    return f"{figure(1e3 * shift_m)} mm and {figure(float(np.rad2deg(turn_rad)))} deg"
+    return mm_and_deg(1e3 * shift_m, float(np.rad2deg(turn_rad)))
 
 
 def _of_looks(arm: ArmErrors, turned: float, shifted: float) -> Finding:

@@ -15,7 +15,7 @@ from visioncal.calibration.stages.cause_ranking import (
 )
 from visioncal.calibration.stages.judged import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import Mount
 from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Remedy, look_at, or_alone
 from visioncal.results import Rms, ViewResult
@@ -479,8 +479,8 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
         beyond = max(arm.away_mm / limits.robot_mm, arm.away_deg / limits.robot_deg)
         if max(found_mm / limits.robot_mm, found_deg / limits.robot_deg) > 1.0:
             words = (
-                f"The residuals would take a flange that is off by {figure(arm.away_mm)} mm and "
-                f"{figure(arm.away_deg)} deg from stop to stop; arms repeat to 0.1 mm."
+                "The residuals would take a flange that is off by "
+                f"{mm_and_deg(arm.away_mm, arm.away_deg)} from stop to stop; arms repeat to 0.1 mm."
             )
             step = Remedy(
                 "Read a few stops twice to see how well readings repeat; more likely than the "

@@ -14,7 +14,7 @@ from visioncal.calibration.stages.motion import RobotMotion
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.core.verdict import GUESS, Finding, Remedy
@@ -455,6 +455,6 @@ def speed_words(clock: ClockOffset, speeds: FloatArray, inside: int) -> str:
     return (
         f"{len(speeds)} of {inside} views with a time are used, taken while the flange moved by up "
         f"to {figure(fastest_mm)} mm/s and {figure(fastest_deg)} deg/s: the uncertainty of the "
-        f"clocks makes {figure(clock.sigma_s * fastest_mm)} mm and "
-        f"{figure(clock.sigma_s * fastest_deg)} deg of it, and counts in the covariance."
+        f"clocks makes {mm_and_deg(clock.sigma_s * fastest_mm, clock.sigma_s * fastest_deg)} of "
+        "it, and counts in the covariance."
     )

@@ -20,7 +20,7 @@ from visioncal.calibration.verification.change_hypotheses import (
 from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.limits import CheckLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import AGAIN, AGREEMENT, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
@@ -326,7 +326,7 @@ def _other_board(check: Check, suspect: Suspect) -> str:
 
 
 def _short(moved: MeasuredMove) -> str:
-    return f"{figure(moved.mm)} mm and {figure(moved.deg)} deg"
+    return mm_and_deg(moved.mm, moved.deg)
 
 
 def _joint_figures(check: Check, suspect: Suspect) -> tuple[float, float, str]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Progress
 from visioncal.results import Calibration, to_document
@@ -54,7 +54,7 @@ def recompute(
     if not differing:
         return Recomputed(True, "Recomputed from the recording: the same numbers, bit for bit.")
     moved = [
-        f"{name} by {figure(mm)} mm and {figure(deg)} deg (sigma {figure(edge.sigma_mm)} mm)"
+        f"{name} by {mm_and_deg(mm, deg)} (sigma {figure(edge.sigma_mm)} mm)"
         for name, edge in calibration.edges.items()
         if name in again.edges
         for mm, deg in [pose_difference(edge.matrix, again.edges[name].matrix)]

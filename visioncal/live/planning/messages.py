@@ -1,7 +1,7 @@
 """A plan of stops, or of motions, in words."""
 
 from visioncal.core.files import some_of
-from visioncal.core.number_format import figure, percent
+from visioncal.core.number_format import figure, mm_and_deg, percent
 from visioncal.dynamics.limits import Kept
 from visioncal.dynamics.sweeps import Sweeps
 from visioncal.dynamics.written import MotionPlan
@@ -17,7 +17,7 @@ def accuracy_words(found: Accuracy) -> str:
     """Says what is predicted: `0.12 mm and 0.02 deg`."""
     if found.is_open:
         return "not determined"
-    return f"{figure(found.mm)} mm and {figure(found.deg)} deg"
+    return mm_and_deg(found.mm, found.deg)
 
 
 def need_words(found: NeedPlanned) -> str:

@@ -11,7 +11,7 @@ from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, percent
+from visioncal.core.number_format import figure, mm_and_deg, percent
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Need, Progress
 from visioncal.estimation.armmodel import block_size
@@ -340,8 +340,8 @@ def _met(need: Need, before: float) -> DataError:
 def _needless(design: Design) -> DataError:
     found = design.before
     return DataError(
-        f"plan: the wish is met by what was recorded, which predicts {figure(found.mm)} mm and "
-        f"{figure(found.deg)} deg; no stop needs to be added.",
+        "plan: the wish is met by what was recorded, which predicts "
+        f"{mm_and_deg(found.mm, found.deg)}; no stop needs to be added.",
         next_step="Wish for more, or leave the wish out to see what further stops would give.",
     )
 
