@@ -42,6 +42,12 @@ def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     return matrices
 
 
+def apply(matrices: FloatArray, points: FloatArray) -> FloatArray:
+    """Carries (..., n, 3) points through (..., 4, 4) transforms."""
+    turned = points @ np.swapaxes(matrices[..., :3, :3], -1, -2)
+    return np.asarray(turned + matrices[..., None, :3, 3])
+
+
 def skew(vectors: FloatArray) -> FloatArray:
     """Builds the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
     matrices = np.zeros((*vectors.shape, 3))

@@ -102,11 +102,14 @@ class ClockChange:
     sigma_s: float
     is_drift: bool
 
+    def shares(self, stamps_s: FloatArray) -> FloatArray:
+        """(m,) how many steps the offset has changed by at some times [s]."""
+        later_s = stamps_s - self.from_s
+        return later_s if self.is_drift else (later_s >= 0.0).astype(float)
+
     def corrected(self, stamps_s: FloatArray) -> FloatArray:
         """(m,) times as a clock would have them that did not change [s]."""
-        later_s = stamps_s - self.from_s
-        change = later_s if self.is_drift else (later_s >= 0.0).astype(float)
-        return np.asarray(stamps_s - self.step_s * change)
+        return np.asarray(stamps_s - self.step_s * self.shares(stamps_s))
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,9 +266,7 @@ def refined_change(
     inside = robot.covers(frames.stamps_s[some] - fit.offset_s, _FARTHEST_S)
     some = some[inside]
     asked_s, weights = _asked_offsets(robot, frames.only(some), fit)
-    later_s = stamped.stamps_s[some] - change.from_s
-    column = later_s if change.is_drift else (later_s >= 0.0).astype(float)
-    more_s, sigma_s, _ = _slope(column, asked_s, weights)
+    more_s, sigma_s, _ = _slope(change.shares(stamped.stamps_s[some]), asked_s, weights)
     return replace(change, step_s=change.step_s + more_s, sigma_s=sigma_s)
 
 

@@ -89,7 +89,7 @@ class ConvergedFit:
     @property
     def frames(self) -> Mapping[str, FloatArray]:
         """Where the unknown frames are."""
-        return dict(zip(self.problem.unknown, self.fit.state.edges, strict=True))
+        return self.problem.frames(self.fit.state)
 
     @property
     def others(self) -> FloatArray:

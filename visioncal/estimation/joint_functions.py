@@ -22,7 +22,7 @@ from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGH
 from visioncal.estimation.linalg import gram, weighted_gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import RATIO_PRIOR, RobotLikelihood, robot_likelihood
+from visioncal.estimation.solve import RobotLikelihood, ratio_prior, robot_likelihood
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     MOST_SIGMA,
@@ -364,14 +364,9 @@ class _ArmLikelihood:
         slope[levels:] += away / _SPREAD
         curvature[levels:, levels:] += np.eye(len(away)) / _SPREAD**2
         value += 0.5 * float(away @ away)
-        for row in range(0, levels, 2):
-            lean = np.zeros(len(logs))
-            lean[row : row + 2] = np.array([-1.0, 1.0]) / RATIO_PRIOR.log_sigma
-            offset = lean @ logs - np.log(RATIO_PRIOR.ratio) / RATIO_PRIOR.log_sigma
-            value, slope = value + 0.5 * float(offset**2), slope + offset * lean
-            curvature = curvature + np.outer(lean, lean)
+        found = ratio_prior(range(levels // 2)).beside(Likely(value, slope, curvature), logs)
         # Residuals fall as errors that are left out of the prediction grow.
-        return _SizesAt(value, slope, curvature, logs, -effects)
+        return _SizesAt(found.value, found.slope, found.curvature, logs, -effects)
 
     def found(self, step: "_SizesAt", gain: float) -> JointFunctions:
         """The errors of all blocks with the sizes at some step."""

@@ -23,7 +23,7 @@ from visioncal.estimation.lens_field import LensLevels, distances, field_modes, 
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import RATIO_PRIOR, normal_equations
+from visioncal.estimation.solve import normal_equations, ratio_prior
 from visioncal.estimation.variance import HARDLY, Likely, most_likely
 
 # Lengths of the field that are tried, as shares of the image's width, from the third on; another
@@ -212,12 +212,9 @@ class _Likelihood:
             second = 2.0 * moved
         curvature = np.zeros((len(logs),) * 2)
         curvature[np.ix_(places, places)] = second
-        lean = (np.diff(logs[_FLANGES:])[::2] - np.log(RATIO_PRIOR.ratio)) / RATIO_PRIOR.log_sigma
-        by_logs = np.kron(np.eye(self.flanges), [-1.0, 1.0]) / RATIO_PRIOR.log_sigma
-        slope[_FLANGES:] += lean @ by_logs
-        curvature[_FLANGES:, _FLANGES:] += by_logs.T @ by_logs
-        value = 0.5 * (self.rows * 2.0 * logs[_NOISE] + determinants + squared + lean @ lean)
-        return Likely(float(value), slope, curvature)
+        value = 0.5 * (self.rows * 2.0 * logs[_NOISE] + determinants + squared)
+        ratios = ratio_prior(range(self.flanges), _FLANGES)
+        return ratios.beside(Likely(float(value), slope, curvature), logs)
 
     def _expected(
         self,

@@ -121,7 +121,7 @@ def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solutio
         tree=problem.tree.with_twin(move.frame, move.twin),
         observations=problem.observations.renamed(move.frame, move.twin, rows),
     )
-    there = dict(zip(problem.unknown, fit.state.edges, strict=True))
+    there = problem.frames(fit.state)
     there[move.twin] = there[move.frame] @ move.change
     edges = np.array([there[name] for name in wider.unknown])
     return wider, replace(fit, state=State(edges, fit.state.values))
@@ -129,8 +129,18 @@ def moved(problem: Problem, fit: Solution, move: Move) -> tuple[Problem, Solutio
 
 def explained_by_noise(problem: Problem, fit: Solution, among: int) -> Mask:
     """(n,) whether noise explains observations as the unknowns are, out of so many in all."""
-    limit = _MARGIN**2 * float(chi2_limit(_FALSE_ALARM / among, 6))
-    return np.asarray(by_noise_alone(problem, fit) < limit)
+    return np.asarray(by_noise_alone(problem, fit) < _noise_limit(among))
+
+
+def _noise_limit(among: int) -> float:
+    """The largest squared distance that noise explains, out of so many observations."""
+    return _MARGIN**2 * float(chi2_limit(_FALSE_ALARM / among, 6))
+
+
+def _weighted_mean(twists: FloatArray, weights: FloatArray) -> FloatArray:
+    """(6,) the mean of (n, 6) twists, each by its own (n, 6, 6) information."""
+    pulls = np.einsum("nij,nj->i", weights, twists)
+    return np.asarray(np.linalg.solve(weights.sum(axis=0), pulls))
 
 
 def better_stop(problem: Problem, fit: Solution, move: Move) -> int:
@@ -336,7 +346,7 @@ def _best_steps(
     apart = log(invert(asked[some])[:, None] @ asked[None])
     both = covariance[some][:, None] + covariance[None]
     squares = np.einsum("abi,abi->ab", apart, np.linalg.solve(both, apart[..., None])[..., 0])
-    alike = squares < _MARGIN**2 * chi2_limit(_FALSE_ALARM / len(problem), 6)
+    alike = squares < _noise_limit(len(problem))
     gains = np.cumsum((alike.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
     # Of stops that explain as much the last: between them nothing speaks for either.
     first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)[::-1]
@@ -349,10 +359,9 @@ def _best_steps(
         after = alike[at] & (stops >= stops[begin])
         gain = int(gains[at, begin]) if left[at] else 0
         if gain >= _FEWEST and _is_enough(after, explained, stops, begin):
-            # The mean of all that ask for this step, each with its own information.
-            weights = np.linalg.inv(covariance[after])
-            pulls = np.einsum("nij,nj->i", weights, apart[at, after])
-            mean = np.linalg.solve(weights.sum(axis=0), pulls)
+            # By all that ask for this step.
+            weights = np.asarray(np.linalg.inv(covariance[after]), dtype=float)
+            mean = _weighted_mean(apart[at, after], weights)
             change = asked[some[at]] @ exp(mean)
             found.append(_MoveCandidate(gain, frame, int(stops[begin]), change))
         left &= ~alike[at][some]
@@ -397,13 +406,12 @@ def common_change(
         return None
     asked, covariance = part.change_of(frame, fit.state), _asked_spread(part, fit, frame)
     middle = mean_transform(asked)
-    apart, weights = log(invert(middle) @ asked), np.linalg.inv(covariance)
-    pulls = np.einsum("nij,nj->i", weights, apart)
-    mean = np.linalg.solve(weights.sum(axis=0), pulls)
+    apart = log(invert(middle) @ asked)
+    weights = np.asarray(np.linalg.inv(covariance), dtype=float)
+    mean = _weighted_mean(apart, weights)
     left = apart - mean
     squares = np.einsum("ni,nij,nj->n", left, weights, left)
-    limit = _MARGIN**2 * float(chi2_limit(_FALSE_ALARM / len(problem), 6))
-    return middle @ exp(mean), squares < limit
+    return middle @ exp(mean), squares < _noise_limit(len(problem))
 
 
 def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mask] | None:

@@ -14,9 +14,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from visioncal.core.quantiles import f_limit
+from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.placing import LEAST_NOISE_M
-from visioncal.estimation.procrustes import align, apply, procrustes_residual
+from visioncal.estimation.procrustes import align, procrustes_residual
 
 # So many orders are all tried: seven points of seven.
 _EXHAUSTIVE = 5040

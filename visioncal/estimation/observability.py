@@ -414,7 +414,7 @@ def _main_axis(turns: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(turns, full_matrices=False)[2][0])
 
 
-def _lone_axis(turns: FloatArray) -> tuple[FloatArray, float, bool]:
+def turn_axis(turns: FloatArray) -> tuple[FloatArray, float, bool]:
     """The main axis of turns, how far they turn beside it [deg], and whether that is little."""
     main = _main_axis(turns)
     aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
@@ -429,7 +429,7 @@ def open_offset(robot: FloatArray, thing: str, frame: str) -> str:
         thing: What hangs by it.
         frame: In which frame the robot's part turns, in words.
     """
-    main, _, is_lone = _lone_axis(_turns(robot))
+    main, _, is_lone = turn_axis(_turns(robot))
     return _words(thing, frame, main, is_rotation=False) if is_lone else ""
 
 
@@ -453,7 +453,7 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
             f"the {stops} differ in position only (largest rotation between two of "
             f"them: {figure(largest)} deg)"
         )
-    main, aside, is_lone = _lone_axis(turns)
+    main, aside, is_lone = turn_axis(turns)
     if is_lone:
         return (
             f"all {stops} turn about {frame}'s {axis_words(main)} to "
@@ -466,7 +466,7 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
 def turns_about_two_axes(robot: FloatArray) -> bool:
     """Whether a robot's part of a chain (m, 4, 4), m of two or more, turns about two axes."""
     turns = _turns(robot)
-    return bool(np.linalg.norm(turns, axis=1).max() >= _STILL_RAD) and not _lone_axis(turns)[2]
+    return bool(np.linalg.norm(turns, axis=1).max() >= _STILL_RAD) and not turn_axis(turns)[2]
 
 
 def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, str]:

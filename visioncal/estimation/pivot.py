@@ -19,7 +19,13 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.linalg import covariance_from, spectrum
-from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
+from visioncal.estimation.observability import (
+    SIGMA_LIMIT_M,
+    SIGMA_LIMIT_RAD,
+    Direction,
+    axis_words,
+    turn_axis,
+)
 from visioncal.estimation.parts import Noise
 from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, counted_noise_m
 from visioncal.estimation.readings import readings_that_close
@@ -370,9 +376,8 @@ def _motion(used: Touches) -> str:
             f"the {count} used touches are all from one orientation of the flange (largest "
             f"rotation between two of them: {figure(largest)} deg)"
         )
-    main = np.linalg.svd(turns, full_matrices=False)[2][0]
-    aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
-    if aside < 0.1 * largest:
+    main, aside, is_lone = turn_axis(turns)
+    if is_lone:
         return (
             f"all {count} used touches turn about the flange's {axis_words(main)} to within "
             f"{figure(max(aside, 0.01))} deg"

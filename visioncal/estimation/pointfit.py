@@ -17,7 +17,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import f_limit, t_chance
-from visioncal.core.transforms import exp, skew
+from visioncal.core.transforms import apply, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
 from visioncal.estimation.groups import GroupFit, Groups, fit_groups
@@ -33,7 +33,6 @@ from visioncal.estimation.placing import (
 )
 from visioncal.estimation.procrustes import (
     align,
-    apply,
     mirrored,
     procrustes_residual,
     scale_between,

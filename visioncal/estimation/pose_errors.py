@@ -31,7 +31,7 @@ from visioncal.estimation.linalg import covariance_among, covariance_root
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, normal_equations, robot_likelihood
-from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA
+from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Likely
 
 # Postures are as far apart by so much of a place as by a radian of a direction [m].
 _REACH_M = 0.5
@@ -335,13 +335,10 @@ class _StopBlock:
 
 
 @dataclass(frozen=True, eq=False)
-class _LikelihoodAt:
-    """The negative log-likelihood at logarithms of sizes, its slope and average information."""
+class _LikelihoodAt(Likely):
+    """The likelihood at some logarithms of sizes; its curvature is average information."""
 
     logs: FloatArray
-    value: float
-    slope: FloatArray
-    curvature: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,12 +466,5 @@ class _Likelihood:
             average += grown @ inverse @ grown.T
             taken += by_root.T @ grown.T
         curvature = 0.5 * (average - taken.T @ taken)
-        lean = np.zeros(count)
-        lean[:2] = np.array([-1.0, 1.0]) / RATIO_PRIOR.log_sigma
-        offset = float(lean @ logs - np.log(RATIO_PRIOR.ratio) / RATIO_PRIOR.log_sigma)
-        return _LikelihoodAt(
-            logs,
-            0.5 * (value + offset**2),
-            slope + offset * lean,
-            curvature + np.outer(lean, lean),
-        )
+        found = RATIO_PRIOR.beside(Likely(0.5 * value, slope, curvature), logs)
+        return _LikelihoodAt(found.value, found.slope, found.curvature, logs)

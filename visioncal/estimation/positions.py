@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.transforms import exp, invert, skew
+from visioncal.core.transforms import apply, exp, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import damped_step
@@ -136,7 +136,7 @@ def fit_mounting(places: Places, start: Mounting | None, count: int) -> Mounting
 def residuals(places: Places, at: Mounting) -> FloatArray:
     """From the predicted to the read places (m, 3), in the flange's frame [m]."""
     x = at.base_from_instrument
-    in_base = places.read @ x[:3, :3].T + x[:3, 3]
+    in_base = apply(x, places.read)
     flange_from_base = invert(places.base_from_flange)
     turned = np.einsum("mij,mj->mi", flange_from_base[:, :3, :3], in_base)
     return np.asarray(turned + flange_from_base[:, :3, 3] - at.on_flange[places.points])

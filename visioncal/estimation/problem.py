@@ -259,6 +259,10 @@ class Problem:
         """How many columns p there are."""
         return 6 * len(self.unknown) + sum(map(len, self.effects))
 
+    def frames(self, state: State) -> dict[str, FloatArray]:
+        """Where the unknown frames are: (4, 4) `parent_from_frame` by the frame."""
+        return dict(zip(self.unknown, state.edges, strict=True))
+
     def start(self, frames: Mapping[str, FloatArray]) -> State:
         """The unknowns where frames are, and where effects were linearised."""
         return State(np.stack([frames[name] for name in self.unknown]), self.start_values)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from visioncal.core.transforms import compose, nearest_rotation
+from visioncal.core.transforms import apply, compose, nearest_rotation
 from visioncal.core.types import FloatArray
 
 # One reflection: with a rotation behind it, it is any other.
@@ -26,12 +26,6 @@ def align(measured: FloatArray, nominal: FloatArray) -> FloatArray:
     spread_a, spread_b = measured - centre_a[..., None, :], nominal - centre_b[..., None, :]
     rotation = nearest_rotation(np.swapaxes(spread_a, -1, -2) @ spread_b)
     return compose(rotation, centre_a - (rotation @ centre_b[..., None])[..., 0])
-
-
-def apply(matrices: FloatArray, points: FloatArray) -> FloatArray:
-    """Carries (..., n, 3) points through (..., 4, 4) transforms."""
-    turned = points @ np.swapaxes(matrices[..., :3, :3], -1, -2)
-    return np.asarray(turned + matrices[..., None, :3, 3])
 
 
 def procrustes_residual(measured: FloatArray, nominal: FloatArray) -> FloatArray:

@@ -1,6 +1,6 @@
 """Solving a problem: Levenberg-Marquardt on all unknowns, and the noise's levels by REML."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Self
@@ -45,6 +45,14 @@ _STEPS = 30
 _LEVELS_SETTLED = 1e-3
 # Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
 RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
+
+
+def ratio_prior(robots: Iterable[int], first: int = 0) -> RatioPrior:
+    """What is known of both levels of some robots, the first one's levels standing at a place."""
+    places = tuple((first + 2 * robot, first + 2 * robot + 1) for robot in robots)
+    return replace(RATIO_PRIOR, places=places)
+
+
 # Robots' noise levels are started from above: at least here [rad and m].
 _START_SIGMA = 5e-4
 # Where they are sought again, it is never from nothing, which no residuals would lift them from.
@@ -507,7 +515,7 @@ class RobotLikelihood:
             self.components,
             self.known,
             start.ravel(),
-            self._ratios,
+            ratio_prior(np.flatnonzero(self.seen).tolist()),
             free,
             least,
             settled,
@@ -637,11 +645,6 @@ class RobotLikelihood:
             determinants = float(np.log(grown).sum() - 2.0 * np.linalg.slogdet(root)[1])
             found[at] = 0.5 * (squares + determinants)
         return found
-
-    @property
-    def _ratios(self) -> RatioPrior:
-        seen = np.flatnonzero(self.seen).tolist()
-        return replace(RATIO_PRIOR, places=tuple((2 * index, 2 * index + 1) for index in seen))
 
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:

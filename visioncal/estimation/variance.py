@@ -97,6 +97,18 @@ class RatioPrior:
     log_sigma: float
     places: tuple[tuple[int, int], ...] = ((0, 1),)
 
+    def beside(self, found: "Likely", logs: FloatArray) -> "Likely":
+        """The likelihood at some logarithms of all sigmas, with what is known of their ratios."""
+        lean = np.zeros((len(self.places), len(logs)))
+        for row, (first, second) in zip(lean, self.places, strict=True):
+            row[first], row[second] = -1.0 / self.log_sigma, 1.0 / self.log_sigma
+        offset = lean @ logs - np.log(self.ratio) / self.log_sigma
+        return Likely(
+            found.value + 0.5 * float(offset @ offset),
+            found.slope + offset @ lean,
+            found.curvature + lean.T @ lean,
+        )
+
 
 def estimate_sigmas(
     residuals: FloatArray,
@@ -380,14 +392,6 @@ class Weighed:
         )
 
 
-def _leaning(prior: RatioPrior, logs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How a prior's pairs depend on the logarithms (n, k), and how far they are off it (n,)."""
-    lean = np.zeros((len(prior.places), len(logs)))
-    for row, (first, second) in zip(lean, prior.places, strict=True):
-        row[first], row[second] = -1.0 / prior.log_sigma, 1.0 / prior.log_sigma
-    return lean, lean @ logs - np.log(prior.ratio) / prior.log_sigma
-
-
 def likelihood(
     residuals: FloatArray,
     jacobian: FloatArray,
@@ -419,8 +423,5 @@ def likelihood(
     curvature = seen - expected + 2.0 * np.diag(slope)
     if np.linalg.eigvalsh(curvature)[0] <= 0.0:
         curvature = expected
-    if prior is None:
-        return Likely(found.value, slope, curvature)
-    lean, offset = _leaning(prior, logs)
-    value = found.value + 0.5 * float(offset @ offset)
-    return Likely(value, slope + offset @ lean, curvature + lean.T @ lean)
+    likely = Likely(found.value, slope, curvature)
+    return likely if prior is None else prior.beside(likely, logs)

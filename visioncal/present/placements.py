@@ -6,7 +6,7 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
-from visioncal.session import Session
+from visioncal.session import Session, frame_name
 
 
 def target_frames(calibration: Calibration, session: Session | None) -> dict[int, str]:
@@ -17,10 +17,7 @@ def target_frames(calibration: Calibration, session: Session | None) -> dict[int
     if not session.targets:
         # A target, or what an instrument reads in its place.
         return dict.fromkeys((view.number for view in session.views), placed[0])
-    frames = {
-        view.number: f"target_{name}" if (name := session.board_of(view)) else "target"
-        for view in session.views
-    }
+    frames = {view.number: frame_name("target", session.board_of(view)) for view in session.views}
     return {view: frame for view, frame in frames.items() if frame in placed}
 
 

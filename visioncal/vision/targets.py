@@ -20,6 +20,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, did_you_mean, find_described, is_inside, read_toml
+from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray, IntArray, Mask, Target, TargetKind
 
 # An undeclared square is known as well as office printers keep their scale: to 0.1 %.
@@ -676,7 +677,7 @@ def rotations(target: Target) -> tuple[IntArray, ...]:
     positions = corner_positions(target)
     permutations = []
     for turn in rotation_transforms(target):
-        turned = positions @ turn[:3, :3].T + turn[:3, 3]
+        turned = apply(turn, positions)
         distance = np.linalg.norm(turned[:, None] - positions[None], axis=-1)
         permutations.append(np.asarray(distance.argmin(axis=1), dtype=np.int64))
     return tuple(permutations)

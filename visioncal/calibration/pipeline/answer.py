@@ -358,8 +358,8 @@ def held_views(solved: Solved, looked: Observed) -> dict[int, ViewResult]:
     rms_px = solved.pixels(held.rows, held.views, problem.predicted(state), state)
     figures = np.stack([1e3 * away_m, np.rad2deg(away_rad), rms_px], axis=1)
     found = {}
-    for row, seen, each in zip(held.rows, held.views, figures.tolist(), strict=True):
-        mm, deg, px = (value if np.isfinite(value) else None for value in each)
+    for row, seen, each in zip(held.rows, held.views, figures, strict=True):
+        mm, deg, px = _known(each)
         stop = solved.cell.stops[row.station]
         count = None if seen.corners is None else len(seen.corners.ids)
         found[row.view] = ViewResult(

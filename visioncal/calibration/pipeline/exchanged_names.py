@@ -5,7 +5,7 @@ from itertools import combinations
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.starting import agreeing_views
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.calibration.stages.pnp import given_poses
 from visioncal.core.errors import VisioncalError
@@ -96,7 +96,7 @@ def _looked(known: RunState, kind: Kind, pair: tuple[str, str]) -> RunState | No
             )
     state = RunState(session, None, known.threads, level=known.level)
     try:
-        for stage in STAGES[: [stage.name for stage in STAGES].index("joints")]:
+        for stage in stages_before("joints"):
             is_known = stage.name == "detect" and is_kept
             state = replace(state, cameras=looks) if is_known else stage.run(state)
     except VisioncalError:

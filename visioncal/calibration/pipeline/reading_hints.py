@@ -20,7 +20,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
     seen_ways,
 )
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cameras import COUNTED_BACKWARDS
 from visioncal.calibration.stages.doubts import is_scattered
 from visioncal.calibration.stages.joints import match_joints
@@ -319,7 +319,7 @@ def _readings_in_cell(known: RunState) -> Iterator[Finding]:
             looked.add(pair.camera)
             try:
                 part = RunState(session.of(pair.camera, robot, pair.target), None, known.threads)
-                for stage in STAGES[: [stage.name for stage in STAGES].index("joints") + 1]:
+                for stage in stages_before("solve"):
                     part = stage.run(part)
             except VisioncalError:
                 # There is too little to see.

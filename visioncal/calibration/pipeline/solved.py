@@ -65,7 +65,7 @@ class Solved:
     @property
     def frames(self) -> dict[str, FloatArray]:
         """Where the unknown frames are."""
-        return dict(zip(self.agreed.problem.unknown, self.agreed.fit.state.edges, strict=True))
+        return self.agreed.problem.frames(self.agreed.fit.state)
 
     def posed(self) -> Self:
         """The same with the robots' poses by their arms."""

@@ -18,6 +18,7 @@ from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
 from visioncal.estimation.parts import Observations, State
 from visioncal.estimation.problem import Problem
+from visioncal.session import frame_name
 
 # Covariance of a pose that was given without one, but for its level [rad^2, m^2].
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
@@ -103,9 +104,8 @@ def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
 
 def targets_of(cell: Cell) -> dict[str, Target]:
     """The printed targets by their frames."""
-    return {
-        f"target_{name}" if name else "target": plate for name, plate in cell.session.plates.items()
-    }
+    plates = cell.session.plates
+    return {frame_name("target", name): plate for name, plate in plates.items()}
 
 
 def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:

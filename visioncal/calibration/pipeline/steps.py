@@ -199,3 +199,8 @@ STAGES: tuple[Stage, ...] = (
     Stage("examine", _examine),
     Stage("judge", _judge),
 )
+
+
+def stages_before(name: str) -> tuple[Stage, ...]:
+    """The steps that come before one."""
+    return STAGES[: [stage.name for stage in STAGES].index(name)]

@@ -1,4 +1,4 @@
-"""Stage 7: where a calibrated arm is better than as stated, and what its joints' functions are."""
+"""Where a calibrated arm is better than as stated, and what its joints' functions are."""
 
 from dataclasses import dataclass
 

@@ -35,12 +35,12 @@ from visioncal.calibration.stages.pairwise import (
     partial_hand_eye,
 )
 from visioncal.calibration.stages.pose_ambiguity import CLEAR_RATIO
-from visioncal.core.transforms import compose, invert, rotation_angle
+from visioncal.core.transforms import apply, compose, invert, rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.positions import Places, find_mounting
-from visioncal.estimation.procrustes import align, apply, spreads
+from visioncal.estimation.procrustes import align, spreads
 
 # A view that is farther off than this says nothing more about which start is right [m].
 _FAR_M = 0.1

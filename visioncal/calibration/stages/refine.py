@@ -1,4 +1,4 @@
-"""Stage 6: what all views share besides the edges: the lens, and the board as it really is."""
+"""Refinement: what all views share besides the edges, the lens and the board as it really is."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

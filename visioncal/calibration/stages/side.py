@@ -79,7 +79,7 @@ class FramesSide:
         ).with_effects([seen.effect(rows), *self.effects, *arms])
 
     def with_errors(self, fitted: ConvergedFit) -> Self:
-        """Looks for errors of the arms; see `joint.Side`."""
+        """Looks for errors of the arms that are not free yet."""
         problem, fit = fitted.problem, fitted.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         arms = {
@@ -91,7 +91,7 @@ class FramesSide:
         return replace(self, arms=arms)
 
     def freed(self, *, freely: bool) -> Self:
-        """Frees errors of the arms; see `joint.Side`."""
+        """Frees all errors of the arms that were found, or those alone that are estimated."""
         return replace(self, freely=freely)
 
     def looks(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import distances
+from visioncal.core.transforms import apply, distances
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
@@ -132,4 +132,4 @@ def predict_corners(
     camera: Camera, cam_from_target: FloatArray, positions: FloatArray
 ) -> FloatArray:
     """Projects a target's (n, 3) corners [m] at a pose, to (n, 2) [px]."""
-    return project(camera, positions @ cam_from_target[:3, :3].T + cam_from_target[:3, 3])
+    return project(camera, apply(cam_from_target, positions))

@@ -220,7 +220,7 @@ def _fitted(known: RunState, solved: Solved) -> _RecordedStart:
     observed = part.observations.observed
     most = max(dict.fromkeys(observed), key=observed.count)
     stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
-    frames = dict(zip(part.unknown, solved.agreed.fit.state.edges, strict=True))
+    frames = part.frames(solved.agreed.fit.state)
     # The arm's own errors are the purpose's business: they are put in again with its priors.
     bare = part.with_effects(
         [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]

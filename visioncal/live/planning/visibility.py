@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.transforms import compose, invert
+from visioncal.core.transforms import apply, compose, invert
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.live.planning.cell import PlanCell, board_size_m
 from visioncal.robot.batch import chain_frames
@@ -184,7 +184,7 @@ class CameraAim:
 
     def shows(self, cam_from_target: FloatArray) -> Mask:
         """Whether the whole print is in the image (k,) of views (k, 4, 4)."""
-        return self.window.holds(_moved(cam_from_target, self.outline))
+        return self.window.holds(apply(cam_from_target, self.outline))
 
     def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
         """In what share of the guesses' draws poses show the whole print.
@@ -211,12 +211,10 @@ class CameraAim:
         in_hand = self.cell.mount == "eye-in-hand"
         flange = invert(base_from_flange) if in_hand else base_from_flange
         # Its corners do for a share, and sides between them are nearly straight.
-        outlines = _moved(self.z[which], self.outline[:_CORNERS])
-        points = _moved(flange, outlines.reshape(-1, 3))
+        outlines = apply(self.z[which], self.outline[:_CORNERS])
+        points = apply(flange, outlines.reshape(-1, 3))
         cam_from_here = invert(self.x[which])
-        return self.window.holds(
-            _moved(cam_from_here, points.reshape(len(flange), *outlines.shape))
-        )
+        return self.window.holds(apply(cam_from_here, points.reshape(len(flange), *outlines.shape)))
 
     def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
         """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
@@ -289,12 +287,6 @@ def _filling_m(cell: PlanCell) -> tuple[float, float]:
         if half * d > radius + _SURELY * np.sqrt(2.0 * cell.sigma_m**2 + turned**2):
             return _NEAREST * full, max(farthest, 1.15 * float(d))
     return _NEAREST * full, _NEVER_BEYOND * full
-
-
-def _moved(a_from_b: FloatArray, points: FloatArray) -> FloatArray:
-    """Moves (..., p, 3) points by (..., 4, 4) transforms."""
-    turned = points @ np.swapaxes(a_from_b[..., :3, :3], -1, -2)
-    return np.asarray(turned + a_from_b[..., None, :3, 3])
 
 
 def _outline(target: Target) -> FloatArray:

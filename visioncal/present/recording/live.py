@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import rerun as rr
 
+from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Image, Mount, Target
 from visioncal.present.coverage import corners_chart
 from visioncal.present.recording import board, colours, paths
@@ -143,4 +144,4 @@ class LiveDrawing:
             pose = flange @ np.asarray(cell.x)
         else:
             shapes, pose = [board.closed_outline(cell.target)], flange @ np.asarray(cell.z)
-        return [shape @ pose[:3, :3].T + pose[:3, 3] for shape in shapes]
+        return [apply(pose, shape) for shape in shapes]

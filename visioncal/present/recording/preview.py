@@ -11,7 +11,7 @@ import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.core.files import written_beside
-from visioncal.core.transforms import invert
+from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.dynamics.motion import JointMotion
 from visioncal.present.coverage import corners_chart, directions_chart, rotation_axes_chart
@@ -142,7 +142,7 @@ def _charts(preview: Preview) -> Charts:
 
 
 def _corners_px(preview: Preview, cam_from_target: FloatArray) -> FloatArray:
-    points = corner_positions(preview.target) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    points = apply(cam_from_target, corner_positions(preview.target))
     return project(preview.camera, points)
 
 
@@ -244,7 +244,7 @@ def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: Fl
     outline = board.closed_outline(preview.target)
     shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
     sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
-    seen = sides @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
+    seen = apply(cam_from_target, sides)
     # Rerun counts from the image's corner, not from the first pixel's centre.
     rim = rr.LineStrips2D([project(preview.camera, seen) + 0.5], colors=colours.DETECTED)
     stream.log(f"{paths.IMAGE}/board", frame, rim)

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import rerun as rr
 
+from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Target
 from visioncal.present import parts
 from visioncal.present.cellmap import pairs, places, sigma_words, spans
@@ -297,7 +298,7 @@ class SceneDrawing:
             )
             stream.log(f"{stops}/{name}", frame, points, static=True)
             shapes = self._shapes_on(flange)
-            strips = [shape @ pose[:3, :3].T + pose[:3, 3] for pose in poses for shape in shapes]
+            strips = [apply(pose, shape) for pose in poses for shape in shapes]
             if strips:
                 lines = rr.LineStrips3D(strips, colors=colour, radii=self._radius(0.3 * _LINE))
                 stream.log(f"{stops}/{name}/carried", frame, lines, static=True)
@@ -314,7 +315,7 @@ class SceneDrawing:
         }
         shapes |= {frame: [board.closed_outline(target)] for frame, target in self._boards.items()}
         return [
-            shape @ matrix[:3, :3].T + matrix[:3, 3]
+            apply(matrix, shape)
             for child in self._carried_by(flange)
             for matrix in [self.frames.matrices[child]]
             for shape in shapes.get(child, ())
