@@ -21,7 +21,7 @@ from visioncal.core.transforms import log
 from visioncal.core.types import Target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
-from visioncal.present.advice import listed, suspects
+from visioncal.present.advice import suspects, view_list
 from visioncal.present.placements import placement
 from visioncal.present.recording import write_recording
 from visioncal.present.recording.notes import view_markdown
@@ -231,7 +231,7 @@ def test_real_contradictions_are_recognised(tmp_path: Path) -> None:
     ],
 )
 def test_views_in_a_sentence(views: list[int], words: str) -> None:
-    assert listed(views) == words
+    assert view_list(views) == words
 
 
 def test_views_that_share_a_reason_share_a_row(sample: Sample) -> None:

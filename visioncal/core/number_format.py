@@ -1,7 +1,7 @@
-"""How figures are written: in sentences, and in tables beside what is uncertain of them."""
+"""How figures and lists are written: in sentences, and in tables beside their uncertainty."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 # Nobody acts on less, in millimetres, degrees or pixels: in sentences, and in tables.
 _LEAST, _SMALLEST = 1e-3, 1e-4
@@ -72,6 +72,12 @@ def significant(value: float | None, digits: int = 2) -> str:
         return f"<{_SMALLEST}"
     exponent = int(f"{value:.{digits - 1}e}".partition("e")[2])
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Writes words one after the other: `a, b and c`."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def ranges(numbers: Iterable[int]) -> str:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.core.number_format import listed
 from visioncal.core.types import FloatArray
 from visioncal.estimation.identifiability import LEAST_SHARE, Jacobians, right_vectors
 from visioncal.estimation.parameters import Parameter
@@ -142,12 +143,6 @@ def _thing(parameter: Parameter, robot: Robot) -> str:
 def joint_words(joint: int, robot: Robot) -> str:
     """A joint by its number and its name."""
     return f"joint {joint + 1} ({robot.joint_names[joint]})"
-
-
-def listed(words: Sequence[str]) -> str:
-    """Words one after the other, with an `and` before the last."""
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _listed(named: Sequence[Parameter], robot: Robot) -> str:

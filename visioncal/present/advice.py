@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import significant
+from visioncal.core.number_format import listed, significant
 from visioncal.results import Calibration, ViewResult
 
 # Views whose residual is this many times the median are named, as by the verdict.
@@ -43,7 +43,7 @@ class Suspects:
     def words(self) -> str:
         """Them, with what is wrong: `views 3 and 6 (cam_top of target): blurred`."""
         of = f" ({self.of})" if self.of else ""
-        return f"{listed(self.views)}{of}: {self.why}"
+        return f"{view_list(self.views)}{of}: {self.why}"
 
 
 def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
@@ -122,10 +122,10 @@ def _outlying(views: Sequence[ViewResult]) -> dict[int, str]:
     return {view: f"off by {' and '.join(word)}" for view, word in words.items()}
 
 
-def listed(views: Sequence[int]) -> str:
+def view_list(views: Sequence[int]) -> str:
     """Names views in a sentence: `view 3`, or `views 3, 6 and 9`."""
     if len(views) == 1:
         return f"view {views[0]}"
     if len(views) > _MOST_LISTED:
         return f"{len(views)} views, as {', '.join(map(str, views[:_MOST_LISTED]))}"
-    return f"views {', '.join(map(str, views[:-1]))} and {views[-1]}"
+    return f"views {listed([*map(str, views)])}"

@@ -9,10 +9,9 @@ import numpy as np
 
 from visioncal.core.choices import Convention
 from visioncal.core.codec import Array, Key, Matrix, Section, WrittenForm
-from visioncal.core.number_format import figure, percent
+from visioncal.core.number_format import figure, listed, percent
 from visioncal.core.types import FloatArray
 from visioncal.estimation.bending import Factor
-from visioncal.estimation.null_space import listed
 from visioncal.results.edge import Covariance
 from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Kind, ThermalModel

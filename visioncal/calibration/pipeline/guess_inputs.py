@@ -58,7 +58,7 @@ def guess_seen(seen: RunState, robot: PoseNumbers | None = None) -> Guess:
         DataError: There is nothing to read.
         DegenerateError: Too few views have both poses.
     """
-    seen, matched = replace(seen, poses=seen.poses_of_one_board), seen.reported.matched
+    matched = seen.reported.matched
     # Joints that are misread say nothing about the poses.
     chain = (
         None
@@ -84,8 +84,7 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
         DegenerateError: The lens cannot be estimated.
         ConvergenceError: The intrinsics do not come to rest.
     """
-    seen = seen_by_camera(RunState(session, progress))
-    return camera_numbers(replace(seen, poses=seen.poses_of_one_board))
+    return camera_numbers(seen_by_camera(RunState(session, progress)))
 
 
 def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
@@ -151,6 +150,7 @@ def seen_by_camera(known: RunState) -> RunState:
 
 def seen_ways(seen: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
     """The camera's poses as the declared robot would have them, and then by the images alone."""
+    seen = replace(seen, poses=seen.poses_of_one_board)
     # They differ where an image allows several poses: the wrong robot would choose wrong ones.
     if any(len(pose.cam_from_target) > 1 for pose in seen.poses.values()):
         # Where the declared robot cannot choose, the images alone are left.
@@ -177,10 +177,11 @@ def _chosen(seen: RunState, robot: PoseNumbers) -> RunState:
 
 
 def camera_numbers(seen: RunState) -> PoseNumbers:
-    """The target's poses, of each view the best by its image, or as the session gives them."""
+    """The poses of one board, of each view the best by its image, or as the session gives them."""
+    shown_in = seen.poses_of_one_board
     if not seen.corners:
         numbers = numbers_in(seen.session, MEASURED_CAM_POSE)
-        shown = np.array([view.number in seen.poses for view in seen.session.views])
+        shown = np.array([view.number in shown_in for view in seen.session.views])
         return replace(
             numbers,
             positions=np.where(shown[:, None], numbers.positions, np.nan),
@@ -188,8 +189,8 @@ def camera_numbers(seen: RunState) -> PoseNumbers:
         )
     poses = np.full((len(seen.session.views), 4, 4), np.nan)
     for at, view in enumerate(seen.session.views):
-        if view.number in seen.poses:
-            poses[at] = seen.poses[view.number].cam_from_target[0]
+        if view.number in shown_in:
+            poses[at] = shown_in[view.number].cam_from_target[0]
     return PoseNumbers.of_poses(poses, places_of(seen.session))
 
 

@@ -132,7 +132,7 @@ def _corners_are_mirrored(seen: RunState) -> bool:
     if any(board.kind == "points" for board in session.boards.values()):
         # Its z may point either way.
         return False
-    poses = camera_numbers(replace(seen, poses=seen.poses_of_one_board)).poses()
+    poses = camera_numbers(seen).poses()
     # A board's z points into it.
     into = np.sum(poses[:, :3, 2] * poses[:, :3, 3], axis=1)
     return bool(np.nanmedian(into) < 0.0)
@@ -149,7 +149,6 @@ def session_is_mirrored(session: Session) -> bool:
 
 def _unrecorded(seen: RunState) -> Finding | None:
     """Says that the robot's rotations were not recorded, where the camera sees others."""
-    seen = replace(seen, poses=seen.poses_of_one_board)
     robot, camera = at_times(seen), camera_numbers(seen)
     both = robot.there & camera.there
     if both.sum() < FEWEST_ROWS:
@@ -172,11 +171,7 @@ def _unrecorded(seen: RunState) -> Finding | None:
 
 def _changed_midway(seen: RunState) -> Finding | None:
     """Says that the robot's poses are read otherwise from some view on."""
-    seen = replace(seen, poses=seen.poses_of_one_board)
-    recording = Recording(
-        at_times(seen), camera_numbers(seen), seen.session.mount, is_measured=bool(seen.corners)
-    )
-    found = changed_rows(recording)
+    found = changed_rows(_recording(seen))
     if found is None:
         return None
     numbers = [view.number for view in seen.session.views]
@@ -223,7 +218,6 @@ def _unpaired(seen: RunState) -> Finding | None:
     """Says that rows and images have nothing in common, where shuffled rows fit as well."""
     # By how much robot and camera turn between two views, which is the same whatever the frames
     # between them are.
-    seen = replace(seen, poses=seen.poses_of_one_board)
     robot, camera = at_times(seen), camera_numbers(seen)
     both = robot.there & camera.there
     if both.sum() < _FEWEST_SHUFFLED:
@@ -267,8 +261,7 @@ def _poses_beside_joints(seen: RunState, declared: Candidate) -> Finding | None:
         # closes and the other does not by rounding alone.
         return None
     robot = PoseNumbers.of_poses(chain, places_of(session))
-    one_board = replace(seen, poses=seen.poses_of_one_board)
-    for camera in seen_ways(one_board, robot):
+    for camera in seen_ways(seen, robot):
         by_joints = guess_reading(
             robot, camera, session.mount, is_measured=bool(seen.corners)
         ).declared
@@ -371,12 +364,14 @@ def _closes_as_declared(seen: RunState) -> bool:
     Args:
         seen: What is known once the camera's poses are.
     """
-    seen = replace(seen, poses=seen.poses_of_one_board)
-    robot = at_times(seen)
-    recording = Recording(
-        robot, camera_numbers(seen), seen.session.mount, is_measured=bool(seen.corners)
+    return closes(_recording(seen))
+
+
+def _recording(seen: RunState) -> Recording:
+    """The robot's poses, and the camera's, before anything is chosen by how they agree."""
+    return Recording(
+        at_times(seen), camera_numbers(seen), seen.session.mount, is_measured=bool(seen.corners)
     )
-    return closes(recording)
 
 
 def is_suspect(known: RunState) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration.guess.joints import JointReading
 from visioncal.core.choices import Convention
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, listed
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
@@ -24,7 +24,6 @@ from visioncal.estimation.null_space import (
     dominant_words,
     imitated,
     joint_words,
-    listed,
     null_of,
     null_words,
 )

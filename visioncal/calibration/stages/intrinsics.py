@@ -9,6 +9,7 @@ import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import TILTED
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
+from visioncal.core.number_format import listed
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import EMPTY_IMAGE, Finding, Remedy
@@ -230,12 +231,11 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
         yield from causes
     empty = _unvisited(stack, fit.camera.resolution)
     if empty:
-        places = " and ".join(filter(None, [", ".join(empty[:-1]), empty[-1]]))
         yield Finding(
             EMPTY_IMAGE,
-            f"No corner was ever seen in the {places} of the image, so the lens is extrapolated "
-            "there.",
-            Remedy(f"In some views, move the target into the {places} of the image."),
+            f"No corner was ever seen in the {listed(empty)} of the image, so the lens is "
+            "extrapolated there.",
+            Remedy(f"In some views, move the target into the {listed(empty)} of the image."),
             # What is needed is needed where the views looked, or at a declared place.
             until_mm=0.0,
         )

@@ -20,11 +20,11 @@ from visioncal.calibration.verification.change_hypotheses import (
 from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.limits import CheckLimits
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import figure, listed, mm_and_deg
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import AGAIN, AGREEMENT, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
-from visioncal.estimation.null_space import joint_words, listed
+from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 

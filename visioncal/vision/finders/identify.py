@@ -8,6 +8,8 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
+from visioncal.core.files import some_of
+from visioncal.core.number_format import listed
 from visioncal.core.types import Image, Target, TargetKind
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.circles import seen_grids
@@ -251,14 +253,9 @@ def _charuco_notes(lattice: Lattice, names: tuple[str, ...]) -> Iterator[str]:
     if not lattice.rows_certain:
         yield f"The board may go on below row {lattice.rows}: its end there is not in the image."
     if len(names) > 1:
-        yield f"{_listed(names[1:])} hold the same markers: any of them finds this board."
+        yield f"{listed(names[1:])} hold the same markers: any of them finds this board."
     if lattice.rows % 2 and lattice.rows_certain:
         yield "With an odd number of rows the legacy layout is the same as the present one."
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    *first, last = names
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _checkerboards(image: Image) -> list[Identity]:
@@ -367,14 +364,13 @@ def _singles(markers: tuple[Marker, ...]) -> list[Identity]:
     names = holding(largest.family, max(ids) + 1)
     notes = []
     if others:
-        listed = ", ".join(map(str, others[:_LISTED])) + (" ..." if len(others) > _LISTED else "")
         notes.append(
-            f"Also seen: {listed}. A target is one marker, and the largest is taken; where they "
-            "are a board's, show more of it; where they lie freely, describe them by a table of "
-            'their corners (kind = "points").'
+            f"Also seen: {some_of([*map(str, others)], _LISTED)}. A target is one marker, and the "
+            "largest is taken; where they are a board's, show more of it; where they lie freely, "
+            'describe them by a table of their corners (kind = "points").'
         )
     if len(names) > 1:
-        notes.append(f"{_listed(names[1:])} hold the same markers: any of them finds this one.")
+        notes.append(f"{listed(names[1:])} hold the same markers: any of them finds this one.")
     return [
         Identity(
             "marker",
