@@ -58,6 +58,8 @@ def bumped(place):
         ("--camera", "left", "--robot", "b"),
         ("--camera", "left", "--target", "plate_a"),
         ("--camera", "hand", "--target", "floor"),
+        # It sees no other target by way of a robot.
+        ("--camera", "hand"),
     ],
 )
 def test_every_pair_of_the_cell_still_holds(place, names):

@@ -132,6 +132,7 @@ def test_angles_beyond_a_turn_are_not_taken_for_radians(tmp_path, logged, names,
 NAMES = [
     ("fanuc", "X,Y,Z,W,P,R"),
     ("abb", "x,y,z,q1,q2,q3,q4"),
+    ("abb", "x,y,z,qw,qx,qy,qz"),
     ("yaskawa", "x,y,z,Rx,Ry,Rz"),
     ("doosan", "x,y,z,a,b,c"),
     ("kuka", "X,Y,Z,A,B,C"),
@@ -145,6 +146,14 @@ def test_the_names_of_makers_are_known(logged, form, names):
     found = read_foreign(source, requested).robot.poses()
     # One conversion to the maker's form and back, near a singularity of none.
     np.testing.assert_allclose(found, BASE_FROM_FLANGE, atol=1e-12)
+
+
+def test_quoted_decimal_commas_are_pointed_to_another_separator(tmp_path):
+    source = tmp_path / "log.csv"
+    source.write_text('x,y,z,a,b,c\n"958,2","51,0","400,5","90,0","0,0","180,0"\n')
+    with pytest.raises(DataError, match="x holds '958,2'; a number is needed") as caught:
+        read_foreign(source, ImportOptions(robot=PoseImportOptions(form="kuka")))
+    assert "semicolons" in caught.value.next_step
 
 
 @pytest.mark.parametrize("key", ["robot", "nested"])

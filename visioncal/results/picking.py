@@ -6,7 +6,13 @@ from visioncal.core.errors import DataError
 from visioncal.results.result import Calibration
 from visioncal.session import Session
 from visioncal.session.choosing import PARTS, Choice, Part
-from visioncal.session.selecting import check_one_of_each, has_several, is_to_be_parted, select
+from visioncal.session.selecting import (
+    check_one_of_each,
+    chosen_of,
+    has_several,
+    is_to_be_parted,
+    select,
+)
 
 
 def picked(
@@ -30,12 +36,20 @@ def picked(
         DataError: There is no such thing, or several are meant.
     """
     several = is_to_be_parted(session, choice) if parted else has_several(session)
+    by_rows = dict[Part, str]()
     if several:
+        chosen = chosen_of(session, choice, parted=parted)
+        by_rows = {part: chosen.frame_of(part) for part in PARTS}
         session = select(session, choice, parted=parted)
     if calibration.cell is None:
         # The names have served for the session.
         return session, calibration if several else calibration.chosen(choice)
-    named = {part: choice.of(part) for part in needs}
+    # What the session's rows make clear needs no name, if the calibration has it.
+    known = calibration.tree.parents
+    named = {
+        part: choice.of(part) or (frame if (frame := by_rows.get(part)) in known else None)
+        for part in needs
+    }
     return session, calibration.chosen(Choice(**named), needs)
 
 

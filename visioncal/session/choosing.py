@@ -78,6 +78,7 @@ def choose(
     *,
     label: str,
     parted: bool = True,
+    seen: Collection[tuple[str, str]] = (),
 ) -> Chosen:
     """Finds the one camera, robot and target that are meant.
 
@@ -87,6 +88,8 @@ def choose(
         needs: What has to be clear; of the rest, any that fits is taken, or none.
         label: What the cell is called in messages.
         parted: Whether the robot is to move camera and target before each other.
+        seen: Which cameras saw which targets, by frame; where targets are needed, others are meant
+            only where none of these fits.
 
     Raises:
         DataError: There is no such thing, several are meant, or this robot does not part these.
@@ -105,6 +108,9 @@ def choose(
     ]
     if not fitting:
         raise _none_fits(frames, known, named, needs, label)
+    if "target" in needs:
+        observed = [option for option in fitting if (option.camera, option.target) in seen]
+        fitting = observed or fitting
     for part in PARTS:
         meant = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
         if part in needs and len(meant) > 1:

@@ -29,6 +29,25 @@ def has_several(session: "Session") -> bool:
     return any(len(session.declaration.named(kind)) > 1 for kind in KINDS)
 
 
+def chosen_of(
+    session: "Session", choice: Choice, needs: Collection[Part] = PARTS, *, parted: bool = True
+) -> Chosen:
+    """Finds the camera, robot and target that are meant by their names, and by a session's rows.
+
+    Args:
+        session: A session.
+        choice: What is named.
+        needs: What has to be clear.
+        parted: Whether the robot is to move camera and target before each other.
+
+    Raises:
+        DataError: There is no such thing, several are meant, or this robot does not part these.
+    """
+    seen = {(observation.seer, observation.seen) for observation in session.observations}
+    label = f"session {session.name!r}"
+    return choose(session.frames, choice, needs, label=label, parted=parted, seen=seen)
+
+
 def select(
     session: "Session",
     choice: Choice,
@@ -50,8 +69,7 @@ def select(
     """
     if not choice and not has_several(session):
         return session
-    label = f"session {session.name!r}"
-    chosen = choose(session.frames, choice, needs, label=label, parted=parted)
+    chosen = chosen_of(session, choice, needs, parted=parted)
     if not has_several(session):
         return session
     if "camera" not in needs:

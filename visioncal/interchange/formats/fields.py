@@ -1,5 +1,6 @@
 """Rows with named values, before it is known what they mean: tables, JSON, arrays."""
 
+import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
 # Columns of a table without a header, by their number: times, then poses of the robot and the
 # camera, each a position with a quaternion or a matrix by rows.
@@ -108,10 +110,15 @@ class Fields:
             odd = ((place, word) for place, word in cells if word and not is_number(word))
             # JSON has numbers in quotes as well.
             place, text = next(odd, (self.places[0], self.texts[full][0]))
+            step = "Correct the cell, or leave the whole pose of that row empty."
+            if _DECIMAL_COMMA.fullmatch(text):
+                step = (
+                    "Save the table with semicolons or tabs: with these, decimal commas are read."
+                )
             raise DataError(
                 f"{place}: {full} holds {text[:40]!r}; a number is needed.",
                 culprits=[place],
-                next_step="Correct the cell, or leave the whole pose of that row empty.",
+                next_step=step,
             )
         return self.numbers[full].reshape(len(self), -1)
 

@@ -26,6 +26,12 @@ class PoseImportOptions:
     unit: str | None = None
     inverse: bool | None = None
 
+    @property
+    def is_scalar_first(self) -> bool:
+        """Whether the user says that quaternions begin with their scalar part."""
+        maker = POSE_FORMS.get(self.form or "")
+        return (self.form if maker is None else maker.rotation) == "quaternion-wxyz"
+
     def applied_to(self, poses: PoseNumbers) -> PoseNumbers:
         """Reads poses as the user says; what the user does not say stays."""
         return poses.read_as(self.reading(poses.reading))

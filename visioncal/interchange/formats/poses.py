@@ -168,6 +168,10 @@ def poses_from(
     """
     if whose == "robot" and fields.form:
         requested = _with_own_form(fields, requested)
+    if not requested.names and len(names) == 7 and requested.is_scalar_first:
+        # That is said of the columns as they stand, and these were found by their names.
+        written = {name: at for at, name in enumerate(fields.numbers)}
+        names = (*names[:3], *sorted(names[3:], key=lambda name: written.get(name, 0)))
     blocks = [fields.column(name) for name in names]
     sizes = [block.shape[1] for block in blocks]
     places = fields.places
