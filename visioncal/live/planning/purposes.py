@@ -38,7 +38,7 @@ class Purpose:
 
 
 # Where the robot finds what the camera sees is the camera's edge alone; the target's is scaffold.
-_HAND_EYE = Purpose("hand-eye", "sight", "the camera's place on the robot", 12)
+_HAND_EYE = Purpose("hand-eye", "sight", "the camera's pose", 12)
 _OFFSETS = Purpose(
     "offsets",
     "workspace",
