@@ -427,6 +427,10 @@ def test_how_an_image_was_turned_is_by_its_corners(words):
     assert found is None or not is_quarter
     assert turned_how(places, places, (400, 400), 0.1) is None
     assert turned_how(seen + 7.0, places, (400, 400), 0.1) is None
+    # However much the others are off by, corners amid the predicted ones are on none of them.
+    upper = places[places[:, 1] < 130.0]
+    amid = np.array([0.0, 399.0]) + (upper + 12.0) * np.array([1.0, -1.0])
+    assert turned_how(amid, upper, (400, 400), 10.0) is None
 
 
 def mahalanobis_sq_of_place(cell, known):

@@ -196,7 +196,8 @@ def _confirmed(guess: "Guess", *, yes: bool) -> "Candidate":
             "stands out.",
             next_step="Check that the poses and what the camera saw are of the same views and the "
             "same robot, and that positions stand before rotations (where not, name the columns in "
-            "that order: --robot-columns 4,5,6,1,2,3). Without --guess it is written as declared.",
+            "that order: --robot-columns 4,5,6,1,2,3). Without --guess it is written as declared; "
+            "visioncal doctor then looks for what happened midway.",
         )
     if yes:
         return guess.best

@@ -15,6 +15,8 @@ from visioncal.core.types import FloatArray
 _NEAR = 5.0
 # Detectors are no better [px].
 _LEAST_PX = 0.05
+# Corners that lie anywhere amid the predicted ones are 0.4 of their spacing off the nearest.
+_OF_SPACING = 0.15
 
 
 @dataclass(frozen=True)
@@ -67,12 +69,21 @@ def turned_how(
         It; None where the corners are where they are predicted, or nothing brings them there.
     """
     known = predicted_px[np.isfinite(predicted_px).all(axis=1)]
-    limit_px = _NEAR * max(typical_px, _LEAST_PX)
+    limit_px = min(_NEAR * max(typical_px, _LEAST_PX), _OF_SPACING * _spacing_px(known))
     if not len(known) or _away_px(px, known) < limit_px:
         return None
     undone = {**_UNDONE, **(_QUARTERS if size[0] == size[1] else {})}
     how = min(undone, key=lambda index: _away_px(undone[index](px, *size), known))
     return how if _away_px(undone[how](px, *size), known) < limit_px else None
+
+
+def _spacing_px(places: FloatArray) -> float:
+    """How far places are from the nearest other one (median) [px]; infinite of one alone."""
+    if len(places) < 2:
+        return np.inf
+    squares = np.sum((places[:, None] - places) ** 2, axis=2)
+    np.fill_diagonal(squares, np.inf)
+    return float(np.sqrt(np.median(squares.min(axis=1))))
 
 
 def _away_px(px: FloatArray, places: FloatArray) -> float:
