@@ -20,6 +20,9 @@ _FALSE_ALARM = 1e-4
 # An autofocus, or corners that err by where they are, would show as much in some order of the views
 # that is as likely as theirs; so many orders are tried, and so few may show more.
 _ORDERS, _RARELY = 300, 0.01
+# Views that follow each other are alike, and with them what the lens's model leaves: then some part
+# of the session that begins otherwhere differs as much. Up to so many views away it is the same.
+_SAME = 2
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,11 @@ def lens_step(
     others = _tested(products[orders], steps)[0].max(axis=1)
     # Those with the same views before it show the same.
     if np.mean(others > (1.0 + 1e-6) * gain) + 2.0 / comb(count, first) > _RARELY:
+        return None
+    begins = np.unique(np.linspace(0, count - 1, min(count, _ORDERS)).round().astype(int))
+    away = np.abs((begins[:, None] - [0, first] + count // 2) % count - count // 2).min(axis=1)
+    parts = (np.arange(count) + begins[away > _SAME, None]) % count
+    if len(parts) and _tested(products[parts], steps)[0].max() > gain:
         return None
     # The residual is what is predicted less what was seen: a step undoes it.
     zoom, *centre = (-found[0, place]).tolist()

@@ -48,6 +48,8 @@ _RIVAL_GAIN, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 _TAKEN = 1e-6
 # Sizes of boards that are exchanged differ by such shares.
 _SHARES = (1e-3, 1e-2, 1e-1)
+# Beside a step, views on either side of it are as far off as others are, or up to so many times.
+_ALIKE = 3.0
 # Noise is left, however much a step explains.
 _MOST_EXPLAINED = 0.99
 
@@ -616,6 +618,22 @@ def with_step(problem: Problem, fit: Solution, step: Move | Resized) -> tuple[Pr
         values = np.append(fit.state.values, step.share)
         start = replace(fit, state=State(fit.state.edges, values))
     return wider, fit_problem(wider, start.state, start.noise)
+
+
+def leaves_noise(problem: Problem, fit: Solution, step: Move | Resized) -> bool:
+    """Whether what a step leaves of the residuals on either side of it is as large as elsewhere.
+
+    Views at an end of the session that are wrong, each otherwise, gain by a step, and stay wrong.
+
+    Args:
+        problem: The observations.
+        fit: The unknowns and the noise, without the step.
+        step: What is otherwise from some stop on.
+    """
+    wider, there = with_step(problem, fit, step)
+    squares, behind = by_noise_alone(wider, there), problem.observations.stops >= step.stop
+    mine, most = problem.observations.involves(step.frame), _ALIKE**2 * np.median(squares)
+    return all(np.median(squares[mine & side]) < most for side in (behind, ~behind))
 
 
 def evidence_gain(

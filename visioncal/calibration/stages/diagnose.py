@@ -19,6 +19,7 @@ from visioncal.estimation.moves import (
     Resized,
     Slip,
     evidence_gain,
+    leaves_noise,
     log_gain,
     resized_board,
     slight_move,
@@ -129,6 +130,8 @@ def _steps(
     for move in found:
         gain = log_gain(problem, fit, move.mahalanobis_sq) - price if move else -np.inf
         if move is None or gain < least:
+            continue
+        if not isinstance(move, Slip) and not leaves_noise(problem, fit, move):
             continue
         numbers = 6 if isinstance(move, Move) else 1
         likely.append((gain - numbers * each, replace(move, mahalanobis_sq=gain)))
