@@ -48,6 +48,8 @@ _RIVAL_GAIN, _MOST_TRIED, _STEPS_EACH = 0.6, 6, 2
 _TAKEN = 1e-6
 # Sizes of boards that are exchanged differ by such shares.
 _SHARES = (1e-3, 1e-2, 1e-1)
+# Runs of stops that begin or end so many away from a step show the same; so many stops are tried.
+_SAME, _PARTS = 2, 60
 # Beside a step, views on either side of it are as far off as others are, or up to so many times.
 _ALIKE = 3.0
 # Noise is left, however much a step explains.
@@ -762,12 +764,63 @@ def _scored(
         every = information.reshape(*columns.shape, -1)[mine]
         alone = np.take_along_axis(every, columns[mine, None], axis=2)
         across = np.delete(every, np.s_[size : wider.size], axis=2)
-        following = -errors.covariance @ np.swapaxes(across, 1, 2)
-        own = alone + across @ following
         asked = gradient.reshape(columns.shape)[mine]
-        steps = -(covariance_from(own) @ asked[..., None])[..., 0]
-        squares = -np.sum(steps * asked, axis=1)
+        own, following, steps, squares = _score(alone, across, asked, errors.covariance)
         yield _Scored(stop, mine, alone, own, following[:, :size], steps, squares)
+
+
+def _score(
+    alone: FloatArray, across: FloatArray, asked: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Rao's score test of k changes, of c numbers each.
+
+    Args:
+        alone: (k, c, c) information on each, were all else known.
+        across: (k, c, p) that which it has in common with the p unknowns of the fit.
+        asked: (k, c) the gradients.
+        covariance: (p, p) of these unknowns.
+
+    Returns:
+        (k, c, c) information beside all else, (k, p, c) how the unknowns would move with each,
+        (k, c) the likeliest ones, and (k,) the evidence for them.
+    """
+    following = -covariance @ np.swapaxes(across, 1, 2)
+    own = alone + across @ following
+    steps = -(covariance_from(own) @ asked[..., None])[..., 0]
+    return own, following, steps, -np.sum(steps * asked, axis=1)
+
+
+def differs_elsewhere(problem: Problem, fit: Solution, move: Move) -> bool:
+    """Whether some other run of stops differs from the rest by more than what follows a move.
+
+    Stops that follow each other have postures that are alike, and an arm's errors follow these:
+    then one part of a programme differs from the rest as much as another.
+
+    Args:
+        problem: The observations.
+        fit: The unknowns and the noise, without the move.
+        move: The step that noise does not explain.
+    """
+    errors, columns = RepeatErrors.of(problem, fit), np.r_[problem.edge_columns(move.frame)]
+    sums = {stop: both for stop, *both in equations_from(problem, fit, errors, columns)}
+    stops = np.unique(problem.observations.stops[problem.observations.involves(move.frame)])
+    begins = np.unique(np.linspace(0, len(stops) - 1, min(len(stops), _PARTS)).astype(int))
+    at = int(np.searchsorted(stops, move.stop))
+    first, behind = np.triu_indices(len(begins), 1)
+    begun, ended = begins[first], begins[behind]
+    away = np.minimum(
+        np.maximum(begun, np.abs(ended - at)),
+        np.maximum(np.abs(begun - at), len(stops) - ended),
+    )
+    apart = (away > _SAME) & (ended - begun >= _FEWEST)
+    every, gradients = (
+        np.array([sums[stop][k] for stop in stops[begins].tolist()]) for k in (0, 1)
+    )
+    # What follows the move comes first.
+    across = np.stack([sums[move.stop][0], *(every[first] - every[behind])[apart]])
+    asked = np.stack([sums[move.stop][1], *(gradients[first] - gradients[behind])[apart]])
+    *_, squares = _score(across[:, :, columns], across, asked, errors.covariance)
+    return bool((squares[1:] > squares[0]).any())
 
 
 def _residual_freedom(problem: Problem, fit: Solution) -> float:

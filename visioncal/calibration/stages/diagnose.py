@@ -18,6 +18,7 @@ from visioncal.estimation.moves import (
     Move,
     Resized,
     Slip,
+    differs_elsewhere,
     evidence_gain,
     leaves_noise,
     log_gain,
@@ -152,6 +153,8 @@ def _beside_errors(
         if isinstance(step, Slip):
             if step.mahalanobis_sq >= arm.gain:
                 yield step
+            continue
+        if isinstance(step, Move) and differs_elsewhere(problem, fit, step):
             continue
         gain, apart, there = evidence_gain(problem, fit, step)
         errors = find_pose_errors(apart, there.state, there.noise, robot)
