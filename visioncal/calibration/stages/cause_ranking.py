@@ -386,10 +386,7 @@ _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
     "board": (
         "unmeasured_board",
         "the board, whose size is not known better",
-        Remedy(
-            "Measure the board over many squares, and state square_m and square_sigma_m in its "
-            ".toml."
-        ),
+        MEASURE_BOARD,
     ),
     "look": (
         "robot_noise",

@@ -311,7 +311,7 @@ def _measured(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScale:
     return measured_scale(side, tried, board) if less.any() else found
 
 
-def chosen(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+def chosen(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
     """Sets free what the data speak for.
 
     The boards' bends, given intrinsics together with them, and the boards' scales are set free
@@ -358,7 +358,7 @@ def _freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
     return again(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
 
 
-def _resized(side: Side, answer: ConvergedFit) -> ConvergedFit:
+def _resized(side: FramesSide, answer: ConvergedFit) -> ConvergedFit:
     """Sets the boards' scales free where the robot measures others than are stated."""
     # One after the other: a board that is off misleads about the others, too.
     for _ in answer.looks.printed:
@@ -370,22 +370,43 @@ def _resized(side: Side, answer: ConvergedFit) -> ConvergedFit:
         if other.contradicts:
             looks = looks.without_prior(place.tolist())
         resized = again(answer, side, np.union1d(answer.moving, place), looks)
-        if not _is_determined(resized, answer):
+        if not _is_determined(resized, answer) or not _is_clear(side, resized, other):
             return answer
         answer = resized
     return answer
 
 
-def _wrongly_sized(side: Side, answer: ConvergedFit) -> MeasuredScale | None:
+def _wrongly_sized(side: FramesSide, answer: ConvergedFit) -> MeasuredScale | None:
     """The board whose size is held and farthest from what the robot measures, if any is beyond."""
     looks = answer.looks
     held = [index for index in looks.printed if looks.scale_of(index)[0] not in answer.moving]
     measured = [_measured(side, answer, board) for board in held]
-    # An arm whose links may all be too long is hard to distinguish from a board that is too large.
-    other = [
-        scale for scale in measured if (scale.contradicts if side.has_errors else scale.is_another)
-    ]
+    other = [scale for scale in measured if _is_wrong(side, scale)]
     return max(other, key=lambda value: abs(value.scale) / value.sigma, default=None)
+
+
+def _is_wrong(side: FramesSide, scale: MeasuredScale) -> bool:
+    # An arm whose links may all be too long is hard to distinguish from a board that is too large.
+    return scale.contradicts if side.has_errors else scale.is_another
+
+
+def _is_clear(side: FramesSide, resized: ConvergedFit, other: MeasuredScale) -> bool:
+    """Whether a board is still of another size beside errors of arms without joint angles.
+
+    Such errors follow the posture and pass for a size, whose sigma by white noise is a small part
+    of what it is.
+    """
+    looks = resized.looks
+    (place,) = looks.scale_of(other.board)
+    at = resized.columns.start + int(np.searchsorted(resized.seen.free, place))
+    # What was stated is taken away again.
+    known = looks.prior_sigma[place] ** -2.0
+    measured = 1.0 / side.covariance_by_posture(resized)[at, at] - known
+    if measured <= 0.0:
+        return False
+    scale, sigma = looks.values[place] * (1.0 + known / measured), measured**-0.5
+    beside = replace(other, scale=float(scale), sigma=max(float(sigma), other.sigma))
+    return _is_wrong(side, beside)
 
 
 def _is_determined(wider: ConvergedFit, fitted: ConvergedFit) -> bool:

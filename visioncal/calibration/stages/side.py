@@ -8,14 +8,15 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm, effects_of
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.core.types import Corners, IntArray, Mask
-from visioncal.estimation.arm import ArmErrors
+from visioncal.core.types import Corners, FloatArray, IntArray, Mask
+from visioncal.estimation.arm import ArmErrors, misfit_covariance
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import ConvergedFit
-from visioncal.estimation.parts import Effect, Noise
+from visioncal.estimation.parts import Effect, Noise, State
+from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
-from visioncal.estimation.solve import robot_likelihood
+from visioncal.estimation.solve import fit_problem, fitted_covariance, robot_likelihood
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +90,25 @@ class FramesSide:
             for name, arm in self.arms.items()
         }
         return replace(self, arms=arms)
+
+    def covariance_by_posture(self, fitted: ConvergedFit) -> FloatArray:
+        """(p, p) a fit's covariance, errors of arms without joint angles being what they may be.
+
+        These are taken for noise, and weighed by `find_pose_errors`.
+        """
+        alone = {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
+        problem = fitted.problem
+        for arm in alone.values():
+            problem = arm.without_errors(problem)
+        values, free = problem.start_values.copy(), len(fitted.seen.free)
+        values[:free] = fitted.fit.state.values[:free]
+        fit = fit_problem(problem, State(fitted.fit.state.edges, values))
+        found = fitted_covariance(problem, fit.state, fit.noise)
+        for robot in alone:
+            errors = find_pose_errors(problem, fit.state, fit.noise, robot)
+            if errors is not None:
+                found += misfit_covariance(problem, fit.state, fit.noise, robot, errors)
+        return found
 
     def freed(self, *, freely: bool) -> Self:
         """Frees all errors of the arms that were found, or those alone that are estimated."""
