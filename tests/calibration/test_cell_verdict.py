@@ -309,7 +309,7 @@ def test_motion_about_one_axis_is_refused_with_what_it_leaves_open():
     ) as caught:
         align(turned(0.0))
     assert caught.value.culprits == ("base_b's offset along base_b's z",)
-    assert "Add 3 or more stops in which flange_b is tilted" in caught.value.next_step
+    assert "add 3 or more stops in which flange_b is tilted" in caught.value.next_step
 
 
 def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
