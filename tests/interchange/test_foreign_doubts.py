@@ -261,6 +261,7 @@ def test_joints_too_large_for_radians_are_taken_for_degrees(tmp_path):
         ("J{}", 6, False),
         ("joint_{}_deg", 5, True),
         ("a{} [deg]", 6, True),
+        ("J{} [°]", 6, True),
         ("joint_positions_degrees", 0, True),
         # They may as well be a quaternion.
         ("q{}", 4, None),
@@ -280,6 +281,15 @@ def test_joints_are_known_by_their_names(tmp_path, name, count, degrees):
         assert found is None
     else:
         np.testing.assert_allclose(found, joints)
+
+
+@pytest.mark.parametrize("unit", ["[deg]", "[°]", "(º)"])
+def test_angles_of_poses_are_in_the_degrees_of_their_header(table, unit):
+    header = ",".join(["X [mm]", "Y [mm]", "Z [mm]", *(f"{name} {unit}" for name in "ABC")])
+    source = table(header, written(POSE_FORMS["kuka"]).tolist())
+    requested = PoseImportOptions(form="kuka")
+    found = read_foreign(source, ImportOptions(mount="eye-in-hand", robot=requested))
+    np.testing.assert_allclose(found.robot.poses(), BASE_FROM_FLANGE, atol=1e-6)
 
 
 def test_a_robots_model_is_checked_before_anything_is_written(tmp_path, logged):

@@ -167,7 +167,9 @@ def _images_of(
             f"{folder} has {len(there)} images ({first} ... {last}), but there are {len(views)} "
             f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
             culprits=[str(folder)],
-            next_step="Remove what is over, or name each row's image with --image-column.",
+            next_step="Name each row's image with --image-column, or remove what is over. Where "
+            "that is not known, remove the last: visioncal doctor then says from where on rows and "
+            "images are shifted.",
         )
     return there, (
         f"Rows and images are paired in order, {labels[0]} with {there[0].name}, {labels[-1]} with "

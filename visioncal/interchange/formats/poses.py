@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.import_options import PoseImportOptions
-from visioncal.interchange.formats.worded import ANGLE_UNITS, without_unit, worded_poses
+from visioncal.interchange.formats.worded import ANGLE_UNITS, DEGREES, without_unit, worded_poses
 from visioncal.session.columns import SELECTORS, joint_columns
 
 # Names under which pose pairs are commonly stored, the most specific first.
@@ -64,7 +64,7 @@ _MOST_TURNS_RAD = 10 * 2 * np.pi
 
 _JOINT_NAME = re.compile(
     r"(?:.*\.)?(joint|axis|j|a|q)[ _]?([1-9])((?:[ _]?(?:pos|position|angle))?(?:[ _]*\W*"
-    r"(?:deg|rad)[a-z]*\W*)?)",
+    r"(?:deg|rad|[°º])[a-z]*\W*)?)",
     re.IGNORECASE,
 )
 _LEAST_JOINTS = 5
@@ -188,7 +188,7 @@ def poses_from(
         )
     units = {without_unit(name)[1] for name in names}
     rotation, notes = _likely_rotation(
-        rotations.shape[1], turned, requested, whose, degrees=bool(units & {"deg", "degrees"})
+        rotations.shape[1], turned, requested, whose, degrees=bool(units & {*DEGREES})
     )
     numbers = PoseNumbers(positions, rotations, Reading(rotation), places)
     lengths = units - {"", *ANGLE_UNITS}
@@ -245,7 +245,7 @@ def joints_from(
         place = fields.places[int(np.argmax(bad))]
         raise DataError(f"{place}: a joint angle is missing or infinite.", culprits=[place])
     ends = [name.rsplit(".", 1)[-1].lower() for name in names]
-    if degrees or all("deg" in end for end in ends):
+    if degrees or all(any(unit in end for unit in DEGREES) for end in ends):
         return np.deg2rad(joints), ()
     if (largest := np.abs(joints).max(initial=0.0)) > _MOST_TURNS_RAD:
         words = f"Joint angles up to {largest:.0f} are no radians"

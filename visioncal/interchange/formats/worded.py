@@ -7,7 +7,9 @@ from collections.abc import Collection, Iterator, Sequence
 from visioncal.core.choices import UNITS_M
 from visioncal.interchange.formats.fields import Fields
 
-ANGLE_UNITS = ("deg", "rad", "degrees", "radians")
+# The sign of degrees is written by an ordinal indicator, too.
+DEGREES = ("deg", "degrees", "°", "º")
+ANGLE_UNITS = (*DEGREES, "rad", "radians")
 # Joints are called q1_rad, and the numbers of quaternions q1.
 _UNIT = re.compile(
     rf"(?!q[0-9])(.*?)[ _]*+(?:[(\[] *({'|'.join([*UNITS_M, *ANGLE_UNITS])}) *[)\]]"
