@@ -25,12 +25,10 @@ RATIONAL = Camera(
 )
 
 
-def estimate(cell, model="brown", coefficients="auto", without=()):
+def estimate(cell, model="brown", without=()):
     corners = {corner.view: corner for corner in cell.corners if corner.view not in without}
     camera = cell.options.camera
-    return estimate_intrinsics(
-        corners, [cell.options.target], camera.resolution, model, coefficients
-    )
+    return estimate_intrinsics(corners, [cell.options.target], camera.resolution, model)
 
 
 def cell_with(camera, seed, **changes):
@@ -38,22 +36,21 @@ def cell_with(camera, seed, **changes):
 
 
 @pytest.mark.parametrize(
-    ("camera", "model", "coefficients"),
-    [
-        (wide_camera(), "brown", "auto"),
-        (RATIONAL, "brown", 8),
-        (fisheye_camera(), "fisheye", "auto"),
-    ],
+    ("camera", "model"),
+    [(wide_camera(), "brown"), (RATIONAL, "brown"), (fisheye_camera(), "fisheye")],
     ids=["brown 5", "brown 8", "fisheye"],
 )
-def test_errors_follow_the_stated_covariance(camera, model, coefficients):
+def test_errors_follow_the_stated_covariance(camera, model, monkeypatch):
+    if camera is RATIONAL:
+        # Not every seed shows that these views need eight coefficients.
+        monkeypatch.setattr("visioncal.calibration.stages.intrinsics._LEAST_GAIN", -np.inf)
     seeds = 24
     surprises, sigmas = [], []
     for seed in range(seeds):
-        result = estimate(cell_with(camera, seed), model, coefficients)
+        result = estimate(cell_with(camera, seed), model)
         # Of six rational coefficients, combinations are open that no image tells apart, and along
         # them the problem is not linear; the matrix is determined in all three models.
-        count = 4 if coefficients == 8 else len(intrinsics(camera))
+        count = 4 if camera is RATIONAL else len(intrinsics(camera))
         error = (intrinsics(result.camera) - intrinsics(camera))[:count]
         surprises.append(error @ np.linalg.solve(result.covariance[:count, :count], error))
         sigmas.append(result.sigma_px)

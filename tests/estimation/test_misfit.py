@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cells import calibrated, error_of, reporting, showing
+from support.edges import inliers_of
 from support.marks import slow
 from support.problems import observed, world
 
@@ -19,7 +20,6 @@ from visioncal.estimation.budget import Sources, covariance_by_source, point_cov
 from visioncal.estimation.chain import chain
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.outliers import inliers
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import covariance_of, fit_problem
@@ -88,7 +88,7 @@ def test_what_a_block_of_stops_alone_determines_is_not_left_out():
     measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
     # The last block's stops are the only ones that see a second target.
     targets = ("target_a",) * 22 + ("target_b",) * 2
-    edges = inliers(chain("eye-in-hand", cell.robot.base_from_flange, measured)).fit.state.edges
+    edges = inliers_of(chain("eye-in-hand", cell.robot.base_from_flange, measured)).fit.state.edges
     problem = chain("eye-in-hand", cell.robot.base_from_flange, measured, targets=targets)
     fit = fit_problem(problem, State(edges[[0, 1, 1]], np.zeros(0)), None)
     found = neighbours(problem, fit.state, fit.noise, ROBOT)
@@ -103,7 +103,7 @@ def test_a_bump_among_measured_poses_is_found():
     measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
     problem = chain("eye-in-hand", exp(lifted) @ cell.robot.base_from_flange, measured)
     assert problem.is_combined
-    found = misfits(problem, inliers(problem).fit, {})[ROBOT]
+    found = misfits(problem, inliers_of(problem).fit, {})[ROBOT]
     assert found.moved is None
     assert found.step.stop == 12
 
@@ -327,7 +327,9 @@ def through_a_wavy_lens(cell, sigma_px, rng):
 def test_noise_of_corners_is_no_field_of_the_lens():
     rng = np.random.default_rng(6)
     px = rng.uniform(0, [1280, 800], (800, 2))
-    found = [lens_field(px, rng.normal(0, 0.1, (800, 2)), (1280, 800)) for _ in range(300)]
+    found = [
+        lens_field(px, rng.normal(0, 0.1, (800, 2)), (1280, 800), np.ones(800)) for _ in range(300)
+    ]
     # One of ten thousand by chance.
     assert not any(item.is_significant for item in found)
     # 60 of 72 directions count, so that F lies about 1.2, 0.2 wide, before a fit takes some out.
@@ -338,14 +340,14 @@ def test_a_field_of_the_lens_is_found_with_its_size():
     rng = np.random.default_rng(7)
     px = rng.uniform(0, [1280, 800], (800, 2))
     wave = 0.08 * np.sqrt(2) * np.sin(2 * np.pi * px[:, ::-1] / 600)
-    found = lens_field(px, wave + rng.normal(0, 0.1, (800, 2)), (1280, 800))
+    found = lens_field(px, wave + rng.normal(0, 0.1, (800, 2)), (1280, 800), np.ones(800))
     assert found.is_significant
     # A cell's mean loses part of a wave of 600 px over cells of 213 x 133.
     assert 0.06 < found.sigma_px < 0.09
 
 
 def test_few_corners_say_nothing_of_a_field():
-    found = lens_field(np.zeros((8, 2)), np.ones((8, 2)), (1280, 800))
+    found = lens_field(np.zeros((8, 2)), np.ones((8, 2)), (1280, 800), np.ones(8))
     assert (found.factor, found.is_significant) == (1.0, False)
 
 

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cells import calibrated, error_of, reporting, showing
+from support.edges import inliers_of
 from support.marks import slow
 
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp
 from visioncal.estimation.chain import chain
-from visioncal.estimation.outliers import distances, inliers
+from visioncal.estimation.outliers import distances
 from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
@@ -47,7 +48,7 @@ def test_of_hundreds_of_uneven_views_several_are_taken_in_by_one_fit(monkeypatch
     # Poses that others measured: no covariance, and some are many times worse than most.
     noise = 3e-4 * np.random.default_rng(0).standard_t(3, (600, 6))
     seen = cell.cam_from_target @ exp(noise)
-    found = inliers(chain("eye-in-hand", cell.robot.base_from_flange, seen))
+    found = inliers_of(chain("eye-in-hand", cell.robot.base_from_flange, seen))
     # All views but one or two belong to the noise, of which the search first left out fifty.
     assert found.used.sum() >= 598
     assert len(fits) < 25
@@ -66,7 +67,7 @@ def test_where_nothing_agrees_nothing_is_left_out():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
     problem = known.solved.problem.with_effects([])
     mixed = replace(problem, poses={ROBOT: np.roll(problem.poses[ROBOT], 1, axis=0)})
-    assert inliers(mixed).used.all()
+    assert inliers_of(mixed).used.all()
 
 
 def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
@@ -75,7 +76,7 @@ def test_what_is_far_off_is_left_out_where_the_others_agree_to_nothing_good():
     rng = np.random.default_rng(0)
     noise = np.repeat([np.deg2rad(1.0), 0.01], 3) * rng.standard_normal((60, 6))
     noise[17, 1] += np.deg2rad(100.0)
-    found = inliers(
+    found = inliers_of(
         chain("eye-in-hand", cell.robot.base_from_flange, cell.cam_from_target @ exp(noise))
     )
     assert np.flatnonzero(~found.used).tolist() == [17]
@@ -87,7 +88,7 @@ def test_a_stop_is_right_or_wrong_as_a_whole():
     (wrong,) = cell.wrong_views
     problem = known.fitted.agreed.problem.with_effects([])
     doubled = problem.observations.take(np.repeat(np.arange(20), 2))
-    found = inliers(replace(problem, observations=doubled))
+    found = inliers_of(replace(problem, observations=doubled))
     assert np.flatnonzero(~found.used).tolist() == [2 * wrong, 2 * wrong + 1]
 
 
@@ -114,10 +115,10 @@ def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, meas
             problem.observations, covariance=unknown, is_uneven=np.ones(len(unknown), dtype=bool)
         )
         problem = replace(problem, observations=seen, is_combined=True)
-    assert inliers(problem).used.all()
+    assert inliers_of(problem).used.all()
     wrong = problem.observations.measured.copy()
     wrong[4 * times + 1] = problem.observations.measured[11 * times]
-    found = inliers(with_measured(problem, wrong))
+    found = inliers_of(with_measured(problem, wrong))
     assert np.flatnonzero(~found.used).tolist() == [4 * times + 1]
 
 

@@ -21,6 +21,7 @@ from visioncal.estimation.solve import (
     fit_problem,
     normal_equations,
     posterior,
+    robot_likelihood,
     solve_problem,
 )
 from visioncal.estimation.variance import Knowledge
@@ -229,7 +230,9 @@ def test_the_fit_is_as_good_as_its_covariance_says():
 def test_what_is_left_of_the_observations_is_their_redundancy():
     cell, problem = problem_of(5)
     fit = fit_problem(problem, true_state(cell, problem.tree))
-    squares, left = posterior(problem, fit.state, fit.noise)
+    squares, left = posterior(
+        problem, fit.state, fit.noise, robot_likelihood(problem, fit.state, fit.noise).reduced
+    )
     # Chi-square of some 300: a standard deviation of 8 %.
     assert left.sum() > 200
     assert squares.sum() == pytest.approx(left.sum(), rel=0.3)

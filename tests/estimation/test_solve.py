@@ -246,6 +246,7 @@ def test_a_noise_level_of_nothing_is_found_beside_a_large_one():
         Components(np.zeros((40, 2, 2)), parts.swapaxes(0, 1)),
         Knowledge(np.zeros((1, 1)), np.zeros(1)),
         np.array([3.0, 3.0]),
+        np.ones(2, dtype=bool),
     )
     assert np.isfinite(value)
     # Forty of them tell a level to a ninth.

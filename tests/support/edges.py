@@ -12,7 +12,7 @@ from visioncal.estimation.observability import (
     directions,
     refuse_too_few,
 )
-from visioncal.estimation.outliers import closed_form
+from visioncal.estimation.outliers import Agreed, closed_form, inliers
 from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import (
@@ -48,6 +48,11 @@ def mount_of(problem: Problem) -> str:
     """Where the camera of a chain is."""
     carried = problem.tree.branches["cam"].parent == FLANGE
     return "eye-in-hand" if carried else "eye-to-hand"
+
+
+def inliers_of(problem: Problem) -> Agreed:
+    """The observations of a chain that agree, found from a closed form of all."""
+    return inliers(problem, closed_form(problem, np.arange(len(problem))))
 
 
 def solved(problem: Problem, solver: str = "joint") -> Solved:

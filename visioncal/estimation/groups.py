@@ -81,7 +81,7 @@ class Groups:
             self._components(),
             Knowledge(np.zeros((size, size)), np.zeros(size)),
             np.array([start]),
-            free=np.array([free]),
+            np.array([free]),
         )
         return float(sigmas[0]), value
 

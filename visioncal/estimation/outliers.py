@@ -8,7 +8,7 @@ Where frames may have moved, the search begins with the earliest stops: what mov
 moved yet.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -37,7 +37,6 @@ from visioncal.estimation.robust import (
     Distances,
     half_of,
     settled,
-    small_sets,
     trimmed_start,
     widened,
 )
@@ -54,8 +53,6 @@ _FALSE_ALARM = 1e-3
 # The earliest share of the stops, at the least, that the search begins with.
 _EARLY_SHARE, _FEWEST_EARLY = 0.4, 8
 _MOST_MOVES = 8
-# So many views determine both edges beside a robot.
-_SET_SIZE = 3
 # An observation is near within so much [m], or so many times the median.
 _NEAR_M, _FAR = 0.04, 6.0
 # Where nothing agrees, what is off by so many times the median is wrong all the same.
@@ -145,14 +142,14 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     return Distances(squares, directions, uneven * limit)
 
 
-def agree(problem: Problem, state: State | None = None, movable: Sequence[str] = ()) -> Agreed:
+def agree(problem: Problem, state: State, movable: Sequence[str] = ()) -> Agreed:
     """Finds what belongs together at first sight, what does not, and what clearly moved.
 
     `settle` has the last word, once lenses and boards are as well known as they can be.
 
     Args:
         problem: All observations.
-        state: A start; None where a closed form gives one (see `closed_form`).
+        state: The start.
         movable: Unknown frames that may have moved.
     """
     if not movable:
@@ -219,12 +216,12 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     return _without_needless(_agreed(problem, used, fit, moves))
 
 
-def inliers(problem: Problem, state: State | None = None, used: Mask | None = None) -> Agreed:
+def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
     """Finds the observations that agree, where nothing moved.
 
     Args:
         problem: All observations.
-        state: A start; None where a closed form gives one.
+        state: The start.
         used: (n,) those that are thought to agree; None for a search without any idea.
 
     Returns:
@@ -234,16 +231,20 @@ def inliers(problem: Problem, state: State | None = None, used: Mask | None = No
     """
     every = np.ones(len(problem), dtype=bool)
     if len(problem) > LEAST_VIEWS:
-        mask, fit = _core(problem, state, every) if used is None else _fitted(problem, state, used)
+        mask, fit = (
+            _core(problem, state, every)
+            if used is None
+            else (used, fit_problem(problem.subset(used), state))
+        )
         mask, fit = _settled(problem, mask, fit)
         is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))
         if mask.sum() >= max(_LEAST_SHARE * len(problem), LEAST_VIEWS) and is_noise:
             return _agreed(problem, mask, fit, ())
-    mask, fit = _fitted(problem, state, every)
+    fit = fit_problem(problem, state)
     near = _near(problem, fit.state, every, _GROSS)
-    if LEAST_VIEWS <= near.sum() < len(problem):
-        mask, fit = _fitted(problem, fit.state, near)
-    return _agreed(problem, mask, fit, ())
+    if not LEAST_VIEWS <= near.sum() < len(problem):
+        return _agreed(problem, every, fit, ())
+    return _agreed(problem, near, fit_problem(problem.subset(near), fit.state), ())
 
 
 def closed_form(problem: Problem, rows: IntArray) -> State | None:
@@ -268,7 +269,7 @@ def closed_form(problem: Problem, rows: IntArray) -> State | None:
     return State(np.array([edges[name] for name in problem.unknown]), problem.start_values)
 
 
-def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Solution]:
+def _core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
     """The trimmed start among some observations, and all of them within its reach."""
     rows, noise = np.flatnonzero(among), starting_noise(problem)
     part = problem.subset(among)
@@ -280,8 +281,7 @@ def _core(problem: Problem, state: State | None, among: Mask) -> tuple[Mask, Sol
         # Noise is estimated once what is wrong by far is out: it would pass for noise of a robot.
         return solve_problem(part.subset(_of_pairs(part, mask, state)), state, noise)[0]
 
-    starts = _starts(part, state)
-    mask, start = trimmed_start(starts, lambda item: _away(part, item), solve, half_of(len(rows)))
+    mask, start = trimmed_start([state], lambda item: _away(part, item), solve, half_of(len(rows)))
     search, mask = _ObservationSearch(part), _of_pairs(part, mask, start)
     every = np.ones(len(rows), dtype=bool)
     mask, fit = widened(search, mask, search.fit_from(mask, start), every)
@@ -298,17 +298,6 @@ def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
     for group in problem.groups if len(problem.groups) > 1 else ():
         found[group.rows[np.argsort(away[group.rows])][: (len(group.rows) + 1) // 2]] = True
     return found & _near(problem, state, mask)
-
-
-def _starts(problem: Problem, state: State | None) -> Iterator[State]:
-    """The one that is given, or closed forms of all observations and of small sets."""
-    if state is not None:
-        yield state
-        return
-    count = len(problem)
-    for rows in (np.arange(count), *small_sets(count, _SET_SIZE)):
-        if (found := closed_form(problem, rows)) is not None:
-            yield found
 
 
 def _early(problem: Problem) -> Mask:
@@ -329,13 +318,6 @@ def _near(problem: Problem, state: State, used: Mask, far: float = _FAR) -> Mask
     """(n,) whether an observation is where it is predicted, as most of some are."""
     away = _away(problem, state)
     return np.asarray(away <= max(far * float(np.median(away[used])), _NEAR_M))
-
-
-def _fitted(problem: Problem, state: State | None, used: Mask) -> tuple[Mask, Solution]:
-    start = state or closed_form(problem, np.flatnonzero(used))
-    if start is None:
-        raise RuntimeError("no closed form gives a start")
-    return used, fit_problem(problem.subset(used), start)
 
 
 def _widened(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:

@@ -76,10 +76,7 @@ class LensField:
 
 
 def lens_field(
-    px: FloatArray,
-    residuals: FloatArray,
-    resolution: tuple[int, int],
-    shares: FloatArray | None = None,
+    px: FloatArray, residuals: FloatArray, resolution: tuple[int, int], shares: FloatArray
 ) -> LensField:
     """Compares the mean residuals of the image's cells with the scatter within them (F test).
 
@@ -91,20 +88,17 @@ def lens_field(
         residuals: (n, 2) of the fit [px].
         resolution: Width and height of the image [px].
         shares: (n,) as how much of a corner each counts: of images that show the same, whatever is
-            wrong with one is wrong with all. All count whole where None.
+            wrong with one is wrong with all.
     """
     place = np.clip((_CELLS * px / np.array(resolution)).astype(np.int64), 0, _CELLS - 1)
     return common_errors(place[:, 0] + _CELLS * place[:, 1], residuals, shares)
 
 
-def common_errors(
-    cell: IntArray, residuals: FloatArray, shares: FloatArray | None = None
-) -> LensField:
+def common_errors(cell: IntArray, residuals: FloatArray, shares: FloatArray) -> LensField:
     """Compares the mean residuals of cells, numbered from 0, with the scatter within them.
 
     Arguments and result are those of `lens_field`, of any (n,) cells.
     """
-    shares = np.ones(len(cell)) if shares is None else shares
     counts = np.bincount(cell, shares)
     rows = counts[cell] >= _FEWEST_CORNERS
     many = counts[counts >= _FEWEST_CORNERS]

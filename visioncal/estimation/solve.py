@@ -515,8 +515,8 @@ class RobotLikelihood:
             self.components,
             self.known,
             start.ravel(),
-            ratio_prior(np.flatnonzero(self.seen).tolist()),
             free,
+            ratio_prior(np.flatnonzero(self.seen).tolist()),
             least,
             settled,
             enough,
@@ -676,7 +676,7 @@ def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikel
 
 
 def posterior(
-    problem: Problem, state: State, noise: Noise, reduced: Reduced | None = None
+    problem: Problem, state: State, noise: Noise, reduced: Reduced
 ) -> tuple[FloatArray, FloatArray]:
     """What the fit leaves of each observation once its flange's error is known as well as it is.
 
@@ -684,7 +684,7 @@ def posterior(
         problem: The observations.
         state: The unknowns.
         noise: Its levels.
-        reduced: What `reduce` gives of these, where it is there already.
+        reduced: What `reduce` gives of these.
 
     Returns:
         (n,) squared residuals in units of their own noise, and (n,) the redundancy of each: how
@@ -692,7 +692,6 @@ def posterior(
     """
     own = problem.covariance(noise)
     weights, linear = np.linalg.inv(own), problem.linear(state)
-    reduced = reduced or reduce(problem, state, linear, own)
     errors = problem.error_covariance(noise)
     known = covariance_among(_whole(reduced, errors)[0], problem.moving)
     of, _ = problem.units

@@ -116,8 +116,8 @@ def estimate_sigmas(
     components: Components,
     known: Knowledge,
     start: FloatArray,
+    free: Mask,
     prior: RatioPrior | None = None,
-    free: Mask | None = None,
     least: FloatArray | float = LEAST_SIGMA,
     settled: float = SETTLED,
     enough: float = np.inf,
@@ -136,9 +136,9 @@ def estimate_sigmas(
         components: What the covariance is made of.
         known: What is known of the parameters from elsewhere.
         start: (k,) sigmas to start from.
+        free: (k,) which of them to estimate; the others stay at their start.
         prior: Of the ratio of pairs of sigmas: it decides where the residuals cannot, because one
             kind of them can be fitted away altogether. None where nothing is known of it.
-        free: (k,) which sigmas to estimate; the others stay at their start. All where None.
         least: Below which they are not sought: one for all, or (k,).
         settled: The step of the logarithms under which they have come to rest.
         enough: See `most_likely`.
@@ -148,9 +148,7 @@ def estimate_sigmas(
     """
     low = np.broadcast_to(np.log(least), start.shape)
     logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), low, np.log(MOST_SIGMA))
-    high = np.full(len(logs), np.log(MOST_SIGMA))
-    if free is not None:
-        low, high = np.where(free, low, logs), np.where(free, high, logs)
+    low, high = np.where(free, low, logs), np.where(free, np.log(MOST_SIGMA), logs)
 
     def at(there: FloatArray) -> Likely:
         return likelihood(residuals, jacobian, components, known, there, prior)

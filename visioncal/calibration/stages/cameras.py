@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.stages.dense import fit_densely
-from visioncal.calibration.stages.detect import Detections, DetectOptions, detect
+from visioncal.calibration.stages.detect import Detections, detect
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
@@ -62,8 +62,13 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
             continue
         if given is None:
             with _naming(session, frame):
-                options = DetectOptions(threads=seen.threads, keeps=seen.keeps_corners)
-                found = detect(session, options, seen.progress, among=views)
+                found = detect(
+                    session,
+                    seen.progress,
+                    among=views,
+                    threads=seen.threads,
+                    keeps=seen.keeps_corners,
+                )
             corners, resolution = found.corners, found.resolution
             seen = seen.noting(found.rejections, _of_other_size(session, found))
             if seen.dense is not None:

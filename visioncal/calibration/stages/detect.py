@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Condition
 
 import cv2
@@ -33,31 +33,13 @@ from visioncal.vision.targets import corner_positions, point_numbers
 
 # A homography takes four points.
 _FEWEST_GIVEN = 4
+# Fewest corners of a board that is found in an image, or all that it has: a homography needs four,
+# the rest are its check.
+_FEWEST_FOUND = 6
 # Corners that others have found may lie outside the image by this share of it.
 _OUTSIDE = 0.1
 # Images with corners that show which layout was printed, or how they were turned; of so many.
 _LAYOUT_SAMPLE, _MOST_LOOKED_AT = 3, 12
-
-
-@dataclass(frozen=True)
-class DetectOptions:
-    """What a view needs in order to be used.
-
-    Attributes:
-        min_corners: Fewest corners of a board, or all that it has; a homography needs 4, the rest
-            are its check.
-        max_blur_px: Widest edges, as a Gaussian's sigma [px]. Defocus of this size still gives
-            corners to 0.1 px; motion of this size is a pose that changed during the exposure.
-        threads: How many images are worked on at a time; 0 for one a core.
-        keeps: Whether what is found is kept beside the session, for the next search.
-        quick: Whether nothing more is searched where a first, quick search fails.
-    """
-
-    min_corners: int = 6
-    max_blur_px: float = MAX_BLUR_PX
-    threads: int = 0
-    keeps: bool = False
-    quick: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,15 +57,6 @@ class Detections:
     rejections: tuple[Rejection, ...]
     resolution: tuple[int, int]
     other_sizes: Mapping[int, tuple[int, int]]
-
-
-@dataclass(frozen=True, eq=False)
-class _Detection:
-    """What one image gave."""
-
-    found: Corners | Rejection
-    resolution: tuple[int, int] | None
-    misfit: bool = False
 
 
 class _Room:
@@ -111,18 +84,20 @@ class _Room:
 
 def detect(
     session: Session,
-    options: DetectOptions | None = None,
     progress: Progress | None = None,
     *,
     among: Sequence[View] | None = None,
+    threads: int = 0,
+    keeps: bool = False,
 ) -> Detections:
     """Finds in each image of a session the target that its row is said to show.
 
     Args:
         session: A session with a target; its views without images or corners are passed over.
-        options: What a view needs.
         progress: Told after each image.
         among: Those of its views to look at; all where None.
+        threads: How many images are worked on at a time; 0 for one a core.
+        keeps: Whether what is found is kept beside the session, for the next search.
 
     Returns:
         The corners and the rejected views.
@@ -132,35 +107,31 @@ def detect(
             camera, the size of the images is not known, or the board that was printed has another
             layout than the one declared.
     """
-    options = options or DetectOptions()
     if not session.boards:
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
     among = session.views if among is None else among
     views = [view for view in among if view.image and not view.has_corners]
     stated = _stated_resolution(session, among)
-    looks: list[_Detection] = []
+    looks: list[Searched] = []
     others = {board for board in session.boards if _shows_another(session, board, views)}
-    quick = replace(options, quick=True, keeps=False)
-    room = _Room()
-    kept = KeptCorners.beside(session, options.min_corners, options.max_blur_px)
+    room, kept = _Room(), KeptCorners.beside(session, grows=keeps)
     with (
         _ONE_OPENCV_THREAD.held(),
-        ThreadPoolExecutor(options.threads or os.cpu_count() or 1) as pool,
+        ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool,
     ):
 
-        def look_at(view: View) -> _Detection:
-            mine = quick if session.board_of(view) in others else options
-            return _look(session, view, stated, mine, room, kept)
+        def look_at(view: View) -> Searched:
+            quick = session.board_of(view) in others
+            return _look(session, view, stated, room, kept, quick=quick)
 
         for look in pool.map(look_at, views):
             looks.append(look)
             if progress is not None:
                 progress("detect", len(looks), len(views))
-    if options.keeps:
-        kept.save()
+    kept.save()
     given = [view for view in among if view.has_corners]
     resolution = _common_resolution(session, views, looks, given, stated)
-    sizes = {view.number: look.resolution for view, look in zip(views, looks, strict=True)}
+    sizes = {view.number: look.size for view, look in zip(views, looks, strict=True)}
     looks = [_of_size(look, view, resolution) for look, view in zip(looks, views, strict=True)]
     for name in session.boards:
         _check_layout(session, name, views, looks)
@@ -240,13 +211,14 @@ def _look(
     session: Session,
     view: View,
     stated: tuple[int, int] | None,
-    options: DetectOptions,
     room: _Room,
     kept: KeptCorners,
-) -> _Detection:
+    *,
+    quick: bool,
+) -> Searched:
     absence = session.images.absence(view.image)
     if absence:
-        return _Detection(Rejection(view.number, f"{view.image} {absence}"), None)
+        return Searched(Rejection(view.number, f"{view.image} {absence}"), None)
     name = session.board_of(view)
     target = session.boards[name]
     data = session.images.read(view.image)
@@ -254,31 +226,26 @@ def _look(
     pixels = size[0] * size[1]
     if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
         # Refused in any case: what another size shows need not be looked at.
-        return _Detection(Rejection(view.number, f"{view.image} is of another size"), size)
+        return Searched(Rejection(view.number, f"{view.image} is of another size"), size)
     # Digests of images take time, too.
-    key = kept.key(data, target, name) if kept.entries or options.keeps else ""
+    key = kept.key(data, target, name) if kept.entries or kept.grows else ""
     before = kept.get(key, view.number)
     if before is not None:
-        return _Detection(before.found, before.size, before.misfit)
+        return before
     most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
     with room.taken(pixels / most):
         image = _decoded(view, data)
         if isinstance(image, Rejection):
-            return _Detection(image, None)
-        found, misfit = look_for(image, target, view.number, options, name=name)
-    searched = Searched(found, misfit, (image.shape[1], image.shape[0]))
-    if key:
+            return Searched(image, None)
+        found, misfit = look_for(image, target, view.number, quick=quick, name=name)
+    searched = Searched(found, (image.shape[1], image.shape[0]), misfit)
+    if not quick:
         kept.put(key, searched)
-    return _Detection(found, searched.size, misfit)
+    return searched
 
 
 def look_for(
-    image: Image,
-    target: Target,
-    view: int,
-    options: DetectOptions | None = None,
-    *,
-    name: str = "",
+    image: Image, target: Target, view: int, *, quick: bool = False, name: str = ""
 ) -> tuple[Corners | Rejection, bool]:
     """Looks for a target in one image, as `detect` does in those of a session.
 
@@ -286,22 +253,21 @@ def look_for(
         image: (h, w) grey image.
         target: What to look for.
         view: The view's number.
-        options: What a view needs.
+        quick: Whether nothing more is searched where a first, quick search fails.
         name: What the session calls the target, where it has several.
 
     Returns:
         The corners, or why the view cannot be used; and whether markers were seen that lie
         otherwise than on this target.
     """
-    options = options or DetectOptions()
-    seen = find_target(image, target, quick=options.quick)
+    seen = find_target(image, target, quick=quick)
     if isinstance(seen, NotFound):
-        cause = why_hard_to_see(image, options.max_blur_px)
+        cause = why_hard_to_see(image, MAX_BLUR_PX)
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
         reason = f"{reason} (looked for target {name})" if name else reason
         return Rejection(view, reason), seen.misfit
     blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
-    trouble = _trouble(target, seen.ids, blur, options)
+    trouble = _trouble(target, seen.ids, blur)
     if trouble:
         return Rejection(view, trouble), False
     return Corners(view, seen.ids, seen.px, blur, seen.weights), False
@@ -331,27 +297,27 @@ def _given(session: Session, view: View, resolution: tuple[int, int]) -> Corners
     return Rejection(view.number, trouble) if trouble else corners
 
 
-def _trouble(target: Target, ids: IntArray, blur_px: float, options: DetectOptions) -> str:
+def _trouble(target: Target, ids: IntArray, blur_px: float) -> str:
     positions = corner_positions(target)
-    needed = 4 if target.kind in ("marker", "points") else min(options.min_corners, len(positions))
+    needed = 4 if target.kind in ("marker", "points") else min(_FEWEST_FOUND, len(positions))
     if len(ids) < needed:
         return f"too few corners: {len(ids)} of {len(positions)}, needs {needed}"
     if not determines_pose(positions[ids]):
         return f"corners on one line: all {len(ids)}, or all but one, lie in one row of the board"
-    if blur_px > options.max_blur_px:
-        return f"blurred: edges are {blur_px:.1f} px wide (limit {options.max_blur_px:.1f})"
+    if blur_px > MAX_BLUR_PX:
+        return f"blurred: edges are {blur_px:.1f} px wide (limit {MAX_BLUR_PX:.1f})"
     return ""
 
 
 def _common_resolution(
     session: Session,
     views: Sequence[View],
-    looks: Sequence[_Detection],
+    looks: Sequence[Searched],
     given: Sequence[View],
     stated: tuple[int, int] | None,
 ) -> tuple[int, int]:
     """The camera's size, or that of most images; checks that more than half of them have it."""
-    sizes = [look.resolution for look in looks if look.resolution is not None]
+    sizes = [look.size for look in looks if look.size is not None]
     if not sizes and given:
         if stated is None:
             raise DataError(
@@ -373,9 +339,9 @@ def _common_resolution(
     line_of = {view.number: line for line, view in enumerate(session.views, start=2)}
     culprits = [
         f"views.csv line {line_of[view.number]}, column image: {view.image} is "
-        f"{look.resolution[0]} x {look.resolution[1]} px"
+        f"{look.size[0]} x {look.size[1]} px"
         for view, look in zip(views, looks, strict=True)
-        if look.resolution is not None and look.resolution != wanted
+        if look.size is not None and look.size != wanted
     ]
     if len(culprits) == len(sizes) and len(set(sizes)) == 1:
         raise _other_size(session, views, sizes[0], wanted, culprits)
@@ -390,13 +356,13 @@ def _common_resolution(
     return wanted
 
 
-def _of_size(look: _Detection, view: View, resolution: tuple[int, int]) -> _Detection:
+def _of_size(look: Searched, view: View, resolution: tuple[int, int]) -> Searched:
     """The look at an image; a rejection where it has another size than the camera's."""
-    if look.resolution in (None, resolution):
+    if look.size in (None, resolution):
         return look
-    (width, height), (wide, high) = look.resolution, resolution
+    (width, height), (wide, high) = look.size, resolution
     words = f"{view.image} is {width} x {height} px, and the camera's images are {wide} x {high}"
-    return _Detection(Rejection(view.number, words), None)
+    return Searched(Rejection(view.number, words), None)
 
 
 def _other_size(
@@ -452,12 +418,12 @@ def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, in
     return sizes.pop() if len(sizes) == 1 else None
 
 
-def _rejections(looks: Sequence[_Detection]) -> list[Rejection]:
+def _rejections(looks: Sequence[Searched]) -> list[Rejection]:
     return [look.found for look in looks if isinstance(look.found, Rejection)]
 
 
 def _check_layout(
-    session: Session, name: str, views: Sequence[View], looks: Sequence[_Detection]
+    session: Session, name: str, views: Sequence[View], looks: Sequence[Searched]
 ) -> None:
     """Refuses a board whose markers lie otherwise than declared in most views that show it."""
     target, board_of = session.boards[name], session.board_of

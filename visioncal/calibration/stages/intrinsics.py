@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -18,8 +17,6 @@ from visioncal.estimation.corners import CornerStack, mean_square_by_view
 from visioncal.estimation.gating import gate
 from visioncal.estimation.poses import fit_poses, planar_poses
 from visioncal.vision.targets import numbered_positions
-
-Coefficients: TypeAlias = Literal["auto", 5, 8]
 
 # Two views of a plane determine fx, fy, cx, cy in theory (Zhang 2000, section 3.1); a third gives
 # the distortion and a first check.
@@ -59,17 +56,17 @@ def estimate_intrinsics(
     targets: Sequence[Target],
     resolution: tuple[int, int],
     model: CameraKind,
-    coefficients: Coefficients = "auto",
 ) -> Intrinsics:
     """Estimates the intrinsics from views of targets (Zhang 2000 where these are planar).
+
+    Brown's model has 5 coefficients of distortion, or 8 where these predict views better that the
+    fit has not seen; a fisheye has 4.
 
     Args:
         corners: The corners by view.
         targets: What was seen; the corners of several are numbered through.
         resolution: (width, height) [px].
         model: `brown` or `fisheye`.
-        coefficients: Brown's model with 5 or 8 coefficients; `auto` takes 8 where that predicts
-            views better that the fit has not seen. A fisheye always has 4.
 
     Returns:
         The intrinsics with covariance.
@@ -89,9 +86,6 @@ def estimate_intrinsics(
     stack = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
         fit = _first_fit(stack, model, resolution)
-        if model == "brown" and coefficients == 8:
-            # From the polynomial: from nowhere, a pole and a zero may cancel inside the image.
-            fit = _fit(stack, _padded(fit.camera), fit.cam_from_target)
         every = stack
         stack, fit, reasons = _gated(every, fit)
         if reasons:
@@ -101,7 +95,7 @@ def estimate_intrinsics(
             again = _gated(every, _fit(every, plain, planar_poses(every, plain).first))
             if len(again[2]) < len(reasons):
                 stack, fit, reasons = again
-        if model == "brown" and coefficients == "auto":
+        if model == "brown":
             fit = _with_rational_terms(stack, fit)
     _check(fit)
     return Intrinsics(
@@ -173,7 +167,10 @@ def _is_flat(stack: CornerStack) -> bool:
 
 def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
     """Takes 8 coefficients instead of 5 where views that were left out are predicted better."""
-    wider = _fit(stack, _padded(fit.camera), fit.cam_from_target)
+    # From the polynomial: from nowhere, a pole and a zero may cancel inside the image.
+    camera = fit.camera
+    padded = replace(camera, distortion=np.concatenate([camera.distortion, np.zeros(3)]))
+    wider = _fit(stack, padded, fit.cam_from_target)
     gain = 1.0 - float(np.sum(wider.residuals**2) / np.sum(fit.residuals**2))
     if not wider.settled or gain < _LEAST_GAIN or len(stack.views) < 2 * _FOLDS:
         return fit
@@ -181,11 +178,6 @@ def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
     # away there, and with all views it does not.
     ratio = float(np.median(_held_out(stack, wider) / _held_out(stack, fit)))
     return wider if ratio < 1.0 - _LEAST_GAIN else fit
-
-
-def _padded(camera: Camera) -> Camera:
-    distortion = np.concatenate([camera.distortion, np.zeros(3)])
-    return Camera(camera.model, camera.resolution, camera.matrix, distortion)
 
 
 def _held_out(stack: CornerStack, fit: BundleFit) -> FloatArray:

@@ -32,13 +32,13 @@ class Searched:
 
     Attributes:
         found: The corners, or why there are none.
+        size: (width, height) of the image [px]; None where it cannot be read.
         misfit: Whether markers were seen that lie otherwise than on the target.
-        size: Of the image [px].
     """
 
     found: Corners | Rejection
-    misfit: bool
-    size: tuple[int, int]
+    size: tuple[int, int] | None
+    misfit: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,22 +47,22 @@ class KeptCorners:
 
     Attributes:
         file: Where they are kept; None of a session without a folder.
-        limits: What a view needs, which belongs to the answer.
+        grows: Whether what comes to it is kept for the next search.
         entries: What is known, as it stands in the file.
         new: What came to it.
     """
 
     file: Path | None
-    limits: tuple[float, ...]
+    grows: bool
     entries: dict[str, Any]
     new: dict[str, Any] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
     @classmethod
-    def beside(cls, session: Session, *limits: float) -> "KeptCorners":
+    def beside(cls, session: Session, *, grows: bool) -> "KeptCorners":
         """Reads those of a session; there are none of one without a folder."""
         if not isinstance(session.images, FolderImages):
-            return cls(None, limits, {})
+            return cls(None, grows, {})
         file = session.images.folder / FOLDER / FILE
         document: Any = None
         if file.exists():
@@ -70,11 +70,11 @@ class KeptCorners:
                 document = json.loads(read_text(file))
         known = isinstance(document, dict) and document.get("made_by") == _MADE_BY
         entries = document.get("searches") if known else None
-        return cls(file, limits, entries if isinstance(entries, dict) else {})
+        return cls(file, grows, entries if isinstance(entries, dict) else {})
 
     def key(self, image: bytes, target: Target, name: str) -> str:
-        """The name of a search: of an image's bytes, for a board, under some limits."""
-        board = json.dumps([asdict(target), name, self.limits], default=_plain, sort_keys=True)
+        """The name of a search: of an image's bytes, for a board."""
+        board = json.dumps([asdict(target), name], default=_plain, sort_keys=True)
         return f"{sha256(image)}-{sha256(board.encode())}"
 
     def get(self, key: str, view: int) -> Searched | None:
@@ -85,7 +85,9 @@ class KeptCorners:
             return None
 
     def put(self, key: str, searched: Searched) -> None:
-        """Adds what was found, by any thread."""
+        """Adds what was found, by any thread, where it is to be kept."""
+        if not self.grows:
+            return
         with self._lock:
             self.new[key] = _document(searched)
 
@@ -116,7 +118,7 @@ def _searched(entry: Any, view: int) -> Searched:  # noqa: ANN401 - as it was re
     width, height = (int(value) for value in entry["size"])
     if "reason" in entry:
         return Searched(
-            Rejection(view, str(entry["reason"])), bool(entry["misfit"]), (width, height)
+            Rejection(view, str(entry["reason"])), (width, height), bool(entry["misfit"])
         )
     weights = entry["weights"]
     found = Corners(
@@ -126,7 +128,7 @@ def _searched(entry: Any, view: int) -> Searched:  # noqa: ANN401 - as it was re
         float(entry["blur_px"]),
         None if weights is None else np.array(weights, dtype=np.float64),
     )
-    return Searched(found, bool(entry["misfit"]), (width, height))
+    return Searched(found, (width, height), bool(entry["misfit"]))
 
 
 def _plain(value: object) -> object:
