@@ -18,7 +18,7 @@ from visioncal.interchange.exports import Selection, document
 from visioncal.results import Alignment, to_document
 from visioncal.robot import load_robot
 from visioncal.session import Session
-from visioncal.session.columns import POSE
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.layout import (
     BoardAt,
@@ -31,7 +31,6 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.records import cell_session
-from visioncal.simulation.rows import pose_row
 from visioncal.simulation.sag import Payload
 
 STOPS = 20

@@ -14,6 +14,7 @@ from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.interchange.formats.exchanging import exchange_views
 from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
     BOARDS,
     BoardAt,
@@ -23,7 +24,6 @@ from visioncal.simulation import (
     fine_camera,
     simulate,
 )
-from visioncal.simulation.rows import POSE, pose_row
 
 # Three cameras, so that two or more see by way of a robot at most stops.
 CELL = replace(

@@ -19,9 +19,9 @@ from visioncal.estimation.positions import Mounting, Places, fit_mounting
 from visioncal.estimation.workspace import postures
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE
 from visioncal.session.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.simulation.arms import forward
-from visioncal.simulation.rows import POSE
 from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
 
 PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)

@@ -10,9 +10,9 @@ from support.whole_cells import misfit
 from visioncal import calibrate
 from visioncal.core.transforms import exp, invert
 from visioncal.session import MemoryImages, Session, target_document
+from visioncal.session.columns import pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import BOARDS, CellOptions, cell_session, read_cell, simulate
-from visioncal.simulation.rows import pose_row
 
 SIGMA_PX = 0.05
 # The size of the board is known: else it is most of what transforms are uncertain by.

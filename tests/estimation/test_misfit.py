@@ -24,9 +24,9 @@ from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.variance import profile_interval
+from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.records import cell_session
-from visioncal.simulation.rows import POSE
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
 MOUNTS = ("eye-in-hand", "eye-to-hand")

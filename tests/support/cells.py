@@ -15,8 +15,8 @@ from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
+from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, SimulatedCell, cell_session
-from visioncal.simulation.rows import POSE
 
 
 def session_of(cell: SimulatedCell) -> Session:

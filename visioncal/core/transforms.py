@@ -48,6 +48,11 @@ def apply(matrices: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(turned + matrices[..., None, :3, 3])
 
 
+def apply_each(matrices: FloatArray, points: FloatArray) -> FloatArray:
+    """Carries (n, 3) points through a transform each, (n, 4, 4)."""
+    return np.asarray((matrices[:, :3, :3] @ points[:, :, None])[:, :, 0] + matrices[:, :3, 3])
+
+
 def skew(vectors: FloatArray) -> FloatArray:
     """Builds the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
     matrices = np.zeros((*vectors.shape, 3))

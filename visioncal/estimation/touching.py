@@ -17,7 +17,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from visioncal.core.transforms import compose, exp, invert, nearest_rotation, skew
+from visioncal.core.transforms import apply_each, compose, exp, invert, nearest_rotation, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.groups import Groups
 from visioncal.estimation.parts import Noise
@@ -194,9 +194,7 @@ def linear_tip(base_from_flange: FloatArray, points: IntArray) -> FloatArray:
 
 def _in_flange(touches: Touches, points: FloatArray) -> FloatArray:
     """Where each touch has its point in the flange's frame: (n, 3) [m]."""
-    flange_from_base = invert(touches.base_from_flange)
-    turned = flange_from_base[:, :3, :3] @ points[touches.points][:, :, None]
-    return np.asarray(turned[:, :, 0] + flange_from_base[:, :3, 3])
+    return apply_each(invert(touches.base_from_flange), points[touches.points])
 
 
 def _main_direction(vectors: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import did_you_mean
@@ -120,6 +121,12 @@ def joint_columns(columns: Sequence[str]) -> tuple[str, ...]:
     """Lists the columns of joint angles that are there, q1_rad first."""
     numbers = sorted(int(match[1]) for name in columns if (match := _JOINT.fullmatch(name)))
     return tuple(f"q{number}_rad" for number in numbers)
+
+
+def pose_row(pose: FloatArray) -> dict[str, float]:
+    """The values of the columns of a pose (4, 4)."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return dict(zip(POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
 
 
 def check_header(columns: Sequence[str], where: str) -> None:

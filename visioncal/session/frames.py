@@ -47,11 +47,6 @@ def robots_of(
     return {name: table for name, table in found.items() if isinstance(table, RobotTable)}
 
 
-def _point_name(view: View) -> str:
-    """The point that an instrument's reading is of; empty where it has no name."""
-    return view.text.get("point", "").strip()
-
-
 def resolve_frames(
     declaration: Declaration, views: Sequence[View], robots: Iterable[str]
 ) -> dict[str, str]:
@@ -131,7 +126,7 @@ class _DeclaredTree:
         ]
         for kind in ("camera", "target", "instrument"):
             listed += [(kind, name) for name in self._names(kind)]
-        points = dict.fromkeys(_point_name(view) for view in self.views if is_read(view))
+        points = dict.fromkeys(view.point for view in self.views if is_read(view))
         listed += [("point", name) for name in points]
         return {frame_name(kind, name): (kind, name) for kind, name in listed}
 
@@ -233,7 +228,7 @@ class _DeclaredTree:
     def _of_point(self, frame: str) -> str | None:
         """A point moves with the robot that its rows name; where they have no pose, it is fixed."""
         _, name = self.frames[frame]
-        rows = [view for view in self.views if is_read(view) and _point_name(view) == name]
+        rows = [view for view in self.views if is_read(view) and view.point == name]
         moved = [row for row in rows if has_robot_state(row)]
         if not moved and len(self.robots) < 2:
             return CELL if self.declaration.is_network else self._flange_of(frame)
@@ -291,7 +286,7 @@ def observed(declaration: Declaration, view: View) -> tuple[str, str]:
         )
     if is_read(view):
         instrument = name_of(declaration, "instrument", view)
-        return frame_name("instrument", instrument), frame_name("point", _point_name(view))
+        return frame_name("instrument", instrument), frame_name("point", view.point)
     return "", ""
 
 

@@ -74,6 +74,11 @@ class View:
         return self.text.get("role", "").strip() == "intrinsics"
 
     @property
+    def point(self) -> str:
+        """The point that an instrument's reading is of; empty where it has no name."""
+        return self.text.get("point", "").strip()
+
+    @property
     def joints_rad(self) -> FloatArray | None:
         """(n,) joint angles [rad], if they were recorded."""
         names = known.joint_columns(tuple(self.numbers))

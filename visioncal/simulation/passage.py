@@ -14,9 +14,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
+from visioncal.core.transforms import apply_each
 from visioncal.core.types import Corners, FloatArray
 from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
+from visioncal.session.columns import POSE
 from visioncal.simulation.arms import DhArm, forward
 from visioncal.simulation.boards import Sheet, corners_m, found_in_part
 from visioncal.simulation.cell import SimulatedCell, SimulatedSight
@@ -25,7 +27,6 @@ from visioncal.simulation.imaging import EDGE_PX, detected
 from visioncal.simulation.layout import CELL, Swept
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CameraOptions, SweepOptions
-from visioncal.simulation.rows import POSE
 
 # A frame of a whole cell that shows less of the board, or shows it more askew, is not recorded.
 _FEWEST_OF_CELL, _FACING = 12, 0.5
@@ -94,8 +95,7 @@ class Passage:
         corners, optics = corners_m(sheet), camera.camera
         late_s = np.zeros(len(corners))
         for _ in range(_ROUNDS if self.options.readout_s else 1):
-            poses = before(self.way(taken_s + late_s))
-            points = (poses[:, :3, :3] @ corners[:, :, None])[:, :, 0] + poses[:, :3, 3]
+            points = apply_each(before(self.way(taken_s + late_s)), corners)
             px = project(optics, points)
             late_s = self.options.readout_s * (px[:, 1] / (optics.resolution[1] - 1) - 0.5)
         ids = np.flatnonzero(sees(optics, points, EDGE_PX)).astype(np.int64)

@@ -14,6 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import Camera, FloatArray
 from visioncal.session import MemoryImages, Session, View, frame_name, target_document
+from visioncal.session.columns import POSE, pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation.boards import corners_m
 from visioncal.simulation.cell import SimulatedCell, SimulatedSight
@@ -22,7 +23,6 @@ from visioncal.simulation.layout import BoardAt, CameraAt, CellOptions
 from visioncal.simulation.optics import project
 from visioncal.simulation.options import BOARDS
 from visioncal.simulation.render import RenderScene, encode, prepare_scene, render
-from visioncal.simulation.rows import POSE, load_row, pose_row
 from visioncal.simulation.touching import Touching, write_touches
 from visioncal.simulation.truth import truth_of, write_truth
 
@@ -224,7 +224,7 @@ def _view(
         joints = stood.joints[stop].tolist()
         state |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
         if stood.loads:
-            state |= load_row(stood.loads[stop])
+            state |= stood.loads[stop].row()
         words = {"robot": robot, **words}
         if stood.approach is not None:
             words["approach"] = "+" if stood.approach[stop] > 0 else "-"

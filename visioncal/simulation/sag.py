@@ -69,6 +69,12 @@ class Payload:
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    def row(self) -> dict[str, float]:
+        """The values of its columns."""
+        centre = {f"payload_{name}_m": at for name, at in zip("xyz", self.centre_m, strict=True)}
+        force = {f"force_{name}_n": at for name, at in zip("xyz", self.force_n, strict=True)}
+        return {"payload_kg": self.kg} | centre | force
+
 
 @dataclass(frozen=True, eq=False)
 class Giving:

@@ -14,11 +14,11 @@ from visioncal.core.files import write_atomically
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
+from visioncal.session.columns import pose_row
 from visioncal.simulation.arms import forward, inverse, reach_m
 from visioncal.simulation.cell import SimulatedCell, SimulatedRobot
 from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.reach import LEAST_DEXTERITY, home_posture, lowest_m
-from visioncal.simulation.rows import pose_row
 
 # How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75

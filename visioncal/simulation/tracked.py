@@ -8,8 +8,8 @@ import numpy as np
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
+from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation.arms import DhArm, arm_named, forward
-from visioncal.simulation.rows import POSE, load_row, pose_row
 from visioncal.simulation.sag import ArmOptions
 from visioncal.simulation.truth import write_truth
 
@@ -121,7 +121,7 @@ def session_of(
                 f"q{at}_rad": joint for at, joint in enumerate(shop.joints[stop].tolist(), 1)
             }
         if payloads:
-            numbers |= load_row(payloads[stop])
+            numbers |= payloads[stop].row()
         name = "abc"[point] if len(options.points) > 1 else ""
         rows.append({"view": view, "stop": stop, "point": name} | numbers)
     noise = {"sigma_m": options.sigma_m}

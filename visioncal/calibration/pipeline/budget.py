@@ -9,6 +9,7 @@ from visioncal.calibration.pipeline.solved import Solved, within
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.validate import HeldOut, validate
+from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import shape_basis, shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
@@ -94,9 +95,7 @@ def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatA
     part, state = solved.part, solved.agreed.fit.state
     middles = middles_of(solved.cell)
     middle = np.array([middles.get(name, np.zeros(3)) for name in part.observations.observed])
-    camera = part.measured(state)
-    seen = (camera[:, :3, :3] @ middle[:, :, None])[:, :, 0] + camera[:, :3, 3]
-    point = seen.mean(axis=0)
+    point = apply_each(part.measured(state), middle).mean(axis=0)
     at_work = {
         name: point_covariance(state.edges[0], edge[:6, :6], point)
         for name, edge in _covariances_of_edges(solved, beside).items()

@@ -11,7 +11,7 @@ from visioncal.calibration.guess.hypothesis import HALF_TURN
 from visioncal.calibration.guess.joints import JointReading
 from visioncal.calibration.guess.misread import FEWEST_JOINT_ROWS, JointGuess, guess_joints
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Remedy
@@ -113,7 +113,7 @@ class _Constants:
 
     @property
     def figures(self) -> str:
-        return f"{figure(1e3 * self.fit.shift.max())} mm and {_deg(self.fit.angle.max())} deg"
+        return _away(self.fit.shift.max(), self.fit.angle.max())
 
 
 def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
@@ -228,7 +228,7 @@ def _rows_out(
     reasons: dict[int, str] = {}
     warnings = list(matched.warnings)
     for row in out.tolist():
-        away = f"{figure(1e3 * found.fit.shift[row])} mm and {_deg(found.fit.angle[row])} deg"
+        away = _away(found.fit.shift[row], found.fit.angle[row])
         reasons[views[row]] = f"its joint angles lead {away} away from its pose"
         if row in swapped:
             mate = views[sum(swapped) - row]
@@ -251,8 +251,8 @@ def _rows_out(
         words = (
             f"Pose and joint angles disagree in "
             f"{', '.join(f'view {views[index]}' for index in rest)}, "
-            f"by up to {figure(1e3 * shift)} mm and {_deg(angle)} deg; in the other views they "
-            "agree. The hand-eye result uses the poses."
+            f"by up to {_away(shift, angle)}; in the other views they agree. The hand-eye result "
+            "uses the poses."
         )
         step = Remedy("Correct what is wrong there in views.csv.")
         named = tuple(views[index] for index in rest)
@@ -307,7 +307,7 @@ def _described(matched: Matched, found: _Constants) -> Matched:
     warnings, notes = list(matched.warnings), list(matched.notes)
     shift, angle = (array[~found.out].max() for array in (found.fit.shift, found.fit.angle))
     if shift > _AGREE_M or angle > _AGREE_RAD:
-        away = f"{figure(1e3 * shift)} mm and {_deg(angle)} deg"
+        away = _away(shift, angle)
         typical_m, typical_rad = found.typical
         if typical_m > _CALIBRATED_M or typical_rad > _CALIBRATED_RAD:
             warnings.append(_disagree(robot, away))
@@ -351,5 +351,5 @@ def zero_taken(zero: JointReading) -> str:
     return f"The zero of {name} was taken so, and the arm is calibrated from there."
 
 
-def _deg(angle: float) -> str:
-    return figure(float(np.rad2deg(angle)))
+def _away(shift_m: float, angle_rad: float) -> str:
+    return mm_and_deg(1e3 * shift_m, float(np.rad2deg(angle_rad)))

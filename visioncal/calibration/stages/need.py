@@ -33,7 +33,7 @@ from visioncal.calibration.stages.validate import HeldOut
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import adjoint, invert, skew
+from visioncal.core.transforms import adjoint, apply_each, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
 from visioncal.estimation.parts import State
@@ -221,7 +221,7 @@ def _picks(
         # The whole chain, in the targets' frames: the noise of its flanges is in it.
         looking, at_m = _of_things(fitted), middles
     else:
-        looking, at_m = _to_base(fitted, base, in_base), _carried(in_base, middles)
+        looking, at_m = _to_base(fitted, base, in_base), apply_each(in_base, middles)
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
@@ -252,7 +252,7 @@ def _picks(
     parts["look"] = look
     placed = {name: _at_points(part, at_m) for name, part in parts.items()}
     at_camera = problem.measured(state)
-    in_camera = _carried(at_camera, middles)
+    in_camera = apply_each(at_camera, middles)
     axes = np.swapaxes(at_camera[:, :3, :3], 1, 2)[:, :, 2]
     if not whole:
         axes = (in_base[:, :3, :3] @ axes[:, :, None])[:, :, 0]
@@ -353,11 +353,6 @@ def _by_boards(covariance: FloatArray, columns: IntArray) -> FloatArray:
     """(p, p) what would not be of a covariance, were the boards' shapes known."""
     among = covariance[:, columns]
     return np.asarray(among @ np.linalg.pinv(among[columns], hermitian=True) @ among.T)
-
-
-def _carried(poses: FloatArray, points: FloatArray) -> FloatArray:
-    """(n, 3) points by (n, 4, 4) poses."""
-    return np.asarray((poses[:, :3, :3] @ points[:, :, None])[:, :, 0] + poses[:, :3, 3])
 
 
 def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:

@@ -98,7 +98,7 @@ def read_instrument(session: Session) -> Readings:
         instrument,
         names,
         {view.number: _read(view) for view in kept},
-        {view.number: names.index(_name(view)) for view in kept},
+        {view.number: names.index(view.point) for view in kept},
         {view.number: _probe(view) for view in kept} if are_poses else None,
         (*missing, *rejections),
     )
@@ -195,10 +195,6 @@ def _probe(view: View) -> FloatArray:
     return matrix
 
 
-def _name(view: View) -> str:
-    return view.text.get("point", "").strip()
-
-
 def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
     """The instrument that read some rows."""
     table = session.instruments.get(name_of(session.declaration, "instrument", rows[0]))
@@ -250,7 +246,7 @@ def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], l
     """The points' names, and rows whose point determines nothing."""
     by_name = defaultdict(list)
     for view in rows:
-        by_name[_name(view)].append(view.number)
+        by_name[view.point].append(view.number)
     if len(by_name) > 1 and "" in by_name:
         others = [name for name in by_name if name]
         raise DataError(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.threads import one_blas_thread
-from visioncal.core.transforms import apply, distances
+from visioncal.core.transforms import apply, apply_each, distances
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
@@ -119,7 +119,7 @@ def chain_rms_px(
         counts = [len(corners.ids) for _, _, corners in views]
         of = np.repeat(rows, counts)
         points = positions[np.concatenate([corners.ids for _, _, corners in views])]
-        points = (poses[of, :3, :3] @ points[:, :, None])[:, :, 0] + poses[of, :3, 3]
+        points = apply_each(poses[of], points)
         away = project(camera, points) - np.concatenate([corners.px for _, _, corners in views])
         # A corner behind the camera counts as a whole image away.
         away = np.nan_to_num(away, nan=float(max(camera.resolution)))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from visioncal.core.transforms import adjoint, exp, invert
+from visioncal.core.transforms import adjoint, apply_each, exp, invert
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.appearance import Compressed, compress_points
 from visioncal.estimation.corners import CornerStack
@@ -73,8 +73,7 @@ def delayed_points(
         (n, 3) places on the target [m], and (n, 3, k) how they move with the times [m/s].
     """
     of_corner = twists[stack.view_of]
-    moves = exp((shares @ times_s)[:, None] * of_corner)
-    points = (moves[:, :3, :3] @ stack.points[:, :, None])[:, :, 0] + moves[:, :3, 3]
+    points = apply_each(exp((shares @ times_s)[:, None] * of_corner), stack.points)
     speeds = np.cross(of_corner[:, :3], points) + of_corner[:, 3:]
     return points, speeds[:, :, None] * shares[:, None, :]
 

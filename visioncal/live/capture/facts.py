@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 import tomli_w
-from scipy.spatial.transform import Rotation
 
-from visioncal.core.types import Camera, FloatArray, Mount, Target
+from visioncal.core.types import Camera, Mount, Target
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.protocols import ArmState
 from visioncal.robot import Robot, load_robot, robot_file, robot_names
 from visioncal.session import View
-from visioncal.session.columns import POSE
+from visioncal.session.columns import pose_row
 from visioncal.vision.targets import load_target, target_document, target_names
 
 _TARGET_FILE = "target.toml"
@@ -99,7 +98,10 @@ def view_of(
         unix_offset_s: What makes the host's monotonic clock UNIX time [s].
     """
     state, frame = taken.state, taken.frame
-    numbers = {"stamp_s": round(frame.stamp_s + unix_offset_s, 6), **_pose(state.base_from_flange)}
+    numbers = {
+        "stamp_s": round(frame.stamp_s + unix_offset_s, 6),
+        **pose_row(state.base_from_flange),
+    }
     for form, values in (
         ("q{}_rad", state.q),
         ("current{}_a", state.currents_a),
@@ -133,16 +135,12 @@ def _texts(taken: TakenView, state: ArmState, facts: CaptureFacts) -> dict[str, 
         "motion_px": f"{taken.motion_px:.3f}",
     }
     if state.flange_from_tool is not None:
-        texts["tcp"] = " ".join(f"{value:.9g}" for value in _pose(state.flange_from_tool).values())
+        texts["tcp"] = " ".join(
+            f"{value:.9g}" for value in pose_row(state.flange_from_tool).values()
+        )
     if taken.frame.exposure_s is not None:
         texts["exposure_ms"] = f"{1e3 * taken.frame.exposure_s:.3f}"
     return texts | {f"device_{name}": str(value) for name, value in facts.settings.items()}
-
-
-def _pose(pose: FloatArray) -> dict[str, float]:
-    """Seven columns of a pose (4, 4)."""
-    turn = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
-    return dict(zip(POSE, map(float, [*pose[:3, 3], *turn]), strict=True))
 
 
 def _shipped_target(target: Target) -> str:
