@@ -781,3 +781,12 @@ def test_a_table_of_another_name_is_named(name):
         Session.assemble(
             document, ("view", "image"), [["0", "0.png"]], MemoryImages({"0.png": b""})
         )
+
+
+def test_a_folder_of_pictures_is_pointed_to_convert(tmp_path):
+    folder = tmp_path / "shots of cell 4"
+    folder.mkdir()
+    (folder / "1.PNG").touch()
+    with pytest.raises(DataError, match="is a folder of pictures, and no session") as caught:
+        Session.load(folder)
+    assert f"visioncal convert TABLE my-session --images '{folder}'" in caught.value.next_step

@@ -1,6 +1,7 @@
 """The parts of `visioncal record`: the cell from a plan or from options, its stops, its words."""
 
 import math
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -348,7 +349,7 @@ def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) ->
     count = len(journal.views)
     say(
         f"{count} view{'s' if count != 1 else ''} in {journal.folder}; next: visioncal "
-        f"calibrate {journal.folder} -o out"
+        f"calibrate {shlex.quote(str(journal.folder))} -o out"
     )
 
 

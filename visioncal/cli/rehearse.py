@@ -1,5 +1,6 @@
 """`visioncal rehearse`."""
 
+import shlex
 import shutil
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -57,7 +58,7 @@ def rehearse_command(
         print_json(document)
     else:
         whole.report()
-    say(f"wrote {out / _SUMMARY}; look: visioncal review {out / 'result'}")
+    say(f"wrote {out / _SUMMARY}; look: visioncal review {shlex.quote(str(out / 'result'))}")
     report_written(whole.written, quiet=True, status=0 if whole.error.passed else EXIT_WRONG)
 
 

@@ -1,5 +1,6 @@
 """`visioncal review`."""
 
+import shlex
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
@@ -101,8 +102,9 @@ def find_recording(path: Path) -> Path:
             if is_session
             else f"{path} holds no {RECORDING}.",
             culprits=[str(path)],
-            next_step=f"Calibrate first: visioncal calibrate {path if is_session else 'SESSION'} "
-            "-o OUT; then visioncal review OUT.",
+            next_step="Calibrate first: visioncal calibrate "
+            f"{shlex.quote(str(path)) if is_session else 'SESSION'} -o OUT; then visioncal review "
+            "OUT.",
         )
     why_not = absence(file)
     if why_not:

@@ -1,5 +1,6 @@
 """`visioncal touch-test`."""
 
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import closing, suppress
@@ -90,8 +91,9 @@ def touch_test_command(
         raise DataError(
             f"touch-test is for one camera and one robot, and {calibration} is of a whole cell.",
             culprits=["-c"],
-            next_step=f"Let visioncal locate {session} -c {calibration} --camera NAME --robot NAME "
-            "say where the board is, touch it there, and compare.",
+            next_step=f"Let visioncal locate {shlex.quote(str(session))} "
+            f"-c {shlex.quote(str(calibration))} --camera NAME --robot NAME say where the board "
+            "is, touch it there, and compare.",
         )
     has_tools = any(frame.startswith("flange_from_") for frame in known.frames)
     is_bare = tool == "none" or (tool is None and not has_tools)
@@ -100,7 +102,7 @@ def touch_test_command(
             f"--tool is {tool!r}, and the calibration has no tool.",
             culprits=["--tool"],
             next_step="Find the tip first, and let it join the calibration: "
-            f"visioncal tcp TOUCHES -c {calibration} --name gripper",
+            f"visioncal tcp TOUCHES -c {shlex.quote(str(calibration))} --name gripper",
         )
     touching = None if is_bare else Tool.among(known.frames, "The calibration", tool)
     with shown_progress(quiet=as_json):

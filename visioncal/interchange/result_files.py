@@ -1,6 +1,7 @@
 """Finds again what an earlier calibration has written."""
 
 import json
+import shlex
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -159,7 +160,8 @@ def _uncalibrated(path: Path, what: str) -> DataError:
     return DataError(
         f"{path} is {what} without a result.",
         culprits=[str(path)],
-        next_step=f"Run visioncal calibrate {path} -o FOLDER first, and name that FOLDER.",
+        next_step=f"Run visioncal calibrate {shlex.quote(str(path))} -o FOLDER first, and name "
+        "that FOLDER.",
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
 
-_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 
 
 class ImageStore(ABC):
@@ -90,7 +90,7 @@ def image_path(path: str) -> str:
         DataError: It leaves the folder, or its ending is none of `.png`, `.jpg`, `.tif`.
     """
     inside = inside_path(path)
-    if not inside.lower().endswith(_ENDINGS):
+    if not inside.lower().endswith(IMAGE_ENDINGS):
         raise DataError(
             f"the image {path!r} is of a kind that is not read; png, jpg or tif is needed.",
             culprits=[path],
