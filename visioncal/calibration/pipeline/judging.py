@@ -11,7 +11,13 @@ from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_
 from visioncal.calibration.pipeline.budget import columns_of_boards, middles_moved, middles_of
 from visioncal.calibration.pipeline.fault_messages import moved_found
 from visioncal.calibration.pipeline.lens_fields import errors_found, lens_changes
-from visioncal.calibration.pipeline.network_ties import or_measured, robot_motion, untied_words
+from visioncal.calibration.pipeline.network_ties import (
+    or_measured,
+    robot_motion,
+    standing_tie,
+    tilting_advice,
+    untied_words,
+)
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
@@ -22,6 +28,7 @@ from visioncal.calibration.stages.judged import (
     JudgedPair,
     PointAccuracy,
     Sensor,
+    StandingTie,
 )
 from visioncal.calibration.stages.need import PickInputs, picks_of
 from visioncal.calibration.stages.priors import prior_words
@@ -97,7 +104,16 @@ def findings_of(known: RunState) -> Findings:
         known.mount or _mount(tied),
         known.session.need,
         picks_of(_pickable(known), known.session.need),
+        None if known.mount else _standing_tie(solved.cell, answer.last_edges),
     )
+
+
+def _standing_tie(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | None:
+    worst = {
+        frame: max(value.sigma / value.limit for value in _directions(cell, frame, edge))
+        for frame, edge in edges.items()
+    }
+    return standing_tie(cell, max(worst, key=worst.__getitem__)) if worst else None
 
 
 def _with_alike(found: Finding, known: RunState) -> Finding:
@@ -146,11 +162,17 @@ _Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence
 def _of_pair(known: RunState) -> _Parts:
     """The worst directions and the place of work of one camera and one robot."""
     answer, work = known.solved, known.work
-    budget = {name.replace("_", " "): mm for name, mm in work.budget_mm.items()}
+    budget = _in_words(work.budget_mm)
     place = PointAccuracy("Where the views look, a point", budget, work.radius95_mm)
     mount = known.session.mount
     found = [*_of_measured(known)]
     return directions(answer.problem, answer.state, answer.covariance, mount), [place], found
+
+
+def _in_words(budget_mm: Mapping[str, float]) -> dict[str, float]:
+    """A budget by sources in words; the names of frames, of which they are, stay."""
+    parts = ((name.partition(" of "), mm) for name, mm in budget_mm.items())
+    return {f"{source.replace('_', ' ')}{of}{frame}": mm for (source, of, frame), mm in parts}
 
 
 def _of_measured(known: RunState) -> Iterator[Finding]:
@@ -192,7 +214,7 @@ def _of_cell(known: RunState) -> _Parts:
     return (
         sorted(worst, key=lambda value: (value.is_rotation, -value.sigma)),
         [
-            PointAccuracy(frame, budget[frame], 1e3 * radius95(edge.covariance[3:, 3:]))
+            PointAccuracy(frame, _in_words(budget[frame]), 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
         [moved_found(move) for move in answer.moved],
@@ -373,13 +395,21 @@ def check_answer(known: RunState) -> None:
         return
     names = {name: _names(part.tree, name) for name in part.unknown}
     lost = agreed.problem.subset(~agreed.used)
+    # A robot that was never tilted leaves more open than one standing view does.
+    is_tilted = not any(tilting_advice(cell, base) for base in part.tree.bases.values())
+
+    def tie_of(frame: str) -> StandingTie | None:
+        return standing_tie(cell, frame) if is_tilted else None
 
     def motion(frame: str) -> str:
         if not part.through(frame).any() and (count := int(lost.through(frame).sum())):
             return f"all {count} observations of it disagree with the rest of the cell"
-        return _motion(cell, part, frame)
+        tie = tie_of(frame)
+        return _motion(cell, part, frame) if tie is None else tie.words
 
     def advice(frame: str, culprit: str) -> str:
+        if (tie := tie_of(frame)) is not None:
+            return tie.advice
         if part.through(frame).any() or not len(lost):
             flanges = part.tree.flanges.values()
             by_way = [name for name in flanges if part.through(name)[part.through(frame)].any()]

@@ -1,10 +1,12 @@
 """What ties the frames of a cell together, and in words what would where nothing does."""
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
+from visioncal.calibration.stages.judged import StandingTie
 from visioncal.core.errors import DegenerateError
 from visioncal.core.files import some_of
 from visioncal.core.transforms import invert
@@ -56,7 +58,9 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
         if parts:
             why += f", which does not determine {' and '.join(parts)}"
         words = [
-            f"To tie {base}: {tilt}" if base in lost and (tilt := _tilting(cell, base)) else other
+            f"To tie {base}: {tilt}"
+            if base in lost and (tilt := tilting_advice(cell, base))
+            else other
             for base, other in zip(bases, words, strict=True)
         ]
     raise DegenerateError(
@@ -91,7 +95,7 @@ def _open_part(cell: Cell, base: str) -> str:
     return open_offset(invert(cell.poses[_robot_on(cell, base)][stations]), base, base)
 
 
-def _tilting(cell: Cell, base: str) -> str:
+def tilting_advice(cell: Cell, base: str) -> str:
     """Advice to tilt a robot that was observed often enough; empty where it was tilted."""
     stations, robot = _stations(cell, base), _robot_on(cell, base)
     if len(stations) < FEWEST_VIEWS or turns_about_two_axes(invert(cell.poses[robot][stations])):
@@ -129,6 +133,34 @@ def _stations(cell: Cell, base: str) -> IntArray:
         if step.robot and cell.tree.branches[step.frame].parent == base
     }
     return np.array(sorted(found), dtype=np.int64)
+
+
+def standing_tie(cell: Cell, frame: str) -> StandingTie | None:
+    """The one camera's view of one board, both standing still, that alone ties a frame.
+
+    However often it is repeated, it is one view.
+
+    Args:
+        cell: The cell.
+        frame: The frame that is known worst.
+
+    Returns:
+        What that is; None where the frame is tied otherwise.
+    """
+    tree = cell.tree
+    moved = [row for row in cell.rows if any(step.robot for step in tree.path(row.seer, row.seen))]
+    tied = replace(cell, rows=tuple(moved)).tied()
+    pairs = {(row.seer, row.seen) for row in cell.rows if (row.seer in tied) != (row.seen in tied)}
+    pairs = {pair for pair in pairs if not any(step.robot for step in tree.path(*pair))}
+    flange = next((name for name in tree.flanges.values() if name in tied), "")
+    if frame in tied or len(pairs) != 1 or not flange:
+        return None
+    ((camera, board),) = pairs
+    return StandingTie(
+        f"{camera} sees {board} from one place alone, and that is one view however often it is "
+        "repeated",
+        f"Let {camera} see a board on {flange} at 5 stops or more, too.",
+    )
 
 
 def untied_words(cell: Cell, frame: str) -> str:

@@ -19,7 +19,7 @@ from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import some_of
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, Corners
-from visioncal.core.verdict import LEAST_NEED_MM, OTHER_SIZE, Finding, Remedy
+from visioncal.core.verdict import EMPTY_IMAGE, LEAST_NEED_MM, OTHER_SIZE, Finding, Remedy
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
@@ -112,9 +112,18 @@ def estimate_lenses(seen: T) -> T:
                     raise
             lens = CameraResult(found.camera, estimated=True, covariance=found.covariance)
             of = frame if len(session.cameras) > 1 else ""
-            seen = seen.noting(found.rejections, (warning.of(of) for warning in found.warnings))
+            seen = seen.noting(found.rejections, (_of(warning, of) for warning in found.warnings))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
+
+
+def _of(warning: Finding, frame: str) -> Finding:
+    """A finding about a lens with the camera's frame, where there are several; empty for one."""
+    found = warning.of(frame)
+    if not frame or found.do is None or found.kind != EMPTY_IMAGE:
+        return found
+    # Several cameras lack different parts of their images.
+    return replace(found, do=Remedy(f"{frame}: {found.do.words[0].lower()}{found.do.words[1:]}"))
 
 
 def locate_targets(seen: T) -> T:

@@ -364,16 +364,23 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
             if of_arm
             else f"Frames are {known} is the board's, as well as its size is stated."
             if of_board
+            else f"Weakly determined, with their sigmas: {', '.join(weak)}; doubt begins at "
+            f"{least}. The cause: {findings.tie.words}."
+            if findings.tie
             else f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt "
             f"begins at {least}."
         )
         yield Finding(
             "weak_motion",
             words,
-            NO_JOINTS if of_arm else MEASURE_BOARD if of_board else _tilted(findings),
+            NO_JOINTS if of_arm else MEASURE_BOARD if of_board else _tied_or_tilted(findings),
             is_fatal=is_fatal,
             until_mm=0.0,
         )
+
+
+def _tied_or_tilted(findings: Findings) -> Remedy:
+    return Remedy(findings.tie.advice) if findings.tie else _tilted(findings)
 
 
 def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:

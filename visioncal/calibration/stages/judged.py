@@ -110,6 +110,19 @@ class PointAccuracy:
 
 
 @dataclass(frozen=True)
+class StandingTie:
+    """That one view of what stands still ties a part of a cell to the rest.
+
+    Attributes:
+        words: Which view that is, as a part of a sentence.
+        advice: What to do about it, in a sentence.
+    """
+
+    words: str
+    advice: str
+
+
+@dataclass(frozen=True)
 class Findings:
     """What the verdict is made of.
 
@@ -125,6 +138,7 @@ class Findings:
         mount: What observed whom.
         need: What the task needs; None where that is not said.
         picks: What picks err by, by each camera and robot; empty where that is not predicted.
+        tie: What alone ties the frame that is known worst; None where more does.
     """
 
     pairs: Sequence[JudgedPair]
@@ -137,6 +151,7 @@ class Findings:
     mount: Mount = "eye-in-hand"
     need: Need | None = None
     picks: Sequence[Picks] = ()
+    tie: StandingTie | None = None
 
     @property
     def plannable(self) -> bool:
