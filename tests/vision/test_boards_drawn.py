@@ -8,6 +8,7 @@ from support.boards import charuco, checkerboard
 from visioncal.core.types import Target
 from visioncal.present.recording.board import picture
 from visioncal.simulation.textures import draw_sheet
+from visioncal.vision.finders import NotFound
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.printing import draw_pattern
 from visioncal.vision.targets import corner_positions, marker_cells, target_from_document
@@ -34,6 +35,17 @@ def test_a_charuco_board_is_found_in_its_picture(target: Target) -> None:
     assert list(seen.ids) == list(range(len(expected)))
     # The detector is good to a few tenths of a pixel on a page without blur.
     np.testing.assert_allclose(seen.px, expected, atol=0.6)
+
+
+def test_two_copies_of_a_charuco_board_in_an_image_are_named() -> None:
+    target = charuco(9, 6, square_m=0.025, marker_m=0.018)
+    drawn = cv2.resize(picture(target), None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    page = np.pad(drawn, 60, constant_values=255)
+    seen = find_charuco(np.hstack([page, page]), target)
+    assert isinstance(seen, NotFound)
+    assert (
+        seen.reason == "markers are seen twice: another board with the same markers is in the image"
+    )
 
 
 @pytest.mark.parametrize("name", DICTIONARIES)

@@ -59,6 +59,11 @@ def find_charuco(
     px, ids, marker_px, marker_ids = detector.detectBoard(image)
     if not marker_px:
         return NotFound(f"no board: no marker of {target.dictionary} is seen")
+    if len(marker_px) - len(np.unique(marker_ids)) >= _LAYOUT_MARKERS:
+        # Of two copies, the corners would be of either, or of both.
+        return NotFound(
+            "markers are seen twice: another board with the same markers is in the image"
+        )
     if _misfit(_by_id(marker_px, marker_ids), target) > LAYOUT_MISFIT:
         return NotFound("the markers do not lie as the target describes them", misfit=True)
     if np.size(ids) == 0 or px is None:
