@@ -230,6 +230,16 @@ def test_poses_that_are_misread_explain_the_rest() -> None:
     assert after.reasons[1:] == before.reasons
 
 
+def test_exchanged_rows_that_are_read_so_leave_other_causes_their_steps() -> None:
+    wrong = Finding("wrong_views", "View 9 was left out.", Remedy("Compare view 9."), (9,))
+    before = judge(changed(SOUND, warnings=(EXCHANGED, wrong), stops=8))
+    after = with_misread(before, Finding("misread_poses", "With views exchanged.", READ_AGAIN))
+    steps = {finding.kind: str(finding.do) for finding in after.findings if finding.do}
+    assert steps["exchanged_views"].startswith("Write a copy of the session with these rows")
+    assert steps["few_stops"] == steps["exchanged_views"]
+    assert steps["wrong_views"] == "Compare view 9."
+
+
 def test_joints_that_are_there_but_misread_come_before_the_errors_they_would_explain() -> None:
     step = Remedy('Write model = "ur5e".')
     misread = Finding("misread_joints", "With the arm a ur5e and not a ur3e, they fit.", step)

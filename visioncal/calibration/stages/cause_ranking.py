@@ -160,8 +160,12 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
         # The same, found by the views themselves; the command exchanges the rows.
         words = "Write a copy of the session with these rows exchanged, and calibrate it."
         step = found.do and replace(found.do, words=words)
+        # What is likely by itself keeps its own step.
         said = (
-            replace(finding, do=step) if finding.do else finding for finding in verdict.findings
+            replace(finding, do=step)
+            if finding.do and (finding.kind == EXCHANGED or not finding.probability)
+            else finding
+            for finding in verdict.findings
         )
         return replace(verdict, findings=tuple(said))
     odds = _odds(EVIDENCE[found.kind].chance)
