@@ -23,6 +23,7 @@ from visioncal.estimation.solve import (
 from visioncal.estimation.variance import (
     Components,
     Knowledge,
+    Weighed,
     estimate_sigmas,
     likelihood,
     likely_sigma,
@@ -167,6 +168,36 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
     levels, fixed = 2.0 * fit.noise.robots, np.zeros(2, dtype=bool)
     found, values = (item.most_likely(levels, fixed)[1] for item in (beside, expected))
     assert found == pytest.approx(values, abs=1e-5)
+
+
+@pytest.mark.parametrize("true_size", [0.0, 2e-3])
+def test_the_likeliest_size_of_effects_is_that_of_the_likelihood_beside_given_levels(true_size):
+    problem, fit = answered(True, views=20, seed=6)
+    found, rng = robot_likelihood(problem, fit.state, fit.noise), np.random.default_rng(0)
+    moves, count = rng.standard_normal((20, 6, 8)), 8
+    moved = found.moved(0, moves)
+    effects = true_size * rng.standard_normal(count)
+    errors, logs = found.reduced.errors + moved @ effects, np.log(fit.noise.robots[0])
+    wider, known = found.beside(0, moves), found.known.beside(count)
+
+    def value(size):
+        information = known.information.copy()
+        information[-count:, -count:] += np.eye(count) / size**2
+        given = replace(known, information=information)
+        jacobian, parts = wider.jacobian, found.components
+        return Weighed.of(errors, jacobian, parts, given, logs).value + count * np.log(size)
+
+    without = Weighed.of(errors, found.jacobian, found.components, found.known, logs)
+    size, gain = without.likely_size(moved, np.ones(20, dtype=bool))
+    sizes = np.exp(np.arange(np.log(1e-7), np.log(1.0), 0.1))
+    values = np.array([value(item) for item in sizes])
+    # Sizes are compared in steps of a fifth, and between two of them a value is hardly larger.
+    assert gain == pytest.approx(max(without.value - values.min(), 0.0), abs=0.1)
+    if true_size:
+        assert size == pytest.approx(sizes[values.argmin()], rel=0.15)
+        assert without.value - value(size) == pytest.approx(gain, abs=1e-3)
+    else:
+        assert size < 1e-4
 
 
 @pytest.mark.parametrize("kind", ["one a stop", "two a stop", "combined"])
