@@ -115,7 +115,8 @@ class ArmTrials:
         if key not in self._fits:
             problem, fewer = self.erring(errors), self._fits.get(key[:-1])
             state, noise = (self.state, self.noise) if fewer is None else (fewer.state, fewer.noise)
-            start = State(state.edges, problem.start_values)
+            added = problem.start_values[len(state.values) :]
+            start = State(state.edges, np.concatenate([state.values, added]))
             self._fits[key] = fit_problem(problem, start, noise)
         return self._fits[key]
 
