@@ -8,6 +8,7 @@ the sizes: below it what does not grow with them counts, too.
 """
 
 import argparse
+import os
 import resource
 import time
 from collections.abc import Callable, Sequence
@@ -145,7 +146,8 @@ def main() -> None:
     if quick:
         views, cameras, stops, small = (20, 25, 30), (2, 3, 4), 12, 12
     tables = views_table(views, quick=quick), cameras_table(cameras, stops, small, quick=quick)
-    text = "\n\n".join(tables)
+    busy = f"Load average meanwhile: {os.getloadavg()[2]:.0f} on {os.cpu_count()} cores."
+    text = "\n\n".join([*tables, busy])
     print(text)
     if not quick:
         write_section("Growth", "PYTHONPATH=tests python tests/benchmarks/growth.py", text)
