@@ -133,5 +133,7 @@ def truth_table(
         sigmas = np.sqrt(np.diag(calibration.camera.covariance))[:4]
         errors = calibration.camera.camera.matrix - camera.matrix
         for name, error, sigma in zip(("fx", "fy", "cx", "cy"), errors, sigmas, strict=True):
-            table.add_row(name, f"{error:+.2f} px", f"{sigma:.2f} px", f"{abs(error) / sigma:.2f}")
+            # A value that is held has no error to be measured by its sigma.
+            ratio = f"{abs(error) / sigma:.2f}" if sigma > 0.0 else ""
+            table.add_row(name, f"{error:+.2f} px", f"{sigma:.2f} px", ratio)
     return table
