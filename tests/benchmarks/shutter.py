@@ -14,7 +14,7 @@ from results import few, first, wished, write_section
 from support.cells import calibrated_sweep
 
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages import clock
+from visioncal.calibration.stages import clock_sweep
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.simulation import CellOptions, SimulatedCell, SweepOptions, sweep
@@ -75,9 +75,9 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
     error, covariance = x_error(moved, known), known.solved.covariance[:6, :6]
     ignoring = np.full(6, np.nan)
     if seed < IGNORED:
-        look, clock.find_delays = clock.find_delays, lambda *_: (None, ())
+        look, clock_sweep.find_delays = clock_sweep.find_delays, lambda *_: (None, ())
         ignoring = x_error(moved, calibrated_sweep(moved))
-        clock.find_delays = look
+        clock_sweep.find_delays = look
     return Outcome(
         found.time_s - world.readout_s,
         found.sigma_s,

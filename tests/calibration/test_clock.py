@@ -12,9 +12,9 @@ from support.marks import slow
 from visioncal.calibration.pipeline import STAGES, calibrate
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.clock_offset import LARGEST_SIGMA_S, ClockOffset
 from visioncal.calibration.stages.clocks import set_clocks
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import LARGEST_SIGMA_S, ClockOffset
 from visioncal.calibration.stages.pnp import given_poses
 from visioncal.calibration.verification import verify
 from visioncal.core.errors import DataError, DegenerateError

@@ -11,8 +11,8 @@ from support.sound_findings import SOUND, changed, directions
 from visioncal.calibration.pipeline.judging import findings_of
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
+from visioncal.calibration.stages.findings import PointAccuracy
 from visioncal.calibration.stages.judge import judge
-from visioncal.calibration.stages.judged import PointAccuracy
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit

@@ -13,9 +13,9 @@ from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.cause_ranking import MEASURE_BOARD, NO_JOINTS, with_misread
+from visioncal.calibration.stages.findings import PointAccuracy
 from visioncal.calibration.stages.fit_messages import scale_found
 from visioncal.calibration.stages.judge import judge
-from visioncal.calibration.stages.judged import PointAccuracy
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.codec import read, write
 from visioncal.core.transforms import exp, invert, pose_difference

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.sound_findings import PAIR, SOUND, changed, directions, left_out, views
 
+from visioncal.calibration.stages.findings import Sensor
 from visioncal.calibration.stages.judge import judge
-from visioncal.calibration.stages.judged import Sensor
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.number_format import figure
 from visioncal.core.types import Rejection

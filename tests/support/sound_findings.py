@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from visioncal.calibration.stages.judged import (
+from visioncal.calibration.stages.findings import (
     Findings,
     JudgedArm,
     JudgedPair,

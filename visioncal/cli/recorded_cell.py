@@ -15,7 +15,7 @@ from rich.markup import escape
 from visioncal.cli.console import messages, print_json, say
 from visioncal.cli.record_options import RecordCellOptions
 from visioncal.core.errors import DataError, DriverError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.boards import target_named
 from visioncal.live.capture.coach import Coach
@@ -305,8 +305,8 @@ def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions)
     )
     say(
         escape(
-            f"{cell.arm.name}, {cell.camera.name}: {count} stop{'s' if count > 1 else ''} to drive "
-            f"at {taking.speed:g} rad/s, about {long}"
+            f"{cell.arm.name}, {cell.camera.name}: {counted(count, 'stop')} to drive at "
+            f"{taking.speed:g} rad/s, about {long}"
         )
     )
     say(
@@ -346,10 +346,9 @@ def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) ->
     if as_json:
         print_json(_summary(journal, steps))
         return
-    count = len(journal.views)
     say(
-        f"{count} view{'s' if count != 1 else ''} in {journal.folder}; next: visioncal "
-        f"calibrate {shlex.quote(str(journal.folder))} -o out"
+        f"{counted(len(journal.views), 'view')} in {journal.folder}; next: visioncal calibrate "
+        f"{shlex.quote(str(journal.folder))} -o out"
     )
 
 

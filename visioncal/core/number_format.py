@@ -74,6 +74,11 @@ def significant(value: float | None, digits: int = 2) -> str:
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
 
 
+def counted(count: int, thing: str) -> str:
+    """Writes how many of something there are: `1 stop`, `3 stops`."""
+    return f"{count} {thing}{'' if count == 1 else 's'}"
+
+
 def listed(words: Sequence[str]) -> str:
     """Writes words one after the other: `a, b and c`."""
     *first, last = words

@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from visioncal.core.errors import DataError
 from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
+from visioncal.core.number_format import counted
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.core.verdict import remarks
 from visioncal.estimation.pointfit import FEWEST_POINTS
@@ -285,7 +286,7 @@ def marked_fixture(
     measured = MeasuredPoints(
         session.name,
         found.names,
-        tuple(_count(index, "image") for index in found.seen_in),
+        tuple(counted(index, "image") for index in found.seen_in),
         tuple(ids[index] for index in seen),
         found.points,
         found.independent,
@@ -328,8 +329,8 @@ def _seen(shown: Sighting, ids: Sequence[int]) -> tuple[int, ...]:
         return seen
     others = sorted(there - set(ids))
     raise DataError(
-        f"session {shown.source!r}: its {_count(len(pictures), 'image')} show "
-        f"{_count(len(seen), 'drawn marker')} of {shown.target.dictionary}"
+        f"session {shown.source!r}: its {counted(len(pictures), 'image')} show "
+        f"{counted(len(seen), 'drawn marker')} of {shown.target.dictionary}"
         f"{_listed(seen)}, at least {FEWEST_POINTS} are needed"
         f"{'; markers that are not drawn' if others else ''}{_listed(others)}.",
         culprits=[f"marker {number}" for number in ids if number not in there],
@@ -340,10 +341,6 @@ def _seen(shown: Sighting, ids: Sequence[int]) -> tuple[int, ...]:
 
 def _listed(ids: Sequence[int]) -> str:
     return f" ({some_of([str(number) for number in ids])})" if ids else ""
-
-
-def _count(count: int, thing: str) -> str:
-    return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
 def _outward(calibration: Calibration, sights: Sequence[Sight], found: SeenPoints) -> FloatArray:

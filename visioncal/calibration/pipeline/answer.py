@@ -26,12 +26,12 @@ from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
 from visioncal.calibration.stages.arms import ArmFound
 from visioncal.calibration.stages.cell import Cell, ObservationRow
-from visioncal.calibration.stages.clock import ClockPair
+from visioncal.calibration.stages.clock_offset import ClockOffset, FoundDelay
+from visioncal.calibration.stages.clock_sweep import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.diagnose import ResidualTest, misfits
 from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import ClockOffset, FoundDelay
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.pose_ambiguity import choose_by, chosen
 from visioncal.calibration.stages.validate import HeldOut, apart

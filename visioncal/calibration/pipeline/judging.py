@@ -22,7 +22,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.distance_scale import distance_scale, measured_turns
-from visioncal.calibration.stages.judged import (
+from visioncal.calibration.stages.findings import (
     Findings,
     JudgedArm,
     JudgedPair,

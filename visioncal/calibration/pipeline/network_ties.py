@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.judged import StandingTie
+from visioncal.calibration.stages.findings import StandingTie
 from visioncal.core.errors import DegenerateError
 from visioncal.core.files import some_of
+from visioncal.core.number_format import counted
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
 from visioncal.estimation.observability import (
@@ -120,7 +121,7 @@ def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
     if robot == robot_key(""):
         who = "the robot"
     if len(stations) < 2:
-        return f"{who} was observed at {len(stations)} stop{'s' * (len(stations) != 1)}"
+        return f"{who} was observed at {counted(len(stations), 'stop')}"
     return motion_words(invert(poses), poses, f"{len(stations)} stops of {who}", base)
 
 

@@ -10,7 +10,7 @@ from visioncal.calibration.pipeline.budget import Work, work_of
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
-from visioncal.calibration.stages.judged import Findings
+from visioncal.calibration.stages.findings import Findings
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.readings import Readings
 from visioncal.core.choices import Convention, SolverName

@@ -11,7 +11,8 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.clock import (
+from visioncal.calibration.stages.clock_offset import ClockOffset
+from visioncal.calibration.stages.clock_sweep import (
     CameraSweep,
     Clocked,
     ClockPair,
@@ -20,7 +21,6 @@ from visioncal.calibration.stages.clock import (
 )
 from visioncal.calibration.stages.motion import is_open, motion_of, stream_of
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.offset import ClockOffset
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.types import Rejection

@@ -13,7 +13,7 @@ from visioncal.calibration.stages.cause_ranking import (
     adding,
     run_evidence,
 )
-from visioncal.calibration.stages.judged import Findings, JudgedArm, JudgedPair, Sensor
+from visioncal.calibration.stages.findings import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.types import Mount

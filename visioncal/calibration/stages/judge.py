@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import is_negligible, ranked
 from visioncal.calibration.stages.doubts import doubts_of, helping, is_scattered
-from visioncal.calibration.stages.judged import Findings
+from visioncal.calibration.stages.findings import Findings
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent

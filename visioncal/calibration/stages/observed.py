@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
-from visioncal.calibration.stages.clock import Clocked, ClockPair
+from visioncal.calibration.stages.clock_sweep import Clocked, ClockPair
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import Reported

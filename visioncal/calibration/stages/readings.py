@@ -11,7 +11,7 @@ from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.files import did_you_mean, some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Rejection
 from visioncal.estimation.positions import Mounting, Places, find_mounting, residuals
@@ -292,8 +292,8 @@ def _check_stops(readings: Readings, stops: IntArray) -> None:
         return
     what = "point on the flange" if points == 1 else f"{points} points on the flange"
     raise DegenerateError(
-        f"instrument: {count} usable stop{'s' if count != 1 else ''} of the robot; at least "
-        f"{needed} are needed to determine where the instrument stands and where the {what} "
+        f"instrument: {counted(count, 'usable stop')} of the robot; at least {needed} are needed "
+        f"to determine where the instrument stands and where the {what} "
         f"{'is' if points == 1 else 'are'}.",
         culprits=["the instrument's place", f"the {what}"],
         next_step="Read at more stops, with the flange turned about different axes; 20 to 30 "

@@ -20,7 +20,7 @@ from visioncal.calibration.verification.change_hypotheses import (
 from visioncal.calibration.verification.check import Check, Suspect
 from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.limits import CheckLimits
-from visioncal.core.number_format import figure, listed, mm_and_deg
+from visioncal.core.number_format import counted, figure, listed, mm_and_deg
 from visioncal.core.transforms import exp, inverse_right_jacobian, skew
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import AGAIN, AGREEMENT, CALIBRATE_ANEW, PLAN, Finding, Remedy, Verdict
@@ -363,8 +363,7 @@ def _doubts(check: Check) -> Iterator[Finding]:
 
 
 def _stops(check: Check) -> str:
-    count = check.seen.stops
-    return f"{count} stop{'' if count == 1 else 's'}"
+    return counted(check.seen.stops, "stop")
 
 
 def _capital(text: str) -> str:

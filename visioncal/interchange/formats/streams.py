@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visioncal.calibration.stages.clock_offset import LEAST_CORRELATION
 from visioncal.calibration.stages.motion import slow_and_new
-from visioncal.calibration.stages.offset import LEAST_CORRELATION
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.clock_correlation import (

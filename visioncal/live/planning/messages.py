@@ -1,7 +1,7 @@
 """A plan of stops, or of motions, in words."""
 
 from visioncal.core.files import some_of
-from visioncal.core.number_format import figure, mm_and_deg, percent
+from visioncal.core.number_format import counted, figure, mm_and_deg, percent
 from visioncal.dynamics.limits import Kept
 from visioncal.dynamics.sweeps import Sweeps
 from visioncal.dynamics.written import MotionPlan
@@ -28,7 +28,7 @@ def need_words(found: NeedPlanned) -> str:
 def summary_of(plan: Plan) -> str:
     """Says in a sentence what a plan gives."""
     count, design = len(plan.stops), plan.design
-    stops = f"{count} stop{'s' if count != 1 else ''}"
+    stops = counted(count, "stop")
     wanted = f"{plan.request.purpose.errors}, predicted sigma"
     if plan.begun is None:
         return (

@@ -13,6 +13,7 @@ from visioncal.calibration.stages.pose_ambiguity import choose_by
 from visioncal.calibration.stages.refine import free_of
 from visioncal.calibration.stages.side import FramesSide
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray, Mount, Progress
@@ -384,8 +385,8 @@ def _missing(known: RunState) -> DataError:
 
 def _too_vague(known: RunState, stops: int) -> DataError:
     return DataError(
-        f"session {known.session.name!r}: its {stops} usable stop{'s' if stops != 1 else ''} "
-        "of the robot do not show where camera and board are, not even roughly.",
+        f"session {known.session.name!r}: its {counted(stops, 'usable stop')} of "
+        "the robot do not show where camera and board are, not even roughly.",
         culprits=[f"session {known.session.name!r}"],
         next_step="Give rough guesses of both, in mm and degrees: --cam 'X Y Z RX RY RZ' --board "
         "'X Y Z RX RY RZ'.",

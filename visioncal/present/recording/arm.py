@@ -21,13 +21,12 @@ _FLOOR = 1.3
 _BELOW_M = 0.004
 
 
-def log_arm(stream: rr.RecordingStream, link_frames: FloatArray, entity: str = paths.ROBOT) -> None:
+def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
     """Draws an arm at the stream's current time.
 
     Args:
         stream: Where to.
         link_frames: (n, 4, 4) the frames of its joints and its flange in the base [m].
-        entity: Under which entity.
     """
     shapes = _Shapes.of(link_frames[None])
     capsules = rr.Capsules3D(
@@ -38,14 +37,14 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray, entity: str = p
         colors=colours.LINK,
         fill_mode="solid",
     )
-    stream.log(f"{entity}/links", capsules)
+    stream.log(f"{paths.ROBOT}/links", capsules)
     balls = rr.Ellipsoids3D(
         centers=shapes.joints_m,
         half_sizes=shapes.half_sizes_m,
         colors=colours.JOINT,
         fill_mode="solid",
     )
-    stream.log(f"{entity}/joints", balls)
+    stream.log(f"{paths.ROBOT}/joints", balls)
 
 
 def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:

@@ -16,6 +16,8 @@ Places: TypeAlias = Sequence[float] | FloatArray
 _THIN, _TICK_PT, _GAP_PT = 0.6, 3.0, 2.5
 _STEPS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 _MOST_DECIMALS = 6
+# Of a scale's span, left free at both ends.
+_ROOM = 0.05
 # What of a colour bar's height is beside its panel, and its width and distance [points].
 _BAR_SHARE, _BAR_PT, _BAR_GAP_PT, _BAR_STEPS = 0.85, 9.0, 9.0, 48
 
@@ -60,11 +62,11 @@ class Scale:
         return [low, high]
 
 
-def spanning(values: FloatArray, room: float = 0.05) -> Scale:
+def spanning(values: FloatArray) -> Scale:
     """A scale that holds values, with some room at both ends; NaN are passed over."""
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    spare = room * (high - low) or 0.5
+    spare = _ROOM * (high - low) or 0.5
     return Scale(low - spare, high + spare)
 
 

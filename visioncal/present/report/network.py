@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from markupsafe import Markup
 
-from visioncal.core.number_format import significant
+from visioncal.core.number_format import counted, significant
 from visioncal.core.types import FloatArray
 from visioncal.present.cellmap import SeenPair, pairs, places, sigma_words, spans, weakest_frame
 from visioncal.present.facts import DEGREE
@@ -39,7 +39,7 @@ def kinds(tree: FrameTree) -> str:
     for kind, start in _KINDS.items():
         count = sum(name.startswith(start) for name in tree.last)
         if count:
-            words.append(f"{count} {kind}{'' if count == 1 else 's'}")
+            words.append(counted(count, kind))
     return ", ".join(words)
 
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visioncal.calibration.guess.joints import JointReading, declared_reading, unit_readings
-from visioncal.calibration.stages.motion import RobotMotion, at_rest, is_open, slow_and_new
-from visioncal.calibration.stages.offset import (
+from visioncal.calibration.stages.clock_offset import (
     FEWEST_VIEWS,
     LARGEST_SIGMA_S,
     LEAST_CORRELATION,
@@ -28,6 +27,7 @@ from visioncal.calibration.stages.offset import (
     turning_doubt,
     why_undetermined,
 )
+from visioncal.calibration.stages.motion import RobotMotion, at_rest, is_open, slow_and_new
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
