@@ -189,6 +189,10 @@ def test_the_likeliest_size_of_effects_is_that_of_the_likelihood_beside_given_le
 
     without = Weighed.of(errors, found.jacobian, found.components, found.known, logs)
     size, gain = without.likely_size(moved, np.ones(20, dtype=bool))
+    # Effects that look like the unknowns alone are of any size, and pull at nothing.
+    taken = found.jacobian[:, :, :3]
+    more = np.concatenate([moved, taken], axis=2)
+    assert without.likely_size(more, np.ones(20, dtype=bool)) == pytest.approx((size, gain))
     sizes = np.exp(np.arange(np.log(1e-7), np.log(1.0), 0.1))
     values = np.array([value(item) for item in sizes])
     # Sizes are compared in steps of a fifth, and between two of them a value is hardly larger.

@@ -30,6 +30,8 @@ _SURPRISE_95, _FIRST_WIDTH, _WIDEST, _EXACT = 1.96, 0.125, 4.0, 0.02
 
 # Logarithms of sizes of random effects that are compared lie so far apart.
 _SIZE_STEP = 0.2
+# Information of so small a share of what there was is rounding.
+_ROUNDING = 1e-9
 
 # Logarithms of the ratio of a value's variance to that of its measurement; and a share of a
 # measurement that is not worth following.
@@ -380,9 +382,12 @@ class Weighed:
         taken = self.root.T @ gram(self.weighted[among], moved)
         information = gram(moved, self.weights[among] @ moved) - taken.T @ taken
         values, vectors = np.linalg.eigh(information)
+        # What the parameters take as a whole is rounding, and pulls at nothing.
+        kept = values > _ROUNDING * np.trace(information + taken.T @ taken)
+        values, vectors = values[kept], vectors[:, kept]
         squares = (gram(moved, self.pulled[among]) @ vectors) ** 2
         sizes = np.exp(np.arange(np.log(LEAST_SIGMA), np.log(MOST_SIGMA), _SIZE_STEP))[:, None]
-        added = 1.0 + sizes**2 * np.maximum(values, 0.0)
+        added = 1.0 + sizes**2 * values
         unlikely = 0.5 * np.sum(np.log(added) - sizes**2 * squares / added, axis=1)
         best = int(np.argmin(unlikely))
         return (
