@@ -129,7 +129,7 @@ MOST_BYTES, MOST_TOML_BYTES = 50_000_000, 2_000_000
 MOST_IMAGE_BYTES = 300_000_000
 # File systems take no longer name [bytes].
 _LONGEST_NAME = 255
-_UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 # Matrices in lists in tables need six.
 _DEEPEST = 40
 # How tomllib says that a table, or a key, is there already.
@@ -235,7 +235,7 @@ def decode_text(data: bytes, label: str) -> str:
         raise DataError(
             f"{label}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8 text.",
             culprits=[f"{label}, line {line}"],
-            next_step=save_as_utf8("UTF-16" if data[:2] in _UTF16_MARKS else "LATIN1"),
+            next_step=save_as_utf8("UTF-16" if data[:2] in UTF16_MARKS else "LATIN1"),
         ) from error
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import decode_text, read_bytes, save_as_utf8
+from visioncal.core.files import UTF16_MARKS, read_bytes, save_as_utf8
 from visioncal.core.types import FloatArray
 
 # Each value costs about a hundred bytes in memory once it is read.
@@ -20,20 +20,22 @@ MAX_VALUES = 1_000_000
 # Matrices in lists in tables need six.
 MAX_DEPTH = 40
 
-_COMMENT_LINE = re.compile(rb"^[ \t]*(?:#|%|//).*$", re.MULTILINE)
 _SHOWN = 60  # characters of a value in a message
 _MOST_AXES = 8
 
 
 def read_plain_text(path: Path) -> str:
-    """Reads a bounded UTF-8 text file, with or without a byte-order mark.
+    """Reads a bounded text file, in UTF-8 or as spreadsheets in the west write their tables.
 
-    Lines that begin as comments may be in any encoding that leaves ASCII as it is.
+    What is no UTF-8 is taken for Windows-1252, of which numbers are the same, and what has the mark
+    of UTF-16 for that.
 
     Raises:
-        DataError: As `read_bytes`, or the bytes are not UTF-8 or hold NUL, as binary files do.
+        DataError: As `read_bytes`, or the bytes hold NUL, as binary files do.
     """
     data = read_bytes(path)
+    if data.startswith(UTF16_MARKS):
+        return data.decode("utf-16", "replace")
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
         raise DataError(
@@ -41,8 +43,10 @@ def read_plain_text(path: Path) -> str:
             culprits=[str(path)],
             next_step=save_as_utf8("UTF-16"),
         )
-    readable = _COMMENT_LINE.sub(lambda pair: pair[0].decode("utf-8", "replace").encode(), data)
-    return decode_text(readable, str(path))
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
 
 
 def too_many(where: str) -> DataError:
