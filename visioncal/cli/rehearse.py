@@ -10,7 +10,7 @@ import typer
 from visioncal.cli.console import print_json, report_written, say
 from visioncal.cli.options import AsJson, OutFolder, Seed, View
 from visioncal.core.choices import CameraMount, Faults
-from visioncal.core.errors import DataError
+from visioncal.core.errors import DataError, DriverError
 from visioncal.core.files import write_json
 from visioncal.core.version import __version__
 from visioncal.live.drivers.extras import refuse_without
@@ -51,7 +51,13 @@ def rehearse_command(
     # Without depthai, pictures come straight from the simulated camera.
     refuse_without("ur", {"ur": "rtde_control", "oak": "depthai"})
     _make_place(out)
-    whole = rehearse(RehearsalOptions(robot, mount, views, seed), out, fault, view=view)
+    try:
+        whole = rehearse(RehearsalOptions(robot, mount, views, seed), out, fault, view=view)
+    except DriverError as error:
+        if "Ctrl-C" not in error.culprits:
+            raise
+        again = "A rehearsal begins anew: repeat the command."
+        raise DriverError(error.message, culprits=error.culprits, next_step=again) from error
     document = whole.document()
     write_json(out / _SUMMARY, document)
     if as_json:
