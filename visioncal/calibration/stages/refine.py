@@ -358,22 +358,38 @@ def _freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
     return again(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
 
 
-def _resized(side: FramesSide, answer: ConvergedFit) -> ConvergedFit:
+def _resized(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
     """Sets the boards' scales free where the robot measures others than are stated."""
-    # One after the other: a board that is off misleads about the others, too.
-    for _ in answer.looks.printed:
+    # One after the other: a board that is off misleads about the others, too, and about the arm's
+    # errors, beside which a size is clear or not.
+    answer, others = fitted, list[MeasuredScale]()
+    for _ in fitted.looks.printed:
         other = _wrongly_sized(side, answer)
         if other is None:
-            return answer
-        place = answer.looks.scale_of(other.board)
-        looks = answer.looks.with_values(place, np.array([other.scale]))
-        if other.contradicts:
-            looks = looks.without_prior(place.tolist())
-        resized = again(answer, side, np.union1d(answer.moving, place), looks)
-        if not _is_determined(resized, answer) or not _is_clear(side, resized, other):
-            return answer
+            break
+        resized = _sized_as(side, answer, other)
+        if not _is_determined(resized, answer):
+            break
         answer = resized
+        others.append(other)
+    if not others:
+        return answer
+    covariance = side.covariance_by_posture(answer)
+    clear = [other for other in others if _is_clear(side, answer, other, covariance)]
+    if len(clear) < len(others):
+        answer = fitted
+        for other in clear:
+            answer = _sized_as(side, answer, other)
     return answer
+
+
+def _sized_as(side: FramesSide, answer: ConvergedFit, other: MeasuredScale) -> ConvergedFit:
+    """The fit with the scale of a board free, from where it was measured."""
+    place = answer.looks.scale_of(other.board)
+    looks = answer.looks.with_values(place, np.array([other.scale]))
+    if other.contradicts:
+        looks = looks.without_prior(place.tolist())
+    return again(answer, side, np.union1d(answer.moving, place), looks)
 
 
 def _wrongly_sized(side: FramesSide, answer: ConvergedFit) -> MeasuredScale | None:
@@ -390,7 +406,9 @@ def _is_wrong(side: FramesSide, scale: MeasuredScale) -> bool:
     return scale.contradicts if side.has_errors else scale.is_another
 
 
-def _is_clear(side: FramesSide, resized: ConvergedFit, other: MeasuredScale) -> bool:
+def _is_clear(
+    side: FramesSide, resized: ConvergedFit, other: MeasuredScale, covariance: FloatArray
+) -> bool:
     """Whether a board is still of another size beside errors of arms without joint angles.
 
     Such errors follow the posture and pass for a size, whose sigma by white noise is a small part
@@ -401,7 +419,7 @@ def _is_clear(side: FramesSide, resized: ConvergedFit, other: MeasuredScale) -> 
     at = resized.columns.start + int(np.searchsorted(resized.seen.free, place))
     # What was stated is taken away again.
     known = looks.prior_sigma[place] ** -2.0
-    measured = 1.0 / side.covariance_by_posture(resized)[at, at] - known
+    measured = 1.0 / covariance[at, at] - known
     if measured <= 0.0:
         return False
     scale, sigma = looks.values[place] * (1.0 + known / measured), measured**-0.5
