@@ -47,8 +47,8 @@ GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal review OUT"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
-# Fewer views are not worth a calibration of their own.
-FEWEST_ALONE = 6
+# Fewer views are too few for a calibration of their own.
+_FEWEST_ALONE = 6
 # The command line as it was typed, to which options are added.
 AGAIN = "AGAIN"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
@@ -86,8 +86,8 @@ def exchanging(first: int, second: int) -> str:
 
 def or_alone(words: str, views: Sequence[int]) -> Remedy:
     """What to do, with the command that calibrates some views alone where they are enough."""
-    is_enough = len(views) >= FEWEST_ALONE
-    return Remedy(words, f"{CALIBRATE_ANEW} --views {ranges(views)}" if is_enough else "")
+    are_enough = len(views) >= _FEWEST_ALONE
+    return Remedy(words, f"{CALIBRATE_ANEW} --views {ranges(views)}" if are_enough else "")
 
 
 READ_AGAIN = Remedy(

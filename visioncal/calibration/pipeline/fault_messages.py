@@ -213,7 +213,7 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
     moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
     out = np.sort(run).tolist()
-    words = "Fasten what moved, and calibrate the views before and after it apart."
+    advice = "Fasten what moved, and calibrate the views before and after it apart."
     on_flange = problem.tree.body(frame) != problem.tree.root
     if on_flange or len(problem.robots) == 1:
         which = "tool" if on_flange else "base"
@@ -222,16 +222,15 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
             f", or the controller reported another {which} frame, "
             f"{mm_and_deg(other_mm, other_deg)} from that of the other views"
         )
-        words = (
+        advice = (
             f"Look which {which} frame was active in the controller, and set the same one for all "
             "views; or fasten what moved, and calibrate the views before and after it apart."
         )
-    step = or_alone(words, _numbers(solved, out))
     words = f"{_views(solved, out)} were left out: {when}, as they agree, {moved}."
     found = Finding(
         "something_moved",
         f"V{words[1:]}",
-        step,
+        or_alone(advice, _numbers(solved, out)),
         _numbers(solved, out),
         mahalanobis_sq=run_evidence(len(run), len(rows)),
     )

@@ -12,7 +12,7 @@ from visioncal.calibration.stages.priors import priors_of
 from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mount
-from visioncal.core.verdict import FEWEST_ALONE, Remedy, or_alone
+from visioncal.core.verdict import Remedy, or_alone
 from visioncal.estimation.chain import edge_names
 from visioncal.estimation.parts import FramePrior
 from visioncal.estimation.tree import Branch, Tree
@@ -79,10 +79,9 @@ class Cell:
         for row in (*self.rows, *self.held):
             parts["before" if row.station < station else "after"].append(row.view)
         where, views = max(parts.items(), key=lambda part: len(part[1]))
-        if len(views) < FEWEST_ALONE:
-            return Remedy(f"{do}, and record again.")
         words = f"{do}, and record again; or calibrate the {len(views)} views {where} it alone."
-        return or_alone(words, views)
+        either = or_alone(words, views)
+        return either if either.command else Remedy(f"{do}, and record again.")
 
     @property
     def mount(self) -> Mount | None:

@@ -372,7 +372,7 @@ def _resized(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
             break
         answer = resized
         others.append(other)
-    if not others:
+    if not (others and side.poses_alone):
         return answer
     covariance = side.covariance_by_posture(answer)
     clear = [other for other in others if _is_clear(side, answer, other, covariance)]

@@ -91,13 +91,17 @@ class FramesSide:
         }
         return replace(self, arms=arms)
 
+    @property
+    def poses_alone(self) -> dict[str, RobotArm]:
+        """The arms whose joints are not known."""
+        return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
+
     def covariance_by_posture(self, fitted: ConvergedFit) -> FloatArray:
         """(p, p) a fit's covariance, errors of arms without joint angles being what they may be.
 
         These are taken for noise, and weighed by `find_pose_errors`.
         """
-        alone = {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
-        problem = fitted.problem
+        problem, alone = fitted.problem, self.poses_alone
         for arm in alone.values():
             problem = arm.without_errors(problem)
         values, free = problem.start_values.copy(), len(fitted.seen.free)
