@@ -10,9 +10,10 @@ from visioncal.calibration.stages.init_frames import init_network
 from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
-from visioncal.estimation.moves import Move, evidence_gain, slight_move
+from visioncal.estimation.moves import Move
 from visioncal.estimation.outliers import agree, settle
 from visioncal.estimation.parts import Effect, FramePrior, Noise, State
+from visioncal.estimation.slight_steps import evidence_gain, slight_move
 from visioncal.estimation.solve import (
     RepeatErrors,
     Solution,

@@ -27,7 +27,6 @@ from visioncal.estimation.moves import (
     moved,
     moved_earlier_or_later,
     needless_move,
-    slight_move,
     unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
@@ -40,6 +39,7 @@ from visioncal.estimation.robust import (
     trimmed_start,
     widened,
 )
+from visioncal.estimation.slight_steps import slight_move
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,

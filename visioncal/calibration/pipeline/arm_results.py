@@ -17,12 +17,12 @@ from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.moves import Slip, step_covariance, with_step
 from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.parts import State
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import inflation
+from visioncal.estimation.slight_steps import Slip, step_covariance, with_step
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,

@@ -25,7 +25,8 @@ from visioncal.core.verdict import (
     look_at,
     or_alone,
 )
-from visioncal.estimation.moves import common_change, common_size
+from visioncal.estimation.moves import common_change
+from visioncal.estimation.slight_steps import common_size
 from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms

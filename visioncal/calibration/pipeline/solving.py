@@ -33,7 +33,6 @@ from visioncal.estimation.arm import rows_of
 from visioncal.estimation.joint import settle as settle_looks
 from visioncal.estimation.joint import target_sizes
 from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.moves import log_gain, slipped_joint
 from visioncal.estimation.observability import (
     check_observability,
     refuse_open_motion,
@@ -42,6 +41,7 @@ from visioncal.estimation.observability import (
 from visioncal.estimation.outliers import Agreed, agree, all_as_inliers, settle
 from visioncal.estimation.parts import Effect, Observations, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.slight_steps import log_gain, slipped_joint
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,

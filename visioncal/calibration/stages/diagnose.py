@@ -14,8 +14,11 @@ from visioncal.core.transforms import pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import PLAN, Finding, Remedy
 from visioncal.estimation.arm import LEVER_M, SIGNIFICANT, ArmErrors, stops_of
-from visioncal.estimation.moves import (
-    Move,
+from visioncal.estimation.moves import Move
+from visioncal.estimation.pose_errors import find_pose_errors
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
+from visioncal.estimation.slight_steps import (
     Resized,
     Slip,
     differs_elsewhere,
@@ -26,9 +29,6 @@ from visioncal.estimation.moves import (
     slight_move,
     slipped_joint,
 )
-from visioncal.estimation.pose_errors import find_pose_errors
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.residual_tests import Drift, Neighbours, drift, neighbours
 from visioncal.estimation.solve import Solution
 
 # What may be otherwise from some stop on.
