@@ -138,6 +138,37 @@ def test_a_tool_is_found_by_touches_of_either_robot_and_joins_the_cell(place, tm
     assert "flange_b_from_pin" in (place / "out" / "frames.json").read_text()
 
 
+def test_touches_or_a_tool_of_a_cell_say_which_robot_is_meant(place, tmp_path):
+    tip, point = np.array([0.01, -0.02, 0.15]), np.array([0.4, 0.1, 0.05])
+    places = point + 0.1 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    rng = np.random.default_rng(4)
+
+    def table(name, at, robots, kinds):
+        path = write_poses(tmp_path / name, turned_poses(rng, at, tip, np.eye(3)))
+        head, *rows = path.read_text().splitlines()
+        cells = zip(rows, robots, kinds, strict=True)
+        path.write_text("\n".join([f"{head},robot,kind", *map(",".join, cells)]) + "\n")
+        return path
+
+    of_b = table("b.csv", np.tile(point, (8, 1)), "b" * 8, ["point"] * 8)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "calibration.json").write_text((place / "out" / "calibration.json").read_text())
+    # The table names one robot of the cell: nobody is asked.
+    done("tcp", of_b, "-c", out, "--name", "pen")
+    assert "flange_b_from_pen" in Calibration.load(out).frames
+    # Without a calibration, --robot says which rows, and which of the cell's tools, are meant.
+    of_both = table("both.csv", np.tile(point, (16, 1)), "a" * 8 + "b" * 8, ["point"] * 16)
+    done("tcp", of_both, "--robot", "b", "-o", tmp_path / "pen.json")
+    jig = table("jig.csv", places, "bbb", ["origin", "x", "xy"])
+    named = ("--tool", f"{out}:pen", "--name", "jig", "-o", tmp_path / "jig.json")
+    done("fixture", jig, *named, "--robot", "b")
+    bare = write_poses(tmp_path / "bare.csv", turned_poses(rng, places, tip, np.eye(3)))
+    refused = visioncal("tcp", bare, "--robot", "b")
+    assert refused.status == 2
+    assert "--robot" in refused.err
+
+
 @pytest.mark.parametrize(
     ("command", "target", "names", "ends"),
     [

@@ -118,6 +118,7 @@ class FrameLocation:
         kind: FrameKind,
         choice: "Choice",
         needs: "Sequence[Part]",
+        touched_by: str | None = None,
     ) -> "FrameLocation":
         """Finds out what is known and where the frame will go, before anything is computed.
 
@@ -126,23 +127,21 @@ class FrameLocation:
             kind: What it is of.
             choice: Which camera and robot of a whole cell are meant.
             needs: What of them has to be clear.
+            touched_by: The only robot that the touches name; it is meant where the cell has it and
+                the user names none.
 
         Raises:
             DataError: A frame of that name is there, or the place cannot take one.
         """
         from visioncal.interchange.result_files import load_result
         from visioncal.results.selecting import placed_name
-        from visioncal.session.choosing import PARTS
 
         name, known, out = transform_name(kind, options.name), options.calibration, options.out
         result = None if known is None else load_result(known)
+        cell = None if result is None else result.cell
+        if cell is not None and choice.robot is None and touched_by in cell.robots:
+            choice = replace(choice, robot=touched_by)
         calibration = None if result is None else result.chosen(choice, needs)
-        if result is None and choice:
-            raise DataError(
-                "Names of cameras and robots are those of a whole cell, and none is named.",
-                culprits=[f"--{part}" for part in PARTS if choice.of(part)],
-                next_step="Name its output folder with -c, or leave them out.",
-            )
         if result is not None:
             name = placed_name(result, choice, needs, name)
         folder = None if known is None or out is not None else _folder(known)
@@ -305,6 +304,7 @@ def place_frame(
         DataError: The source cannot be read or does not show what is needed, or options contradict
             each other.
     """
+    from visioncal.interchange.formats.touches import robots_of
     from visioncal.session.choosing import ARM, EYE, Choice
 
     kind, part = asked.kind, asked.part
@@ -313,7 +313,11 @@ def place_frame(
         own = "the tool's point" if kind == "tool" else "the fixture's origin"
         refuse_given({"--point-mm": asked.point_mm}, f"touches say where {own} is")
         refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
-        place = FrameLocation.of(asked.goes, kind, Choice(robot=part.robot), ARM)
+        robots = robots_of(asked.source)
+        if asked.goes.calibration is None and not robots and tool in (None, "none"):
+            refuse_given({"--robot": part.robot}, "neither touches nor a calibration name robots")
+        only = robots[0] if len(robots) == 1 else None
+        place = FrameLocation.of(asked.goes, kind, Choice(robot=part.robot), ARM, only)
         frame = by_touches(place.calibration)
     else:
         place = FrameLocation.of(asked.goes, kind, replace(part.choice, target=None), EYE)

@@ -57,6 +57,20 @@ def read_touches(
     return _rows_of(fields, path, foreign.robot.poses(), foreign.joints_rad)
 
 
+def robots_of(path: Path) -> tuple[str, ...]:
+    """The robots that touches name, in their order; none where they name none.
+
+    Args:
+        path: As for `read_touches`.
+
+    Raises:
+        DataError: It cannot be read.
+    """
+    if path.is_dir() or path.suffix.lower() == ".rrd":
+        return tuple(filter(None, Session.load(path).robots))
+    return tuple(filter(None, dict.fromkeys(read_fields(path).texts.get("robot", ()))))
+
+
 def _of_robot(fields: Fields, robot: str | None) -> Fields:
     """The rows of one robot, where a column names it."""
     named = fields.texts.get("robot", ())
