@@ -10,13 +10,13 @@ from visioncal.core.files import (
     DocumentTable,
     check_free,
     decode_text,
-    did_you_mean,
     parse_toml,
     read_bytes,
     read_text,
     read_text_inside,
     write_atomically,
 )
+from visioncal.core.number_format import did_you_mean
 
 
 def test_text_survives_odd_paths(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ from visioncal.cli.console import answers, messages, print_json, say, warn
 from visioncal.cli.correct import CorrectOptions
 from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, did_you_mean, some_of, write_atomically
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.files import check_free, write_atomically
+from visioncal.core.number_format import did_you_mean, figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.result_files import load_calibration

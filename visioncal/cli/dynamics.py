@@ -11,7 +11,7 @@ from visioncal.cli.lazy import LazyGroup
 from visioncal.cli.options import RobotName
 from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 
 # Help does not wait for them.
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 
 # As a shell reports a program that SIGINT ended.
 _EXIT_CTRL_C = 128 + 2

@@ -12,8 +12,7 @@ from visioncal.cli.options import AsJson, CameraName, RobotName
 from visioncal.cli.parsing import FORMS, named_result, numbers_in, plane_of, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 
 # Help does not wait for them.
 if TYPE_CHECKING:

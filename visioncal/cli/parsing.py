@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 
 # Help does not wait for them.
 if TYPE_CHECKING:

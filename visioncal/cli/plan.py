@@ -11,7 +11,7 @@ from visioncal.cli.options import AsJson, OutFolder
 from visioncal.cli.plan_options import ClearanceOptions, PlanCellOptions, PlanOptions, SightOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.interchange.outputs import write_plan
 from visioncal.live.planning.purposes import purpose_of
 

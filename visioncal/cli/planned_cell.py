@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from visioncal.cli.parsing import numbers_in, refuse_given, size_in
 from visioncal.cli.plan_options import PlanCellOptions
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, Progress
 from visioncal.estimation.parts import Noise

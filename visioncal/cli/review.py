@@ -10,7 +10,8 @@ import typer
 
 from visioncal.cli.console import say
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence, some_of
+from visioncal.core.files import absence
+from visioncal.core.number_format import some_of
 from visioncal.interchange.outputs import PREVIEW, RECORDING
 
 # The first bytes of every recording that rerun writes.

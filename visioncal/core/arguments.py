@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Target
 
 Given = ParamSpec("Given")

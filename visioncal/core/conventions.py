@@ -15,7 +15,7 @@ from visioncal.core.choices import POSE_FORMS as POSE_FORMS
 from visioncal.core.choices import UNITS_M as UNITS_M
 from visioncal.core.choices import PoseForm as PoseForm
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.transforms import compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 

@@ -1,19 +1,19 @@
 """Reading and writing of files, and of the small TOML tables that describe boards and robots."""
 
-import difflib
 import hashlib
 import json
 import math
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.temporary_files import aside_file
 
 
@@ -310,13 +310,6 @@ def _too_deep(where: str) -> DataError:
     )
 
 
-def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
-    """Words a hint at the known names nearest to `word`; empty where none is as near as `least`."""
-    names = {name.lower(): name for name in sorted(known)}
-    near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=least)
-    return f"Did you mean {' or '.join(names[name] for name in near)}?" if near else ""
-
-
 def one_line(text: str) -> str:
     """Replaces by spaces what does not print, such as line ends."""
     return "".join(name if name.isprintable() else " " for name in text)
@@ -328,12 +321,6 @@ def natural(path: Path) -> tuple[object, ...]:
     return tuple(
         (int(part), "") if part.isascii() and part.isdecimal() else (-1, part) for part in parts
     )
-
-
-def some_of(names: Sequence[str], most: int = 8) -> str:
-    """Words a list, cut short: `a, b and 3 more`."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def find_described(

@@ -1,5 +1,6 @@
-"""How figures and lists are written: in sentences, and in tables beside their uncertainty."""
+"""How figures, lists and names are written: in sentences, and in tables with their sigmas."""
 
+import difflib
 import math
 from collections.abc import Iterable, Sequence
 
@@ -94,3 +95,16 @@ def ranges(numbers: Iterable[int]) -> str:
         else:
             runs.append([number])
     return ",".join(str(run[0]) + (f"-{run[-1]}" if len(run) > 1 else "") for run in runs)
+
+
+def some_of(names: Sequence[str], most: int = 8) -> str:
+    """Words a list, cut short: `a, b and 3 more`."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
+    """Words a hint at the known names nearest to `word`; empty where none is as near as `least`."""
+    names = {name.lower(): name for name in sorted(known)}
+    near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=least)
+    return f"Did you mean {' or '.join(names[name] for name in near)}?" if near else ""

@@ -5,7 +5,7 @@ from html import escape
 from typing import TypeVar
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 
 _T = TypeVar("_T")
 _COLOURS = {"good": "#2e7d32", "check": "#b26a00", "bad": "#c62828"}

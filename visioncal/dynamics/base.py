@@ -17,7 +17,7 @@ from scipy.linalg import qr, solve_triangular
 from scipy.special import logsumexp, softmax
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.model import DynamicModel

@@ -6,8 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.dynamics.reading import RecordedSamples
 

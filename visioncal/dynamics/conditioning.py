@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import binary_opening, median_filter, uniform_filter1d
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.dynamics.clock import StampClock, clock_notes, even_parts, without_frozen
 from visioncal.dynamics.motion import JointMotion, Measured

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
 from visioncal.dynamics.base import BaseModel, Condition, condition_of, smooth_condition

@@ -5,9 +5,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.core.files import some_of
 from visioncal.core.limits import DynamicsLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import Mask
 from visioncal.core.verdict import NOTE, Finding, Remedy, Verdict, VerdictStatus
 from visioncal.dynamics.base import random_motion

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import JointMotion
 from visioncal.robot import Inertias, Robot, joint_torques, moving

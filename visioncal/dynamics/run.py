@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.threads import on_one_blas_thread
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.conditioning import Conditioned, condition

@@ -14,8 +14,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from visioncal.core.errors import DegenerateError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.groups import GroupFit, State

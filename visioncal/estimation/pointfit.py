@@ -14,8 +14,7 @@ import numpy as np
 
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.quantiles import f_limit, t_chance
 from visioncal.core.transforms import apply, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 from visioncal.estimation.pointfit import PointPairs
 

@@ -7,9 +7,8 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.features import (

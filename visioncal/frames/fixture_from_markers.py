@@ -8,9 +8,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
 from visioncal.core.limits import FixtureLimits
-from visioncal.core.number_format import counted
+from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.core.verdict import remarks
 from visioncal.estimation.pointfit import FEWEST_POINTS

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
 from visioncal.estimation.parts import Noise

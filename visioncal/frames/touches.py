@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Remedy

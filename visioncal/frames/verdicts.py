@@ -4,8 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.verdict import AGAIN, Finding, Remedy
 from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from visioncal.calibration.pipeline import Run
 from visioncal.core.errors import DataError
-from visioncal.core.files import read_bytes, some_of
+from visioncal.core.files import read_bytes
+from visioncal.core.number_format import some_of
 from visioncal.interchange.outputs import CALIBRATION, Written, write_outputs
 from visioncal.interchange.result_files import FRAMES, load_stored
 from visioncal.results import Calibration, Frame, FrameFile

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from visioncal.core.arguments import typed
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.transforms import inverse_right_jacobian, invert, log, pose_difference
 from visioncal.core.types import Camera, FloatArray, Mount
 from visioncal.estimation.chain import edge_names

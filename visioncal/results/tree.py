@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.tree import Branch, PathStep, Tree

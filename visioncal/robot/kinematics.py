@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, did_you_mean
+from visioncal.core.files import DocumentTable
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
 from visioncal.robot.inertia import Inertias

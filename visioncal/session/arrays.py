@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import LAST_ROW, rigid_fault
 from visioncal.core.types import Camera, FloatArray, Image, Image16, IntArray, Mount, Target
 from visioncal.session.columns import POSE

@@ -9,7 +9,8 @@ import numpy as np
 
 from visioncal.core.documents.tables import separator_of
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, read_text_inside, sha256
+from visioncal.core.files import read_text_inside, sha256
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Corners, FloatArray, IntArray, Target
 from visioncal.session.boards import COLUMN
 from visioncal.session.document import Declaration

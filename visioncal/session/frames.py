@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.session.document import Declaration, Kind
 from visioncal.session.kinds import has_robot_state, is_read, is_seen, name_of
 from visioncal.session.table import View

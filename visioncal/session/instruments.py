@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, did_you_mean, parse_toml, read_text
+from visioncal.core.files import DocumentTable, parse_toml, read_text
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray
 
 _FILE = Path(__file__).with_name("instruments.toml")

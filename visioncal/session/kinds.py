@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import absence, did_you_mean, is_inside, some_of
+from visioncal.core.files import absence, is_inside
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session.columns import POSITION
 from visioncal.session.document import KINDS, Declaration, Kind

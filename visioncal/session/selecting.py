@@ -5,8 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import ranges
+from visioncal.core.number_format import ranges, some_of
 from visioncal.session.boards import COLUMN as TARGET
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.columns import SELECTORS, is_number

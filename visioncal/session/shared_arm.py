@@ -13,7 +13,7 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.session.boards import COLUMN as TARGET
 from visioncal.session.corners import CornerTable
 from visioncal.session.images import ImageStore

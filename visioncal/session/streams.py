@@ -12,7 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from visioncal.core.documents.tables import separator_of, with_points
 from visioncal.core.errors import DataError
-from visioncal.core.files import named_errors, read_text_inside, sha256, some_of, write_atomically
+from visioncal.core.files import named_errors, read_text_inside, sha256, write_atomically
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.session import columns as known
 from visioncal.session.table import NUMBER

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import cross
 from visioncal.core.types import FloatArray
 

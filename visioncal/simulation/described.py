@@ -10,7 +10,8 @@ from typing import Any, TypeAlias, TypeVar, get_args, get_type_hints
 
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, did_you_mean, find_described, parse_toml, read_text
+from visioncal.core.files import DocumentTable, find_described, parse_toml, read_text
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Camera, Target
 from visioncal.session.document import NAME
 from visioncal.simulation.layout import (

@@ -19,7 +19,8 @@ from visioncal.core import transforms
 from visioncal.core.arguments import typed
 from visioncal.core.documents.tables import TextTable, read_table
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, did_you_mean, find_described, is_inside, read_toml
+from visioncal.core.files import DocumentTable, find_described, is_inside, read_toml
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray, IntArray, Mask, Target, TargetKind
 

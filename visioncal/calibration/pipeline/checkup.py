@@ -20,9 +20,8 @@ from visioncal.calibration.stages.observed import CameraLook, by_reason
 from visioncal.calibration.stages.pictures import unnamed_images, unseen_cause
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
-from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.shown import html_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mask, Mount, Progress

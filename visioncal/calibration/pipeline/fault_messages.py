@@ -12,8 +12,7 @@ from visioncal.calibration.stages.cause_ranking import run_evidence
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import apart
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import (

@@ -32,9 +32,8 @@ from visioncal.calibration.stages.findings import (
 )
 from visioncal.calibration.stages.need import PickInputs, picks_of
 from visioncal.calibration.stages.priors import prior_words
-from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import NOTE, Finding, Remedy

@@ -8,8 +8,7 @@ import numpy as np
 from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.findings import StandingTie
 from visioncal.core.errors import DegenerateError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import counted
+from visioncal.core.number_format import counted, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import IntArray
 from visioncal.estimation.observability import (

@@ -16,8 +16,7 @@ from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import Camera, Corners
 from visioncal.core.verdict import EMPTY_IMAGE, LEAST_NEED_MM, OTHER_SIZE, Finding, Remedy
 from visioncal.results import CameraResult

@@ -13,8 +13,7 @@ import numpy as np
 from visioncal.calibration.stages.motion import RobotMotion
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, FloatArray, Mask
 from visioncal.core.verdict import GUESS, Finding, Remedy

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.arm import ArmErrors

@@ -13,7 +13,7 @@ from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.reported_poses import Reported
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import Corners, FloatArray, Progress, Rejection
 from visioncal.core.verdict import Finding
 from visioncal.estimation.scene import Scene

@@ -8,8 +8,8 @@ import numpy as np
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.core.errors import DataError, VisioncalError
-from visioncal.core.files import some_of
 from visioncal.core.limits import MAX_BLUR_PX, CalibrationLimits
+from visioncal.core.number_format import some_of
 from visioncal.core.types import Image, Target
 from visioncal.core.verdict import EMPTY_ROWS, LEAST_NEED_MM, MISSING, Finding, Remedy
 from visioncal.session import Session, View

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import did_you_mean, figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy, remarks
 from visioncal.estimation.observability import SIGMA_LIMIT_M

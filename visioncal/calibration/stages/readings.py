@@ -10,8 +10,7 @@ import numpy as np
 from visioncal.calibration.stages.observed import Observed, nothing_seen
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import did_you_mean, some_of
-from visioncal.core.number_format import counted, figure
+from visioncal.core.number_format import counted, did_you_mean, figure, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Rejection
 from visioncal.estimation.positions import Mounting, Places, find_mounting, residuals

@@ -17,8 +17,7 @@ from visioncal.calibration.stages.thermal_fit import (
     uninformative,
 )
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors
 from visioncal.estimation.armmodel import ArmModel

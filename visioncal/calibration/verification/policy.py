@@ -9,7 +9,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import DocumentTable, did_you_mean, read_toml
+from visioncal.core.files import DocumentTable, read_toml
+from visioncal.core.number_format import did_you_mean
 from visioncal.results import Calibration
 from visioncal.session import Session
 

@@ -16,7 +16,8 @@ import numpy as np
 from visioncal.core.arguments import typed
 from visioncal.core.choices import SIMULATED_ARMS
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, read_toml, write_atomically
+from visioncal.core.files import read_toml, write_atomically
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Progress
 from visioncal.interchange.batch.work import Options, jobs_of

@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
 from visioncal.dynamics import Identified
 from visioncal.interchange.exports.arm import ArmFormat, select_arm

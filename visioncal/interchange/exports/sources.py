@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Mount
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
 

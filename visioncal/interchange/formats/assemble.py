@@ -12,7 +12,8 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import is_number
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes, some_of
+from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
+from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
 from visioncal.interchange.formats.boards import described_target, target_name
 from visioncal.interchange.formats.corner_lists import with_corners

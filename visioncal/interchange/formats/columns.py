@@ -17,7 +17,7 @@ from visioncal.core.documents import (
     read_yaml,
 )
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.interchange.formats.fields import (
     Fields,

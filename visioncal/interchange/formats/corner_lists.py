@@ -16,7 +16,8 @@ from visioncal.core.documents import is_number, read_npz, read_opencv, read_tabl
 from visioncal.core.documents.arrays import Array
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
-from visioncal.core.files import natural, some_of
+from visioncal.core.files import natural
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.columns import DOCUMENTS, read_document
 from visioncal.interchange.formats.foreign import Foreign, FoundCorners

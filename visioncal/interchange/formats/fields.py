@@ -12,7 +12,7 @@ import numpy as np
 from visioncal.core.documents import TextTable, is_number
 from visioncal.core.documents.arrays import Array
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import is_inside, natural, some_of
+from visioncal.core.files import is_inside, natural
+from visioncal.core.number_format import some_of
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # Enough to recognise a text file.

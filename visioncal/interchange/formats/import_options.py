@@ -6,7 +6,7 @@ from pathlib import Path
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, UNITS_M, PoseNumbers, Reading
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import Mount
 
 

@@ -16,7 +16,7 @@ from visioncal.core.documents import is_number
 from visioncal.core.documents.pendants import PendantPose, is_marked_pose, read_pose
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.interchange.formats.fields import Fields
 
 _BETWEEN = re.compile(r"[\s,;\[\]()]+")

@@ -7,7 +7,8 @@ from typing import TypeAlias
 from visioncal.calibration.guess import Candidate
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, did_you_mean
+from visioncal.core.files import check_free
+from visioncal.core.number_format import did_you_mean
 from visioncal.interchange.formats.assemble import assemble, wished
 from visioncal.interchange.formats.columns import TABLE
 from visioncal.interchange.formats.exchanging import exchange_views

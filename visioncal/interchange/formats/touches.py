@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.conventions import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import FloatArray
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.touches import TouchRows, touches_of

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import TypeAlias, TypeVar
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
 

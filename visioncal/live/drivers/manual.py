@@ -8,7 +8,7 @@ import numpy as np
 from visioncal.core.conventions import POSE_FORMS
 from visioncal.core.documents.pendants import PendantPose, possible_forms, read_pose
 from visioncal.core.errors import DataError, DriverError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers.protocols import ArmState

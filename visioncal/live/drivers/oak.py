@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType, ModuleType
 
 from visioncal.core.errors import DriverError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Camera
 from visioncal.live.drivers.extras import Handle, depthai
 from visioncal.live.drivers.oak_calibration import SOCKETS, factory_intrinsics

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
+from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, Progress
 from visioncal.live.planning.cell import PlanCell, collisions_of
 from visioncal.live.planning.visibility import Shade, sight_of

@@ -1,7 +1,6 @@
 """A plan of stops, or of motions, in words."""
 
-from visioncal.core.files import some_of
-from visioncal.core.number_format import counted, figure, mm_and_deg, percent
+from visioncal.core.number_format import counted, figure, mm_and_deg, percent, some_of
 from visioncal.dynamics.limits import Kept
 from visioncal.dynamics.sweeps import Sweeps
 from visioncal.dynamics.written import MotionPlan

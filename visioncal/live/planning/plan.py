@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Criterion
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg, percent
+from visioncal.core.number_format import figure, mm_and_deg, percent, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Need, Progress
 from visioncal.estimation.armmodel import block_size

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 
 # Errors of a point that the camera sees, or of what the arm carries all over its workspace.
 Judged: TypeAlias = Literal["sight", "workspace"]

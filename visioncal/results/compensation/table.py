@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.documents import TextTable, is_number, read_table
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean, some_of
+from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import compose, invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.results.compensation.correction import FAR_M, WIDE_RAD, Corrected

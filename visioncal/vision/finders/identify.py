@@ -8,8 +8,7 @@ import numpy as np
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import some_of
-from visioncal.core.number_format import listed
+from visioncal.core.number_format import listed, some_of
 from visioncal.core.types import Image, Target, TargetKind
 from visioncal.vision.finders.charuco import find_charuco
 from visioncal.vision.finders.circles import seen_grids

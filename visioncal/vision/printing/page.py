@@ -5,7 +5,7 @@ import textwrap
 from dataclasses import dataclass, replace
 
 from visioncal.core.errors import DataError
-from visioncal.core.files import did_you_mean
+from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Target
 from visioncal.vision.printing.pattern import Pattern, draw_pattern
 
