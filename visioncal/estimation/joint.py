@@ -5,7 +5,8 @@ the chains of frames are closed over all stops with what is left open of these. 
 the answer, until it stays, is Gauss-Newton's method on the whole problem.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -140,10 +141,21 @@ def settle(
     Raises:
         ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
     """
+    with diverging():
+        return _settled(side, _fitted(side, looks.seen(moving, before), frames, others))
+
+
+@contextmanager
+def diverging() -> Iterator[None]:
+    """Says of what fails within that the fit diverges.
+
+    Raises:
+        ConvergenceError: Matrices were singular, or not finite.
+    """
     try:
         # Numbers that run away overflow before they fail.
         with np.errstate(over="ignore", invalid="ignore"):
-            return _settled(side, _fitted(side, looks.seen(moving, before), frames, others))
+            yield
     except np.linalg.LinAlgError as error:
         raise ConvergenceError(
             "hand-eye: no frames explain both the robot's poses and what the camera saw: the fit "
@@ -170,8 +182,7 @@ def _settled(side: Side, fitted: ConvergedFit) -> ConvergedFit:
             break
         seen = _stepped(fitted)
         if seen is fitted.seen:
-            # The corners follow no part of the step: another round would ask for the same.
-            break
+            raise np.linalg.LinAlgError("the corners follow no part of the step")
         before, fitted = fitted, _fitted(side, seen, fitted.frames, fitted.others)
         if not (before.fit.settled or fitted.fit.settled):
             break
@@ -185,10 +196,12 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     limits = [_FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.seen.sigmas_px]
     looks, free, change = fitted.seen.looks, fitted.seen.free, fitted.change
     for _ in range(_HALVINGS):
-        seen = looks.with_values(free, looks.values[free] + change).seen(fitted.moving)
-        if all(sigma <= limit for sigma, limit in zip(seen.sigmas_px, limits, strict=True)):
-            return seen
+        there = looks.with_values(free, looks.values[free] + change)
         change = change / 2
+        if there.has_lenses:
+            seen = there.seen(fitted.moving)
+            if all(sigma <= limit for sigma, limit in zip(seen.sigmas_px, limits, strict=True)):
+                return seen
     return fitted.seen
 
 

@@ -22,6 +22,7 @@ from visioncal.estimation.joint import (
     again,
     chance_limit,
     contradicted_lens,
+    diverging,
     measured_scale,
     moved_mahalanobis_sq,
     settle,
@@ -76,7 +77,8 @@ def refined(
         The fit, and the side with the errors of its arms.
     """
     try:
-        fitted, found = _refined(side, looks, frames, is_plain=False)
+        with diverging():
+            fitted, found = _refined(side, looks, frames, is_plain=False)
         levels = fitted.looks.levels
         sizes = zip(fitted.looks.problems, fitted.seen.sigmas_px, strict=True)
         if not any(name in levels and are_beyond(levels[name], value) for name, value in sizes):
@@ -85,7 +87,8 @@ def refined(
         pass
     # A field of many pixels is none: poses run away with it. Lenses are then what they say.
     plain = dict.fromkeys(looks.problems, LensLevels())
-    return _refined(side, looks.with_levels(plain), frames, is_plain=True)
+    with diverging():
+        return _refined(side, looks.with_levels(plain), frames, is_plain=True)
 
 
 def _refined(

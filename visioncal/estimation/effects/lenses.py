@@ -216,6 +216,11 @@ class CameraParameters:
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
 
     @property
+    def has_lenses(self) -> bool:
+        """Whether every camera has a lens that can be: its focal lengths are positive."""
+        return all(self.values[place][:2].min() > 0 for place in self.lenses.values())
+
+    @property
     def points(self) -> FloatArray:
         """(c, 3) where the corners of all boards lie, each on its own board [m]."""
         return np.concatenate(self.corners)
