@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from support.commands import visioncal as run_command
+from support.marks import slow
 
 import visioncal
 from visioncal.core.errors import DegenerateError
@@ -220,7 +221,7 @@ def as_inverse(pose: RigidTransform) -> RigidTransform:
     return pose.inv()
 
 
-@pytest.mark.parametrize("since", [7, 13])
+@pytest.mark.parametrize("since", [slow(7), 13])
 @pytest.mark.parametrize(
     ("written", "words"),
     [(as_wxyz, "rotations as a quaternion w, x, y, z"), (as_inverse, "poses inverse")],
@@ -276,7 +277,7 @@ def test_millimetres_come_first_where_more_than_the_unit_is_wrong(tmp_path):
     assert first.words in said_first(folder)
 
 
-@pytest.mark.parametrize("since", [9, 14])
+@pytest.mark.parametrize("since", [slow(9), 14])
 def test_poses_that_are_a_row_late_from_some_view_on_are_named(tmp_path, since):
     def repeated(poses):
         return [*poses[:since], *poses[since - 1 : -1]]

@@ -361,6 +361,22 @@ def test_what_cannot_be_located_is_refused_by_name(in_hand):
         locate(replace(calibration, camera=None), middle, level, flange)
 
 
+@pytest.mark.parametrize(
+    ("point", "words"),
+    [
+        (np.zeros((800, 1280, 3)), r"point_target_m has the shape \(800, 1280, 3\); three metres"),
+        ([0.0, np.nan, 0.0], "three metres are needed"),
+        ([120.0, 40.0, 0.0], "looks like millimetres"),
+    ],
+)
+def test_a_point_that_is_none_is_no_fault_of_the_images(in_hand, point, words):
+    cell, calibration = in_hand
+    session = session_of(cell)
+    with pytest.raises(DataError, match=words) as refused:
+        visioncal.locate_views(session, calibration, point)
+    assert str(refused.value).startswith("point_target_m")
+
+
 def with_offset(pose, factor):
     other = pose.copy()
     other[:3, 3] *= factor

@@ -311,7 +311,11 @@ def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArra
         DataError: It is no three finite numbers, or farther off than any arm reaches.
     """
     point = np.asarray(point_m, dtype=float)
-    if point.shape != (3,) or not np.isfinite(point).all():
+    if point.shape != (3,):
+        raise DataError(
+            f"{name} has the shape {point.shape}; three metres are needed.", culprits=[name]
+        )
+    if not np.isfinite(point).all():
         raise DataError(f"{name} is {point.tolist()}; three metres are needed.", culprits=[name])
     if np.abs(point).max() > FAR_M:
         raise DataError(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Progress
+from visioncal.frames.camera_chain import checked_point
 from visioncal.frames.locate import locate_target
 from visioncal.frames.located import Located
 from visioncal.frames.session_observations import nothing_fits, session_looks, without_label
@@ -61,8 +62,9 @@ def locate_views(
         progress: Told after each image.
 
     Raises:
-        DataError: No view shows the target and has what else it needs.
+        DataError: No view shows the target and has what else it needs, or the point is none.
     """
+    point = checked_point(point_target_m, "point_target_m")
     choice = Choice(camera, robot, target)
     session, calibration = picked(session, calibration, choice, EYE, parted=False)
     shown = session_looks(session, calibration, "base", among=among, progress=progress)
@@ -75,7 +77,7 @@ def locate_views(
                 sight.seen,
                 shown.target,
                 sight.base_from_flange,
-                point_target_m,
+                point,
                 joints_rad=sight.joints_rad,
                 sigma_px=sigma_px,
                 label=sight.label,
