@@ -207,14 +207,19 @@ def _in_words(entry: Mapping[str, Any]) -> str:
     kind = str(entry["type"])
     if kind == "missing":
         return f"is missing{_MISSING.get(str(entry['loc'][-1]), '')}"
+    if kind == "string_type" and entry["loc"] == ("target",):
+        return (
+            f"is {entry['input']!r}, but must be a name in targets/, or the path of a .toml with it"
+        )
     return f"is {entry['input']!r}, but must be {needed.get(kind, kind)}"
 
 
+_TARGET = "a name in targets/, or the path of a .toml"
 _MISSING = {
     "schema": " (schema = 1)",
     "name": ' (name = "...")',
     "mount": ' (mount = "eye-in-hand" or "eye-to-hand")',
-    "target": " (target = a name in targets/, or the path of a .toml)",
+    "target": f" (target = {_TARGET})",
 }
 
 
