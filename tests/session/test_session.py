@@ -413,7 +413,7 @@ TOML_REFUSALS = [
     ('name = "oak"', "matrix_sigma_px = 1e300", r"is 1e\+300, but .* of at most 10000"),
     ("resolution", "size", "camera.resolution is missing: camera.matrix holds for one"),
     ('target = "board.toml"\n', "", r"target is missing, but view 7 has an image\. Add target"),
-    ('"board.toml"', '{ kind = "x" }', "target is {'kind': 'x'}, but must be a name in targets/, or"),
+    ('"board.toml"', '{ kind = "x" }', "target is {'kind': 'x'}, but must be a name in targets/"),
     ("board.toml", "boad.toml", r"target file .*boad\.toml does not exist"),
     ("board.toml", "charuco", "There is no target named 'charuco'"),
     ("[robot]", "[clock]\ncamera_minus_robot_s = '0'\n[robot]", "clock.camera_minus_robot_s is"),
