@@ -7,7 +7,8 @@ The generator is numpy and OpenCV alone; corners travel through `corners.csv`, p
 covariance per degree of freedom, of the camera's pose in the frame of the ray of its image's centre
 (X) and of picks (a point of the table that `visioncal.locate` finds by one pixel), the median
 errors of the camera's place and of picks, those by Park's X and the lens that
-Park had (OpenCV), the share of each verdict, and refusals. Base and flange are those of which the
+Park had (OpenCV), the share of each verdict, how many are good although X is beyond three sigma,
+and refusals. Base and flange are those of which the
 robot reports: what of an arm's errors is one twist of the base and one of the flange at all
 postures is in no residual, and an arm that goes where it is sent does it again.
 """
@@ -27,6 +28,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.stats import chi2, norm
 
 import visioncal
 
@@ -40,6 +42,8 @@ WINDOW_M = np.array([0.22, 0.16])
 LEVER_M = 0.3
 # Picks of each cell.
 LOOKS = 4
+# The squared error per degree of freedom that X exceeds as seldom as a number does three sigma.
+BEYOND = float(chi2.isf(2.0 * norm.sf(3.0), 6)) / 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -621,13 +625,14 @@ def row(name: str, mount: str, given: bool, seeds: int) -> str:
     verdicts = "/".join(
         str(sum(mapping["status"] == word for mapping in done)) for word in ("good", "check", "bad")
     )
+    beyond = sum(mapping["status"] == "good" and mapping["x"] > BEYOND for mapping in done)
     causes = Counter(cause for mapping in done for cause in mapping["cause"])
     first = ", ".join(f"{cause} {count}" for cause, count in causes.most_common(2))
     return (
         f"| {name} | {mount} | {'given' if given else 'estimated'} | {mean('x'):.2f} "
         f"| {mean('pick'):.2f} | {middle('x_mm'):.3f}, {middle('park_x_mm'):.3f} "
         f"| {middle('pick_mm'):.3f}, {middle('park_mm'):.3f} "
-        f"| {verdicts} | {first} | {len(found) - len(done)} |"
+        f"| {verdicts} | {beyond} | {first} | {len(found) - len(done)} |"
     )
 
 
@@ -638,9 +643,9 @@ def main() -> None:
     names = [word for word in words if word in WORLDS] or list(WORLDS)[: 2 if quick else None]
     print(
         "| world | mount | lens | X | pick | X [mm], Park's | pick [mm], Park's "
-        "| good/check/bad | likeliest causes | refused |"
+        "| good/check/bad | good beyond 3 sigma | likeliest causes | refused |"
     )
-    print(f"|{' --- |' * 10}")
+    print(f"|{' --- |' * 11}")
     for name in names:
         for mount in ("eye-in-hand", "eye-to-hand"):
             for given in (True, False) if WORLDS[name].off_px == 0.0 else (True,):
