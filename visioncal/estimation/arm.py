@@ -91,25 +91,18 @@ class ArmErrors:
     def effect(self, robot: str, name: str = "arm", values: FloatArray | None = None) -> Effect:
         """Returns the errors as unknowns of a robot's flange, at their (p,) current values."""
         size = self.basis.shape[2]
-        current = np.zeros(size) if values is None else values
+        start = np.zeros(size) if values is None else values
         information = np.eye(size) / self.sigma**2
-        prior = Knowledge(information, information @ current)
+        prior = Knowledge(information, information @ start)
         held = np.zeros(size, dtype=bool)
-        return Effect(
-            f"{name} of {robot}", current, prior, held, flange_jacobian={robot: self.basis}
-        )
+        return Effect(f"{name} of {robot}", start, prior, held, flange_jacobian={robot: self.basis})
 
 
 def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
-    """Jacobian of the flange for small twists of all links.
+    """Jacobian (m, 6, 6 n) of the flange by small twists of all links, at (m, n) joint angles.
 
-    Args:
-        robot: The nominal model.
-        joints_rad: (m, n) joint angles.
-
-    Returns:
-        (m, 6, 6 n) right perturbations of `base_from_flange`, for a link's rotation by 1 rad and
-        its translation by 0.5 m.
+    Right perturbations of `base_from_flange`, for a link's rotation by 1 rad and its translation by
+    0.5 m.
     """
     links = np.array([robot.link_frames(row)[:-1] for row in joints_rad])
     flange_from_base = invert(robot.base_from_flange(joints_rad))
@@ -118,16 +111,11 @@ def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
 
 
 def pose_basis(base_from_flange: FloatArray) -> FloatArray:
-    """Jacobian of the flange for generic errors that are functions of its pose, without joints.
+    """Jacobian (m, 6, 48) of the flange by generic errors that are functions of its pose.
 
     Constant twists of base and flange, and twists of the base in proportion to the flange's
-    position and to the direction of its axis.
-
-    Args:
-        base_from_flange: (m, 4, 4).
-
-    Returns:
-        (m, 6, 48) in the units of `link_basis`.
+    position and to the direction of its axis; in the units of `link_basis`, for (m, 4, 4)
+    `base_from_flange`.
     """
     of_base = adjoint(invert(base_from_flange)) * TWIST_UNITS
     of_flange = np.broadcast_to(np.eye(6) * TWIST_UNITS, of_base.shape)

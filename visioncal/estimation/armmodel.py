@@ -155,10 +155,8 @@ class ArmModel:
         """(n, k, 2) harmonics of the joints' functions [rad]; None without any."""
         if HARMONICS not in self.weights:
             return None
-        coefficients = self.harmonic_directions @ self.values[self.place_of(HARMONICS)]
-        return np.asarray(
-            self.weights[HARMONICS] * coefficients.reshape(self.nominal.joint_count, -1, 2)
-        )
+        waves = self.harmonic_directions @ self.values[self.place_of(HARMONICS)]
+        return np.asarray(self.weights[HARMONICS] * waves.reshape(self.nominal.joint_count, -1, 2))
 
     @property
     def is_kept(self) -> Mask:
@@ -176,10 +174,8 @@ class ArmModel:
             return np.zeros((len(q), 6, 6))
         orders = len(self.harmonic_sizes) // (2 * self.nominal.joint_count)
         jacobian = self.weights[HARMONICS] * self.robot.harmonic_jacobian(q, orders)
-        prior, determined = jacobian * self.harmonic_sizes, jacobian @ self.harmonic_directions
-        return np.asarray(
-            prior @ np.swapaxes(prior, 1, 2) - determined @ np.swapaxes(determined, 1, 2)
-        )
+        prior, known = jacobian * self.harmonic_sizes, jacobian @ self.harmonic_directions
+        return np.asarray(prior @ np.swapaxes(prior, 1, 2) - known @ np.swapaxes(known, 1, 2))
 
     def _joint_values(self, name: str) -> FloatArray:
         """Values (n,) of a block with one per joint; zeros where the arm lacks it."""
@@ -218,15 +214,9 @@ class ArmModel:
         return placements, functions
 
     def columns(self, name: str, q: FloatArray, loads: Loads | None = None) -> FloatArray:
-        """Jacobian of the reported frame by a block's errors.
+        """Jacobian (m, 6, p) of the reported frame by a block's errors, at (m, n) joints [rad].
 
-        Args:
-            name: The block.
-            q: (m, n) joint angles [rad].
-            loads: Loads of the flange; none if None.
-
-        Returns:
-            (m, 6, p) right perturbations for a unit of each column.
+        Right perturbations for a unit of each column; no loads if None.
         """
         bent = self.bent(q, loads)
         if name == BACKLASH:

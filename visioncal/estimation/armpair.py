@@ -17,9 +17,6 @@ class ArmPair:
     """The two frames on either side of an arm between which it is observed most often.
 
     Attributes:
-        problem: The observations.
-        state: The unknowns.
-        robot: The robot.
         observer: The observing frame.
         observed: The observed frame.
     """
@@ -159,12 +156,7 @@ class ArmData:
     """Observations of a robot's arm whose errors are estimated.
 
     Attributes:
-        problem: The observations.
-        state: The unknowns.
-        noise: The noise levels.
         covariance: (u, u) of the unknowns.
-        robot: The robot.
-        model: The arm.
         columns: (p,) columns of its errors among the unknowns.
         error_rad: Size of the errors.
         stops: (m,) the stops at which it was observed.
@@ -222,11 +214,9 @@ class ArmData:
         jacobian = np.zeros((len(q), 6, self.problem.size))
         jacobian[:, :, :edges] = pair_jacobian[:, :, :edges]
         jacobian[:, :, self.columns] = pair_jacobian[:, :, edges : edges + errors]
-        chain_jacobian = np.concatenate(
-            [jacobian[:, :, self.chain], pair_jacobian[:, :, edges + errors :]], axis=2
-        )
-        position_jacobian = self.pair.place_jacobian(poses, chain_jacobian, self.at)
-        return position_jacobian[:, :, :-6], position_jacobian[:, :, -6:]
+        columns = [jacobian[:, :, self.chain], pair_jacobian[:, :, edges + errors :]]
+        by_both = self.pair.place_jacobian(poses, np.concatenate(columns, axis=2), self.at)
+        return by_both[:, :, :-6], by_both[:, :, -6:]
 
     def place_sigmas_m(self, q: FloatArray) -> FloatArray:
         """(k,) predicted sigma of that position at (k, n) joint angles, over all three axes [m]."""
@@ -234,18 +224,13 @@ class ArmData:
         chain_covariance = self.covariance[np.ix_(self.chain, self.chain)]
         undetermined = self.error_rad**2 * self.model.left_open(q)
         variances = np.einsum("mij,jk,mik->m", by_chain, chain_covariance, by_chain)
-        return np.asarray(
-            np.sqrt(variances + np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange))
-        )
+        variances += np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange)
+        return np.asarray(np.sqrt(variances))
 
     def function_errors(self, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Joint function errors beyond offset and ratio, with their standard deviations.
+        """Joint function errors (n, k) beyond offset and ratio, with standard deviations [rad].
 
-        Args:
-            angles: (k,) angles of every joint [rad].
-
-        Returns:
-            (n, k) the error of each joint there, and its standard deviation [rad].
+        They are those at (k,) angles of every joint [rad].
         """
         model = self.model
         count, chain = model.nominal.joint_count, model.bare.chain

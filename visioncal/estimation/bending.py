@@ -37,26 +37,19 @@ def compliance_unit(model: ArmModel) -> float:
 
 
 def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
-    """Bend of each joint at each stop, as if the stop's whole residual were that joint's.
+    """Bend (m, n) of each joint at each stop, as if the stop's whole residual were its own [rad].
 
     Partial residuals of a regression (Larsen and McCleary 1972): the fitted bend plus the component
-    of the residual, weighted by its covariance, along the joint.
-
-    Args:
-        arm: Observations of the arm.
-        torques: (m, n) on the joints [N m].
-
-    Returns:
-        (m, n) [rad]; NaN where the torque is too small to show it.
+    of the residual, weighted by its covariance, along the joint. NaN where the (m, n) torque [N m]
+    is too small to show it.
     """
     model, problem = arm.model, arm.problem
     residuals, jacobian = whitened(problem, arm.state, arm.noise, ideal=False)
     columns = jacobian[:, :, arm.columns[model.place_of(COMPLIANCE)]]
     masks = [problem.observations.stops == stop for stop in arm.stops.tolist()]
     gradient = np.array([np.einsum("mij,mi->j", columns[mask], residuals[mask]) for mask in masks])
-    information = np.array(
-        [np.einsum("mij,mij->j", columns[mask], columns[mask]) for mask in masks]
-    )
+    own = [columns[mask] for mask in masks]
+    information = np.array([np.einsum("mij,mij->j", part, part) for part in own])
     least = np.maximum(_LEAST_NM, _LEAST_SHARE * np.abs(torques).max(axis=0))
     determined = (np.abs(torques) > least) & (information > 0.0)
     correction = np.full(torques.shape, np.nan)

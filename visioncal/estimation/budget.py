@@ -36,22 +36,13 @@ class Sources:
 def covariance_by_source(
     problem: Problem, state: State, noise: Noise, sources: Sources
 ) -> dict[str, FloatArray]:
-    """Splits the covariance of the edges into the contributions of the sources.
+    """Splits the covariance of the edges into contributions (6 e, 6 e) of the sources.
 
     The estimate is linear in the errors of observations, flanges, effects and priors: each
     contributes its own covariance through the same gain, and the parts add up to the total. Priors
     of effects may be correlated, as of lens and board that are known from the same corners: each
     takes half of the cross terms, which may make one contribution negative where they compensate
     each other.
-
-    Args:
-        problem: The observations.
-        state: The solution.
-        noise: Its levels.
-        sources: Names of the sources.
-
-    Returns:
-        (6 e, 6 e) by source.
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
@@ -65,19 +56,17 @@ def covariance_by_source(
     for name, part in _by_errors(problem, linear, gain, noise, sources):
         parts[name] += part
     edge_columns = fitted[:, : 6 * len(problem.unknown)]
-    prior_information = problem.knowledge(state).information
-    columns_of_sources = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
+    prior_info = problem.knowledge(state).information
+    owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
     for prior in problem.priors:
         _, jacobian = problem.prior_rows(prior, state)
-        prior_information = prior_information - jacobian.T @ jacobian
+        prior_info = prior_info - jacobian.T @ jacobian
         response = jacobian @ edge_columns
         parts[sources.priors] += response.T @ response
     for name, columns in sources.columns.items():
-        share = np.where(np.isin(columns_of_sources, columns), 0.5, 0.0)
-        part = (share[:, None] + share) * prior_information[
-            np.ix_(columns_of_sources, columns_of_sources)
-        ]
-        parts[name] += edge_columns[columns_of_sources].T @ part @ edge_columns[columns_of_sources]
+        share = np.where(np.isin(owned, columns), 0.5, 0.0)
+        part = (share[:, None] + share) * prior_info[np.ix_(owned, owned)]
+        parts[name] += edge_columns[owned].T @ part @ edge_columns[owned]
     return dict(parts)
 
 
@@ -86,12 +75,8 @@ def less_noise(
 ) -> FloatArray:
     """Change (p, p) of a fit's covariance if a robot's noise differs from that of the weights.
 
-    Args:
-        problem: The observations.
-        state: The solution.
-        noise: The levels of the weights.
-        robot: The robot.
-        white: (2,) its noise, of rotation [rad] and position [m].
+    `noise` is that of the weights, and `white` (2,) the robot's, of rotation [rad] and position
+    [m].
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     linear, index = problem.linear(state, ideal=True), problem.robots.index(robot)

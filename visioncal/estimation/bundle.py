@@ -28,7 +28,6 @@ class BundleFit:
     """Result of the bundle adjustment.
 
     Attributes:
-        camera: The intrinsics.
         cam_from_target: (v, 4, 4).
         residuals: (n, 2) [px].
         sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].

@@ -35,15 +35,9 @@ def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
 
 
 def scatter(problem: Problem, others: Problem, state: State) -> tuple[FloatArray, FloatArray]:
-    """Distances of the observed targets from their mean poses in other observations.
+    """Distances (n,) [m] and (n,) [rad] of observed targets from their means in `others`.
 
-    Args:
-        problem: The n observations.
-        others: The observations to compare with, of the same targets.
-        state: The unknowns of both.
-
-    Returns:
-        (n,) distances [m], and (n,) [rad].
+    The state is that of both problems, which are of the same targets.
     """
     poses, targets = _target_poses(others, state), np.array(others.observations.observed)
     mean = {

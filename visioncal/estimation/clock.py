@@ -67,7 +67,6 @@ class DelayedFit:
 
     Attributes:
         clock: The offset and both edges.
-        delays: The effects.
         times_s: (k,) their times [s].
         sigmas_s: (k,) standard deviations of the times [s].
         freedom: Degrees of freedom of these.
@@ -138,7 +137,7 @@ class _Delays:
         unknowns = 6 * len(frames) + len(self.times_s)
         weight = floored_sigma_px(stack.sigma_px(compressed.residuals, unknowns)) ** -2.0
         prior = np.array([delay.sigma_s for delay in self.delays]) ** -2.0
-        information = Knowledge(
+        knowledge = Knowledge(
             weight * compressed.shared_information + np.diag(prior),
             weight * compressed.shared_gradient + prior * self.times_s,
         )
@@ -147,10 +146,7 @@ class _Delays:
             flange,
             compressed.cam_from_target,
             covariance_from(weight * compressed.information),
-            effects=[
-                clock_effect(speeds),
-                Effect.free("delays", information, compressed.by_shared),
-            ],
+            effects=[clock_effect(speeds), Effect.free("delays", knowledge, compressed.by_shared)],
         )
         return problem, weight * compressed.shared_pulls
 
@@ -158,12 +154,7 @@ class _Delays:
 def fit_offset(
     robot: Trajectory, frames: ImageTimes, starts: Sequence[float]
 ) -> tuple[ClockFit, ...]:
-    """Fits the offset and both edges together, from several starts.
-
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: Views of the camera.
-        starts: Start offsets [s].
+    """Fits the offset and both edges together, from several start offsets [s].
 
     Returns:
         The fits that stay near their starts, least residual noise first; none where the chain does
@@ -191,15 +182,8 @@ def fit_delays(
 ) -> DelayedFit | None:
     """Fits delays within images, the offset and both edges together.
 
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: Views of the camera.
-        camera: The intrinsics.
-        start: The fit without delays.
-        delays: The effects.
-
-    Returns:
-        The fit; None where too few frames are covered, or their corners are not known.
+    `start` is the fit without delays. None where too few frames are covered, or their corners are
+    not known.
     """
     if frames.stack is None or not delays:
         return None
@@ -214,15 +198,7 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
 
     For each frame the offset is estimated at which it agrees with the fit. Means of these over
     stretches of time are taken as independent; their residual scatter is the noise of the test (of
-    a change point; Page 1955).
-
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: Views of the camera.
-        fit: The fit with one offset.
-
-    Returns:
-        The change; None where noise explains it, or there are too few stretches.
+    a change point; Page 1955). None where noise explains it, or there are too few stretches.
     """
     selected = frames.only(_evenly(len(frames), _MOST_OWN))
     selected = selected.only(robot.covers(selected.stamps_s - fit.offset_s, _FARTHEST_S))
@@ -235,20 +211,19 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
     if np.sum(valid) < _FEWEST_STRETCHES:
         return None
     means = (np.bincount(stretch_of, weights * own_s)[valid]) / information[valid]
-    middles = (np.bincount(stretch_of, weights * times_s)[valid]) / information[valid]
-    columns = [(middles >= middle).astype(float) for middle in middles[2:-1]]
-    candidates = [
-        _fit_slope(value, means, information[valid]) for value in (middles - middles[0], *columns)
-    ]
+    times = (np.bincount(stretch_of, weights * times_s)[valid]) / information[valid]
+    columns = [(times >= middle).astype(float) for middle in times[2:-1]]
+    columns.insert(0, times - times[0])
+    scored = [_fit_slope(column, means, information[valid]) for column in columns]
     freedom = len(means) - 2
-    best = int(np.argmax([pair[2] for pair in candidates]))
-    step_s, sigma_s, square = candidates[best]
-    if square < f_limit(_FALSE_ALARM / len(candidates), 1, freedom):
+    best = int(np.argmax([pair[2] for pair in scored]))
+    step_s, sigma_s, square = scored[best]
+    if square < f_limit(_FALSE_ALARM / len(scored), 1, freedom):
         return None
     if best == 0:
         return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
     # The most significant frame within the neighbouring stretches.
-    nearby = np.flatnonzero((times_s >= middles[best]) & (times_s <= middles[best + 2]))
+    nearby = np.flatnonzero((times_s >= times[best]) & (times_s <= times[best + 2]))
     scores = [
         _fit_slope((times_s >= times_s[index]).astype(float), own_s, weights)[2] for index in nearby
     ]
@@ -259,14 +234,9 @@ def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockC
 def refined_change(
     robot: Trajectory, frames: ImageTimes, fit: ClockFit, stamped: ImageTimes, change: ClockChange
 ) -> ClockChange:
-    """Re-estimates the size of a change from frames at times corrected by it.
+    """Re-estimates the size of a change from frames at times corrected by it, and their fit.
 
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: Views of the camera, at corrected times.
-        fit: The fit of these.
-        stamped: The same views at their stamped times.
-        change: The change by which they are corrected.
+    `stamped` are the same frames at their stamped times.
     """
     selected = _evenly(len(frames), _MOST_OWN)
     inside = robot.covers(frames.stamps_s[selected] - fit.offset_s, _FARTHEST_S)
@@ -350,13 +320,11 @@ def _fitted(
     if result is None:
         return None
     delays, clock = replace(delays, times_s=result.times_s), result.clock
-    covered = _covered(robot, frames, clock.offset_s)
-    inliers = _inliers(
-        delays.problem(robot, covered, clock.offset_s, clock.fit.state)[0], clock.fit
-    )
+    near = _covered(robot, frames, clock.offset_s)
+    inliers = _inliers(delays.problem(robot, near, clock.offset_s, clock.fit.state)[0], clock.fit)
     if inliers.all():
         return result
-    return _iterated(robot, covered.only(inliers), clock.offset_s, clock.fit.state, delays)
+    return _iterated(robot, near.only(inliers), clock.offset_s, clock.fit.state, delays)
 
 
 def _iterated(

@@ -30,7 +30,6 @@ class ImageTimes:
     """Views of a camera, by its own clock.
 
     Attributes:
-        mount: Mounting of the camera.
         stamps_s: (m,) times [s], ascending.
         cam_from_target: (m, 4, 4) [m].
         covariance: (m, 6, 6) of their right perturbations; None where unknown.
@@ -179,14 +178,12 @@ class _Rotation:
         both = sides[0][0] & sides[1][0] & inside
         angles_before, angles_after = (angles[both[mask]] for mask, angles in sides)
         rate = (angles_after - angles_before) / (2.0 * _STEP_S)
-        residual = self.by_camera[both] - angles_here[both[inside]]
+        error = self.by_camera[both] - angles_here[both[inside]]
         information = float(np.sum((rate - rate.mean()) ** 2)) if len(rate) else 0.0
         if not information > 0.0:
             return np.inf
         # Errors of pairs that share a stretch of time are correlated.
-        variance = (
-            np.mean((residual - residual.mean()) ** 2) * max(self.per_window, 1.0) / information
-        )
+        variance = np.mean((error - error.mean()) ** 2) * max(self.per_window, 1.0) / information
         return float(np.hypot(np.sqrt(variance), _LEAST_SIGMA_S))
 
 

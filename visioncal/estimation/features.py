@@ -65,9 +65,7 @@ class FeatureTouches:
 
     def rows(self, kind: FeatureKind) -> IntArray:
         """Rows of the touches of a kind."""
-        return np.array(
-            [row for row, name in enumerate(self.kinds) if name == kind], dtype=np.int64
-        )
+        return np.array([i for i, name in enumerate(self.kinds) if name == kind], dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,15 +36,7 @@ class Gate:
 
 
 def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
-    """Finds the corners and views whose residuals noise does not explain.
-
-    Args:
-        stack: The corners.
-        residuals: (n, 2) their reprojection residuals [px].
-
-    Returns:
-        The corners that pass and the views that do not.
-    """
+    """Finds the corners, and views, whose reprojection residuals (n, 2) [px] exceed noise."""
     # Median of the length of a two-dimensional Gaussian: sqrt(2 ln 2) sigma (Rayleigh).
     length = np.linalg.norm(residuals, axis=1)
     sigma = np.median(length) / np.sqrt(2 * np.log(2))

@@ -77,18 +77,13 @@ def agreeing_groups(
         doubtful = _doubtful(fit)
         if doubtful.any():
             fit = fit_groups(problem, fit.used | doubtful, fit.state)
-    group_distances = distances(fit)
-    directions = np.maximum(group_distances.directions, 1)
+    found = distances(fit)
+    counts = np.maximum(found.directions, 1)
     explained = not doubtful.any() and (
         expected_sigma is None or _is_explained(fit, expected_sigma)
     )
     return GroupInliers(
-        fit,
-        fit.used,
-        group_distances.squares / directions,
-        group_distances.limit / directions,
-        doubtful,
-        explained,
+        fit, fit.used, found.squares / counts, found.limit / counts, doubtful, explained
     )
 
 
@@ -102,13 +97,9 @@ class _GroupSearch(Generic[State]):
         return fit_groups(self.problem, used, start.state)
 
     def distances(self, used: Mask, fit: GroupFit[State]) -> Distances:
-        all_distances = distances(fit)
+        found = distances(fit)
         # Without degrees of freedom nothing is rejected.
-        return (
-            all_distances
-            if fit.freedom > 0
-            else replace(all_distances, squares=np.zeros(len(used)))
-        )
+        return found if fit.freedom > 0 else replace(found, squares=np.zeros(len(used)))
 
 
 def distances(fit: GroupFit[State]) -> Distances:

@@ -61,27 +61,19 @@ class Jacobians:
 
 
 def identifiability(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
-    """Counts the directions that stops determine, and that any stops could.
-
-    Args:
-        stops: Jacobians at the stops.
-        anywhere: Jacobians at postures all over the workspace.
-    """
+    """Counts the directions that stops determine, and that postures over the workspace could."""
     frame_rank, free = anywhere.free()
     sizes, vectors = right_vectors(free)
-    identifiable = vectors[sizes > LEAST_SHARE * sizes[0]]
+    shown = vectors[sizes > LEAST_SHARE * sizes[0]]
     frames_determined, values, determined = _determined(stops)
     # The identifiable space without the determined one; both have orthonormal bases.
-    missing = _singular(identifiable.T - determined.T @ (determined @ identifiable.T))[0]
+    missing = _singular(shown.T - determined.T @ (determined @ shown.T))[0]
     return Identifiability(
         columns=stops.frames.shape[1] + stops.arm.shape[1],
-        identifiable=frame_rank
-        + len(identifiable)
-        + stops.frames.shape[1]
-        - anywhere.frames.shape[1],
+        identifiable=frame_rank + len(shown) + stops.frames.shape[1] - anywhere.frames.shape[1],
         determined=frames_determined + len(values),
         values=values,
-        missing=missing[:, : max(len(identifiable) - len(values), 0)],
+        missing=missing[:, : max(len(shown) - len(values), 0)],
     )
 
 

@@ -33,11 +33,6 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
     the logarithm of the level (Jeffreys 1946), scales the covariance correctly: for n degrees of
     freedom it is n / (n - 2) times the most likely variance.
 
-    Args:
-        problem: The observations.
-        state: The solution.
-        noise: The most likely levels.
-
     Returns:
         (r, 2) by robot: the rotation's [rad] and the translation's [m], no lower than in `noise`. A
         robot's two levels are scaled together, with the others held.
@@ -64,11 +59,6 @@ def expected_levels(problem: Problem, state: State, noise: Noise) -> FloatArray:
 
 def noise_intervals(problem: Problem, state: State, noise: Noise) -> FloatArray:
     """95 % intervals of the robots' noise levels by the profile likelihood.
-
-    Args:
-        problem: The observations.
-        state: The solution.
-        noise: The most likely levels.
 
     Returns:
         (r, 2, 2) by robot: low and high of the rotation's sigma [rad], then of the translation's

@@ -366,17 +366,9 @@ class _ArmLikelihood:
         gradients[levels:] += deviation / _SPREAD
         curvature[levels:, levels:] += np.eye(len(deviation)) / _SPREAD**2
         value += 0.5 * float(deviation @ deviation)
-        with_ratio_prior = ratio_prior(range(levels // 2)).beside(
-            Likely(value, gradients, curvature), logs
-        )
+        full = ratio_prior(range(levels // 2)).beside(Likely(value, gradients, curvature), logs)
         # Residuals have the opposite sign of the prediction.
-        return _SizesAt(
-            with_ratio_prior.value,
-            with_ratio_prior.slope,
-            with_ratio_prior.curvature,
-            logs,
-            -effects,
-        )
+        return _SizesAt(full.value, full.slope, full.curvature, logs, -effects)
 
     def assembled(self, step: "_SizesAt", gain: float) -> JointFunctions:
         """The errors of all blocks with the sizes at some step."""

@@ -61,7 +61,6 @@ class LevelFit:
 
     Attributes:
         errors: The errors by block; empty for the nominal arm.
-        fit: The unknowns and the noise.
         gain: Twice the gain in log-likelihood over the nominal arm.
         inside: (m, 6) residuals of the robot's observations (rotation [rad], translation [m]).
         left_out: (m, 6) leave-one-out residuals of each stop, to first order.
@@ -87,8 +86,6 @@ class ArmTrials:
 
     Attributes:
         problem: The observations, without errors of this arm.
-        state: The start.
-        robot: The robot.
         bases: (s, 6, p) by stop, columns of each block of errors by its name.
         noise: Starts of the noise levels; default starts where None.
     """
@@ -113,10 +110,8 @@ class ArmTrials:
         """The fit with some errors of the arm."""
         key = tuple(errors.values())
         if key not in self._fits:
-            problem, previous = self.erring(errors), self._fits.get(key[:-1])
-            state, noise = (
-                (self.state, self.noise) if previous is None else (previous.state, previous.noise)
-            )
+            problem, base = self.erring(errors), self._fits.get(key[:-1])
+            state, noise = (self.state, self.noise) if base is None else (base.state, base.noise)
             added = problem.start_values[len(state.values) :]
             start = State(state.edges, np.concatenate([state.values, added]))
             self._fits[key] = fit_problem(problem, start, noise)
@@ -164,12 +159,7 @@ class ArmTrials:
 def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
     """Fits all unknowns with some blocks of the errors of one robot's arm free.
 
-    Args:
-        arm: The observations, and the blocks of the arm that they may show.
-        blocks: Those to free; blocks that are not significant stay out.
-
-    Returns:
-        The fit; None where no block that defines the level is significant.
+    Blocks that are not significant stay out; None where no block that defines the level is.
     """
     if blocks.own and not arm.bases.keys() & set(blocks.own):
         return None
@@ -210,12 +200,10 @@ def without_springs(arm: ArmTrials, errors: Mapping[str, ArmErrors]) -> dict[str
     """
     kept = dict(errors)
     while COMPLIANCE in kept:
-        compliance_errors = kept[COMPLIANCE]
-        name = compliance_errors.effect(arm.robot, COMPLIANCE).name
+        block = kept[COMPLIANCE]
+        name = block.effect(arm.robot, COMPLIANCE).name
         compliances = arm.erring(kept).values_of(name, arm.fitted(kept).state)
         if not (compliances < 0.0).any():
             break
-        kept[COMPLIANCE] = replace(
-            compliance_errors, basis=compliance_errors.basis * (compliances >= 0.0)
-        )
+        kept[COMPLIANCE] = replace(block, basis=block.basis * (compliances >= 0.0))
     return kept

@@ -59,11 +59,9 @@ def lens_step(
     count, tried = len(order), len(order) + 1 - 2 * _FEWEST
     if tried < 1:
         return None
-    reprojection = reproject(stack, camera, cam_from_target)
-    columns = np.concatenate(
-        [reprojection.by_intrinsics, reprojection.residuals[:, :, None]], axis=2
-    )
-    eliminated = WithoutPoses.of(stack, reprojection.by_pose, columns, None).left
+    seen = reproject(stack, camera, cam_from_target)
+    columns = np.concatenate([seen.by_intrinsics, seen.residuals[:, :, None]], axis=2)
+    eliminated = WithoutPoses.of(stack, seen.by_pose, columns, None).left
     products = stack.products_by_view(eliminated, eliminated)[order]
     steps = np.zeros((products.shape[1] - 1, 3))
     steps[:2, 0], steps[2, 1], steps[3, 2] = camera.matrix[:2], 1.0, 1.0

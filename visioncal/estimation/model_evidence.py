@@ -34,9 +34,7 @@ class Belief:
     """Posterior of the calibration, the prior of a verification.
 
     Attributes:
-        state: The unknowns.
         covariance: (p, p) of their steps.
-        noise: Its levels.
         freedom: Degrees of freedom of its scale; infinite where it is known.
     """
 
@@ -51,7 +49,6 @@ class Cause:
     """A change that may have happened since the calibration, of p unknowns.
 
     Attributes:
-        name: Name of the change.
         by_sensor: (n, 6, p) right perturbations of the measured poses that undo it.
         flange_jacobian: (s, 6, p) right perturbations of the flange at each stop that undo it.
         units: (p,) the size of each unknown, for a change of one metre.
@@ -96,12 +93,9 @@ class CauseEvidence:
 
 
 def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> CauseEvidence:
-    """Computes the evidence for a cause from some stops.
+    """Computes the evidence for a cause from the stops of one robot; with None, for no change.
 
-    Args:
-        problem: The stops of one robot, with all unknowns of `belief`.
-        belief: The calibration.
-        cause: The change; None for no change.
+    The problem has all unknowns of `belief`.
     """
     cause = cause or _nothing(problem)
     units, (widest_m, factor) = cause.units, cause.trials[-1]
@@ -143,12 +137,12 @@ class _StopResiduals:
 def _nothing(problem: Problem) -> Cause:
     """The cause of no change, without unknowns."""
     (poses,) = problem.poses.values()
-    no_sensor, no_flange, no_values = (
+    sensor, flange, values = (
         np.zeros((len(problem), 6, 0)),
         np.zeros((len(poses), 6, 0)),
         np.zeros(0),
     )
-    return Cause("nothing", no_sensor, no_flange, no_values, no_values, (1.0,))
+    return Cause("nothing", sensor, flange, values, values, (1.0,))
 
 
 def _converged(
@@ -173,15 +167,10 @@ def _linearised(
     linear = without.linear(with_change(belief.state, cause))
     noise = replace(belief.noise, robots=factor * belief.noise.robots)
     jacobian = linear.jacobian.reshape(-1, without.size)
-    jacobian_calibrated, jacobian_cause = jacobian[:, :calibrated], jacobian[:, calibrated:]
-    covariance = (
-        _total_covariance(without, linear, noise)
-        + jacobian_calibrated @ belief.covariance @ jacobian_calibrated.T
-    )
+    known, own = jacobian[:, :calibrated], jacobian[:, calibrated:]
+    covariance = _total_covariance(without, linear, noise) + known @ belief.covariance @ known.T
     covariance += _LEAST_SIGMA**2 * np.eye(len(covariance))
-    return _StopResiduals(
-        values, linear.residuals.reshape(-1) - jacobian_cause @ values, jacobian_cause, covariance
-    )
+    return _StopResiduals(values, linear.residuals.reshape(-1) - own @ values, own, covariance)
 
 
 def _total_covariance(problem: Problem, linear: Linear, noise: Noise) -> FloatArray:
@@ -196,17 +185,9 @@ def _total_covariance(problem: Problem, linear: Linear, noise: Noise) -> FloatAr
 
 
 def undone(problem: Problem, cause: Cause, values: FloatArray) -> Problem:
-    """The stops with a change of some size undone, and their Jacobian by it.
+    """The stops with a change of (p,) values undone, and these as their last effect.
 
     Changes may be large: a board may have turned by any angle.
-
-    Args:
-        problem: The stops of one robot.
-        cause: The change.
-        values: (p,) its unknowns.
-
-    Returns:
-        The stops, with the p unknowns as their last effect.
     """
     by_sensor, flange_jacobian = (
         _stepped(jacobian, values) for jacobian in (cause.by_sensor, cause.flange_jacobian)

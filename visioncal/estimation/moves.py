@@ -89,13 +89,7 @@ def _weighted_mean(twists: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def better_stop(problem: Problem, fit: Solution, move: Move) -> int:
-    """The stop of a move that explains most, now that both poses are fitted.
-
-    Args:
-        problem: All n observations.
-        fit: The unknowns and the noise.
-        move: The move.
-    """
+    """The stop of a move that explains most, now that both poses are fitted."""
     involved = problem.observations.involves(move.frame) | problem.observations.involves(move.twin)
     part = problem.subset(involved)
     all_rows = np.ones(len(part), dtype=bool)
@@ -128,13 +122,7 @@ def moved_earlier_or_later(
 
 
 def needless_move(problem: Problem, fit: Solution, moves: Sequence[Move]) -> Move | None:
-    """The least significant move if its two poses are equal up to noise; else None.
-
-    Args:
-        problem: The inlier observations.
-        fit: The unknowns and the noise.
-        moves: The moves.
-    """
+    """The least significant move if its two poses are equal up to noise; else None."""
     if not moves:
         return None
     covariance = fitted_covariance(problem, fit.state, fit.noise)
@@ -152,11 +140,7 @@ def fitted_change(
 ) -> tuple[FloatArray, FloatArray]:
     """A fitted change (6,) in the frame's own old pose, and its covariance (6, 6).
 
-    Args:
-        problem: The observations, with both frames.
-        fit: The unknowns and the noise.
-        known: (p, p) the covariance of the unknowns.
-        move: The move.
+    The problem has both frames, and `known` (p, p) is the covariance of its unknowns.
     """
     first, second = (problem.unknown[name] for name in (move.frame, move.twin))
     between = invert(fit.state.edges[first]) @ fit.state.edges[second]
@@ -202,13 +186,7 @@ def gross_move(
 
     Two simultaneous moves look like one where both frames are seen: of moves that explain about as
     much, the one counts after which the next explains most. A pushed robot base is no move: its
-    observations stay outliers.
-
-    Args:
-        problem: All n observations.
-        fit: The unknowns and the noise, by the inliers.
-        agrees: (n,) inlier mask.
-        movable: Frames that may have moved.
+    observations stay outliers. `agrees` is the (n,) inlier mask.
     """
     steps = _steps(problem, fit, agrees, movable)
     if not steps or _pushed_gain(problem, fit, agrees) > steps[0].gain:
@@ -339,13 +317,7 @@ def _change_covariance(problem: Problem, fit: Solution, frame: str) -> FloatArra
 def common_change(
     problem: Problem, fit: Solution, frame: str, some: Mask
 ) -> tuple[FloatArray, Mask] | None:
-    """The new pose of a frame that some observations agree on.
-
-    Args:
-        problem: All n observations.
-        fit: The unknowns and the noise, by other observations.
-        frame: The frame.
-        some: (n,) mask of the observations.
+    """The new pose of a frame that (n,) some observations agree on, by a fit of others.
 
     Returns:
         (4, 4) the change in the frame's own pose, and for each of them whether noise explains the
@@ -367,10 +339,7 @@ def common_change(
 def move_limit(problem: Problem, tried: int, kinds: int = 1) -> float:
     """Limit of the squared length of a significant step, for a number tried (F distribution).
 
-    Args:
-        problem: The observations.
-        tried: Number of steps tried.
-        kinds: Number of kinds of residuals, if a step may be in one of them alone.
+    `kinds` is the number of kinds of residuals, if a step may be in one of them alone.
     """
     freedom = max(0.5 * (6.0 * len(problem) - problem.size) / kinds, 6.0)
     return 6.0 * float(f_limit(FALSE_MOVE / tried, 6, freedom))

@@ -41,18 +41,12 @@ class Null:
 
 
 def null_of(jacobian: Jacobians) -> Null:
-    """Null space of a table's parameters over all postures.
-
-    Args:
-        jacobian: By the frames and by the table's parameters, at postures all over the workspace.
-    """
+    """Null space of a table's parameters, by Jacobians at postures all over the workspace."""
     _, free = jacobian.free()
     sizes, vectors = right_vectors(free)
     directions = _echelon(vectors[sizes <= LEAST_SHARE * sizes[0]])
-    compensation = np.linalg.lstsq(jacobian.frames, jacobian.arm @ directions.T, rcond=LEAST_SHARE)[
-        0
-    ]
-    return Null(directions, np.asarray(compensation))
+    frames = np.linalg.lstsq(jacobian.frames, jacobian.arm @ directions.T, rcond=LEAST_SHARE)[0]
+    return Null(directions, np.asarray(frames))
 
 
 def _echelon(rows: FloatArray) -> FloatArray:
@@ -69,12 +63,9 @@ def _echelon(rows: FloatArray) -> FloatArray:
 
 
 def imitated(numbers: Jacobians, arm: Jacobians, directions: FloatArray) -> FloatArray:
-    """Least changes (k, n) of a table's parameters equivalent to some errors of the arm.
+    """Least changes (k, n) of a table's parameters equivalent to (p, n) errors of the arm.
 
-    Args:
-        numbers: Jacobians by the frames and by the table's parameters, at some postures.
-        arm: Jacobians by the frames and by the arm's errors, at the same.
-        directions: (p, n) errors of the arm.
+    The Jacobians by the parameters and by the arm's errors are at the same postures.
     """
     (_, by_numbers), (_, by_arm) = numbers.free(), arm.free()
     return np.asarray(np.linalg.lstsq(by_numbers, by_arm @ directions, rcond=LEAST_SHARE)[0])

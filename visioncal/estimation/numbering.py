@@ -65,13 +65,9 @@ class Numbering:
         return np.flatnonzero(self.assignment != np.arange(len(self.assignment)))
 
     def words(self, labels: Sequence[str]) -> str:
-        """Words for the difference from the stated order: `P3 and P7 are exchanged`.
+        """Words for the difference from the stated order, if any: `P3 and P7 are exchanged`.
 
-        Args:
-            labels: (m,) names of the drawn points; the first n are the stated ones.
-
-        Returns:
-            The words; empty where the order is the stated one.
+        `labels` are the (m,) names of the drawn points; the first n are the stated ones.
         """
         moved, count, drawn = self.moved, len(self.assignment), len(labels)
         if not len(moved):

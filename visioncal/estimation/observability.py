@@ -104,12 +104,6 @@ def check_observability(
 def refuse_open_motion(problem: Problem, state: State, noise: Noise, mount: Mount) -> None:
     """Refuses motion that leaves a direction undetermined at any noise, before a fit.
 
-    Args:
-        problem: The views.
-        state: Start of a fit.
-        noise: Its start.
-        mount: Mounting of the camera.
-
     Raises:
         DegenerateError: A direction is numerically null.
     """
@@ -148,13 +142,7 @@ def check_determined(
 ) -> None:
     """Refuses motion that leaves a direction of an unknown frame undetermined.
 
-    Args:
-        problem: The observations.
-        state: The solution.
-        noise: Of the residuals; see `check_observability`.
-        scene: The words.
-        pixel_px: As there.
-        looks: Whether the first effect has to be determined, too.
+    Arguments are those of `check_observability`; `scene` is the wording.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
@@ -179,13 +167,11 @@ def _at_typical_noise(
 ) -> tuple[Problem, Noise]:
     """The same observations at a typical noise, where the data show a larger one."""
     shares = {name: min(1.0, TYPICAL_PX / px) for name, px in pixel_px.items()}
-    observations, least = problem.observations, min(shares.values(), default=1.0)
-    row_shares = np.array([shares.get(observer, 1.0) for observer in observations.observers])[
-        :, None, None
-    ]
+    seen, least = problem.observations, min(shares.values(), default=1.0)
+    scale = np.array([shares.get(observer, 1.0) for observer in seen.observers])[:, None, None]
     typical = replace(
         problem,
-        observations=replace(observations, covariance=row_shares**2 * observations.covariance),
+        observations=replace(seen, covariance=scale**2 * seen.covariance),
         effects=tuple(
             replace(
                 effect, known=replace(effect.known, information=effect.known.information / least**2)
@@ -270,11 +256,7 @@ def directions(
 ) -> tuple[Direction, ...]:
     """Least certain directions of the camera's edge and of each target's, offset before rotation.
 
-    Args:
-        problem: The views.
-        state: The solution.
-        covariance: (p, p) covariance of the unknowns.
-        mount: Mounting of the camera.
+    `covariance` is (p, p), of all unknowns.
     """
     return tuple(
         direction
@@ -306,12 +288,7 @@ def edge_directions(
 
 
 def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
-    """Refuses fewer stops than any calibration needs.
-
-    Args:
-        problem: The used views.
-        mount: Mounting of the camera.
-        views: Their number.
+    """Refuses fewer stops, of a number of used views, than any calibration needs.
 
     Raises:
         DegenerateError: There are fewer than three stops.
@@ -342,10 +319,8 @@ def _null_direction(
 ) -> tuple[str, str]:
     """The first frame with (p, k) null directions, and its undetermined part in words."""
     for frame, edge in problem.unknown.items():
-        rotation_matrix, start = state.edges[edge][:3, :3], problem.edge_columns(frame).start
-        rotation, translation = (
-            rotation_matrix @ null[start + at : start + at + 3] for at in (0, 3)
-        )
+        axes, start = state.edges[edge][:3, :3], problem.edge_columns(frame).start
+        rotation, translation = (axes @ null[start + at : start + at + 3] for at in (0, 3))
         parts = [
             _open_part(scene.names[frame], directions, is_rotation)
             for directions, is_rotation in ((translation, False), (rotation, True))
@@ -428,10 +403,7 @@ def turn_axis(turns: FloatArray) -> tuple[FloatArray, float, bool]:
 def open_offset(robot: FloatArray, thing: str, frame: str) -> str:
     """The offset left undetermined by rotation about one axis, in words; empty for more axes.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of a chain.
-        thing: Name of the frame to be placed.
-        frame: Name of the frame in which the robot's part rotates.
+    `robot` is its part (m, 4, 4) of a chain, which rotates in `frame`; `thing` is to be placed.
     """
     main, _, is_lone = turn_axis(_turns(robot))
     return _words(thing, frame, main, is_rotation=False) if is_lone else ""
@@ -474,12 +446,7 @@ def turns_about_two_axes(robot: FloatArray) -> bool:
 
 
 def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, str]:
-    """Why the motion alone leaves a calibration undetermined, and advice; empty if it does not.
-
-    Args:
-        base_from_flange: (m, 4, 4) poses of the flange, two or more.
-        mount: Mounting of the camera.
-    """
+    """Why (m, 4, 4) flange poses alone leave a calibration undetermined, and advice; or empty."""
     robot = robot_part(base_from_flange, mount)
     if turns_about_two_axes(robot):
         return "", ""

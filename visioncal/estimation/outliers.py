@@ -126,10 +126,7 @@ class _ObservationSearch:
 def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     """Mahalanobis distance of each observation from the prediction of the others.
 
-    Args:
-        problem: All n observations.
-        used: (n,) mask of those that were fitted.
-        fit: The unknowns and the noise.
+    `used` is the (n,) mask of the fit.
     """
     squares, directions = mahalanobis_sq(problem, used, fit)
     counted = np.maximum(directions, 1.0)
@@ -143,13 +140,7 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
 
 
 def agree(problem: Problem, state: State, movable: Sequence[str] = ()) -> Agreed:
-    """Finds the inliers and the clear moves in a first pass; `settle` refines both.
-
-    Args:
-        problem: All observations.
-        state: The start.
-        movable: Unknown frames that may have moved.
-    """
+    """Finds the inliers and the clear moves in a first pass; `settle` refines both."""
     if not movable:
         return inliers(problem, state)
     used, fit = _core(problem, state, _early(problem))
@@ -215,16 +206,10 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
 
 
 def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
-    """Finds the inliers where nothing moved.
+    """Finds the inliers where nothing moved; `used` are (n,) presumed ones, if any.
 
-    Args:
-        problem: All observations.
-        state: The start.
-        used: (n,) presumed inliers; None for a search from scratch.
-
-    Returns:
-        The inliers. Where fewer than half are, or their noise exceeds any accepted result's, the
-        outliers cannot be identified: all stay except gross outliers.
+    Where fewer than half are inliers, or their noise exceeds any accepted result's, the outliers
+    cannot be identified: all stay except gross outliers.
     """
     all_rows = np.ones(len(problem), dtype=bool)
     if len(problem) > LEAST_VIEWS:
@@ -247,9 +232,7 @@ def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
 def closed_form(problem: Problem, rows: IntArray) -> State | None:
     """The unknowns by a hand-eye solver, if there are two edges with one robot between.
 
-    Args:
-        problem: The observations.
-        rows: (m,) those to solve from.
+    It solves from (m,) rows of the observations.
     """
     paths = [group.path for group in problem.groups]
     if len(paths) != 1 or not problem.observations.has_rotation.all() or problem.points:
@@ -279,7 +262,7 @@ def _core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
         return solve_problem(part.subset(_of_pairs(part, mask, state)), state, noise)[0]
 
     mask, start = trimmed_start(
-        [state], lambda item: _lever_distances(part, item), solve, half_of(len(rows))
+        [state], lambda at: _lever_distances(part, at), solve, half_of(len(rows))
     )
     search, mask = _ObservationSearch(part), _of_pairs(part, mask, start)
     every = np.ones(len(rows), dtype=bool)
@@ -293,12 +276,10 @@ def _of_pairs(problem: Problem, mask: Mask, state: State) -> Mask:
     """The observations of a mask, and the nearest half of each pair of frames, if near."""
     # The nearest half of all may be of few pairs of frames, such as the still boards of still
     # cameras: other frames would be undetermined.
-    distance, mask_of_pairs = _lever_distances(problem, state), mask.copy()
+    distance, nearest = _lever_distances(problem, state), mask.copy()
     for group in problem.groups if len(problem.groups) > 1 else ():
-        mask_of_pairs[
-            group.rows[np.argsort(distance[group.rows])][: (len(group.rows) + 1) // 2]
-        ] = True
-    return mask_of_pairs & _near(problem, state, mask)
+        nearest[group.rows[np.argsort(distance[group.rows])][: (len(group.rows) + 1) // 2]] = True
+    return nearest & _near(problem, state, mask)
 
 
 def _early(problem: Problem) -> Mask:

@@ -90,16 +90,9 @@ def _free(table: DHTable, functions: FloatArray, *, links: bool) -> Iterator[Par
 
 
 def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parameter]) -> FloatArray:
-    """Jacobian of a table's parameters by the arm's errors.
+    """Jacobian (k, p) of a table's parameters by the arm's errors; `table_of(model.bare, ...)`.
 
-    Args:
-        model: The arm.
-        table: `table_of(model.bare, ...)`.
-        parameters: The selected parameters.
-
-    Returns:
-        (k, p) derivatives, zero where the convention fixes a parameter and the base or the flange
-        changes instead.
+    It is zero where the convention fixes a parameter and the base or the flange changes instead.
     """
     steps = [model.changes(row) for row in np.eye(len(model.values))]
     placements, functions = (np.array(pair) for pair in zip(*steps, strict=True))

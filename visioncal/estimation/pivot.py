@@ -189,11 +189,9 @@ def _result(
     covariance[6 - edge :, 6 - edge :] = fit.covariance[:edge, :edge]
     count = len(fit.state.points)
     blocks = fit.covariance[edge:, edge:].reshape(count, 3, count, 3)
-    indices = np.arange(count)
+    at = np.arange(count)
     belongs = _belonging(problem, inliers)
-    return PivotFit(
-        inliers, problem.oriented, covariance, blocks[indices, :, indices, :], belongs, worst
-    )
+    return PivotFit(inliers, problem.oriented, covariance, blocks[at, :, at, :], belongs, worst)
 
 
 def _belonging(
@@ -228,10 +226,9 @@ def _mahalanobis_sq_at(
     touched = replace(problem, touches=replace(problem.touches, points=points))
     groups = touched.linearise(fit.state)
     rows = groups.observed[row]
-    residual, jacobian = groups.residuals[row][rows], groups.jacobian[row][rows]
+    residual, slope = groups.residuals[row][rows], groups.jacobian[row][rows]
     covariance = (
-        groups.covariance(fit.sigma)[row][np.ix_(rows, rows)]
-        + jacobian @ fit.covariance @ jacobian.T
+        groups.covariance(fit.sigma)[row][np.ix_(rows, rows)] + slope @ fit.covariance @ slope.T
     )
     limit = f_limit(_FALSE_ALARM, len(residual), max(fit.freedom, 1))
     return float(residual @ np.linalg.solve(covariance, residual) / (len(residual) * limit))
@@ -315,14 +312,12 @@ def _worst(
     values, vectors = np.linalg.eigh(tip)
     several = values[-2] > SIGMA_LIMIT_M**2
     words = "from the flange" if several else f"along the flange's {axis_words(vectors[:, -1])}"
-    directions = [
-        _direction(f"the tip's offset {words}", values[-1], SIGMA_LIMIT_M, is_rotation=False)
-    ]
+    worst = [_direction(f"the tip's offset {words}", values[-1], SIGMA_LIMIT_M, is_rotation=False)]
     if problem.oriented:
         values, vectors = np.linalg.eigh(covariance[:3, :3])
         words = f"the tool's rotation about its {axis_words(vectors[:, -1])}"
-        directions.append(_direction(words, values[-1], SIGMA_LIMIT_RAD, is_rotation=True))
-    return tuple(directions)
+        worst.append(_direction(words, values[-1], SIGMA_LIMIT_RAD, is_rotation=True))
+    return tuple(worst)
 
 
 def _direction(words: str, variance: float, limit: float, *, is_rotation: bool) -> Direction:

@@ -167,12 +167,9 @@ def determines_hand(measured: FloatArray, nominal: FloatArray, noise_m: float) -
 
 
 def check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
-    """Refuses points that are the mirror image of the drawing.
+    """Refuses points that are the mirror image of the drawing, at a stated noise [m].
 
-    Args:
-        pairs: The points.
-        numbering: The best order.
-        noise_m: Stated noise of a coordinate [m].
+    `numbering` is the order in which they fit best.
 
     Raises:
         DataError: Mirrored, the points fit significantly better.

@@ -113,13 +113,9 @@ class _Model:
 
 
 def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -> ArmErrors | None:
-    """Averages models of the errors of an arm without joint angles.
+    """Averages models of the errors of an arm without joint angles, from the white-noise solution.
 
-    Args:
-        problem: The observations.
-        state: The solution under white noise.
-        noise: Its levels; those of the sensors and of other robots are kept.
-        robot: The robot.
+    The noise levels of the sensors and of other robots are kept.
 
     Returns:
         Its errors, and the noise beside them, both averaged over all models; None for too few
@@ -165,17 +161,13 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     ]
     most_stops = _MOST_COLUMNS // 6 // max(sum(map(bool, kinds)), 1)
     by_posture, in_time = (_columns(some, len(posed), observed_rows, most_stops) for some in kinds)
-    variances = sum(
-        (weight * model.white**2 for model, weight in pairs), by_posture[1] + in_time[1]
-    )
+    left = sum((weight * model.white**2 for model, weight in pairs), by_posture[1] + in_time[1])
     columns, lasting = np.concatenate([by_posture[0], in_time[0]], axis=2), in_time[0].shape[2]
     basis = np.zeros((len(poses), 6, columns.shape[2]))
     basis[posed] = columns
-    levels_beside = np.sqrt(variances)
-    errors = ArmErrors(
-        basis, 1.0, gain, of_links=False, white=levels_beside, look=levels, lasting=lasting
-    )
-    return replace(errors, away=left_out_clusters(problem, state, noise, robot, errors))
+    beside = np.sqrt(left)
+    found = ArmErrors(basis, 1.0, gain, of_links=False, white=beside, look=levels, lasting=lasting)
+    return replace(found, away=left_out_clusters(problem, state, noise, robot, found))
 
 
 def left_out_clusters(
@@ -208,14 +200,12 @@ def left_out_clusters(
         information, gradient = normal_equations(rest, widened_state, noise)
         fitted = covariance_among(information[:size, :size], problem.moving)
         linear = left_out.linear(widened_state)
-        jacobian, arm_jacobian = np.split(linear.jacobian, [size], axis=2)
+        jacobian, by_arm = np.split(linear.jacobian, [size], axis=2)
         residuals = linear.residuals - jacobian @ (fitted @ gradient[:size])
-        arm_jacobian = errors.sigma * (
-            arm_jacobian - jacobian @ (fitted @ information[:size, size:])
-        )
+        by_arm = errors.sigma * (by_arm - jacobian @ (fitted @ information[:size, size:]))
         fitted = fitted + less_noise(problem.subset(~held), state, noise, robot, white)
         predicted = left_out.total_covariance(linear, noise_beside)
-        predicted += arm_jacobian @ np.swapaxes(arm_jacobian, 1, 2)
+        predicted += by_arm @ np.swapaxes(by_arm, 1, 2)
         predicted += jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
         squares[0] += np.sum(residuals**2, axis=0).reshape(2, 3)
         squares[1] += np.sum(np.diagonal(predicted, axis1=1, axis2=2), axis=0).reshape(2, 3)
@@ -272,11 +262,8 @@ def _models(poses: FloatArray, white: FloatArray, observed: IntArray) -> Iterato
 
 def _squared_distances(poses: FloatArray) -> FloatArray:
     """(s, s) squared distances of postures; 2 (1 - cos) of an angle [rad^2]."""
-    positions, rotations = (
-        poses[:, :3, 3] / _REACH_M,
-        poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0),
-    )
-    features = np.concatenate([positions, rotations], axis=1)
+    places, turns = (poses[:, :3, 3] / _REACH_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0))
+    features = np.concatenate([places, turns], axis=1)
     return np.asarray(np.sum((features[:, None] - features) ** 2, axis=2))
 
 
@@ -285,14 +272,9 @@ def _columns(
 ) -> tuple[FloatArray, FloatArray]:
     """Factors the covariance of processes by blocks of stops, largest remainder first.
 
-    Args:
-        processes: The processes.
-        count: Number of stops s.
-        observed: (m,) those that were observed.
-        most: Most stops that may have columns.
-
     Returns:
-        (s, 6, c) columns, and (2,) the mean variance that they leave at observed stops.
+        (s, 6, c) columns of at most `most` stops, and (2,) the mean variance that they leave at
+        (m,) observed stops.
     """
     all_stops, columns = np.arange(count), np.zeros((count, 6, 0))
     remainder = np.zeros((count, 6, 6))
@@ -386,13 +368,9 @@ class _Likelihood:
         members, stops, width = likelihood.members, likelihood.stops, errors.shape[1]
         units = np.flatnonzero((members == index).any(axis=1))
         units = units[np.argsort(stops[units], kind="stable")]
-        blocks_of_units = np.array_split(units, -(-len(units) * width // _MOST_ROWS))
-        chosen_blocks = (
-            np.linspace(0, len(blocks_of_units) - 1, min(len(blocks_of_units), _MOST_BLOCKS))
-            .round()
-            .astype(int)
-        )
-        chosen = [blocks_of_units[at] for at in chosen_blocks]
+        every = np.array_split(units, -(-len(units) * width // _MOST_ROWS))
+        spread = np.linspace(0, len(every) - 1, min(len(every), _MOST_BLOCKS)).round().astype(int)
+        chosen = [every[at] for at in spread]
         rest = np.setdiff1d(np.arange(len(members)), np.concatenate(chosen))
         total = likelihood.reduced.covariance[rest] + problem.error_covariance(noise)[rest]
         weighted = np.linalg.solve(total, jacobian[rest])
@@ -422,29 +400,25 @@ class _Likelihood:
         ]
         sizes = np.array([process.size for process in model.processes])
         least = np.append([LEAST_SIGMA] * 2, np.full(len(sizes), _NOTHING))
-        damping, current = 1e-3, self._step(common, np.log(np.append(model.white, sizes)))
+        damping, now = 1e-3, self._step(common, np.log(np.append(model.white, sizes)))
         for _ in range(_ITERATIONS):
-            if current is None or damping > _WORST_DAMPING:
+            if now is None or damping > _WORST_DAMPING:
                 break
-            curvature = current.curvature + damping * np.diag(np.diag(current.curvature) + 1e-6)
-            step = np.clip(
-                -np.linalg.solve(curvature, current.slope), -_LONGEST_STEP, _LONGEST_STEP
-            )
-            trial = self._step(
-                common, np.clip(current.logs + step, np.log(least), np.log(MOST_SIGMA))
-            )
-            if trial is None or trial.value > current.value:
+            curvature = now.curvature + damping * np.diag(np.diag(now.curvature) + 1e-6)
+            step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
+            trial = self._step(common, np.clip(now.logs + step, np.log(least), np.log(MOST_SIGMA)))
+            if trial is None or trial.value > now.value:
                 damping *= 10.0
                 continue
-            gained, current, damping = current.value - trial.value, trial, damping / 10.0
+            gained, now, damping = now.value - trial.value, trial, damping / 10.0
             if gained < _CONVERGED:
                 break
-        if current is None:
+        if now is None:
             return model
-        sigmas = np.exp(current.logs)
+        sigmas = np.exp(now.logs)
         pairs = zip(model.processes, sigmas[2:].tolist(), strict=True)
         processes = tuple(replace(process, size=size) for process, size in pairs)
-        return replace(model, processes=processes, white=sigmas[:2], value=current.value)
+        return replace(model, processes=processes, white=sigmas[:2], value=now.value)
 
     def _step(self, common: Sequence[FloatArray], logs: FloatArray) -> _LikelihoodAt | None:
         """The likelihood at some sizes; None where the covariance is numerically singular."""
@@ -460,38 +434,29 @@ class _Likelihood:
                 return None
             inverse = lapack.dpotri(factor, lower=1)[0]
             inverse = np.tril(inverse) + np.tril(inverse, -1).T
-            weighted, weighted_errors = inverse @ block.jacobian, inverse @ block.errors
+            weighted, pulled = inverse @ block.jacobian, inverse @ block.errors
             information += block.jacobian.T @ weighted
-            gradient += block.jacobian.T @ weighted_errors
-            value += 2.0 * float(np.log(np.diag(factor)).sum()) + float(
-                block.errors @ weighted_errors
-            )
-            solved.append((inverse, weighted, weighted_errors))
+            gradient += block.jacobian.T @ pulled
+            value += 2.0 * float(np.log(np.diag(factor)).sum()) + float(block.errors @ pulled)
+            solved.append((inverse, weighted, pulled))
         root = covariance_root(information)
         estimate = root @ (root.T @ gradient)
         value -= 2.0 * float(np.linalg.slogdet(root)[1]) + float(gradient @ estimate)
         gradients, average = np.zeros(count), np.zeros((count, count))
         projected = np.zeros((len(root), count))
-        for block, parts, (inverse, weighted, weighted_errors) in zip(
+        for block, parts, (inverse, weighted, pulled) in zip(
             self.blocks, common, solved, strict=True
         ):
-            weighted_residuals = weighted_errors - weighted @ estimate
+            left_over = pulled - weighted @ estimate
             by_root = weighted @ root
-            projection = inverse - by_root @ by_root.T
-            of_white = block.white * weighted_residuals
-            working = (
-                np.concatenate([of_white, parts @ weighted_residuals]) if len(parts) else of_white
-            )
-            traces = [
-                *(block.white @ np.diag(projection)),
-                *(np.sum(projection * part) for part in parts),
-            ]
-            gradients += squares * (np.array(traces) - working @ weighted_residuals)
+            left = inverse - by_root @ by_root.T
+            of_white = block.white * left_over
+            working = np.concatenate([of_white, parts @ left_over]) if len(parts) else of_white
+            traces = [*(block.white @ np.diag(left)), *(np.sum(left * part) for part in parts)]
+            gradients += squares * (np.array(traces) - working @ left_over)
             working = 2.0 * squares[:, None] * working
             average += working @ inverse @ working.T
             projected += by_root.T @ working.T
         curvature = 0.5 * (average - projected.T @ projected)
-        with_ratio_prior = RATIO_PRIOR.beside(Likely(0.5 * value, gradients, curvature), logs)
-        return _LikelihoodAt(
-            with_ratio_prior.value, with_ratio_prior.slope, with_ratio_prior.curvature, logs
-        )
+        full = RATIO_PRIOR.beside(Likely(0.5 * value, gradients, curvature), logs)
+        return _LikelihoodAt(full.value, full.slope, full.curvature, logs)

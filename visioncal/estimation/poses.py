@@ -129,13 +129,7 @@ class PoseFit:
 
 
 def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> PoseFit:
-    """Minimises each view's reprojection error by Levenberg-Marquardt.
-
-    Args:
-        stack: The corners.
-        camera: The intrinsics, held.
-        cam_from_target: (v, 4, 4) starts.
-    """
+    """Minimises each view's reprojection error by Levenberg-Marquardt, from (v, 4, 4) starts."""
     damping = np.full(len(cam_from_target), _START_DAMPING)
     return _descended(stack, camera, cam_from_target, damping, _ITERATIONS)
 

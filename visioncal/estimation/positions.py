@@ -106,12 +106,10 @@ def distances(places: Places, mounting: Mounting) -> FloatArray:
 
 
 def fit_mounting(places: Places, start: Mounting | None, count: int) -> Mounting:
-    """Minimises the distances between read and predicted positions.
+    """Minimises the distances between read and predicted positions of a number of points.
 
-    Args:
-        places: The readings.
-        start: The start; None to align the flange with the readings, with the points at its origin.
-        count: Number of points; those without readings stay where they are.
+    Without a start, the flange is aligned with the readings, with the points at its origin. Points
+    without readings stay there.
     """
     if start is None:
         x = align(places.base_from_flange[:, :3, 3], places.read)

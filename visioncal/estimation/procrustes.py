@@ -51,13 +51,9 @@ def scale_between(measured: FloatArray, nominal: FloatArray) -> float:
 
 
 def spreads(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Extents of points along their principal axes.
+    """Root mean square extents (3,) of (n, 3) points along their principal axes [m].
 
-    Args:
-        points: (n, 3) [m].
-
-    Returns:
-        (3,) root mean square extents, largest first [m], and the (3, 3) axes as rows.
+    Largest first, with the (3, 3) axes as rows.
     """
     _, sizes, axes = np.linalg.svd(points - points.mean(axis=0))
     extents = np.zeros(3)

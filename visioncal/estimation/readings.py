@@ -37,9 +37,6 @@ def readings_that_close(touches: Touches) -> tuple[PoseReading, ...]:
     Touches of one point close in both directions alike, with the tip and the point exchanged; of
     several points, in one only. Those along the tool's axes, all of one point, do in one only, too.
 
-    Args:
-        touches: As they were read; those of kind `point` count, and others if of one point.
-
     Returns:
         The conventions under which they close to within 2 mm and twenty times better, best first.
     """

@@ -100,11 +100,8 @@ def common_errors(cell: IntArray, residuals: FloatArray, shares: FloatArray) -> 
     """
     counts = np.bincount(cell, shares)
     rows = counts[cell] >= _FEWEST_CORNERS
-    cell_counts = counts[counts >= _FEWEST_CORNERS]
-    between, within = (
-        2 * len(cell_counts) - _ABSORBED,
-        2 * (float(cell_counts.sum()) - len(cell_counts)),
-    )
+    many = counts[counts >= _FEWEST_CORNERS]
+    between, within = (2 * len(many) - _ABSORBED, 2 * (float(many.sum()) - len(many)))
     if between < 1:
         return LensField(1.0, 0.0, 0.0, is_significant=False)
     sums = np.stack(
@@ -114,12 +111,12 @@ def common_errors(cell: IntArray, residuals: FloatArray, shares: FloatArray) -> 
         ],
         axis=1,
     )
-    between_squares = float(np.sum(sums[counts >= _FEWEST_CORNERS] ** 2 / cell_counts[:, None]))
+    between_squares = float(np.sum(sums[counts >= _FEWEST_CORNERS] ** 2 / many[:, None]))
     noise = (float(np.sum(shares[rows, None] * residuals[rows] ** 2)) - between_squares) / within
     factor = between_squares / between / noise if noise > 0.0 else 1.0
     return LensField(
         max(factor, 1.0),
-        float(np.sqrt(max(factor - 1.0, 0.0) * noise / np.mean(cell_counts))),
+        float(np.sqrt(max(factor - 1.0, 0.0) * noise / np.mean(many))),
         float(chdtri(1.0, max(fdtrc(between, within, factor), _LEAST_CHANCE))),
         bool(factor > f_limit(_FALSE_ALARM, between, within)),
     )
@@ -128,15 +125,10 @@ def common_errors(cell: IntArray, residuals: FloatArray, shares: FloatArray) -> 
 def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neighbours:
     """Compares a blocked jackknife with the covariance of the fit.
 
-    Blocks of neighbouring stops of one robot are left out in turn (Kuensch 1989), to first order.
-    The squared influence of each block is compared with its expectation under the model, so that
-    small samples and unequal blocks do not bias it.
-
-    Args:
-        problem: The observations, their stops in the order of the session.
-        state: The least-squares solution: elsewhere the gradient passes for a misfit.
-        noise: Its levels.
-        robot: The robot whose stops are left out.
+    Blocks of neighbouring stops of one robot, in the order of the session, are left out in turn
+    (Kuensch 1989), to first order. The squared influence of each block is compared with its
+    expectation under the model, so that small samples and unequal blocks do not bias it. The state
+    has to be the least-squares solution: elsewhere the gradient passes for a misfit.
     """
     moving, edges = problem.moving, slice(6 * len(problem.unknown))
     information_all = normal_equations(problem, state, noise)[0]
@@ -167,16 +159,9 @@ def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neig
 def drift(problem: Problem, state: State, noise: Noise, robot: str) -> Drift | None:
     """Tests for a motion of a robot's base in proportion to the number of the stop.
 
-    Rao's score test: stationary frames move by as much in the base, in the opposite direction.
-
-    Args:
-        problem: The observations, their stops in the order of the session.
-        state: The least-squares solution.
-        noise: Its levels.
-        robot: The robot.
-
-    Returns:
-        The motion; None where it is not significant.
+    Rao's score test: stationary frames move by as much in the base, in the opposite direction. The
+    stops are in the order of the session, and the state is the least-squares solution. None where
+    the motion is not significant.
     """
     stops, poses = stops_of(problem, robot), problem.poses[robot]
     jacobian = np.zeros((len(poses), 6, 6))
@@ -214,12 +199,7 @@ def inflation(
 ) -> FloatArray:
     """Covariance (p, p) added for correlated neighbouring stops of a robot.
 
-    Args:
-        problem: The observations.
-        state: The solution.
-        noise: Its levels.
-        robot: The robot.
-        factor: Variance contributed by its stops, over that of independent noise.
+    `factor` is the variance contributed by its stops, over that of independent noise.
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     part = problem.subset(rows_of(problem, robot))

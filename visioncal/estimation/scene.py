@@ -33,7 +33,6 @@ class Scene:
 
     Attributes:
         targets: The nominal targets; the corners of several are numbered consecutively.
-        camera: The intrinsics.
         estimated: Whether they were estimated from these corners.
         mode: Treatment of given intrinsics: `hold`, `refine` or `auto`.
         matrix_sigma_px: Prior sigma of given fx, fy, cx, cy; None where not stated.
@@ -53,10 +52,8 @@ class Scene:
 def repeat_shares(shown: Mapping[int, Hashable]) -> dict[int, float]:
     """Weight of each view; images that repeat an earlier one share one weight.
 
-    Errors of a lens, a print or a detector in one of them are the same in all.
-
-    Args:
-        shown: By view number, a key that is equal for views of the same content and pose.
+    Errors of a lens, a print or a detector in one of them are the same in all. `shown` has a key by
+    view number that is equal for views of the same content and pose.
     """
     counts = Counter(shown.values())
     return {view: 1.0 / counts[key] for view, key in shown.items()}
@@ -67,8 +64,6 @@ class CornerProblem:
     """The corners of m views with the priors of lens and boards.
 
     Attributes:
-        scene: The scene.
-        stack: The corners.
         positions: (c, 3) corners of the flat boards, each in its own frame [m].
         basis: (c, 3, s) of `boards_basis`.
         prior_sigma: (k + s,) prior sigmas of lens and boards; inf where there is no prior.

@@ -92,12 +92,7 @@ class Resized:
 
 
 def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mask] | None:
-    """The new size of a board that some observations agree on.
-
-    Args:
-        problem: All n observations.
-        fit: The unknowns and the noise, by other observations.
-        some: (n,) mask of the observations.
+    """The new size of a board that (n,) some observations agree on, by a fit of others.
 
     Returns:
         The relative increase, and for each of them whether noise explains the rest; None where they
@@ -107,11 +102,9 @@ def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mas
     board, *others = {frame for frame, mine in pairs if mine}
     if others or not board.startswith("target"):
         return None
-    measured = problem.measured(fit.state)[some, :3, 3]
-    predicted = problem.predicted(fit.state)[some, :3, 3]
-    share = (
-        float(np.median(np.sum(predicted * measured, axis=1) / np.sum(measured**2, axis=1))) - 1.0
-    )
+    away = problem.measured(fit.state)[some, :3, 3]
+    there = problem.predicted(fit.state)[some, :3, 3]
+    share = float(np.median(np.sum(there * away, axis=1) / np.sum(away**2, axis=1))) - 1.0
     widened = problem.with_effects([*problem.effects, _of_size(problem, fit, board, some)])
     resized = replace(fit, state=State(fit.state.edges, np.append(fit.state.values, share)))
     return share, explained_by_noise(widened, resized, len(problem))[some]
@@ -122,13 +115,9 @@ def slight_move(
 ) -> Move | None:
     """The most significant step of a frame at any stop; None where none is significant.
 
-    Args:
-        problem: The inlier observations.
-        fit: The unknowns and the noise.
-        movable: Frames that may have moved.
-        kinds: Number of kinds of residuals, rotations and positions, if it may be in one alone. The
-            noise of each is estimated separately: in one of two, a step has to explain half as
-            much, and noise explains it more often than stated.
+    `kinds` is the number of kinds of residuals, rotations and positions, if it may be in one alone.
+    The noise of each is estimated separately: in one of two, a step has to explain half as much,
+    and noise explains it more often than stated.
     """
     columns = np.array([np.r_[problem.edge_columns(name)] for name in movable]).reshape(-1, 6)
     tried = int(problem.observations.stops.max()) + 1
@@ -162,20 +151,15 @@ def slipped_joint(
 ) -> Slip | None:
     """The most significant step of a joint's offset at any stop; None if none is significant.
 
-    Args:
-        problem: The inlier observations.
-        fit: The unknowns and the noise.
-        offsets: (s, 6, n) by robot, Jacobian of its flange at each stop by its n joint offsets.
+    `offsets` are (s, 6, n) by robot: Jacobians of its flange at each stop by its n joint offsets.
     """
-    joints = [
-        (robot, joint) for robot, offset in offsets.items() for joint in range(offset.shape[2])
-    ]
+    joints = [(robot, at) for robot, offset in offsets.items() for at in range(offset.shape[2])]
     between = [_between(problem, rows_of(problem, robot)) for robot, _ in joints]
     step = _most_significant(problem, fit, _of_joints(offsets), between)
     if step is None:
         return None
-    robot, joint = joints[step.which]
-    return Slip(robot, joint, step.stop, step.step, step.sigma, step.mahalanobis_sq)
+    robot, at = joints[step.which]
+    return Slip(robot, at, step.stop, step.step, step.sigma, step.mahalanobis_sq)
 
 
 def resized_board(problem: Problem, fit: Solution) -> Resized | None:
@@ -205,11 +189,7 @@ def _most_significant(
 ) -> _ValueStep | None:
     """The most significant step of a value of some effects; None if none is significant.
 
-    Args:
-        problem: The inlier observations.
-        fit: The unknowns and the noise.
-        effects: The effects, which the problem lacks.
-        between: The stops at which each of their values may step.
+    `between` are the stops at which each of their values may step.
     """
     count = len(between)
     if not count:
@@ -270,10 +250,7 @@ def _as_f_tests(squares: FloatArray, freedom: float, numbers: int) -> FloatArray
 def log_gain(problem: Problem, fit: Solution, mahalanobis_sq: float) -> float:
     """Twice the gain in log-likelihood by an effect, with the noise re-estimated.
 
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the effect.
-        mahalanobis_sq: Its statistic by Rao's score test.
+    `mahalanobis_sq` is its statistic by Rao's score test, at the fit without it.
     """
     freedom = _residual_freedom(problem, fit)
     share = min(mahalanobis_sq / freedom, _MOST_EXPLAINED)
@@ -295,12 +272,8 @@ def with_step(problem: Problem, fit: Solution, step: Move | Resized) -> tuple[Pr
 def leaves_noise(problem: Problem, fit: Solution, step: Move | Resized) -> bool:
     """Whether the residuals beside a step are as small as elsewhere, once it is fitted.
 
-    A few wrong views at an end of the session gain by a step, and stay wrong.
-
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the step.
-        step: The step.
+    A few wrong views at an end of the session gain by a step, and stay wrong. The given fit is that
+    without the step.
     """
     widened, step_fit = with_step(problem, fit, step)
     squares, behind = by_noise_alone(widened, step_fit), problem.observations.stops >= step.stop
@@ -314,15 +287,7 @@ def evidence_gain(
     """Twice the log Bayes factor of a step: by a fit with it, with its own noise.
 
     `log_gain` has one noise level for rotations and positions. A pushed camera shows in positions
-    alone, which are only half of the score.
-
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the step.
-        step: The step.
-
-    Returns:
-        The gain, and the problem with the step and its fit.
+    alone, which are only half of the score. Returns also the problem with the step and its fit.
     """
     widened, step_fit = with_step(problem, fit, step)
     # The sensors' levels are held, the same for both.
@@ -357,13 +322,7 @@ def step_covariance(
     """Covariance (p, p) added for a step that a fit does not model.
 
     The solution lies between the states before and after the step, which are equally likely to be
-    needed: the mean of the squared distances from both.
-
-    Args:
-        problem: The inlier observations.
-        fit: The unknowns and the noise, without the step.
-        step: The step.
-        offsets: As of `slipped_joint`.
+    needed: the mean of the squared distances from both. `offsets` are as of `slipped_joint`.
     """
     after, stops, effects = np.zeros(problem.size), np.array([step.stop]), list[Effect]()
     if isinstance(step, Move):
@@ -412,12 +371,8 @@ def _scored(
 ) -> Iterator[_Scored]:
     """Yields score tests of steps of some unknowns, stop by stop, the last first.
 
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise.
-        columns: (u, c) the columns of each; those of `effects` follow the problem's.
-        between: The stops at which each may step.
-        effects: Effects that the problem lacks.
+    `columns` are (u, c), those of `effects` behind the problem's; `between` are the stops at which
+    each may step.
     """
     errors, size = RepeatErrors.of(problem, fit), problem.size
     widened = problem.with_effects([*problem.effects, *effects])
@@ -464,12 +419,7 @@ def differs_elsewhere(problem: Problem, fit: Solution, move: Move) -> bool:
     """Whether another run of stops differs from the rest by more than the stops after a move.
 
     Successive stops have similar postures, on which an arm's errors depend: one part of a programme
-    then differs from the rest as much as another.
-
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the move.
-        move: The significant step.
+    then differs from the rest as much as another. The given fit is that without the move.
     """
     errors, columns = RepeatErrors.of(problem, fit), np.r_[problem.edge_columns(move.frame)]
     sums = {stop: both for stop, *both in equations_from(problem, fit, errors, columns)}

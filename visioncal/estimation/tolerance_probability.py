@@ -44,10 +44,7 @@ def chance_within(
 def radius_within(spreads: FloatArray, share: float, freedom: float = np.inf) -> float:
     """The least radius within which a share of the position errors stays [m].
 
-    Args:
-        spreads: (k, 6, 6) as in `chance_within`.
-        share: Between 0 and 1.
-        freedom: As there.
+    Other arguments are those of `chance_within`.
     """
     positions_sq = _lengths(spreads)[1]
     guess = float(np.sqrt(positions_sq.max()))

@@ -84,7 +84,6 @@ class TouchProblem:
     the rotation where that is not estimated, and the points in the base [m].
 
     Attributes:
-        touches: The touches.
         noise: Stated errors of the flange.
         oriented: Whether the tool's rotation is estimated.
     """

@@ -180,12 +180,12 @@ class TreePaths:
 
         An edge is perturbed on its right: at its end, or at its start where it is traversed up.
         """
-        product, jacobians = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4)), []
+        back, jacobians = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4)), []
         for stride in reversed(self.strides):
-            before, product = product, product @ stride.backward(edges, change)
-            is_variable = len(stride.edges) or stride.moves is not None or (stride.slots >= 0).any()
+            before, back = back, back @ stride.backward(edges, change)
+            varies = len(stride.edges) or stride.moves is not None or (stride.slots >= 0).any()
             none = np.zeros((len(self.rows), 6, 0))
             jacobians.append(
-                (-adjoint(product) if stride.is_up else adjoint(before)) if is_variable else none
+                (-adjoint(back) if stride.is_up else adjoint(before)) if varies else none
             )
-        return product, jacobians[::-1]
+        return back, jacobians[::-1]

@@ -22,7 +22,6 @@ class Delay:
     """An effect of time within an image.
 
     Attributes:
-        name: Name of the effect.
         sigma_s: Prior standard deviation of the time, about zero [s].
         shares: Of (n, 2) corners [px] in an image of some resolution, the (n,) shares.
         result: Fields of `results.ClockResult`, from a time, its sigma [s], whether it is
