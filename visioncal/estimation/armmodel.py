@@ -72,12 +72,7 @@ class ArmModel:
         return cls(nominal, tool, {}, np.zeros(0), functions=functions)
 
     def loaded(self, q: FloatArray, loads: Loads | None = None) -> "ArmModel":
-        """Returns the arm with compliances in units of the greatest torque of some stops.
-
-        Args:
-            q: (m, n) joint angles [rad].
-            loads: Loads of the flange; none if None.
-        """
+        """Returns the arm with compliances in units of the greatest torque at (m, n) `q` [rad]."""
         greatest = float(np.abs(self.robot.load_torques(q, loads)).max(initial=0.0))
         return replace(self, torque_nm=greatest or 1.0)
 

@@ -104,7 +104,9 @@ def turning_matches(
     rotation = _Rotation.of(robot, frames, first, later[first])
     if not len(rotation.steps):
         return ()
-    reach_s = min(WIDEST_OFFSET_S, 0.25 * _common_s(robot, frames))
+    start_s = max(robot.stamps_s[0], frames.stamps_s[0])
+    common_s = max(float(min(robot.stamps_s[-1], frames.stamps_s[-1]) - start_s), 0.0)
+    reach_s = min(WIDEST_OFFSET_S, 0.25 * common_s)
     lags = np.arange(-int(reach_s / _STEP_S), int(reach_s / _STEP_S) + 1)
     scores = np.zeros(len(lags))
     for index, lag in enumerate(lags.tolist()):
@@ -198,12 +200,6 @@ def _steps(stamps_s: FloatArray) -> IntArray:
     starts = np.cumsum(counts) - counts
     steps = np.unique(np.repeat(low - starts, counts) + np.arange(counts.sum()))
     return np.asarray(steps[steps < places[-1]])
-
-
-def _common_s(robot: Trajectory, frames: ImageTimes) -> float:
-    """Stamped time that the streams have in common [s]."""
-    start = max(robot.stamps_s[0], frames.stamps_s[0])
-    return max(float(min(robot.stamps_s[-1], frames.stamps_s[-1]) - start), 0.0)
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> float:

@@ -119,19 +119,15 @@ def find_numbering(
     # Corrected for the number of orders among which the best one was chosen.
     tried = min(perm(len(nominal), count), _MOST_TRIED)
     limit = f_limit(_FALSE_ALARM / tried, freedom, freedom)
+    # Exchanging two measurements of one drawn point gives no other order.
+    distinct = np.asarray(np.unique(nominal, axis=0, return_inverse=True)[1]).ravel()
     return Numbering(
         orders[best].astype(np.int64),
         float(np.sqrt(squares[best] / count)),
         float(np.sqrt(squares[stated_row] / count)),
         bool(ratio[stated_row] > limit and not as_good[stated_row]),
-        # Exchanging two measurements of one drawn point gives no other order.
-        len(np.unique(_places(nominal)[orders[as_good]], axis=0)),
+        len(np.unique(distinct[orders[as_good]], axis=0)),
     )
-
-
-def _places(nominal: FloatArray) -> IntArray:
-    """Numbers (m,) of the drawn points' positions: the same where points coincide."""
-    return np.asarray(np.unique(nominal, axis=0, return_inverse=True)[1]).ravel()
 
 
 def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:

@@ -352,10 +352,10 @@ def _words(thing: str, frame: str, direction: FloatArray, is_rotation: bool) -> 
 def _names(problem: Problem, mount: Mount) -> dict[str, tuple[str, str]]:
     """Names of the frames of the edges, the camera's first, and of their parents."""
     camera, *targets = problem.unknown
-    hangs = "the base" if mount == "eye-in-hand" else "the tool"
+    parent = "the base" if mount == "eye-in-hand" else "the tool"
     return {
         camera: (f"the {_sensor(mount)}", f"the {_frame(mount)}"),
-        **{target: (f"the {target.replace('_', ' ', 1)}", hangs) for target in targets},
+        **{target: (f"the {target.replace('_', ' ', 1)}", parent) for target in targets},
     }
 
 

@@ -73,16 +73,16 @@ def half_of(count: int) -> int:
     return (count + 1) // 2 + 1
 
 
-def nearest(away: FloatArray, count: int) -> Mask:
+def nearest(distances: FloatArray, count: int) -> Mask:
     """(m,) mask of the nearest units."""
-    mask = np.zeros(len(away), dtype=bool)
-    mask[np.argsort(away)[:count]] = True
+    mask = np.zeros(len(distances), dtype=bool)
+    mask[np.argsort(distances)[:count]] = True
     return mask
 
 
-def trimmed_sum(away: FloatArray, count: int) -> float:
+def trimmed_sum(distances: FloatArray, count: int) -> float:
     """The sum of the distances of the nearest units."""
-    return float(np.sort(away)[:count].sum())
+    return float(np.sort(distances)[:count].sum())
 
 
 def trimmed_start(
@@ -113,7 +113,7 @@ def trimmed_start(
 def _concentrated(
     state: State,
     distances: FloatArray,
-    away: Callable[[State], FloatArray],
+    distances_of: Callable[[State], FloatArray],
     solve: Callable[[Mask, State], State],
     count: int,
 ) -> tuple[float, Mask, State]:
@@ -124,7 +124,7 @@ def _concentrated(
     least, mask = trimmed_sum(distances, count), nearest(distances, count)
     for _ in range(_ROUNDS):
         trial = solve(mask, state)
-        distances = away(trial)
+        distances = distances_of(trial)
         if (lower := trimmed_sum(distances, count)) >= least:
             break
         least, mask, state = lower, nearest(distances, count), trial

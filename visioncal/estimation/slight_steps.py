@@ -99,12 +99,13 @@ def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mas
         are not of one board.
     """
     pairs = zip(problem.observations.observed, some.tolist(), strict=True)
-    board, *others = {frame for frame, mine in pairs if mine}
+    board, *others = {frame for frame, chosen in pairs if chosen}
     if others or not board.startswith("target"):
         return None
-    away = problem.measured(fit.state)[some, :3, 3]
-    there = problem.predicted(fit.state)[some, :3, 3]
-    share = float(np.median(np.sum(there * away, axis=1) / np.sum(away**2, axis=1))) - 1.0
+    measured = problem.measured(fit.state)[some, :3, 3]
+    predicted = problem.predicted(fit.state)[some, :3, 3]
+    ratios = np.sum(predicted * measured, axis=1) / np.sum(measured**2, axis=1)
+    share = float(np.median(ratios)) - 1.0
     widened = problem.with_effects([*problem.effects, _of_size(problem, fit, board, some)])
     resized = replace(fit, state=State(fit.state.edges, np.append(fit.state.values, share)))
     return share, explained_by_noise(widened, resized, len(problem))[some]
@@ -395,14 +396,14 @@ def _scored(
 
 
 def _score(
-    alone: FloatArray, across: FloatArray, asked: FloatArray, covariance: FloatArray
+    alone: FloatArray, across: FloatArray, gradients: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Rao's score test of k changes, of c numbers each.
 
     Args:
         alone: (k, c, c) information on each, all else held.
         across: (k, c, p) cross information with the p unknowns of the fit.
-        asked: (k, c) the gradients.
+        gradients: (k, c) of each.
         covariance: (p, p) of these unknowns.
 
     Returns:
@@ -410,9 +411,9 @@ def _score(
         likely changes, and (k,) the test statistics.
     """
     following = -covariance @ np.swapaxes(across, 1, 2)
-    own = alone + across @ following
-    steps = -(covariance_from(own) @ asked[..., None])[..., 0]
-    return own, following, steps, -np.sum(steps * asked, axis=1)
+    marginal = alone + across @ following
+    steps = -(covariance_from(marginal) @ gradients[..., None])[..., 0]
+    return marginal, following, steps, -np.sum(steps * gradients, axis=1)
 
 
 def differs_elsewhere(problem: Problem, fit: Solution, move: Move) -> bool:

@@ -202,10 +202,10 @@ def _main_direction(vectors: FloatArray) -> FloatArray:
     return np.asarray(direction * (1.0 if side.sum() + 0.5 * side[0] >= 0.0 else -1.0))
 
 
-def _small_sets(touches: Touches, there: IntArray) -> Iterator[IntArray]:
+def _small_sets(touches: Touches, tips: IntArray) -> Iterator[IntArray]:
     """Random small sets of touches: three of one point, or two each of two points."""
     rng = np.random.default_rng(0)
-    by_point = [there[touches.points[there] == index] for index in range(len(touches.names))]
+    by_point = [tips[touches.points[tips] == index] for index in range(len(touches.names))]
     several = [rows for rows in by_point if len(rows) > 1]
     drawn = set()
     for _ in range(_SETS):

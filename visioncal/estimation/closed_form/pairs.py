@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form import quaternions
 
 FADES_FROM_RAD = np.radians(165.0)
@@ -63,11 +63,7 @@ def pair_products(left: FloatArray, right: FloatArray) -> FloatArray:
     """Products `left[j] * right[i]` of (m, 4) quaternions for all pairs of views, as (4, n)."""
     if len(left) <= _GROUP:
         return quaternions.all_products(left, right)
-    parts = [quaternions.all_products(left[group], right[group]) for group in _groups(len(left))]
+    order = np.random.default_rng(0).permutation(len(left))
+    groups = np.array_split(order, -(-len(left) // _GROUP))
+    parts = [quaternions.all_products(left[group], right[group]) for group in groups]
     return np.concatenate(parts, axis=1)
-
-
-def _groups(views: int) -> list[IntArray]:
-    """Random groups of views within which all are paired."""
-    order = np.random.default_rng(0).permutation(views)
-    return np.array_split(order, -(-views // _GROUP))
