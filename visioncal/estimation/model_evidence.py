@@ -103,10 +103,10 @@ def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Cau
     scores = []
     for size_m, factor_tried in cause.trials:
         if factor_tried != factor:
-            stops = _linearised(problem, belief, cause, stops.values, factor_tried)
+            stops = _at(problem, belief, cause, stops.values, factor_tried)
         scores.append(_score(stops, size_m * units, belief.freedom))
     factor_tried = cause.trials[int(np.argmax(scores))][1]
-    stops = _linearised(problem, belief, cause, stops.values, factor_tried)
+    stops = _at(problem, belief, cause, stops.values, factor_tried)
     # With the widest prior on the change's size, which hardly shrinks it.
     mean, covariance = _posterior(stops, widest_m * units)
     prior_misfit = float(np.sum((mean / (widest_m * units)) ** 2))
@@ -149,17 +149,17 @@ def _converged(
     problem: Problem, belief: Belief, cause: Cause, sigmas: FloatArray, factor: float
 ) -> _StopResiduals:
     """Linearises at a cause's most likely values, by iteration."""
-    stops = _linearised(problem, belief, cause, cause.start, factor)
+    stops = _at(problem, belief, cause, cause.start, factor)
     for _ in range(_ROUNDS if len(sigmas) else 0):
         values = _posterior(stops, sigmas)[0]
         step = np.abs(values - stops.values).max()
-        stops = _linearised(problem, belief, cause, values, factor)
+        stops = _at(problem, belief, cause, values, factor)
         if step < _CONVERGED:
             break
     return stops
 
 
-def _linearised(
+def _at(
     problem: Problem, belief: Belief, cause: Cause, values: FloatArray, factor: float
 ) -> _StopResiduals:
     """Linearises at some values (p,) of a cause."""

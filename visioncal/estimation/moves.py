@@ -265,11 +265,9 @@ def _best_steps(
     covariance = _change_covariance(part, fit, frame)[order]
     stops, explained = part.observations.stops[order], agrees[rows][order]
     outliers = np.flatnonzero(~explained)
-    candidates = outliers[
-        np.linspace(0, len(outliers) - 1, min(_CANDIDATES, len(outliers))).astype(int)
-    ]
-    differences = log(invert(changes[candidates])[:, None] @ changes[None])
-    covariances = covariance[candidates][:, None] + covariance[None]
+    tried = outliers[np.linspace(0, len(outliers) - 1, min(_CANDIDATES, len(outliers))).astype(int)]
+    differences = log(invert(changes[tried])[:, None] @ changes[None])
+    covariances = covariance[tried][:, None] + covariance[None]
     squares = np.einsum(
         "abi,abi->ab", differences, np.linalg.solve(covariances, differences[..., None])[..., 0]
     )
@@ -277,11 +275,11 @@ def _best_steps(
     gains = np.cumsum((agreeing.astype(int) - explained.astype(int))[:, ::-1], axis=1)[:, ::-1]
     # Of equally good stops the last: between them the data favour neither pose.
     first = np.flatnonzero(np.diff(stops, prepend=-1) > 0)[::-1]
-    steps, available = [], np.ones(len(candidates), dtype=bool)
+    steps, available = [], np.ones(len(tried), dtype=bool)
     for _ in range(_STEPS_EACH):
         candidate, stop_index = np.unravel_index(
             np.where(available[:, None], gains[:, first], -1).argmax(),
-            (len(candidates), len(first)),
+            (len(tried), len(first)),
         )
         begin = int(first[stop_index])
         after = agreeing[candidate] & (stops >= stops[begin])
@@ -290,9 +288,9 @@ def _best_steps(
             # The mean over all observations that agree with this step.
             weights = np.asarray(np.linalg.inv(covariance[after]), dtype=float)
             mean = _weighted_mean(differences[candidate, after], weights)
-            change = changes[candidates[candidate]] @ exp(mean)
+            change = changes[tried[candidate]] @ exp(mean)
             steps.append(_MoveCandidate(gain, frame, int(stops[begin]), change))
-        available &= ~agreeing[candidate][candidates]
+        available &= ~agreeing[candidate][tried]
         available[candidate] = False
     return steps
 

@@ -143,7 +143,7 @@ def agree(problem: Problem, state: State, movable: Sequence[str] = ()) -> Agreed
     """Finds the inliers and the clear moves in a first pass; `settle` refines both."""
     if not movable:
         return inliers(problem, state)
-    used, fit = _core(problem, state, _early(problem))
+    used, fit = _trimmed_core(problem, state, _early(problem))
     moves: list[Move] = []
     used, fit = _widened(problem, used, fit)
     while len(moves) < _MOST_MOVES:
@@ -158,7 +158,7 @@ def agree(problem: Problem, state: State, movable: Sequence[str] = ()) -> Agreed
         used = np.where(involved, explained_by_noise(problem, fit, len(problem)), used)
         used, fit = _widened(problem, used, fit)
     used, fit = _widened(problem, used, fit)
-    return _without_needless(_timed(_agreed(problem, used, fit, moves)))
+    return _without_needless(_timed(_inlier_fit(problem, used, fit, moves)))
 
 
 def _timed(agreed: Agreed) -> Agreed:
@@ -170,7 +170,7 @@ def _timed(agreed: Agreed) -> Agreed:
             problem, moves = moved_earlier_or_later(problem, moves, move, stop)
     if problem is agreed.problem:
         return agreed
-    return _agreed(problem, *_widened(problem, agreed.used, fit), moves)
+    return _inlier_fit(problem, *_widened(problem, agreed.used, fit), moves)
 
 
 def _without_needless(agreed: Agreed) -> Agreed:
@@ -179,13 +179,13 @@ def _without_needless(agreed: Agreed) -> Agreed:
     while (move := needless_move(problem.subset(used), fit, moves)) is not None:
         problem, fit, moves = unmoved(problem, fit, moves, move)
         used, fit = _widened(problem, used, fit)
-    return agreed if len(moves) == len(agreed.moves) else _agreed(problem, used, fit, moves)
+    return agreed if len(moves) == len(agreed.moves) else _inlier_fit(problem, used, fit, moves)
 
 
 def all_as_inliers(problem: Problem, state: State) -> Agreed:
     """Fits all observations as inliers, for sets known not to agree."""
     used = np.ones(len(problem), dtype=bool)
-    return _agreed(problem, used, fit_problem(problem, state), ())
+    return _inlier_fit(problem, used, fit_problem(problem, state), ())
 
 
 def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
@@ -193,7 +193,7 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     problem, moves = agreed.problem, list(agreed.moves)
     if not movable:
         return inliers(problem, agreed.fit.state, agreed.used)
-    used, fit = _settled(problem, *_widened(problem, agreed.used, agreed.fit))
+    used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
         slight = slight_move(problem.subset(used), fit, movable)
         if slight is None:
@@ -201,8 +201,8 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
         problem, fit = moved(problem, fit, slight)
         movable = (*movable, slight.twin)
         moves.append(slight)
-        used, fit = _settled(problem, *_widened(problem, used, fit))
-    return _without_needless(_agreed(problem, used, fit, moves))
+        used, fit = _refined(problem, *_widened(problem, used, fit))
+    return _without_needless(_inlier_fit(problem, used, fit, moves))
 
 
 def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
@@ -214,19 +214,19 @@ def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
     all_rows = np.ones(len(problem), dtype=bool)
     if len(problem) > LEAST_VIEWS:
         mask, fit = (
-            _core(problem, state, all_rows)
+            _trimmed_core(problem, state, all_rows)
             if used is None
             else (used, fit_problem(problem.subset(used), state))
         )
-        mask, fit = _settled(problem, mask, fit)
+        mask, fit = _refined(problem, mask, fit)
         is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))
         if mask.sum() >= max(_LEAST_SHARE * len(problem), LEAST_VIEWS) and is_noise:
-            return _agreed(problem, mask, fit, ())
+            return _inlier_fit(problem, mask, fit, ())
     fit = fit_problem(problem, state)
     near = _near(problem, fit.state, all_rows, _GROSS)
     if not LEAST_VIEWS <= near.sum() < len(problem):
-        return _agreed(problem, all_rows, fit, ())
-    return _agreed(problem, near, fit_problem(problem.subset(near), fit.state), ())
+        return _inlier_fit(problem, all_rows, fit, ())
+    return _inlier_fit(problem, near, fit_problem(problem.subset(near), fit.state), ())
 
 
 def closed_form(problem: Problem, rows: IntArray) -> State | None:
@@ -249,7 +249,7 @@ def closed_form(problem: Problem, rows: IntArray) -> State | None:
     return State(np.array([edges[name] for name in problem.unknown]), problem.start_values)
 
 
-def _core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
+def _trimmed_core(problem: Problem, state: State, among: Mask) -> tuple[Mask, Solution]:
     """Least-trimmed-squares start among some observations, extended by all it predicts."""
     rows, noise = np.flatnonzero(among), starting_noise(problem)
     part = problem.subset(among)
@@ -307,9 +307,9 @@ def _widened(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solutio
     return widened(search, used, search.fit(used, fit))
 
 
-def _settled(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
+def _refined(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solution]:
     return settled(_ObservationSearch(problem), used, fit, LEAST_VIEWS, _SUSPECT_SHARE)
 
 
-def _agreed(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> Agreed:
+def _inlier_fit(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> Agreed:
     return Agreed(problem, fit, used, distances(problem, used, fit), tuple(moves))

@@ -144,10 +144,10 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     models.append(likelihood.maximised(_Model("both", _PRIOR["both"], both, white.white)))
     logs = np.array([model.evidence for model in models])
     shares = np.exp(logs - logs.max())
-    white_value = min(model.value + len(model.processes) for model in independent)
+    independent_value = min(model.value + len(model.processes) for model in independent)
     # Drift has its own test, and is no error of the arm.
     of_arm = [value for value, model in zip(logs, models, strict=True) if model.kind != "drift"]
-    gain = 2.0 * float(np.logaddexp.reduce(of_arm) + white_value)
+    gain = 2.0 * float(np.logaddexp.reduce(of_arm) + independent_value)
     weights = np.where(shares / shares.sum() > _NO_WEIGHT, shares, 0.0)
     weights /= weights.sum()
     pairs = [pair for pair in zip(models, weights.tolist(), strict=True) if pair[1]]
