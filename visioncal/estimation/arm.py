@@ -1,10 +1,10 @@
-"""Errors of the arm that follow its posture: what white noise from stop to stop is not.
+"""Posture-dependent errors of the arm, as random effects.
 
-Real arms repeat to some hundredths of a millimetre and are off by several tenths, and by how much
-depends on the posture. Small twists of all links, drawn from one distribution, are random effects
-beside the edges; restricted likelihood determines their size from the residuals, and separates them
-from white noise. What of them looks the same in all views hides in the edges: its share of the
-covariance is the price of an uncalibrated arm.
+Real arms repeat to some hundredths of a millimetre and are off by several tenths, depending on the
+posture. Small twists of all links with one common variance are random effects beside the edges.
+Restricted likelihood determines their size from the residuals, and separates them from white noise.
+The part that is the same in all views is absorbed by the edges: its share of the covariance is the
+price of an uncalibrated arm.
 """
 
 from dataclasses import dataclass, replace
@@ -23,16 +23,16 @@ from visioncal.robot import Robot
 
 # Arms are off by some 0.5 mm for each mrad.
 LEVER_M = 0.5
-# One unit of a twist turns by a radian, or shifts by as much as that is at the lever.
+# Units of a twist: a rotation by 1 rad, or a translation by the lever.
 TWIST_UNITS: FloatArray = np.repeat([1.0, LEVER_M], 3)
-# Twice the gain in log-likelihood that noise gives in one session of ten thousand, and in one of
-# twenty: chi-square of one degree of freedom.
+# Limits of twice the gain in log-likelihood that noise exceeds in one session of ten thousand, and
+# of twenty: chi-square of one degree of freedom.
 SIGNIFICANT, _LIKELY = 15.1, 3.84
-# Sizes below are none [rad].
+# Smaller sizes count as zero [rad].
 _NOTHING = 1e-6
-# Fewer stops have hardly more residuals than the edges and the noise take.
+# Fewer stops have hardly more residuals than edges and noise have parameters.
 _FEWEST_STOPS = 6
-# Positions and directions change over about so much when an arm's posture does [m].
+# Position by which the errors change in proportion [m]: typical reach of an arm.
 _REACH_M = 0.6
 
 
@@ -41,21 +41,21 @@ class ArmErrors:
     """Errors of the arm as random effects.
 
     Attributes:
-        basis: (s, 6, p) how the flange moves with them at each stop, all of them in radians.
-        sigma: Their standard deviation [rad], averaged over having none; lengths are off by 0.5 m
-            times as much.
+        basis: (s, 6, p) Jacobian of the flange at each stop; all errors are in radians.
+        sigma: Their standard deviation [rad], shrunk by the Akaike weight against none; lengths are
+            off by 0.5 m times as much.
         gain: Twice the gain in log-likelihood over white noise alone.
-        of_links: Whether they are errors of this arm's links, which can be estimated along; else
-            they have the shape of any arm's, and only their size means something.
-        white: (2,) the noise that is left beside them, of rotation [rad] and place [m]; None where
+        of_links: Whether they are errors of this arm's links, which can be estimated; else the
+            basis is generic for any arm, and only their size is meaningful.
+        white: (2,) white noise left beside them, of rotation [rad] and position [m]; None where
             that is the noise of the fit.
-        look: (2,) both together as single stops show them, which is the noise of the fit; of the
-            errors, what looks the same at all stops is not in it. None of links.
-        away: (2, 2) what postures err by of which the fit has seen none near: of rotation [rad] and
-            place [m], as found and as predicted; see `pose_errors.left_out_clusters`. None where
+        look: (2,) noise of the fit: white noise and errors together as single stops show them,
+            without what is the same at all stops. None of links.
+        away: (2, 2) errors at postures far from all others of the fit, of rotation [rad] and
+            position [m], measured and predicted; see `pose_errors.left_out_clusters`. None where
             that is not known.
-        lasting: How many of the errors, the last ones, are alike at stops near in time; the others
-            at postures that are near. At another time they are others.
+        lasting: Number of errors, the last ones, that are correlated in time; the others are
+            correlated over the posture. At another time they have other values.
     """
 
     basis: FloatArray
@@ -69,13 +69,13 @@ class ArmErrors:
 
     @property
     def last(self) -> Mask:
-        """(p,) which of the errors are alike at stops near in time."""
+        """(p,) mask of the errors that are correlated in time."""
         count = self.basis.shape[2]
         return np.asarray(np.arange(count) >= count - self.lasting)
 
     @property
     def is_significant(self) -> bool:
-        """Whether they are beyond chance; others are likely enough to be counted with."""
+        """Whether they exceed chance; less significant ones may still count in the covariance."""
         return self.gain > SIGNIFICANT
 
     @property
@@ -85,29 +85,24 @@ class ArmErrors:
 
     @property
     def is_estimated(self) -> bool:
-        """Whether they are unknowns of the fit; others only count in the covariance."""
+        """Whether they are unknowns of the fit; else they only count in the covariance."""
         return self.of_links and self.is_significant
 
     def effect(self, robot: str, name: str = "arm", values: FloatArray | None = None) -> Effect:
-        """Puts the effects as unknowns of a robot's flange, at their (p,) present values."""
+        """Returns the errors as unknowns of a robot's flange, at their (p,) current values."""
         size = self.basis.shape[2]
-        at = np.zeros(size) if values is None else values
+        start = np.zeros(size) if values is None else values
         information = np.eye(size) / self.sigma**2
-        known = Knowledge(information, information @ at)
+        prior = Knowledge(information, information @ start)
         held = np.zeros(size, dtype=bool)
-        return Effect(f"{name} of {robot}", at, known, held, flange_jacobian={robot: self.basis})
+        return Effect(f"{name} of {robot}", start, prior, held, flange_jacobian={robot: self.basis})
 
 
 def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
-    """How the flange moves with small twists of all links.
+    """Jacobian (m, 6, 6 n) of the flange by small twists of all links, at (m, n) joint angles.
 
-    Args:
-        robot: The nominal model.
-        joints_rad: (m, n) joint angles.
-
-    Returns:
-        (m, 6, 6 n) right perturbations of `base_from_flange`, for a link's rotation by 1 rad and
-        its translation by 0.5 m.
+    Right perturbations of `base_from_flange`, for a link's rotation by 1 rad and its translation by
+    0.5 m.
     """
     links = np.array([robot.link_frames(row)[:-1] for row in joints_rad])
     flange_from_base = invert(robot.base_from_flange(joints_rad))
@@ -116,24 +111,19 @@ def link_basis(robot: Robot, joints_rad: FloatArray) -> FloatArray:
 
 
 def pose_basis(base_from_flange: FloatArray) -> FloatArray:
-    """How arms err as a function of where the flange is, without their joints.
+    """Jacobian (m, 6, 48) of the flange by generic errors that are functions of its pose.
 
-    Twists of base and flange that stay, and twists of the base that change in proportion to the
-    flange's position and to the direction of its axis.
-
-    Args:
-        base_from_flange: (m, 4, 4).
-
-    Returns:
-        (m, 6, 48) in the units of `link_basis`.
+    Constant twists of base and flange, and twists of the base in proportion to the flange's
+    position and to the direction of its axis; in the units of `link_basis`, for (m, 4, 4)
+    `base_from_flange`.
     """
     of_base = adjoint(invert(base_from_flange)) * TWIST_UNITS
     of_flange = np.broadcast_to(np.eye(6) * TWIST_UNITS, of_base.shape)
     position, axis = base_from_flange[:, :3, 3] / _REACH_M, base_from_flange[:, :3, 2]
-    changing = [
+    varying = [
         of_base * factor[:, None, None] for factor in np.concatenate([position, axis], axis=1).T
     ]
-    return np.concatenate([of_flange, of_base, *changing], axis=2)
+    return np.concatenate([of_flange, of_base, *varying], axis=2)
 
 
 def find_arm_errors(
@@ -144,20 +134,21 @@ def find_arm_errors(
     of_links: bool,
     least: float | None = None,
 ) -> ArmErrors | None:
-    """Estimates the size of the errors of one robot's arm, where they are significant.
+    """Estimates the size of one robot's arm errors, if they are significant.
 
     Args:
-        likelihood: That of the robots' levels without these errors, at the answer.
-        robot: The robot, by its place among them.
+        likelihood: That of the robots' noise levels without these errors, at the solution.
+        robot: Index of the robot.
         basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
-        of_links: Whether it is of this arm's links.
-        least: What they have to gain over white noise; None for what makes them likelier, or of
-            links for any gain at all.
+        of_links: Whether the basis is of this arm's links.
+        least: Least gain over white noise; None for the limit of likelihood, and of links for any
+            gain at all.
 
     Returns:
-        The errors; None where they gain no more than that.
+        The errors; None where the gain is no larger.
     """
-    # An arm whose links all look like its frames, as one with parallel axes, has no columns.
+    # The basis is empty for an arm whose link errors all equal errors of its frames (parallel
+    # axes).
     stops, size = likelihood.stops[(likelihood.members == robot).any(axis=1)], basis.shape[2]
     if len(np.unique(stops)) < _FEWEST_STOPS or not size:
         return None
@@ -166,11 +157,11 @@ def find_arm_errors(
         return None
     widened = likelihood.beside(robot, basis)
     if least is None:
-        # Every arm's links err: their size counts however little noise alone is less likely.
+        # Every arm has link errors: their size counts even where it hardly gains likelihood.
         least = 0.0 if of_links else _LIKELY
-    unlikely = likelihood.white[1]
-    sigma, value = _most_likely_size(widened, size, levels, start, unlikely - 0.5 * least)
-    gain = 2.0 * (unlikely - value)
+    white_value = likelihood.white[1]
+    sigma, value = _most_likely_size(widened, size, levels, start, white_value - 0.5 * least)
+    gain = 2.0 * (white_value - value)
     if gain <= least:
         return None
     return ArmErrors(basis, float(np.sqrt(level_weight(gain))) * sigma, gain, of_links)
@@ -179,9 +170,9 @@ def find_arm_errors(
 def _most_likely_size(
     likelihood: RobotLikelihood, size: int, levels: FloatArray, start: float, enough: float
 ) -> tuple[float, float]:
-    """The most likely size of the last unknowns as random effects, beside the robots' levels."""
-    # They are observed to be zero, in units of their own, as one more component of the variance.
-    # Where that does not seem to be likely enough, the search ends before.
+    """Maximum-likelihood size of the last unknowns as random effects, with the robots' levels."""
+    # Pseudo-observations of zero, in units of their own, are one more variance component. The
+    # search stops early where the likelihood seems not to reach `enough`.
     reduced, components = likelihood.reduced, likelihood.components
     width, columns = reduced.errors.shape[1], reduced.jacobian.shape[2]
     units, places = np.divmod(np.arange(size), width)
@@ -191,18 +182,18 @@ def _most_likely_size(
     part[units, places] = 1.0
     parts = np.zeros((len(components.parts) + 1, len(reduced.errors) + count, width))
     parts[:-1, :-count], parts[-1, -count:] = components.parts, part
-    # Places that are left over in the last unit are of no unknown.
-    rest = np.eye(width) * (1.0 - part)[:, None, :]
-    grown = replace(
+    # Padding of the last unit belongs to no unknown.
+    padding = np.eye(width) * (1.0 - part)[:, None, :]
+    extended = replace(
         likelihood,
         reduced=replace(
             reduced,
             errors=np.pad(reduced.errors, ((0, count), (0, 0))),
             jacobian=np.concatenate([reduced.jacobian, jacobian]),
         ),
-        components=Components(np.concatenate([components.known, rest]), parts),
+        components=Components(np.concatenate([components.known, padding]), parts),
     )
-    sigmas, value = grown.most_likely(
+    sigmas, value = extended.most_likely(
         np.append(levels, start),
         np.append(np.repeat(likelihood.seen, 2), True),
         np.append(np.full(levels.size, LEAST_SIGMA), _NOTHING),
@@ -212,87 +203,60 @@ def _most_likely_size(
 
 
 def rows_of(problem: Problem, robot: str) -> Mask:
-    """(n,) which observations belong to units that have the error of a robot's flange."""
-    (of, members), place = problem.units, problem.robots.index(robot)
-    found = of >= 0
-    found[found] = (members[of[found]] == place).any(axis=1)
-    return found
+    """(n,) mask of the observations whose unit contains the error of a robot's flange."""
+    (unit_of, members), index = problem.units, problem.robots.index(robot)
+    mask = unit_of >= 0
+    mask[mask] = (members[unit_of[mask]] == index).any(axis=1)
+    return mask
 
 
 def stops_of(problem: Problem, robot: str) -> IntArray:
-    """The stops at which a robot was observed, in their order."""
+    """The stops at which a robot was observed, ascending."""
     return np.unique(problem.observations.stops[rows_of(problem, robot)])
 
 
 def misfit_covariance(
     problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
 ) -> FloatArray:
-    """What errors of the arm add to the covariance of a fit that takes them for white noise.
+    """Covariance (p, p) that arm errors add to a fit that models them as white noise.
 
-    Where the noise beside them is known, the fit's covariance is that of too much noise: what it
-    has too much of is taken off.
-
-    Args:
-        problem: The observations.
-        state: The answer.
-        noise: The white noise that it was weighted with.
-        robot: The robot.
-        errors: The arm's errors, at the same stops.
-
-    Returns:
-        (p, p) among the unknowns.
+    Where the white noise beside the errors is known, the fit was weighted with too much noise; the
+    excess is subtracted. The errors are at the problem's stops.
     """
-    answer = errors.sigma * misfit_jacobian(problem, state, noise, robot, errors)
-    found = answer @ answer.T
+    response = errors.sigma * misfit_jacobian(problem, state, noise, robot, errors)
+    covariance = response @ response.T
     if errors.white is not None:
-        found += less_noise(problem, state, noise, robot, errors.white)
-    return np.asarray(found)
+        covariance += less_noise(problem, state, noise, robot, errors.white)
+    return np.asarray(covariance)
 
 
 def covariance_of_size(
     problem: Problem, covariance: FloatArray, robot: str, errors: ArmErrors
 ) -> FloatArray:
-    """What it adds to a fit's covariance that the size of an arm's errors was estimated, too.
+    """Covariance (p, p) added because the size of an arm's errors was itself estimated.
 
-    What the observations do not determine of the errors is drawn from a distribution whose variance
-    was found from the k that they do determine: it follows Student's t, whose variance is k / (k -
-    2) times that. To first order in the variance of the errors, for all unknowns.
-
-    Args:
-        problem: The observations, with these errors among the unknowns.
-        covariance: (p, p) the fit's covariance.
-        robot: The robot.
-        errors: The arm's errors.
-
-    Returns:
-        (p, p) among the unknowns.
+    Undetermined errors are drawn from a distribution whose variance was estimated from the k
+    determined ones. They follow Student's t, whose variance is k / (k - 2) times that. To first
+    order in the variance of the errors, for all unknowns. The errors are unknowns of the problem.
     """
     arm, variance = problem.effect_columns[f"arm of {robot}"], errors.sigma**2
     with_arm = covariance[arm]
     determined = len(with_arm) - float(np.trace(with_arm[:, arm])) / variance
-    # Two or fewer would leave it without bound.
+    # The variance is unbounded for two or fewer.
     return np.asarray(2.0 / (max(determined - 2.0, 1.0) * variance) * with_arm.T @ with_arm)
 
 
 def misfit_jacobian(
     problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
 ) -> FloatArray:
-    """How a fit that takes errors of the arm for white noise moves with them.
+    """(p, q) Jacobian of a fit that models arm errors as white noise, by these errors.
 
-    Args:
-        problem: The observations.
-        state: The answer.
-        noise: The white noise that it was weighted with.
-        robot: The robot.
-        errors: The arm's errors, at the same stops.
-
-    Returns:
-        (p, q) by how much the fit is off from the truth, for each error of one.
+    The state and the noise are those of the fit; the errors are at the same stops.
     """
     effect = errors.effect(robot)
     widened = problem.with_effects([*problem.effects, effect])
-    there = State(state.edges, np.concatenate([state.values, effect.values]))
-    information = normal_equations(widened, there, noise)[0]
+    widened_state = State(state.edges, np.concatenate([state.values, effect.values]))
+    information = normal_equations(widened, widened_state, noise)[0]
     size = problem.size
     fitted = covariance_among(information[:size, :size], problem.moving)
     return np.asarray(fitted @ information[:size, size:])

@@ -1,4 +1,4 @@
-"""What was observed of a robot's arm: its stops, and a pair of frames that it parts."""
+"""Observations of a robot's arm: its stops, and the pair of frames observed across it."""
 
 from dataclasses import dataclass, field, replace
 
@@ -14,14 +14,11 @@ from visioncal.robot import Loads
 
 @dataclass(frozen=True, eq=False)
 class ArmPair:
-    """The frames that an arm parts, and that most of its stops observe of each other.
+    """The two frames on either side of an arm between which it is observed most often.
 
     Attributes:
-        problem: The observations.
-        state: The unknowns.
-        robot: The robot.
-        observer: The frame that observes.
-        observed: The frame that is observed.
+        observer: The observing frame.
+        observed: The observed frame.
     """
 
     problem: Problem
@@ -32,50 +29,50 @@ class ArmPair:
 
     @classmethod
     def of(cls, problem: Problem, state: State, robot: str) -> "ArmPair":
-        """The pair of the most observations of poses, without another robot where there is one."""
+        """The pair with the most pose observations, if possible with no other robot between."""
 
         def rank(at: int) -> tuple[bool, int]:
             group = problem.groups[at]
             robots = [step.robot for step in group.path if step.robot]
-            turned = int(problem.observations.has_rotation[group.rows].sum())
-            return robots == [robot], turned
+            pose_count = int(problem.observations.has_rotation[group.rows].sum())
+            return robots == [robot], pose_count
 
-        mine = [
+        candidates = [
             at
             for at, group in enumerate(problem.groups)
             if robot in {step.robot for step in group.path}
         ]
-        row = int(problem.groups[max(mine, key=rank)].rows[0])
-        seen = problem.observations
-        return cls(problem, state, robot, seen.observers[row], seen.observed[row])
+        row = int(problem.groups[max(candidates, key=rank)].rows[0])
+        observations = problem.observations
+        return cls(problem, state, robot, observations.observers[row], observations.observed[row])
 
     @property
     def rows(self) -> IntArray:
-        """The observations of the pair."""
-        seen = self.problem.observations
-        pairs = zip(seen.observers, seen.observed, strict=True)
-        mine = (self.observer, self.observed)
-        return np.flatnonzero(np.array([pair == mine for pair in pairs], dtype=bool))
+        """Rows of the pair's observations."""
+        observations = self.problem.observations
+        pairs = zip(observations.observers, observations.observed, strict=True)
+        own = (self.observer, self.observed)
+        return np.flatnonzero(np.array([pair == own for pair in pairs], dtype=bool))
 
     @property
     def is_observer_carried(self) -> bool:
-        """Whether the arm carries the observer; else what it observes."""
+        """Whether the arm carries the observer; else it carries the observed frame."""
         path = self.problem.tree.path(self.observer, self.observed)
         return next(step.is_up for step in path if step.robot == self.robot)
 
     def at(self, base_from_flange: FloatArray) -> tuple[Linear, FloatArray]:
-        """The pair with its flange at (k, 4, 4), all other robots as at its first stop.
+        """Linearises the pair at flange poses (k, 4, 4), with other robots as at its first stop.
 
         Returns:
-            How it moves with the edges of the problem, and with errors of this flange alone; and
-            (k, 4, 4) `observer_from_observed`.
+            Its Jacobian by the problem's edges and by errors of this flange alone; and (k, 4, 4)
+            `observer_from_observed`.
         """
         count, stop = len(base_from_flange), self.problem.observations.stops[self.rows[0]]
         poses = {
             name: np.repeat(pose[stop][None], count, axis=0)
             for name, pose in self.problem.poses.items()
         }
-        seen = Observations(
+        observations = Observations(
             (self.observer,) * count,
             (self.observed,) * count,
             np.arange(count),
@@ -85,24 +82,24 @@ class ArmPair:
             np.ones(count, dtype=bool),
             np.zeros(count, dtype=bool),
         )
-        here = replace(
+        pair_problem = replace(
             self.problem,
             poses=poses | {self.robot: base_from_flange},
-            observations=seen,
+            observations=observations,
             effects=(),
             is_combined=False,
             with_repeats=False,
         )
         edges = State(self.state.edges, np.zeros(0))
-        linear = here.linear(edges, ideal=True)
-        slot = here.units[1][0].tolist().index(here.robots.index(self.robot))
+        linear = pair_problem.linear(edges, ideal=True)
+        slot = pair_problem.units[1][0].tolist().index(pair_problem.robots.index(self.robot))
         errors = linear.by_errors[:, :, 6 * slot : 6 * slot + 6]
-        return replace(linear, by_errors=errors), here.predicted(edges)
+        return replace(linear, by_errors=errors), pair_problem.predicted(edges)
 
     def jacobian(
         self, base_from_flange: FloatArray, moved: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """How the pose of the observed moves with all edges and with anything of the arm.
+        """Jacobian of the observed pose by all edges and by perturbations of the arm.
 
         Args:
             base_from_flange: (k, 4, 4) the flange.
@@ -112,11 +109,11 @@ class ArmPair:
             (k, 4, 4) `observer_from_observed`, and its (k, 6, 6 e + p) right perturbations.
         """
         linear, poses = self.at(base_from_flange)
-        # Residuals fall as what is predicted moves on.
+        # Residuals have the opposite sign of the prediction.
         return poses, -np.concatenate([linear.jacobian, linear.by_errors @ moved], axis=2)
 
     def frame_jacobian(self, base_from_flange: FloatArray) -> FloatArray:
-        """(k, 6, 12) how the flange moves with the frames of its base and of what it carries."""
+        """(k, 6, 12) flange twists equivalent to twists of its base and of the carried frame."""
         flange = self.problem.tree.flanges[self.robot]
         carried = self.observer if self.is_observer_carried else self.observed
         flange_from_end = self.problem.between(flange, carried, self.state, self.rows[:1])[0]
@@ -124,54 +121,50 @@ class ArmPair:
         return np.concatenate([adjoint(invert(base_from_flange)), of_end], axis=2)
 
     def place_jacobian(self, poses: FloatArray, jacobian: FloatArray, at: FloatArray) -> FloatArray:
-        """How the place of what the arm carries moves, seen from what stands still.
+        """Jacobian of the carried point's position, seen from the stationary side.
 
-        That is the observer's origin seen from what it observes, or a point of that seen from it.
+        The point is the observer's origin seen from the observed frame, or a point of the observed
+        frame seen from the observer.
 
         Args:
             poses: (k, 4, 4) `observer_from_observed`.
             jacobian: (k, 6, p) their right perturbations.
-            at: (3,) the point of what is observed, in its frame [m].
+            at: (3,) the point in the observed frame [m].
 
         Returns:
             (k, 3, p), up to a rotation [m].
         """
-        places = np.broadcast_to(at, (len(poses), 3))
+        positions = np.broadcast_to(at, (len(poses), 3))
         if self.is_observer_carried:
-            places = invert(poses)[:, :3, 3]
-        return np.asarray(-skew(places) @ jacobian[:, :3] + jacobian[:, 3:])
+            positions = invert(poses)[:, :3, 3]
+        return np.asarray(-skew(positions) @ jacobian[:, :3] + jacobian[:, 3:])
 
     def weight(self, noise: Noise, measured: Mask) -> FloatArray:
-        """(6, 6) what makes noise like the pair's white; nothing of what is not measured."""
+        """Whitening matrix (6, 6) of the pair's mean noise; zero for components not measured."""
         linear = self.problem.linear(self.state, ideal=True)
         covariance = self.problem.total_covariance(linear, noise)[self.rows][:, measured][
             :, :, measured
         ]
-        found = np.zeros((6, 6))
+        whitening = np.zeros((6, 6))
         root = np.linalg.cholesky(np.linalg.inv(covariance).mean(axis=0))
-        found[np.ix_(measured, measured)] = root.T
-        return found
+        whitening[np.ix_(measured, measured)] = root.T
+        return whitening
 
 
 @dataclass(frozen=True, eq=False)
 class ArmData:
-    """What was seen of a robot's arm whose errors are estimated.
+    """Observations of a robot's arm whose errors are estimated.
 
     Attributes:
-        problem: The observations.
-        state: The unknowns.
-        noise: The noise's levels.
         covariance: (u, u) of the unknowns.
-        robot: The robot.
-        model: The arm.
-        columns: (p,) which of the unknowns are its errors.
-        error_rad: Their size.
+        columns: (p,) columns of its errors among the unknowns.
+        error_rad: Size of the errors.
         stops: (m,) the stops at which it was observed.
         q: (m, n) joint angles there [rad].
-        loads: What it carried there.
-        at: (3,) the point of a target that counts, in its frame [m].
-        frames: (f,) which of the unknowns are frames of which nothing is known.
-        measured: (6,) which components of the poses are seen (rotation, translation).
+        loads: Its loads there.
+        at: (3,) reference point of the target, in its frame [m].
+        frames: (f,) columns of the unknown frames without a prior.
+        measured: (6,) which components of the poses are measured (rotation, translation).
     """
 
     problem: Problem
@@ -196,51 +189,48 @@ class ArmData:
 
     @property
     def chain(self) -> IntArray:
-        """(f + p,) which of the unknowns are frames and the arm's errors."""
+        """(f + p,) columns of the frames and of the arm's errors."""
         return np.concatenate([self.frames, self.columns])
 
     @property
     def pair(self) -> ArmPair:
-        """The frames that the arm is seen by."""
+        """The pair of frames between which the arm is observed."""
         return ArmPair.of(self.problem, self.state, self.robot)
 
     def basis(self, q: FloatArray) -> FloatArray:
-        """(k, 6, p) how the flange moves with the arm's errors."""
+        """(k, 6, p) Jacobian of the flange by the arm's errors."""
         return self.model.basis(q)
 
     def place_jacobian(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How the place of what the arm carries moves at (k, n) joints [rad].
+        """Jacobian of the carried point's position at (k, n) joint angles [rad].
 
         Returns:
             (k, 3, f + p) by the chain's unknowns, and (k, 3, 6) by motions of the flange.
         """
         motions = np.broadcast_to(np.eye(6), (len(q), 6, 6))
-        moved_by = np.concatenate([self.basis(q), motions], axis=2)
-        poses, moved = self.pair.jacobian(self.model.base_from_flange(q), moved_by)
-        edges, errors = moved.shape[2] - moved_by.shape[2], len(self.columns)
+        perturbations = np.concatenate([self.basis(q), motions], axis=2)
+        poses, pair_jacobian = self.pair.jacobian(self.model.base_from_flange(q), perturbations)
+        edges, errors = pair_jacobian.shape[2] - perturbations.shape[2], len(self.columns)
         jacobian = np.zeros((len(q), 6, self.problem.size))
-        jacobian[:, :, :edges] = moved[:, :, :edges]
-        jacobian[:, :, self.columns] = moved[:, :, edges : edges + errors]
-        found = np.concatenate([jacobian[:, :, self.chain], moved[:, :, edges + errors :]], axis=2)
-        place = self.pair.place_jacobian(poses, found, self.at)
-        return place[:, :, :-6], place[:, :, -6:]
+        jacobian[:, :, :edges] = pair_jacobian[:, :, :edges]
+        jacobian[:, :, self.columns] = pair_jacobian[:, :, edges : edges + errors]
+        columns = [jacobian[:, :, self.chain], pair_jacobian[:, :, edges + errors :]]
+        by_both = self.pair.place_jacobian(poses, np.concatenate(columns, axis=2), self.at)
+        return by_both[:, :, :-6], by_both[:, :, -6:]
 
     def place_sigmas_m(self, q: FloatArray) -> FloatArray:
-        """(k,) predicted sigma of that place at (k, n) joints, over all three axes [m]."""
-        place, moved = self.place_jacobian(q)
-        seen = self.covariance[np.ix_(self.chain, self.chain)]
-        left_open = self.error_rad**2 * self.model.left_open(q)
-        variances = np.einsum("mij,jk,mik->m", place, seen, place)
-        return np.asarray(np.sqrt(variances + np.einsum("mij,mjk,mik->m", moved, left_open, moved)))
+        """(k,) predicted sigma of that position at (k, n) joint angles, over all three axes [m]."""
+        by_chain, by_flange = self.place_jacobian(q)
+        chain_covariance = self.covariance[np.ix_(self.chain, self.chain)]
+        undetermined = self.error_rad**2 * self.model.left_open(q)
+        variances = np.einsum("mij,jk,mik->m", by_chain, chain_covariance, by_chain)
+        variances += np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange)
+        return np.asarray(np.sqrt(variances))
 
     def function_errors(self, angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """How far joints turn beyond offset and ratio, and how surely that is known.
+        """Joint function errors (n, k) beyond offset and ratio, with standard deviations [rad].
 
-        Args:
-            angles: (k,) angles of every joint [rad].
-
-        Returns:
-            (n, k) the error of each joint there, and its standard deviation [rad].
+        They are those at (k,) angles of every joint [rad].
         """
         model = self.model
         count, chain = model.nominal.joint_count, model.bare.chain
@@ -255,11 +245,11 @@ class ArmData:
         variances = np.zeros((count, len(angles)))
         for joint in range(count):
             rows = slice(2 * orders * joint, 2 * orders * (joint + 1))
-            known = higher @ model.harmonic_directions[rows]
-            slopes = np.zeros((len(angles), len(model.values)))
-            slopes[:, harmonic] = known
-            slopes[:, [eccentric.start + joint, eccentric.start + count + joint]] = first
-            whole = np.sum((higher * model.harmonic_sizes[rows]) ** 2, axis=1)
-            variances[joint] = np.einsum("kp,pq,kq->k", slopes, self.arm_covariance, slopes)
-            variances[joint] += self.error_rad**2 * (whole - np.sum(known**2, axis=1))
+            determined = higher @ model.harmonic_directions[rows]
+            jacobian = np.zeros((len(angles), len(model.values)))
+            jacobian[:, harmonic] = determined
+            jacobian[:, [eccentric.start + joint, eccentric.start + count + joint]] = first
+            prior = np.sum((higher * model.harmonic_sizes[rows]) ** 2, axis=1)
+            variances[joint] = np.einsum("kp,pq,kq->k", jacobian, self.arm_covariance, jacobian)
+            variances[joint] += self.error_rad**2 * (prior - np.sum(determined**2, axis=1))
         return errors.T, np.sqrt(np.maximum(variances, 0.0))

@@ -1,4 +1,4 @@
-"""Where the uncertainty of a result comes from, and how it looks at a place of work."""
+"""Uncertainty budget: contributions of the error sources, and uncertainty at a work point."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -17,14 +17,14 @@ from visioncal.estimation.solve import fisher_information
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """What the sources of uncertainty are called; those of one name are one.
+    """Names of the error sources; sources with the same name are merged.
 
     Attributes:
-        sensors: The noise of what each frame observed, by the frame.
-        robots: The error of each robot's flange from stop to stop, by the robot.
-        columns: The prior uncertainty of effects, by the source: which of the problem's
-            columns these are. Those of no source count for nothing.
-        priors: What was measured of frames by hand.
+        sensors: The source of each observing frame's measurement noise, by the frame.
+        robots: The source of each robot's flange error from stop to stop, by the robot.
+        columns: The problem's columns with the prior uncertainty of effects, by the source. Columns
+            of no source do not count.
+        priors: The source of hand-measured frames.
     """
 
     sensors: Mapping[str, str]
@@ -36,136 +36,120 @@ class Sources:
 def covariance_by_source(
     problem: Problem, state: State, noise: Noise, sources: Sources
 ) -> dict[str, FloatArray]:
-    """Splits the covariance of the edges into the parts that its sources contribute.
+    """Splits the covariance of the edges into contributions (6 e, 6 e) of the sources.
 
     The estimate is linear in the errors of observations, flanges, effects and priors: each
-    contributes its own covariance through the same gain, and the parts add up to the whole. What is
-    known of effects together hangs together, as of lens and board that are known from the same
-    corners: each takes half of what is common, which may leave one of them less than nothing where
-    they make up for each other.
-
-    Args:
-        problem: The observations.
-        state: The answer.
-        noise: Its levels.
-        sources: What is to be distinguished.
-
-    Returns:
-        (6 e, 6 e) by source.
+    contributes its own covariance through the same gain, and the parts add up to the total. Priors
+    of effects may be correlated, as of lens and board that are known from the same corners: each
+    takes half of the cross terms, which may make one contribution negative where they compensate
+    each other.
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     linear, own = problem.linear(state, ideal=True), problem.covariance(noise)
     gain = _weighted_jacobian(problem, linear, own, noise) @ fitted[:, : 6 * len(problem.unknown)]
-    found: dict[str, FloatArray] = defaultdict(lambda: np.zeros((gain.shape[2],) * 2))
+    parts: dict[str, FloatArray] = defaultdict(lambda: np.zeros((gain.shape[2],) * 2))
     for frame in dict.fromkeys(problem.observations.observers):
-        mine = np.array([observer == frame for observer in problem.observations.observers])
-        # Where nothing is known of the observations' own noise, that and the robot's are one.
-        if own[mine].any():
-            found[sources.sensors[frame]] += gram(gain[mine], own[mine] @ gain[mine])
+        rows = np.array([observer == frame for observer in problem.observations.observers])
+        # If the observations' own noise is unknown, the robot's noise includes it.
+        if own[rows].any():
+            parts[sources.sensors[frame]] += gram(gain[rows], own[rows] @ gain[rows])
     for name, part in _by_errors(problem, linear, gain, noise, sources):
-        found[name] += part
-    carried = fitted[:, : 6 * len(problem.unknown)]
-    known = problem.knowledge(state).information
+        parts[name] += part
+    edge_columns = fitted[:, : 6 * len(problem.unknown)]
+    prior_info = problem.knowledge(state).information
     owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
     for prior in problem.priors:
         _, jacobian = problem.prior_rows(prior, state)
-        known = known - jacobian.T @ jacobian
-        pulled = jacobian @ carried
-        found[sources.priors] += pulled.T @ pulled
+        prior_info = prior_info - jacobian.T @ jacobian
+        response = jacobian @ edge_columns
+        parts[sources.priors] += response.T @ response
     for name, columns in sources.columns.items():
         share = np.where(np.isin(owned, columns), 0.5, 0.0)
-        part = (share[:, None] + share) * known[np.ix_(owned, owned)]
-        found[name] += carried[owned].T @ part @ carried[owned]
-    return dict(found)
+        part = (share[:, None] + share) * prior_info[np.ix_(owned, owned)]
+        parts[name] += edge_columns[owned].T @ part @ edge_columns[owned]
+    return dict(parts)
 
 
 def less_noise(
     problem: Problem, state: State, noise: Noise, robot: str, white: FloatArray
 ) -> FloatArray:
-    """What a fit's covariance changes by where a robot has another noise than it was weighted with.
+    """Change (p, p) of a fit's covariance if a robot's noise differs from that of the weights.
 
-    Args:
-        problem: The observations.
-        state: The answer.
-        noise: The levels that it was weighted with.
-        robot: The robot.
-        white: (2,) its noise, of rotation [rad] and place [m].
-
-    Returns:
-        (p, p) among the unknowns.
+    `noise` is that of the weights, and `white` (2,) the robot's, of rotation [rad] and position
+    [m].
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
-    linear, place = problem.linear(state, ideal=True), problem.robots.index(robot)
+    linear, index = problem.linear(state, ideal=True), problem.robots.index(robot)
     gain = _weighted_jacobian(problem, linear, problem.covariance(noise), noise) @ fitted
-    mine = _of_flange(problem, linear, gain, place)
-    change = np.repeat(white**2 - noise.robots[place] ** 2, 3)
-    return gram(mine, change[:, None] * mine)
+    robot_gain = _of_flange(problem, linear, gain, index)
+    change = np.repeat(white**2 - noise.robots[index] ** 2, 3)
+    return gram(robot_gain, change[:, None] * robot_gain)
 
 
 def _weighted_jacobian(
     problem: Problem, linear: Linear, own: FloatArray, noise: Noise
 ) -> FloatArray:
-    """(n, 6, p) the inverse covariance of all residuals times their Jacobian."""
-    found, alone, (of, _) = linear.jacobian, problem.alone, problem.units
+    """Inverse covariance (n, 6, p) of all residuals times their Jacobian."""
+    weighted_jacobian, alone, (unit_of, _) = linear.jacobian, problem.alone, problem.units
     total = problem.total_covariance(linear, noise)
-    found[alone] = np.linalg.solve(total[alone], found[alone])
+    weighted_jacobian[alone] = np.linalg.solve(total[alone], weighted_jacobian[alone])
     rest = np.flatnonzero(~alone)
     if not len(rest):
-        return found
+        return weighted_jacobian
     weights = np.linalg.inv(own[rest])
-    found[rest] = weights @ found[rest]
+    weighted_jacobian[rest] = weights @ weighted_jacobian[rest]
     errors = problem.error_covariance(noise)
-    joined, units = rest[of[rest] >= 0], of[rest][of[rest] >= 0]
-    jacobian = linear.by_errors[joined]
-    turned = np.swapaxes(jacobian, 1, 2)
-    weighted = weights[of[rest] >= 0] @ jacobian
+    shared, units = rest[unit_of[rest] >= 0], unit_of[rest][unit_of[rest] >= 0]
+    jacobian = linear.by_errors[shared]
+    transposed = np.swapaxes(jacobian, 1, 2)
+    weighted = weights[unit_of[rest] >= 0] @ jacobian
     shape = errors.shape
-    known, asked = np.zeros(shape), np.zeros((len(errors), shape[1], linear.size))
-    np.add.at(known, units, turned @ weighted)
-    np.add.at(asked, units, turned @ found[joined])
-    taken = np.linalg.solve(np.eye(shape[1]) + errors @ known, errors @ asked)
-    found[joined] -= weighted @ taken[units]
-    return found
+    information, right = np.zeros(shape), np.zeros((len(errors), shape[1], linear.size))
+    np.add.at(information, units, transposed @ weighted)
+    np.add.at(right, units, transposed @ weighted_jacobian[shared])
+    correction = np.linalg.solve(np.eye(shape[1]) + errors @ information, errors @ right)
+    weighted_jacobian[shared] -= weighted @ correction[units]
+    return weighted_jacobian
 
 
 def _by_errors(
     problem: Problem, linear: Linear, gain: FloatArray, noise: Noise, sources: Sources
 ) -> list[tuple[str, FloatArray]]:
-    """What flanges' errors contribute, and those that repeats share, by their sources."""
+    """Contributions of the flanges' errors, and of errors that repeats share, by source."""
     _, members = problem.units
     errors = problem.error_covariance(noise)
-    found = []
-    for at, robot in enumerate(problem.robots):
-        mine = _of_flange(problem, linear, gain, at)
-        variances = np.repeat(noise.robots[at] ** 2, 3)
-        found.append((sources.robots[robot], gram(mine, variances[:, None] * mine)))
+    parts = []
+    for index, robot in enumerate(problem.robots):
+        robot_gain = _of_flange(problem, linear, gain, index)
+        variances = np.repeat(noise.robots[index] ** 2, 3)
+        parts.append((sources.robots[robot], gram(robot_gain, variances[:, None] * robot_gain)))
     by_unit = _by_unit(problem, linear, gain)
     first = len(members) - len(problem.repeats)
     for unit, repeated in enumerate(problem.repeats, start=first):
         frame = problem.observations.observers[repeated[0]]
         part = by_unit[unit].T @ errors[unit] @ by_unit[unit]
-        found.append((sources.sensors[frame], part))
-    return found
+        parts.append((sources.sensors[frame], part))
+    return parts
 
 
 def _of_flange(problem: Problem, linear: Linear, gain: FloatArray, robot: int) -> FloatArray:
-    """(u, 6, c) how the estimate moves with a robot's flange at each unit that it has a part in."""
+    """(u, 6, c) gain of a robot's flange error at each unit that contains it."""
     units, slots = np.nonzero(problem.units[1] == robot)
-    places = 6 * slots[:, None] + np.arange(6)
-    return np.asarray(_by_unit(problem, linear, gain)[units[:, None], places])
+    columns = 6 * slots[:, None] + np.arange(6)
+    return np.asarray(_by_unit(problem, linear, gain)[units[:, None], columns])
 
 
 def _by_unit(problem: Problem, linear: Linear, gain: FloatArray) -> FloatArray:
-    """(u, 6 w, c) how the estimate moves with the errors that the observations of a unit share."""
-    of, members = problem.units
-    rows = of >= 0
-    found = np.zeros((len(members), linear.by_errors.shape[2], gain.shape[2]))
-    np.add.at(found, of[rows], np.swapaxes(linear.by_errors[rows], 1, 2) @ gain[rows])
-    return found
+    """(u, 6 w, c) gain of the errors that the observations of a unit share."""
+    unit_of, members = problem.units
+    rows = unit_of >= 0
+    gains = np.zeros((len(members), linear.by_errors.shape[2], gain.shape[2]))
+    np.add.at(gains, unit_of[rows], np.swapaxes(linear.by_errors[rows], 1, 2) @ gain[rows])
+    return gains
 
 
 def radius95(covariance: FloatArray) -> float:
-    """Radius of the ball that holds a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
+    """Radius of the ball that contains a Gaussian with 95 % (three-moment fit of Imhof 1961)."""
     values = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
     first, second, third = (float(np.sum(values**power)) for power in (1, 2, 3))
     if not third > 0.0:
@@ -176,7 +160,7 @@ def radius95(covariance: FloatArray) -> float:
 
 
 def point_covariance(edge: FloatArray, covariance: FloatArray, point: FloatArray) -> FloatArray:
-    """Covariance of a point that an uncertain transform carries.
+    """Covariance of a point mapped by an uncertain transform.
 
     Args:
         edge: (4, 4) `a_from_b`.
@@ -186,5 +170,5 @@ def point_covariance(edge: FloatArray, covariance: FloatArray, point: FloatArray
     Returns:
         (3, 3) of the point in frame a [m^2].
     """
-    slope = edge[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1)
-    return np.asarray(slope @ covariance @ slope.T)
+    jacobian = edge[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1)
+    return np.asarray(jacobian @ covariance @ jacobian.T)

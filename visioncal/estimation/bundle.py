@@ -1,4 +1,4 @@
-"""Intrinsics and poses together, from corners alone (Zhang 2000, section 3.2).
+"""Bundle adjustment of intrinsics and poses, from corners alone (Zhang 2000, section 3.2).
 
 The poses are eliminated view by view with a Schur complement (Triggs et al. 2000, section 6.1), so
 that each step solves a system of the size of the intrinsics.
@@ -19,21 +19,20 @@ from visioncal.vision.camera import intrinsics, with_intrinsics
 # The intrinsics (4 + k,) and the poses (v, 4, 4).
 _State: TypeAlias = tuple[FloatArray, FloatArray]
 
-# Relative decrease of the cost below which the fit has settled.
-_SETTLED = 1e-9
+# Relative decrease of the cost at which the fit has converged.
+_CONVERGED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class BundleFit:
-    """Intrinsics and poses.
+    """Result of the bundle adjustment.
 
     Attributes:
-        camera: The intrinsics.
         cam_from_target: (v, 4, 4).
         residuals: (n, 2) [px].
         sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
         covariance: (4 + k, 4 + k) of the intrinsics, poses marginalised.
-        settled: Whether the iteration came to rest.
+        settled: Whether the iteration converged.
     """
 
     camera: Camera
@@ -58,19 +57,15 @@ class _Blocks:
         """Eliminates the poses.
 
         Returns:
-            (k, k) information and (k,) gradient of the intrinsics alone, and (v, 6, k + 1): what
-            the poses do in answer to a step of the intrinsics, and by themselves.
+            (k, k) information and (k,) gradient of the intrinsics alone, and (v, 6, k + 1) response
+            of the poses: to a step of the intrinsics, and of their own gradient.
         """
         damped = self.by_pose + damping * self.by_pose * np.eye(6)
         right = np.concatenate([self.between, self.pose_gradient[:, :, None]], axis=2)
-        answer = covariance_from(damped) @ right
-        taken = np.swapaxes(self.between, 1, 2) @ answer
-        taken = taken.sum(axis=0)
-        return (
-            self.by_intrinsics - taken[:, :-1],
-            self.intrinsics_gradient - taken[:, -1],
-            answer,
-        )
+        response = covariance_from(damped) @ right
+        schur = (np.swapaxes(self.between, 1, 2) @ response).sum(axis=0)
+        gradient = self.intrinsics_gradient - schur[:, -1]
+        return self.by_intrinsics - schur[:, :-1], gradient, response
 
 
 def fit_bundle(
@@ -82,7 +77,7 @@ def fit_bundle(
         stack: The corners of v views.
         camera: The start, and the mean of the prior.
         cam_from_target: (v, 4, 4) starts.
-        prior_sigma: (4 + k,) weak prior, which keeps what the views cannot determine in place.
+        prior_sigma: (4 + k,) weak prior, which holds what the views cannot determine.
 
     Returns:
         The fit. Its covariance counts the corners only, not the prior.
@@ -91,42 +86,47 @@ def fit_bundle(
 
     def linearise(at: _State) -> Linearised[_State]:
         values, poses = at
-        now = reproject(stack, with_intrinsics(camera, values), poses)
+        reprojection = reproject(stack, with_intrinsics(camera, values), poses)
         offset = values - start
-        blocks = _blocks(stack, now)
+        blocks = _blocks(stack, reprojection)
 
         def step(damping: float) -> _State:
-            information, gradient, answer = blocks.reduced(damping)
+            information, gradient, response = blocks.reduced(damping)
             # The prior is in units of a corner's noise of 1 px, as the information is.
-            moved = damped_step(information + np.diag(weight), gradient + weight * offset, damping)
-            pose_steps = -(answer[:, :, :-1] @ moved) - answer[:, :, -1]
-            return values + moved, poses @ exp(pose_steps)
+            change = damped_step(information + np.diag(weight), gradient + weight * offset, damping)
+            pose_steps = -(response[:, :, :-1] @ change) - response[:, :, -1]
+            return values + change, poses @ exp(pose_steps)
 
-        return Linearised(at, float(np.sum(now.residuals**2) + weight @ offset**2), step)
+        return Linearised(at, float(np.sum(reprojection.residuals**2) + weight @ offset**2), step)
 
-    (values, poses), settled = levenberg_marquardt((start, cam_from_target), linearise, _SETTLED)
+    (values, poses), settled = levenberg_marquardt((start, cam_from_target), linearise, _CONVERGED)
     fitted = with_intrinsics(camera, values)
     return _finished(stack, fitted, poses, reproject(stack, fitted, poses), settled=settled)
 
 
 def _finished(
-    stack: CornerStack, camera: Camera, poses: FloatArray, now: Reprojection, *, settled: bool
+    stack: CornerStack,
+    camera: Camera,
+    poses: FloatArray,
+    reprojection: Reprojection,
+    *,
+    settled: bool,
 ) -> BundleFit:
-    information, _, _ = _blocks(stack, now).reduced(0.0)
-    sigma_px = stack.sigma_px(now.residuals, 6 * len(poses) + len(information))
+    information, _, _ = _blocks(stack, reprojection).reduced(0.0)
+    sigma_px = stack.sigma_px(reprojection.residuals, 6 * len(poses) + len(information))
     covariance = sigma_px**2 * covariance_from(information)
-    return BundleFit(camera, poses, now.residuals, sigma_px, covariance, settled)
+    return BundleFit(camera, poses, reprojection.residuals, sigma_px, covariance, settled)
 
 
-def _blocks(stack: CornerStack, at: Reprojection) -> _Blocks:
-    by_pose, by_intrinsics = at.by_pose, at.by_intrinsics
+def _blocks(stack: CornerStack, reprojection: Reprojection) -> _Blocks:
+    by_pose, by_intrinsics = reprojection.by_pose, reprojection.by_intrinsics
     size, flat = by_intrinsics.shape[2], by_intrinsics.reshape(-1, by_intrinsics.shape[2])
-    rest = np.concatenate([by_pose, by_intrinsics, at.residuals[:, :, None]], axis=2)
+    rest = np.concatenate([by_pose, by_intrinsics, reprojection.residuals[:, :, None]], axis=2)
     products = stack.products_by_view(by_pose, rest)
     return _Blocks(
         flat.T @ flat,
         products[:, :, :6],
         products[:, :, 6 : 6 + size],
-        flat.T @ at.residuals.reshape(-1),
+        flat.T @ reprojection.residuals.reshape(-1),
         products[:, :, -1],
     )

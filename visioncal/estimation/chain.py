@@ -1,10 +1,10 @@
-"""The problem of one robot and one camera: a chain of frames with a robot in it.
+"""Problem of one robot and one camera: a chain of frames with a robot in it.
 
     eye-in-hand   base -> flange -> cam,  base -> target
     eye-to-hand   base -> flange -> target,  base -> cam
 
-A measuring instrument that reads a probe on the flange is a camera that stands still, and the probe
-its target.
+A measuring instrument that reads a probe on the flange is modelled as a stationary camera, with the
+probe as its target.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ BASE, FLANGE = "base", "flange"
 
 
 def edge_names(mount: Mount) -> tuple[str, str]:
-    """Names of the edges that place the camera and an only target."""
+    """Names of the edges of the camera and of a single target."""
     if mount == "instrument":
         return "base_from_instrument", "flange_from_probe"
     if mount == "eye-in-hand":
@@ -30,32 +30,27 @@ def edge_names(mount: Mount) -> tuple[str, str]:
 
 
 def robot_part(base_from_flange: FloatArray, mount: Mount) -> FloatArray:
-    """The robot's part (m, 4, 4) of the chain `robot * x * camera = z`."""
+    """Robot transforms (m, 4, 4) of the chain `robot * x * camera = z`."""
     return base_from_flange if mount == "eye-in-hand" else invert(base_from_flange)
 
 
 def scatter(problem: Problem, others: Problem, state: State) -> tuple[FloatArray, FloatArray]:
-    """How far observations place their targets from where others do on average.
+    """Distances (n,) [m] and (n,) [rad] of observed targets from their means in `others`.
 
-    Args:
-        problem: The n observations.
-        others: Those that they are compared with, of the same targets.
-        state: The unknowns of both.
-
-    Returns:
-        (n,) distances [m], and (n,) [rad].
+    The state is that of both problems, which are of the same targets.
     """
-    placed, among = _placed(others, state), np.array(others.observations.observed)
+    poses, targets = _target_poses(others, state), np.array(others.observations.observed)
     mean = {
-        value: mean_transform(placed[among == value]) for value in dict.fromkeys(among.tolist())
+        value: mean_transform(poses[targets == value]) for value in dict.fromkeys(targets.tolist())
     }
     return distances(
-        _placed(problem, state), np.array([mean[name] for name in problem.observations.observed])
+        _target_poses(problem, state),
+        np.array([mean[name] for name in problem.observations.observed]),
     )
 
 
-def _placed(problem: Problem, state: State) -> FloatArray:
-    """(n, 4, 4) where each observation places its target, in the frame that this hangs on."""
+def _target_poses(problem: Problem, state: State) -> FloatArray:
+    """(n, 4, 4) pose of each observation's target, in the target's parent frame."""
     edges = state.edges[[problem.unknown[name] for name in problem.observations.observed]]
     return np.asarray(edges @ invert(problem.predicted(state)) @ problem.measured(state))
 
@@ -71,22 +66,22 @@ def chain(
     order: Sequence[str] = (),
     effects: Sequence[Effect] = (),
 ) -> Problem:
-    """Puts the problem of one robot and one camera.
+    """Builds the problem of one robot and one camera.
 
     Args:
-        mount: Where the camera is.
-        base_from_flange: (s, 4, 4) where the robot was, at each stop.
-        cam_from_target: (m, 4, 4) what the views measured.
-        covariance: (m, 6, 6) of its right perturbations; None where nothing is known of it.
+        mount: Mounting of the camera.
+        base_from_flange: (s, 4, 4) robot poses, by stop.
+        cam_from_target: (m, 4, 4) poses that the views measured.
+        covariance: (m, 6, 6) of their right perturbations; None where unknown.
         stops: (m,) the stop of each view, numbered from 0; None where each has its own.
-        targets: (m,) the frame of the target that each view shows; empty for an only one.
+        targets: (m,) the frame of the target in each view; empty for a single one.
         order: The targets in the order of the unknowns; empty for that of their first views.
-        effects: What moves views together.
+        effects: Effects common to many views.
     """
     count = len(cam_from_target)
-    (camera, observer), (target, only) = (name.split("_from_") for name in edge_names(mount))
-    observed = tuple(targets) or (only,) * count
-    targets = order or observed or (only,)
+    (camera, observer), (target, single) = (name.split("_from_") for name in edge_names(mount))
+    observed = tuple(targets) or (single,) * count
+    targets = order or observed or (single,)
     unknown = {observer: Branch(camera), **{name: Branch(target) for name in targets}}
     return Problem(
         Tree(BASE, {FLANGE: Branch(BASE, robot=ROBOT), **unknown}),

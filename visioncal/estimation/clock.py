@@ -1,7 +1,7 @@
-"""What one clock is ahead of another, from one motion that was seen by both.
+"""Clock offset between camera and robot, from a motion that both recorded.
 
-From where both turn alike, the offset is one more unknown of the chain of frames: it moves the
-flange along its way.
+Starting where both rotate alike, the offset is one more unknown of the chain of frames: it moves
+the flange along its trajectory.
 """
 
 from collections.abc import Sequence
@@ -25,33 +25,34 @@ from visioncal.estimation.solve import Solution, fisher_information, fit_problem
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.variance import Knowledge
 
-# A start from more frames is no better; a fit of more takes long.
+# Frames for a start; most and fewest frames of a fit.
 _START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4
-# So many determine times within images well enough: each has dozens of corners.
+# Frames for delays within images: each has dozens of corners.
 _MOST_DELAYED = 400
-# Times within images are there by chance in one sweep of ten thousand.
+# False alarms, per sweep, of delays and of changes of the offset.
 _FALSE_ALARM = 1e-4
-_ROUNDS, _SETTLED_S = 12, 1e-7
-# Frames that are off by so many times what is typical are wrong ones.
+_ROUNDS, _CONVERGED_S = 12, 1e-7
+# Frames beyond this multiple of the typical residual are outliers.
 _OUTLYING = 4.0
-# Errors of frames within this time of each other may be alike [s]; so many stretches suffice.
+# Length of a stretch of time within which errors may be correlated [s]; fewest stretches for a
+# test.
 _STRETCH_S, _FEWEST_STRETCHES = 1.0, 6
-# So many frames are asked for their own offset, so far from the common one at most, in such steps
+# Most frames whose own offset is estimated, the farthest from the common one, and the search step
 # [s].
-_MOST_ASKED, _FARTHEST_S, _ASKED_STEP_S = 600, 0.5, 0.02
-# Fits that leave so many times the least, of rotations times positions, are no worse.
+_MOST_OWN, _FARTHEST_S, _SEARCH_STEP_S = 600, 0.5, 0.02
+# Ratio of residual noise, rotations times positions, up to which fits are equally good.
 _ALIKE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
 class ClockFit:
-    """An offset with both edges.
+    """A clock offset with both edges.
 
     Attributes:
-        offset_s: What the camera's clock is ahead of the robot's [s].
+        offset_s: Camera clock minus robot clock [s].
         sigma_s: Its standard deviation [s]; very large where the motion does not determine it.
-        fit: Both edges, as the moving frames have them, and the noise.
-        frames: How many frames it rests on.
+        fit: Both edges, by the moving frames, and the noise.
+        frames: Number of frames used.
     """
 
     offset_s: float
@@ -62,14 +63,13 @@ class ClockFit:
 
 @dataclass(frozen=True, eq=False)
 class DelayedFit:
-    """An offset with times by which corners are taken later than others.
+    """A clock offset with delays of corners within the image.
 
     Attributes:
         clock: The offset and both edges.
-        delays: The effects.
         times_s: (k,) their times [s].
-        sigmas_s: (k,) the standard deviations of these [s].
-        freedom: How many degrees of freedom these were estimated with.
+        sigmas_s: (k,) standard deviations of the times [s].
+        freedom: Degrees of freedom of these.
     """
 
     clock: ClockFit
@@ -80,21 +80,20 @@ class DelayedFit:
 
     @property
     def is_clear(self) -> Mask:
-        """(k,) which of the times are beyond chance."""
+        """(k,) mask of the times that are significant."""
         limit = f_limit(_FALSE_ALARM, 1, self.freedom)
         return np.asarray((self.times_s / self.sigmas_s) ** 2 > limit)
 
 
 @dataclass(frozen=True)
 class ClockChange:
-    """How an offset changes over the frames.
+    """Step or drift of a clock offset.
 
     Attributes:
-        from_s: From which of the camera's times on it is another [s]; of a drift, from which on it
-            grows.
-        step_s: By how much it is larger then [s]; of a drift, in a second.
-        sigma_s: The standard deviation of that.
-        is_drift: Whether it grows steadily.
+        from_s: Camera time of the step, or of the start of the drift [s].
+        step_s: Increase of the offset [s]; of a drift, per second.
+        sigma_s: Its standard deviation.
+        is_drift: Whether the offset grows steadily.
     """
 
     from_s: float
@@ -103,18 +102,18 @@ class ClockChange:
     is_drift: bool
 
     def shares(self, stamps_s: FloatArray) -> FloatArray:
-        """(m,) how many steps the offset has changed by at some times [s]."""
+        """(m,) change of the offset at some times [s], in units of `step_s`."""
         later_s = stamps_s - self.from_s
         return later_s if self.is_drift else (later_s >= 0.0).astype(float)
 
     def corrected(self, stamps_s: FloatArray) -> FloatArray:
-        """(m,) times as a clock would have them that did not change [s]."""
+        """(m,) times by a clock without the change [s]."""
         return np.asarray(stamps_s - self.step_s * self.shares(stamps_s))
 
 
 @dataclass(frozen=True, eq=False)
-class _Late:
-    """Effects of time within images, with where their times are [s]; none without a camera."""
+class _Delays:
+    """Delays within images, with their current times [s]; none without a camera."""
 
     camera: Camera | None
     delays: tuple[Delay, ...]
@@ -123,212 +122,189 @@ class _Late:
     def problem(
         self, robot: Trajectory, frames: ImageTimes, offset_s: float, state: State
     ) -> tuple[Problem, FloatArray]:
-        """The problem of some frames, with changes of the offset and of the times [s]."""
-        # With it, (m, k) half the gradient of each frame's corners by the times, its pose being
-        # free.
+        """The problem of some frames, with changes of the offset and of the times [s].
+
+        Second, half the gradient (m, k) of each frame's corners by the times, its pose eliminated.
+        """
         stack = frames.stack
         if self.camera is None or stack is None:
             return clock_problem(robot, frames, offset_s), np.zeros((len(frames), 0))
         at_s, poses = frames.stamps_s - offset_s, frames.cam_from_target
         flange, speeds = robot.at(at_s), robot.speeds(at_s)
-        moved = target_twists(frames.mount, flange, state.edges[0], poses, speeds)
+        twists = target_twists(frames.mount, flange, state.edges[0], poses, speeds)
         shares = shares_of(self.delays, stack, self.camera)
-        seen = compress_delayed(stack, self.camera, shares, moved, self.times_s, poses)
+        compressed = compress_delayed(stack, self.camera, shares, twists, self.times_s, poses)
         unknowns = 6 * len(frames) + len(self.times_s)
-        weight = floored_sigma_px(stack.sigma_px(seen.residuals, unknowns)) ** -2.0
+        weight = floored_sigma_px(stack.sigma_px(compressed.residuals, unknowns)) ** -2.0
         prior = np.array([delay.sigma_s for delay in self.delays]) ** -2.0
-        known = Knowledge(
-            weight * seen.shared_information + np.diag(prior),
-            weight * seen.shared_gradient + prior * self.times_s,
+        knowledge = Knowledge(
+            weight * compressed.shared_information + np.diag(prior),
+            weight * compressed.shared_gradient + prior * self.times_s,
         )
         problem = chain(
             frames.mount,
             flange,
-            seen.cam_from_target,
-            covariance_from(weight * seen.information),
-            effects=[clock_effect(speeds), Effect.free("delays", known, seen.by_shared)],
+            compressed.cam_from_target,
+            covariance_from(weight * compressed.information),
+            effects=[clock_effect(speeds), Effect.free("delays", knowledge, compressed.by_shared)],
         )
-        return problem, weight * seen.shared_pulls
+        return problem, weight * compressed.shared_pulls
 
 
 def fit_offset(
     robot: Trajectory, frames: ImageTimes, starts: Sequence[float]
 ) -> tuple[ClockFit, ...]:
-    """Fits the offset and both edges together, from several starts.
-
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: What the camera saw.
-        starts: Offsets to start from [s].
+    """Fits the offset and both edges together, from several start offsets [s].
 
     Returns:
-        The fits that stay near their starts, the one that leaves the least first; none where the
-        chain does not close, or too few frames are covered.
+        The fits that stay near their starts, least residual noise first; none where the chain does
+        not close, or too few frames are covered.
     """
-    # Frames that are rare and taken at rest match over as long as the rests last.
+    # Sparse frames taken at rest match over as long as the rests last.
     near_s = NEAR_S if frames.are_dense else WIDEST_OFFSET_S
     with one_blas_thread():
-        some = frames.only(_evenly(len(frames), _MOST_FRAMES))
-        on_time = _Late(None, (), np.zeros(0))
+        selected = frames.only(_evenly(len(frames), _MOST_FRAMES))
+        no_delays = _Delays(None, (), np.zeros(0))
         fits = [
             fit.clock
             for start in starts
-            if (fit := _fitted(robot, some, start, None, on_time)) is not None
+            if (fit := _fitted(robot, selected, start, None, no_delays)) is not None
             and abs(fit.clock.offset_s - start) <= near_s
         ]
-    # Few frames agree with anything.
+    # A fit of few frames agrees with anything.
     most = max((fit.frames for fit in fits), default=0)
-    whole = (fit for fit in fits if 2 * fit.frames > most)
-    return tuple(sorted(whole, key=left_by))
+    complete = (fit for fit in fits if 2 * fit.frames > most)
+    return tuple(sorted(complete, key=left_by))
 
 
 def fit_delays(
     robot: Trajectory, frames: ImageTimes, camera: Camera, start: ClockFit, delays: Sequence[Delay]
 ) -> DelayedFit | None:
-    """Fits times within images, the offset and both edges together.
+    """Fits delays within images, the offset and both edges together.
 
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: What the camera saw.
-        camera: The intrinsics.
-        start: The fit without them.
-        delays: The effects.
-
-    Returns:
-        The fit; None where too few frames are covered, or their corners are not known.
+    `start` is the fit without delays. None where too few frames are covered, or their corners are
+    not known.
     """
     if frames.stack is None or not delays:
         return None
     with one_blas_thread():
-        some = frames.only(_evenly(len(frames), _MOST_DELAYED))
-        late = _Late(camera, tuple(delays), np.zeros(len(delays)))
-        return _fitted(robot, some, start.offset_s, start.fit.state, late)
+        selected = frames.only(_evenly(len(frames), _MOST_DELAYED))
+        free = _Delays(camera, tuple(delays), np.zeros(len(delays)))
+        return _fitted(robot, selected, start.offset_s, start.fit.state, free)
 
 
 def clock_change(robot: Trajectory, frames: ImageTimes, fit: ClockFit) -> ClockChange | None:
-    """Looks for a step of the offset at any frame, and for a steady drift.
+    """Tests for a step of the offset at any frame, and for a steady drift.
 
-    Each frame is asked for the offset at which it is where the fit has it. Means of these over
-    stretches of time are independent, as far as errors that last are: what they leave is the noise
-    of the test (of a change point; Page 1955).
-
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: What the camera saw.
-        fit: The fit with one offset.
-
-    Returns:
-        The change; None where noise explains it, or there are too few stretches.
+    For each frame the offset is estimated at which it agrees with the fit. Means of these over
+    stretches of time are taken as independent; their residual scatter is the noise of the test (of
+    a change point; Page 1955). None where noise explains it, or there are too few stretches.
     """
-    some = frames.only(_evenly(len(frames), _MOST_ASKED))
-    some = some.only(robot.covers(some.stamps_s - fit.offset_s, _FARTHEST_S))
-    asked_s, weights = _asked_offsets(robot, some, fit)
-    times_s, of = some.stamps_s, np.zeros(len(some), dtype=np.int64)
-    if len(some):
-        of = np.unique((times_s - times_s[0]) // _STRETCH_S, return_inverse=True)[1]
-    sums = np.bincount(of, weights).astype(float)
-    kept = sums > 0.0
-    if np.sum(kept) < _FEWEST_STRETCHES:
+    selected = frames.only(_evenly(len(frames), _MOST_OWN))
+    selected = selected.only(robot.covers(selected.stamps_s - fit.offset_s, _FARTHEST_S))
+    own_s, weights = _own_offsets(robot, selected, fit)
+    times_s, stretch_of = selected.stamps_s, np.zeros(len(selected), dtype=np.int64)
+    if len(selected):
+        stretch_of = np.unique((times_s - times_s[0]) // _STRETCH_S, return_inverse=True)[1]
+    information = np.bincount(stretch_of, weights).astype(float)
+    valid = information > 0.0
+    if np.sum(valid) < _FEWEST_STRETCHES:
         return None
-    means = (np.bincount(of, weights * asked_s)[kept]) / sums[kept]
-    middles = (np.bincount(of, weights * times_s)[kept]) / sums[kept]
-    columns = [(middles >= middle).astype(float) for middle in middles[2:-1]]
-    tried = [_slope(value, means, sums[kept]) for value in (middles - middles[0], *columns)]
+    means = (np.bincount(stretch_of, weights * own_s)[valid]) / information[valid]
+    times = (np.bincount(stretch_of, weights * times_s)[valid]) / information[valid]
+    columns = [(times >= middle).astype(float) for middle in times[2:-1]]
+    columns.insert(0, times - times[0])
+    scored = [_fit_slope(column, means, information[valid]) for column in columns]
     freedom = len(means) - 2
-    best = int(np.argmax([pair[2] for pair in tried]))
-    step_s, sigma_s, square = tried[best]
-    if square < f_limit(_FALSE_ALARM / len(tried), 1, freedom):
+    best = int(np.argmax([pair[2] for pair in scored]))
+    step_s, sigma_s, square = scored[best]
+    if square < f_limit(_FALSE_ALARM / len(scored), 1, freedom):
         return None
     if best == 0:
         return ClockChange(float(times_s[0]), step_s, sigma_s, is_drift=True)
-    # Within the stretches about it, the frame that parts best.
-    near = np.flatnonzero((times_s >= middles[best]) & (times_s <= middles[best + 2]))
-    parts = [
-        _slope((times_s >= times_s[index]).astype(float), asked_s, weights)[2] for index in near
+    # The most significant frame within the neighbouring stretches.
+    nearby = np.flatnonzero((times_s >= times[best]) & (times_s <= times[best + 2]))
+    scores = [
+        _fit_slope((times_s >= times_s[index]).astype(float), own_s, weights)[2] for index in nearby
     ]
-    from_s = float(times_s[near[int(np.argmax(parts))]])
+    from_s = float(times_s[nearby[int(np.argmax(scores))]])
     return ClockChange(from_s, step_s, sigma_s, is_drift=False)
 
 
 def refined_change(
     robot: Trajectory, frames: ImageTimes, fit: ClockFit, stamped: ImageTimes, change: ClockChange
 ) -> ClockChange:
-    """The change with what frames ask for that are corrected by it.
+    """Re-estimates the size of a change from frames at times corrected by it, and their fit.
 
-    Args:
-        robot: `base_from_flange` over the robot's time.
-        frames: What the camera saw, at corrected times.
-        fit: The fit of these.
-        stamped: The same at the times that were stamped.
-        change: The change by which they are corrected.
+    `stamped` are the same frames at their stamped times.
     """
-    some = _evenly(len(frames), _MOST_ASKED)
-    inside = robot.covers(frames.stamps_s[some] - fit.offset_s, _FARTHEST_S)
-    some = some[inside]
-    asked_s, weights = _asked_offsets(robot, frames.only(some), fit)
-    more_s, sigma_s, _ = _slope(change.shares(stamped.stamps_s[some]), asked_s, weights)
+    selected = _evenly(len(frames), _MOST_OWN)
+    inside = robot.covers(frames.stamps_s[selected] - fit.offset_s, _FARTHEST_S)
+    selected = selected[inside]
+    own_s, weights = _own_offsets(robot, frames.only(selected), fit)
+    more_s, sigma_s, _ = _fit_slope(change.shares(stamped.stamps_s[selected]), own_s, weights)
     return replace(change, step_s=change.step_s + more_s, sigma_s=sigma_s)
 
 
-def _asked_offsets(
+def _own_offsets(
     robot: Trajectory, frames: ImageTimes, fit: ClockFit
 ) -> tuple[FloatArray, FloatArray]:
-    """(m,) by how much the offset is to change for each frame [s], and the information on it."""
-    # What no offset explains has none.
+    """(m,) change of the offset that each frame alone would have [s], and its information."""
+    # Frames that no offset explains have no information.
     best = np.full(len(frames), np.inf)
-    asked_s, weights = np.zeros(len(frames)), np.zeros(len(frames))
-    for change_s in np.arange(-_FARTHEST_S, _FARTHEST_S + 0.5 * _ASKED_STEP_S, _ASKED_STEP_S):
+    own_s, weights = np.zeros(len(frames)), np.zeros(len(frames))
+    for change_s in np.arange(-_FARTHEST_S, _FARTHEST_S + 0.5 * _SEARCH_STEP_S, _SEARCH_STEP_S):
         problem = clock_problem(robot, frames, fit.offset_s + change_s)
         linear = problem.linear(State(fit.fit.state.edges, problem.start_values))
-        late = linear.jacobian[:, :, -1:]
-        both = np.concatenate([late, linear.residuals[:, :, None]], axis=2)
+        offset_jacobian = linear.jacobian[:, :, -1:]
+        columns = np.concatenate([offset_jacobian, linear.residuals[:, :, None]], axis=2)
         blocks = problem.total_covariance(linear, fit.fit.noise)
-        products = np.swapaxes(both, 1, 2) @ np.linalg.solve(blocks, both)
-        own, pull = np.maximum(products[:, 0, 0], 1e-12), products[:, 0, 1]
-        step_s = -pull / own
-        left = products[:, 1, 1] - pull**2 / own
-        better = (left < best) & (np.abs(step_s) <= _ASKED_STEP_S)
-        best = np.where(better, left, best)
-        asked_s = np.where(better, change_s + step_s, asked_s)
-        weights = np.where(better, own, weights)
-    sound = best <= _OUTLYING**2 * float(np.median(best))
-    return asked_s, np.where(sound, weights, 0.0)
+        products = np.swapaxes(columns, 1, 2) @ np.linalg.solve(blocks, columns)
+        information, gradient = np.maximum(products[:, 0, 0], 1e-12), products[:, 0, 1]
+        step_s = -gradient / information
+        remaining = products[:, 1, 1] - gradient**2 / information
+        better = (remaining < best) & (np.abs(step_s) <= _SEARCH_STEP_S)
+        best = np.where(better, remaining, best)
+        own_s = np.where(better, change_s + step_s, own_s)
+        weights = np.where(better, information, weights)
+    inlier = best <= _OUTLYING**2 * float(np.median(best))
+    return own_s, np.where(inlier, weights, 0.0)
 
 
-def _slope(column: FloatArray, values: FloatArray, weights: FloatArray) -> tuple[float, ...]:
-    """A slope beside a constant by weighted least squares, its sigma, and F for it."""
+def _fit_slope(column: FloatArray, values: FloatArray, weights: FloatArray) -> tuple[float, ...]:
+    """A slope beside a constant by weighted least squares, its sigma, and its F statistic."""
     count, total = len(values), weights.sum()
     centred = column - weights @ column / total
-    about = values - weights @ values / total
+    centred_values = values - weights @ values / total
     square = float(weights @ centred**2)
     if square <= 0.0:
         return 0.0, np.inf, 0.0
-    slope = float(weights @ (centred * about)) / square
-    left = float(weights @ (about - slope * centred) ** 2) / (count - 2)
-    sigma = float(np.sqrt(left / square))
+    slope = float(weights @ (centred * centred_values)) / square
+    residual_variance = float(weights @ (centred_values - slope * centred) ** 2) / (count - 2)
+    sigma = float(np.sqrt(residual_variance / square))
     return slope, sigma, (slope / sigma) ** 2 if sigma > 0.0 else 0.0
 
 
 def clear_fit(fits: Sequence[ClockFit], stated_s: float | None) -> ClockFit | None:
-    """The fit that stands out: motion that repeats itself has several that leave as little.
+    """The best fit, unless repetitive motion makes distinct offsets equally good.
 
-    Of these it is the one that is stated. None where none is, or there are no fits.
+    Then it is the one near the stated offset; None where none is, or there are no fits.
     """
     if not fits:
         return None
-    alike = [fit for fit in fits if left_by(fit) <= _ALIKE * left_by(fits[0])]
-    if all(abs(clock_fit.offset_s - fits[0].offset_s) <= NEAR_S for clock_fit in alike):
+    rivals = [fit for fit in fits if left_by(fit) <= _ALIKE * left_by(fits[0])]
+    if all(abs(clock_fit.offset_s - fits[0].offset_s) <= NEAR_S for clock_fit in rivals):
         return fits[0]
     near = [
         clock_fit
-        for clock_fit in alike
+        for clock_fit in rivals
         if stated_s is not None and abs(clock_fit.offset_s - stated_s) <= NEAR_S
     ]
     return near[0] if near else None
 
 
 def left_by(fit: ClockFit) -> float:
-    """What a fit leaves of rotations and positions, as its likelihood has it."""
+    """Residual noise of rotations times positions, as the likelihood has it."""
     return float(fit.fit.noise.robots.prod())
 
 
@@ -337,45 +313,45 @@ def _evenly(count: int, most: int) -> IntArray:
 
 
 def _fitted(
-    robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, late: _Late
+    robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, delays: _Delays
 ) -> DelayedFit | None:
-    """Fits from one start, and once more without the frames that contradict the others."""
-    found = _settled(robot, frames, offset_s, start, late)
-    if found is None:
+    """Fits from one start, and once more without outlier frames."""
+    result = _iterated(robot, frames, offset_s, start, delays)
+    if result is None:
         return None
-    late, clock = replace(late, times_s=found.times_s), found.clock
+    delays, clock = replace(delays, times_s=result.times_s), result.clock
     near = _covered(robot, frames, clock.offset_s)
-    sound = _sound(late.problem(robot, near, clock.offset_s, clock.fit.state)[0], clock.fit)
-    if sound.all():
-        return found
-    return _settled(robot, near.only(sound), clock.offset_s, clock.fit.state, late)
+    inliers = _inliers(delays.problem(robot, near, clock.offset_s, clock.fit.state)[0], clock.fit)
+    if inliers.all():
+        return result
+    return _iterated(robot, near.only(inliers), clock.offset_s, clock.fit.state, delays)
 
 
-def _settled(
-    robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, late: _Late
+def _iterated(
+    robot: Trajectory, frames: ImageTimes, offset_s: float, start: State | None, delays: _Delays
 ) -> DelayedFit | None:
-    """Moves times, offset and both edges until they rest; None where too few frames are covered."""
+    """Iterates delays, offset and edges to convergence; None where too few frames are covered."""
     for _ in range(_ROUNDS):
-        near = _covered(robot, frames, offset_s)
-        if len(near) < _FEWEST_FRAMES:
+        covered = _covered(robot, frames, offset_s)
+        if len(covered) < _FEWEST_FRAMES:
             return None
         if start is None:
-            first = _evenly(len(near), _START_FRAMES)
-            start = closed_form(clock_problem(robot, near, offset_s), first)
+            first = _evenly(len(covered), _START_FRAMES)
+            start = closed_form(clock_problem(robot, covered, offset_s), first)
         if start is None:
             raise RuntimeError("no closed form gives a start")
-        problem, pulls = late.problem(robot, near, offset_s, start)
-        found = fit_problem(problem, State(start.edges, problem.start_values))
-        # A step farther than angles are compared over is a slope that misleads.
-        step_s = np.clip(found.state.values, -WINDOW_S, WINDOW_S)
-        start, offset_s = found.state, offset_s + float(step_s[0])
-        late = replace(late, times_s=late.times_s + step_s[1:])
-        if np.abs(step_s).max() < _SETTLED_S:
+        problem, pulls = delays.problem(robot, covered, offset_s, start)
+        solution = fit_problem(problem, State(start.edges, problem.start_values))
+        # Limited to the correlation window: a longer step is beyond the linearisation.
+        step_s = np.clip(solution.state.values, -WINDOW_S, WINDOW_S)
+        start, offset_s = solution.state, offset_s + float(step_s[0])
+        delays = replace(delays, times_s=delays.times_s + step_s[1:])
+        if np.abs(step_s).max() < _CONVERGED_S:
             break
-    fit = replace(found, state=State(found.state.edges, problem.start_values))
-    sigmas_s, freedom = _sigmas_s(problem, fit, near.stamps_s, pulls)
-    clock = ClockFit(offset_s, float(sigmas_s[0]), fit, len(near))
-    return DelayedFit(clock, late.delays, late.times_s, sigmas_s[1:], freedom)
+    fit = replace(solution, state=State(solution.state.edges, problem.start_values))
+    sigmas_s, freedom = _sigmas_s(problem, fit, covered.stamps_s, pulls)
+    clock = ClockFit(offset_s, float(sigmas_s[0]), fit, len(covered))
+    return DelayedFit(clock, delays.delays, delays.times_s, sigmas_s[1:], freedom)
 
 
 def _covered(robot: Trajectory, frames: ImageTimes, offset_s: float) -> ImageTimes:
@@ -395,8 +371,8 @@ def clock_problem(robot: Trajectory, frames: ImageTimes, offset_s: float) -> Pro
     )
 
 
-def _sound(problem: Problem, fit: Solution) -> Mask:
-    """Which frames agree with the others."""
+def _inliers(problem: Problem, fit: Solution) -> Mask:
+    """Mask of the frames whose residuals are within the outlier limit."""
     linear = problem.linear(fit.state)
     residuals, covariance = linear.residuals, problem.total_covariance(linear, fit.noise)
     squares = np.einsum("mi,mij,mj->m", residuals, np.linalg.inv(covariance), residuals)
@@ -406,10 +382,12 @@ def _sound(problem: Problem, fit: Solution) -> Mask:
 def _sigmas_s(
     problem: Problem, fit: Solution, stamps_s: FloatArray, pulls: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Standard deviations of the offset and of times, the larger of two each, and their freedom."""
-    # One takes the errors of all frames for independent. The other takes those of a stretch of time
-    # together, as they are: where a lens or an arm errs the same for a while, it is the honest one
-    # (the jackknife over clusters; Bell and McCaffrey 2002).
+    """Standard deviations of the offset and of the delays, and their degrees of freedom.
+
+    The larger of two each. One takes the errors of all frames for independent. The other takes
+    those of a stretch of time together (the jackknife over clusters; Bell and McCaffrey 2002),
+    which holds where the errors of a lens or an arm are correlated in time.
+    """
     # A direction without information has a very large variance here.
     covariance = covariance_from(fisher_information(problem, fit.state, fit.noise))
     independent = np.diag(covariance)[12:]
@@ -421,12 +399,12 @@ def _sigmas_s(
     residuals, jacobian = linear.residuals, linear.jacobian
     blocks = problem.total_covariance(linear, fit.noise)
     weighted = np.linalg.solve(blocks, np.concatenate([jacobian, residuals[:, :, None]], axis=2))
-    information, moved = covariance_from(covariance), np.zeros((count, jacobian.shape[2]))
+    information, changes = covariance_from(covariance), np.zeros((count, jacobian.shape[2]))
     for stretch in range(count):
-        mine = stretches == stretch
-        both = gram(jacobian[mine], weighted[mine])
-        both[len(both) - pulls.shape[1] :, -1] += pulls[mine].sum(axis=0)
-        # Without the stretch: its own leverage would hide how far it is off.
-        moved[stretch] = covariance_from(information - both[:, :-1]) @ both[:, -1]
-    together = moved.T @ moved * (count - 1) / count
-    return np.sqrt(np.maximum(independent, np.diag(together)[12:])), count - 1.0
+        rows = stretches == stretch
+        products = gram(jacobian[rows], weighted[rows])
+        products[len(products) - pulls.shape[1] :, -1] += pulls[rows].sum(axis=0)
+        # Leave-one-out: the stretch's own leverage would hide its error.
+        changes[stretch] = covariance_from(information - products[:, :-1]) @ products[:, -1]
+    clustered = changes.T @ changes * (count - 1) / count
+    return np.sqrt(np.maximum(independent, np.diag(clustered)[12:])), count - 1.0

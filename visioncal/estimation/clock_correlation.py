@@ -1,7 +1,7 @@
-"""About what one clock is ahead of another: where camera and robot turn alike.
+"""Coarse clock offset, by correlating the rotation of camera and robot.
 
-A camera's turning between two frames and the robot's are equally large, whatever frames their poses
-are of and however these are read. Where the angles go along best, the clocks agree.
+Between two frames the camera and the robot rotate by equal angles, whatever frames their poses are
+of and however these are read. The clocks agree where the angles correlate best.
 """
 
 from dataclasses import dataclass, replace
@@ -14,23 +14,22 @@ from visioncal.core.types import FloatArray, IntArray, Mask, Mount
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 
-# Clocks that are farther apart are not on one network [s].
+# Widest offset searched; clocks farther apart are not on one network [s].
 WIDEST_OFFSET_S = 5.0
-# Angles are compared over at least this time, on a grid of such a step [s]; the resolution
-# of an offset on it, after interpolation [s].
+# Least time over which angles are compared, and the grid's step [s]; least sigma of an interpolated
+# offset [s].
 WINDOW_S, _STEP_S, _LEAST_SIGMA_S = 0.2, 0.005, 1e-3
-# Peaks of the comparison that stay within so much of the best are rivals, so many at most; nearer
-# than this to each other [s] they are one.
+# Peaks within this share of the best are rivals, and their greatest number; least distance of
+# distinct peaks [s].
 _RIVAL_SHARE, _MOST_RIVALS, NEAR_S = 0.9, 12, 0.1
 _FEWEST_PAIRS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class ImageTimes:
-    """What a camera saw, by its own clock.
+    """Views of a camera, by its own clock.
 
     Attributes:
-        mount: Which of the two trees it is.
         stamps_s: (m,) times [s], ascending.
         cam_from_target: (m, 4, 4) [m].
         covariance: (m, 6, 6) of their right perturbations; None where unknown.
@@ -48,31 +47,31 @@ class ImageTimes:
 
     @property
     def are_dense(self) -> bool:
-        """Whether they show the turning itself, and not only where it led from rest to rest."""
+        """Whether they sample the motion itself, and not only the rests between motions."""
         return len(self) > 2 and float(np.median(np.diff(self.stamps_s))) <= WINDOW_S
 
     def only(self, chosen: Mask | IntArray) -> "ImageTimes":
-        """Returns some of them, in ascending order."""
-        known, stack = self.covariance, self.stack
+        """Returns some of the views, in ascending order."""
+        covariance, stack = self.covariance, self.stack
         rows = np.arange(len(self))[chosen]
         return replace(
             self,
             stamps_s=self.stamps_s[chosen],
             cam_from_target=self.cam_from_target[chosen],
-            covariance=None if known is None else known[chosen],
+            covariance=None if covariance is None else covariance[chosen],
             stack=None if stack is None else stack.keep(np.isin(stack.view_of, rows)),
         )
 
 
 @dataclass(frozen=True)
 class Match:
-    """An offset at which camera and robot turn alike.
+    """An offset at which camera and robot rotate alike.
 
     Attributes:
-        offset_s: What the camera's clock is ahead of the robot's [s].
-        sigma_s: How well the angles determine it [s]; infinite where they do not change with it.
-        correlation: Of their angles there.
-        at_end: Whether the search ends there.
+        offset_s: Camera clock minus robot clock [s].
+        sigma_s: Its standard deviation by the angles [s]; infinite where they do not depend on it.
+        correlation: Correlation of the angles there.
+        at_end: Whether it lies at an end of the search range.
     """
 
     offset_s: float
@@ -84,51 +83,52 @@ class Match:
 def turning_matches(
     robot: Trajectory, frames: ImageTimes, about_s: float = 0.0
 ) -> tuple[Match, ...]:
-    """Finds the offsets at which camera and robot turn alike, the best first.
+    """Finds the offsets at which camera and robot rotate alike, best first.
 
-    Angles are compared between each frame and the first one some time behind it, by their
-    correlation.
+    The angles between each frame and the first one some time later are correlated.
 
     Args:
         robot: `base_from_flange` over the robot's time.
-        frames: What the camera saw.
-        about_s: Around which offset to look [s].
+        frames: Views of the camera.
+        about_s: Centre of the search [s].
 
     Returns:
-        The matches; none where neither turns, where the streams have too little time in common, or
-            where the robot's samples are too far apart to show a motion.
+        The matches; none where neither rotates, where the streams have too little time in common,
+        or where the robot's samples are too far apart to show a motion.
     """
     frames = replace(frames, stamps_s=frames.stamps_s - about_s)
     later = np.searchsorted(frames.stamps_s, frames.stamps_s + WINDOW_S)
     first = np.flatnonzero(later < len(frames))
     if len(first) < _FEWEST_PAIRS:
         return ()
-    turning = _Turning.of(robot, frames, first, later[first])
-    if not len(turning.steps):
+    rotation = _Rotation.of(robot, frames, first, later[first])
+    if not len(rotation.steps):
         return ()
-    reach_s = min(WIDEST_OFFSET_S, 0.25 * _common_s(robot, frames))
+    start_s = max(robot.stamps_s[0], frames.stamps_s[0])
+    common_s = max(float(min(robot.stamps_s[-1], frames.stamps_s[-1]) - start_s), 0.0)
+    reach_s = min(WIDEST_OFFSET_S, 0.25 * common_s)
     lags = np.arange(-int(reach_s / _STEP_S), int(reach_s / _STEP_S) + 1)
     scores = np.zeros(len(lags))
-    for at, lag in enumerate(lags.tolist()):
-        inside, turned = turning.by_robot(lag)
+    for index, lag in enumerate(lags.tolist()):
+        inside, angles = rotation.by_robot(lag)
         # Chance alone correlates a short overlap.
         if inside.sum() > max(0.5 * len(first), 2):
-            scores[at] = _correlation(turned, turning.by_camera[inside])
-    found = _peaks(turning, lags, scores)
-    return tuple(replace(match, offset_s=match.offset_s + about_s) for match in found)
+            scores[index] = _correlation(angles, rotation.by_camera[inside])
+    matches = _peaks(rotation, lags, scores)
+    return tuple(replace(match, offset_s=match.offset_s + about_s) for match in matches)
 
 
 @dataclass(frozen=True, eq=False)
-class _Turning:
-    """By how much camera and robot turned between pairs of frames.
+class _Rotation:
+    """Rotation angles of camera and robot between pairs of frames.
 
     Attributes:
-        by_camera: (k,) as the camera saw it [rad].
-        first: (k,) where each pair's first frame lies on the grid, with clocks that agree.
-        second: (k,) where its second one lies.
-        steps: (g,) the grid's points that lie within the robot's samples, ascending.
+        by_camera: (k,) angles from the camera [rad].
+        first: (k,) grid step of each pair's first frame at zero offset.
+        second: (k,) grid step of its second frame.
+        steps: (g,) the grid's steps within the robot's samples, ascending.
         quaternions: (g, 4) of the robot there.
-        per_window: How many pairs share a stretch of time.
+        per_window: Number of pairs that share a stretch of time.
     """
 
     by_camera: FloatArray
@@ -141,56 +141,56 @@ class _Turning:
     @classmethod
     def of(
         cls, robot: Trajectory, frames: ImageTimes, first: IntArray, second: IntArray
-    ) -> "_Turning":
-        """Compares some frames with others behind them."""
-        seen = frames.cam_from_target
+    ) -> "_Rotation":
+        """Pairs frames with later ones."""
+        poses = frames.cam_from_target
         begin_s, end_s = robot.stamps_s[[0, -1]]
         steps = _steps(robot.stamps_s)
         # Stamps since 1970 are rounded to 0.2 us: a step may end behind the last of them.
         grid_s = np.minimum(begin_s + _STEP_S * steps, end_s)
-        known = robot.covers(grid_s)
-        turned = Slerp(robot.stamps_s, Rotation.from_matrix(robot.poses[:, :3, :3]))
-        places = np.rint((frames.stamps_s - begin_s) / _STEP_S).astype(np.int64)
+        covered = robot.covers(grid_s)
+        interpolate = Slerp(robot.stamps_s, Rotation.from_matrix(robot.poses[:, :3, :3]))
+        grid_steps = np.rint((frames.stamps_s - begin_s) / _STEP_S).astype(np.int64)
         return cls(
-            rotation_angle(invert(seen[first]) @ seen[second]),
-            places[first],
-            places[second],
-            steps[known],
-            turned(grid_s[known]).as_quat(),
+            rotation_angle(invert(poses[first]) @ poses[second]),
+            grid_steps[first],
+            grid_steps[second],
+            steps[covered],
+            interpolate(grid_s[covered]).as_quat(),
             float(np.median(second - first)),
         )
 
     def by_robot(self, lag: int) -> tuple[Mask, FloatArray]:
-        """Which pairs (k,) the robot knows at a lag, and (j,) by how much it turned there [rad]."""
-        one, one_known = self._at(self.first - lag)
-        other, other_known = self._at(self.second - lag)
-        inside = one_known & other_known
-        products = self.quaternions[one[inside]] * self.quaternions[other[inside]]
+        """Mask (k,) of the pairs covered by the robot at a lag, and (j,) its angles there [rad]."""
+        first, first_known = self._at(self.first - lag)
+        second, second_known = self._at(self.second - lag)
+        inside = first_known & second_known
+        products = self.quaternions[first[inside]] * self.quaternions[second[inside]]
         return inside, 2.0 * np.arccos(np.minimum(np.abs(products.sum(axis=1)), 1.0))
 
     def _at(self, steps: IntArray) -> tuple[IntArray, Mask]:
-        """Rows of steps (k,) of the grid, and which of them are there."""
+        """Rows of grid steps (k,), and a mask of those that exist."""
         rows = np.minimum(np.searchsorted(self.steps, steps), len(self.steps) - 1)
         return rows, self.steps[rows] == steps
 
     def sigma_s(self, lag: int) -> float:
-        """Standard deviation of an offset [s]: angles are off by noise, and change with it."""
-        inside, turned = self.by_robot(lag)
+        """Standard deviation of an offset [s], by the scatter of the angles and their rates."""
+        inside, angles_here = self.by_robot(lag)
         sides = [self.by_robot(lag + side) for side in (-1, 1)]
         both = sides[0][0] & sides[1][0] & inside
-        early, late = (angles[both[known]] for known, angles in sides)
-        slope = (late - early) / (2.0 * _STEP_S)
-        off = self.by_camera[both] - turned[both[inside]]
-        information = float(np.sum((slope - slope.mean()) ** 2)) if len(slope) else 0.0
+        angles_before, angles_after = (angles[both[mask]] for mask, angles in sides)
+        rate = (angles_after - angles_before) / (2.0 * _STEP_S)
+        error = self.by_camera[both] - angles_here[both[inside]]
+        information = float(np.sum((rate - rate.mean()) ** 2)) if len(rate) else 0.0
         if not information > 0.0:
             return np.inf
-        # Pairs that share a stretch of time err alike.
-        variance = np.mean((off - off.mean()) ** 2) * max(self.per_window, 1.0) / information
+        # Errors of pairs that share a stretch of time are correlated.
+        variance = np.mean((error - error.mean()) ** 2) * max(self.per_window, 1.0) / information
         return float(np.hypot(np.sqrt(variance), _LEAST_SIGMA_S))
 
 
 def _steps(stamps_s: FloatArray) -> IntArray:
-    """The grid's steps (g,) between samples that are near each other.
+    """Grid steps (g,) between neighbouring samples.
 
     A clock that was set during a recording leaves samples that are years apart.
     """
@@ -202,42 +202,36 @@ def _steps(stamps_s: FloatArray) -> IntArray:
     return np.asarray(steps[steps < places[-1]])
 
 
-def _common_s(robot: Trajectory, frames: ImageTimes) -> float:
-    """How much time the streams have in common, as stamped [s]."""
-    start = max(robot.stamps_s[0], frames.stamps_s[0])
-    return max(float(min(robot.stamps_s[-1], frames.stamps_s[-1]) - start), 0.0)
-
-
 def _correlation(a: FloatArray, b: FloatArray) -> float:
     a, b = a - a.mean(), b - b.mean()
     norm = float(np.linalg.norm(a) * np.linalg.norm(b))
     return float(a @ b) / norm if norm > 0 else 0.0
 
 
-def _peaks(turning: _Turning, lags: IntArray, scores: FloatArray) -> tuple[Match, ...]:
-    """The best offset and its rivals, each a maximum of its surroundings."""
+def _peaks(rotation: _Rotation, lags: IntArray, scores: FloatArray) -> tuple[Match, ...]:
+    """The best offset and its rivals, each a local maximum."""
     around = int(NEAR_S / _STEP_S)
-    left, found = scores.copy(), list[Match]()
+    remaining, matches = scores.copy(), list[Match]()
     best = float(scores.max(initial=0.0))
-    while len(found) < _MOST_RIVALS and best > 0.0 and left.max() >= _RIVAL_SHARE * best:
-        at = int(left.argmax())
-        offset_s = _summit(lags, scores, at) * _STEP_S
-        sigma_s, ends = turning.sigma_s(int(lags[at])), at in (0, len(lags) - 1)
-        found.append(Match(offset_s, sigma_s, float(scores[at]), ends))
-        low, high = at, at
-        # Down both sides of the hill, and at least as far as what is no rival.
-        while low > 0 and (at - low < around or scores[low - 1] < scores[low]):
+    while len(matches) < _MOST_RIVALS and best > 0.0 and remaining.max() >= _RIVAL_SHARE * best:
+        peak = int(remaining.argmax())
+        offset_s = _summit(lags, scores, peak) * _STEP_S
+        sigma_s, ends = rotation.sigma_s(int(lags[peak])), peak in (0, len(lags) - 1)
+        matches.append(Match(offset_s, sigma_s, float(scores[peak]), ends))
+        low, high = peak, peak
+        # Masks both flanks of the peak, at least as far as the distance of distinct peaks.
+        while low > 0 and (peak - low < around or scores[low - 1] < scores[low]):
             low -= 1
-        while high < len(lags) - 1 and (high - at < around or scores[high + 1] < scores[high]):
+        while high < len(lags) - 1 and (high - peak < around or scores[high + 1] < scores[high]):
             high += 1
-        left[low : high + 1] = -1.0
-    return tuple(found)
+        remaining[low : high + 1] = -1.0
+    return tuple(matches)
 
 
-def _summit(lags: IntArray, scores: FloatArray, at: int) -> float:
-    """Where the parabola through a maximum and its neighbours is highest."""
-    if at in (0, len(lags) - 1):
-        return float(lags[at])
-    left, middle, right = scores[at - 1 : at + 2]
+def _summit(lags: IntArray, scores: FloatArray, peak: int) -> float:
+    """Vertex of the parabola through a maximum and its neighbours."""
+    if peak in (0, len(lags) - 1):
+        return float(lags[peak])
+    left, middle, right = scores[peak - 1 : peak + 2]
     curvature = left - 2 * middle + right
-    return float(lags[at] + (0.5 * (left - right) / curvature if curvature < 0 else 0.0))
+    return float(lags[peak] + (0.5 * (left - right) / curvature if curvature < 0 else 0.0))

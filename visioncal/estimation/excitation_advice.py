@@ -1,4 +1,4 @@
-"""Why stops do not determine what others would: which joints would have to move, and how far."""
+"""Advice on exciting the arm: which joints would have to move, and how far."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,18 +9,18 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.workspace import turning_range
 from visioncal.robot import Robot
 
-# How far joints are turned to see whether that helps; prismatic ones move by as many times 1 m.
+# Tried ranges of a joint; of prismatic ones in metres.
 _SPANS_RAD = tuple(np.deg2rad([30.0, 60.0, 120.0, 240.0]).tolist())
 
 
 @dataclass(frozen=True)
 class Move:
-    """A joint that would have to move.
+    """A joint that has to move over a wider range.
 
     Attributes:
-        joint: Which, from 0.
-        moved: How far it moved over the stops [rad or m].
-        wanted: How far would be enough, all other joints as they were [rad or m].
+        joint: Index from 0.
+        moved: Its range over the stops [rad or m].
+        wanted: Sufficient range, all other joints unchanged [rad or m].
     """
 
     joint: int
@@ -31,40 +31,41 @@ class Move:
 def joints_to_move(
     robot: Robot, q: FloatArray, count: Callable[[FloatArray], int], missing: int
 ) -> tuple[Move, ...]:
-    """Finds joints that determine what is missing when they move farther.
+    """Finds joints whose wider range would determine what is missing.
 
-    A joint is moved evenly over a wider range, in no order that has to do with the others. The one
-    is taken that determines all with the least range; else the best, and another.
+    A joint is moved evenly over a wider range, in an order independent of the other joints. The
+    joint that determines everything with the least range is chosen; else the best one, and then
+    another.
 
     Args:
         robot: The arm.
         q: (m, n) joint angles of the stops [rad].
-        count: Counts what stops with other joint angles determine.
-        missing: How much more is to be determined.
+        count: Number of directions that stops at given joint angles determine.
+        missing: Number of further directions to determine.
 
     Returns:
         The joints; none where no joint alone would help.
     """
-    found: list[Move] = []
-    now = count(q)
-    wanted = now + missing
-    while now < wanted:
+    moves: list[Move] = []
+    determined = count(q)
+    wanted = determined + missing
+    while determined < wanted:
         tried = _tried(robot, q, count, wanted)
-        # Of equal joints, the one that has to move least, and then that moved least.
+        # Ties: the least wanted range, then the least present range.
         best = max(
             tried, key=lambda value: (tried[value], -value.wanted, -value.moved), default=None
         )
-        if best is None or tried[best] <= now:
+        if best is None or tried[best] <= determined:
             break
-        found.append(best)
-        q, now = _range_of(robot, q, best.joint, best.wanted), tried[best]
-    return tuple(found)
+        moves.append(best)
+        q, determined = _range_of(robot, q, best.joint, best.wanted), tried[best]
+    return tuple(moves)
 
 
 def _tried(
     robot: Robot, q: FloatArray, count: Callable[[FloatArray], int], wanted: int
 ) -> dict[Move, int]:
-    """What one joint determines if it moves farther, by ranges up to one that determines all."""
+    """Directions determined with one joint's wider range, by ranges up to a sufficient one."""
     moved = np.ptp(q, axis=0)
     tried: dict[Move, int] = {}
     for span in _SPANS_RAD:

@@ -1,8 +1,8 @@
-"""A fixture's frame from touches of its origin, its x axis and its xy plane.
+"""Fixture frame from touches of its origin, its x axis and its xy plane.
 
-In the fixture's frame a touch of the origin is off by three numbers, one of the x axis by its y and
-z, one of the xy plane by its z. Where it lies along the axis or in the plane says nothing, except
-on which side: x and y are positive there. Any number of each are fitted together.
+In the fixture's frame a touch of the origin has three residuals, one of the x axis its y and z, one
+of the xy plane its z. Its position along the axis or in the plane only matters by its side: x and y
+are positive there. Any number of each are fitted together.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,12 +35,12 @@ _ZEROS: Mapping[str, tuple[bool, bool, bool]] = MappingProxyType(
     {"origin": (True, True, True), "x": (False, True, True), "xy": (False, False, True)}
 )
 FEATURE_KINDS: tuple[FeatureKind, ...] = ("origin", "x", "xy")
-# As many starts from one touch of each kind are tried.
+# Most starts from one touch of each kind.
 _SETS = 60
-# The determinant of axes is one, or zero where there are none.
+# Least determinant of axes: it is one, or zero for collinear touches.
 _IS_FRAME = 0.5
-# Touches so near to the start, as a share of the farthest one's distance, may be on either side:
-# noise puts them there, and they do no harm.
+# Touches nearer to the start than this share of the farthest one's distance may be on either side,
+# by noise; they do no harm.
 _BEHIND = 0.1
 
 
@@ -50,9 +50,9 @@ class FeatureTouches:
 
     Attributes:
         labels: (n,) the touches' names.
-        kinds: (n,) what was touched.
+        kinds: (n,) the touched features.
         points: (n, 3) in the base [m].
-        covariances: (n, 3, 3) what is known of their noise [m^2]; zeros where nothing is.
+        covariances: (n, 3, 3) stated covariance of their noise [m^2]; zeros where none is.
     """
 
     labels: tuple[str, ...]
@@ -64,8 +64,8 @@ class FeatureTouches:
         return len(self.labels)
 
     def rows(self, kind: FeatureKind) -> IntArray:
-        """Numbers of the touches of a kind."""
-        return np.array([at for at, name in enumerate(self.kinds) if name == kind], dtype=np.int64)
+        """Rows of the touches of a kind."""
+        return np.array([i for i, name in enumerate(self.kinds) if name == kind], dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,13 @@ class FeatureFit:
     """A fixture's frame from n touches of its features.
 
     Attributes:
-        agreement: Which touches agree, and their fit. Its residuals are in the fixture's frame [m],
-            zero where a touch says nothing.
-        noise_m: Noise of a touch per axis, beyond what is known of each [m]: estimated where there
-            are touches to spare, else the expected one, else zero where each touch's own is known;
+        agreement: The inlier touches, and their fit. Its residuals are in the fixture's frame [m],
+            zero where a coordinate is unconstrained.
+        noise_m: Noise of a touch per axis, beyond its stated one [m]: estimated where there are
+            redundant touches, else the expected one, else zero where each touch's own is stated;
             None where nothing determines it.
-        worst: The worst known offset, and the worst known rotation. Where nothing determines the
-            noise they are those of a careful touch.
+        worst: The least certain offset, and the least certain rotation. Where nothing determines
+            the noise they are those of a careful touch.
     """
 
     agreement: GroupInliers[FloatArray]
@@ -101,7 +101,7 @@ class FeatureFit:
 
     @property
     def by_points(self) -> FloatArray:
-        """(n, 6, 3) how the frame's right perturbation moves with each touched point."""
+        """(n, 6, 3) Jacobian of the frame's right perturbation by each touched point."""
         fit = self.agreement.fit
         observed = np.where(fit.groups.observed[:, :, None], fit.state[:3, :3].T, 0.0)
         return np.asarray(fit.gains @ observed)
@@ -114,7 +114,7 @@ class FeatureProblem:
     touches: FeatureTouches
 
     def guesses(self) -> Iterator[FloatArray]:
-        """Gives the frame from the means of each kind, then from one touch of each."""
+        """The frame from the means of each kind, then from one touch of each."""
         points = self.touches.points
         kinds = [self.touches.rows(kind) for kind in FEATURE_KINDS]
         yield _frame_from(*(points[rows].mean(axis=0) for rows in kinds))
@@ -122,11 +122,11 @@ class FeatureProblem:
         if len(sets) > _SETS:
             sets = np.random.default_rng(0).choice(sets, _SETS, replace=False)
         frames = (_frame_from(*points[rows]) for rows in sets)
-        # Three touches on one line make no frame, and nothing would contradict what is none.
+        # Collinear touches determine no frame, and no other touch would contradict it.
         yield from (frame for frame in frames if np.linalg.det(frame[:3, :3]) > _IS_FRAME)
 
     def linearise(self, state: FloatArray) -> Groups:
-        """Residuals (n, 3) in the fixture's frame, and their derivatives by its perturbation.
+        """Residuals (n, 3) in the fixture's frame, and their Jacobian by its perturbation.
 
         A step (w, v) on the right moves a point `q` of the fixture's frame by `q x w - v`.
         """
@@ -147,8 +147,8 @@ class FeatureProblem:
 
 
 def _frame_from(origin: FloatArray, on_x: FloatArray, in_xy: FloatArray) -> FloatArray:
-    """Builds the (4, 4) frame of three points: on the origin, the x axis and the xy plane."""
-    # Of points on a line axes are zero, and the determinant is.
+    """The (4, 4) frame of three points: on the origin, the x axis and the xy plane."""
+    # For collinear points axes are zero, and so is the determinant.
     x = on_x - origin
     x = x / max(float(np.linalg.norm(x)), np.finfo(float).tiny)
     z = np.cross(x, in_xy - origin)
@@ -161,11 +161,11 @@ def fit_features(touches: FeatureTouches, expected_noise_m: float | None = None)
 
     Args:
         touches: At least one of each kind.
-        expected_noise_m: Noise that is to be expected of a touch per axis, beyond what is known of
-            each [m]; None where nobody knows.
+        expected_noise_m: Expected noise of a touch per axis, beyond its stated one [m]; None where
+            unknown.
 
     Returns:
-        The frame, how well it is known, and which touches agree.
+        The frame with its covariance, and the inlier touches.
 
     Raises:
         DataError: A kind is missing, touches of one kind lie on both sides of the origin, or the
@@ -197,8 +197,8 @@ def _noise_of(
         return fit.sigma
     if expected_noise_m is not None:
         return expected_noise_m
-    known = np.trace(touches.covariances[fit.used], axis1=1, axis2=2)
-    return 0.0 if np.all(known > 0.0) else None
+    stated = np.trace(touches.covariances[fit.used], axis1=1, axis2=2)
+    return 0.0 if np.all(stated > 0.0) else None
 
 
 def _check_kinds(touches: FeatureTouches) -> None:
@@ -220,7 +220,7 @@ def _check_kinds(touches: FeatureTouches) -> None:
 
 
 def _check_sides(touches: FeatureTouches) -> None:
-    """Refuses touches from which no axes follow: too near, or on both sides."""
+    """Refuses touches that do not determine the axes: too near, or on both sides."""
     origin = touches.points[touches.rows("origin")].mean(axis=0)
     along = touches.points[touches.rows("x")] - origin
     _check_one_side(touches, "x", along, "origin", LEAST_NOISE_M)
@@ -233,11 +233,11 @@ def _check_sides(touches: FeatureTouches) -> None:
 
 
 def _check_one_side(
-    touches: FeatureTouches, kind: FeatureKind, away: FloatArray, start: str, least_m: float
+    touches: FeatureTouches, kind: FeatureKind, vectors: FloatArray, start: str, least_m: float
 ) -> None:
-    """Checks (k, 3) ways from the origin, or from the x axis, to the touches of a kind."""
+    """Checks (k, 3) vectors from the origin, or from the x axis, to the touches of a kind."""
     names = [touches.labels[at] for at in touches.rows(kind)]
-    distances = np.linalg.norm(away, axis=1)
+    distances = np.linalg.norm(vectors, axis=1)
     farthest = int(np.argmax(distances))
     if distances[farthest] <= least_m:
         axes = "y and z axes" if kind == "x" else "x axis"
@@ -248,7 +248,7 @@ def _check_one_side(
             culprits=names,
             next_step=f"Touch a point far from the {start}.",
         )
-    shares = away @ away[farthest] / distances[farthest] ** 2
+    shares = vectors @ vectors[farthest] / distances[farthest] ** 2
     behind = [name for name, share in zip(names, shares, strict=True) if share < -_BEHIND]
     if behind:
         raise DataError(
@@ -260,11 +260,11 @@ def _check_one_side(
 
 
 def _contradiction(touches: FeatureTouches, fit: GroupFit[FloatArray]) -> DataError:
-    off = np.linalg.norm(fit.groups.residuals, axis=1)
-    rms_mm, worst = 1e3 * np.sqrt(np.mean(off**2)), int(np.argmax(off))
+    distances = np.linalg.norm(fit.groups.residuals, axis=1)
+    rms_mm, worst = 1e3 * np.sqrt(np.mean(distances**2)), int(np.argmax(distances))
     return DataError(
         f"fixture: the touches contradict each other: they are {rms_mm:.3g} mm off (root mean "
-        f"square), most of all {touches.labels[worst]} with {1e3 * off[worst]:.3g} mm.",
+        f"square), most of all {touches.labels[worst]} with {1e3 * distances[worst]:.3g} mm.",
         culprits=[touches.labels[worst]],
         next_step="Check their kinds and touch the worst again.",
     )

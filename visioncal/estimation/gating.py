@@ -1,4 +1,4 @@
-"""Telling wrong corners and wrong views from noise by their reprojection residuals."""
+"""Outlier rejection of corners and views by their reprojection residuals."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.corners import CornerStack, mean_square_by_view
 from visioncal.estimation.poses import determines_pose
 
-# Views differ in noise by two or so, and eight sigma of all are four of the noisiest; a corner that
-# belongs elsewhere is off by a good part of a square.
+# Views differ in noise by a factor of two or so: eight sigma of all are four of the noisiest. A
+# wrong corner is off by a good part of a square.
 _CORNER_SIGMAS = 8.0
 # Views differ in blur and distance, so that their noise differs by two or three; a view with a
 # wrong layout, a moving board or another board is off by far more.
 _VIEW_RATIO = 5.0
-# No corner and no view is thrown out for less [px]: such errors do no harm.
+# Least rejection limits [px]: smaller errors do no harm.
 _CORNER_FLOOR_PX, _VIEW_FLOOR_PX = 0.5, 1.0
-# A view that loses more than this share of its corners is wrong as a whole; so is one whose
+# A view that loses more than this share of its corners is rejected as a whole; so is one whose
 # remaining corners do not determine its pose.
 _CORNER_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Gate:
-    """What passes: an (n,) mask of corners, and the reason for each view thrown out."""
+    """Result of the gate: an (n,) mask of inlier corners, and a reason for each rejected view."""
 
     mask: Mask
     reasons: Mapping[int, str]
@@ -36,15 +36,7 @@ class Gate:
 
 
 def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
-    """Finds the corners and the views whose residuals are no noise.
-
-    Args:
-        stack: The corners.
-        residuals: (n, 2) their reprojection residuals [px].
-
-    Returns:
-        The corners that pass and the views that do not.
-    """
+    """Finds the corners, and views, whose reprojection residuals (n, 2) [px] exceed noise."""
     # Median of the length of a two-dimensional Gaussian: sqrt(2 ln 2) sigma (Rayleigh).
     length = np.linalg.norm(residuals, axis=1)
     sigma = np.median(length) / np.sqrt(2 * np.log(2))
@@ -53,18 +45,18 @@ def gate(stack: CornerStack, residuals: FloatArray) -> Gate:
     rms = np.sqrt(mean_square_by_view(stack, residuals))
     limit = max(_VIEW_RATIO * float(np.median(rms)), _VIEW_FLOOR_PX)
     kept = stack.sum_by_view(passes.astype(float))
-    # A few wrong corners spoil a view's rms without spoiling the view.
+    # A view's rms without its wrong corners, which do not make the view wrong.
     inner = np.sqrt(mean_square_by_view(stack, residuals * passes[:, None]))
     reasons = {}
     ends = stack.starts + stack.counts
     for at, view in enumerate(stack.views):
-        mine = slice(stack.starts[at], ends[at])
+        rows = slice(stack.starts[at], ends[at])
         if (rms[at] > limit) & (inner[at] > limit):
             reasons[view] = (
                 f"residual too large: {rms[at]:.2f} px (limit {limit:.2f}, set by the other views)"
             )
         elif kept[at] < (1 - _CORNER_SHARE) * stack.counts[at] or (
-            kept[at] < stack.counts[at] and not determines_pose(stack.points[mine][passes[mine]])
+            kept[at] < stack.counts[at] and not determines_pose(stack.points[rows][passes[rows]])
         ):
             reasons[view] = (
                 f"residual too large: only {kept[at]:.0f} of {stack.counts[at]} corners fit one "

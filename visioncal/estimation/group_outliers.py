@@ -1,4 +1,4 @@
-"""Which groups of residuals are outliers: wrong touches and points, separated from noise."""
+"""Outlier rejection for groups of residuals: wrong touches and points."""
 
 from dataclasses import dataclass, replace
 from math import comb
@@ -12,28 +12,27 @@ from visioncal.estimation.groups import GroupFit, GroupProblem, State, descended
 from visioncal.estimation.linalg import covariance_from, gram, squared_lengths
 from visioncal.estimation.robust import Distances, half_of, settled, trimmed_start, widened
 
-# Noise leaves sound groups out in one set of a thousand.
+# Share of outlier-free sets in which noise rejects a group.
 _FALSE_ALARM = 1e-3
-# Where fewer than this share of the groups agree, which of them are right is unknown.
+# Least share of inlier groups; with fewer, the outliers cannot be identified.
 _LEAST_SHARE = 0.5
-# One group is called wrong when that is so many times as likely as any other being it.
+# Odds over any other group at which a single group is called the outlier.
 _ODDS = 100.0
 
 
 @dataclass(frozen=True, eq=False)
 class GroupInliers(Generic[State]):
-    """The groups that agree, and their fit.
+    """The inlier groups, and their fit.
 
     Attributes:
-        fit: From the groups that agree.
+        fit: From the inlier groups.
         agrees: (m,) mask of them.
-        mahalanobis_sq: (m,) squared Mahalanobis distance of each group from what the others
-            predict, over the number of directions in which they predict it: one on average where
-            it is noise.
-        limit: (m,) what it may be; infinite where the others do not predict the group at all.
+        mahalanobis_sq: (m,) squared Mahalanobis distance of each group from the prediction of the
+            others, over the number of predicted directions: one on average for noise.
+        limit: (m,) its rejection limit; infinite where the others do not predict the group at all.
         doubtful: (m,) groups of which some are wrong, not known which: all of them stay.
-        explained: Whether noise explains the groups that stay: none is doubtful, and their misfit
-            is within the chi-square limit of the expected level, where one was given.
+        explained: Whether noise explains the inliers: none is doubtful, and their misfit is within
+            the chi-square limit of the expected level, where one was given.
     """
 
     fit: GroupFit[State]
@@ -45,7 +44,7 @@ class GroupInliers(Generic[State]):
 
     @property
     def off_m(self) -> FloatArray:
-        """(m,) how far each group is off, in as many directions as are observed [m]."""
+        """(m,) residual distance of each group over the observed directions [m]."""
         return np.asarray(np.linalg.norm(self.fit.groups.residuals, axis=1))
 
 
@@ -54,37 +53,38 @@ def agreeing_groups(
     expected_sigma: float | None = None,
     start: tuple[Mask, State] | None = None,
 ) -> GroupInliers[State]:
-    """Finds the groups that agree with each other, and fits the unknowns to them.
+    """Finds the inlier groups, and fits the unknowns to them.
 
     Args:
-        problem: What is to be fitted.
-        expected_sigma: Level of noise to be expected of one residual [m]: what stays is compared
-            with it, and it stands for the level where there is no freedom. None where unknown.
-        start: (m,) the groups that are thought to agree, and the state that they agree on; None
-            for a search without any idea.
+        problem: The problem to fit.
+        expected_sigma: Expected noise of one residual [m]: the inliers' misfit is tested against
+            it, and it is the level where there are no degrees of freedom. None where unknown.
+        start: (m,) presumed inliers, and the state by them; None for a search from scratch.
 
     Returns:
-        The groups that agree. Where fewer than half do, the right ones are unknown: all stay.
+        The inliers. Where fewer than half are, the outliers cannot be identified: all stay.
     """
     expected = 0.0 if expected_sigma is None else expected_sigma
     guess = None if start is None else start[1]
-    everything = fit_groups(problem, start=guess, expected_sigma=expected)
-    count = len(everything.used)
-    fit, doubtful = everything, np.zeros(count, dtype=bool)
-    if everything.freedom > 1:
+    all_groups = fit_groups(problem, start=guess, expected_sigma=expected)
+    count = len(all_groups.used)
+    fit, doubtful = all_groups, np.zeros(count, dtype=bool)
+    if all_groups.freedom > 1:
         first = _core(problem, count) if start is None else fit_groups(problem, *start)
         fit = settled(_GroupSearch(problem), first.used, first, fewest=1, suspect=0.0)[1]
         if fit.used.sum() < max(_LEAST_SHARE * count, 1) or fit.freedom < 1:
-            fit = everything
+            fit = all_groups
         doubtful = _doubtful(fit)
         if doubtful.any():
             fit = fit_groups(problem, fit.used | doubtful, fit.state)
-    away = distances(fit)
-    per = np.maximum(away.directions, 1)
+    found = distances(fit)
+    counts = np.maximum(found.directions, 1)
     explained = not doubtful.any() and (
         expected_sigma is None or _is_explained(fit, expected_sigma)
     )
-    return GroupInliers(fit, fit.used, away.squares / per, away.limit / per, doubtful, explained)
+    return GroupInliers(
+        fit, fit.used, found.squares / counts, found.limit / counts, doubtful, explained
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,81 +98,81 @@ class _GroupSearch(Generic[State]):
 
     def distances(self, used: Mask, fit: GroupFit[State]) -> Distances:
         found = distances(fit)
-        # Without any freedom, nothing contradicts anything.
+        # Without degrees of freedom nothing is rejected.
         return found if fit.freedom > 0 else replace(found, squares=np.zeros(len(used)))
 
 
 def distances(fit: GroupFit[State]) -> Distances:
-    """How far each group is from what the other groups predict.
+    """Mahalanobis distance of each group from the prediction of the other groups.
 
     For a group inside the fit this is the deletion residual's, by the identity of Cook and Weisberg
-    (1982, section 2.2): its covariance is that of the noise less what the fit has taken.
+    (1982, section 2.2): its covariance is that of the noise less the fit's leverage.
     """
     groups = fit.groups
     covariance = groups.covariance(fit.sigma)
-    taken = groups.jacobian @ fit.covariance @ np.swapaxes(groups.jacobian, 1, 2)
-    left = covariance + np.where(fit.used, -1.0, 1.0)[:, None, None] * taken
-    squares, directions = squared_lengths(groups.residuals, left, covariance)
+    leverage = groups.jacobian @ fit.covariance @ np.swapaxes(groups.jacobian, 1, 2)
+    residual_covariance = covariance + np.where(fit.used, -1.0, 1.0)[:, None, None] * leverage
+    squares, directions = squared_lengths(groups.residuals, residual_covariance, covariance)
     directions = directions - np.sum(~groups.observed, axis=1)
-    # The level is estimated from the residuals that stay, which gives the squares the tails of an F
-    # distribution; and the sets that stay were chosen for their small level among all of their
-    # size. Half of the false alarms go to the first group that is left out, a quarter to the next.
+    # The level is estimated from the inliers' residuals, which gives the squares an F distribution;
+    # and the inliers were selected for their small level among all sets of their size. Half of the
+    # false alarms go to the first excluded group, a quarter to the next.
     excluded = int(np.sum(~fit.used))
     share = _FALSE_ALARM / 2.0**excluded / comb(len(fit.used), excluded)
-    there = np.maximum(directions, 1)
-    limit = there * f_limit(share, there, max(fit.freedom, 1))
+    positive = np.maximum(directions, 1)
+    limit = positive * f_limit(share, positive, max(fit.freedom, 1))
     return Distances(squares, directions, np.where(directions > 0, limit, np.inf))
 
 
 def _core(problem: GroupProblem[State], count: int) -> GroupFit[State]:
-    """The trimmed start, and all groups within its reach."""
+    """Least-trimmed-squares start, extended by all groups it predicts."""
     groups = problem.linearise(next(iter(problem.guesses())))
     even = np.eye(groups.residuals.shape[1])[None].repeat(count, axis=0)
-    # So that groups of different size compare.
+    # Makes groups of different size comparable.
     typical = chi2_limit(0.5, np.maximum(groups.observed.sum(axis=1), 1))
 
-    def away(state: State) -> FloatArray:
+    def normalised_squares(state: State) -> FloatArray:
         return np.asarray(np.sum(problem.linearise(state).residuals ** 2, axis=1) / typical)
 
     def solve(mask: Mask, state: State) -> State:
         return descended(problem, state, mask, even)[0]
 
-    mask, state = trimmed_start(problem.guesses(), away, solve, half_of(count))
+    mask, state = trimmed_start(problem.guesses(), normalised_squares, solve, half_of(count))
     fit = fit_groups(problem, mask, state)
     return widened(_GroupSearch(problem), mask, fit, np.ones(count, dtype=bool))[1]
 
 
 def _doubtful(fit: GroupFit[State]) -> Mask:
-    """Groups that disagree, of which the wrong ones are unknown."""
-    # Each excluded group is set against each that stays: under the mean-shift model, with a level
-    # of noise that is unknown, the odds of the one being wrong rather than the other are those of
-    # what is left of the squared residuals without it (Cook and Weisberg 1982, section 2.2.2).
+    """Groups among which the outliers cannot be identified."""
+    # Each excluded group is compared with each inlier: under the mean-shift model with unknown
+    # noise, the odds of one or the other being wrong are those of the squared residuals left
+    # without it (Cook and Weisberg 1982, section 2.2.2).
     doubtful = np.zeros(len(fit.used), dtype=bool)
-    for one in np.flatnonzero(~fit.used):
-        both = fit.used.copy()
-        both[one] = True
-        left = _left_without(fit, both)
-        rivals = fit.used & (left < left[one] * _ODDS ** (2.0 / max(fit.freedom, 1)))
+    for excluded in np.flatnonzero(~fit.used):
+        used = fit.used.copy()
+        used[excluded] = True
+        squares = _squares_without(fit, used)
+        rivals = fit.used & (squares < squares[excluded] * _ODDS ** (2.0 / max(fit.freedom, 1)))
         if rivals.any():
             doubtful |= rivals
-            doubtful[one] = True
+            doubtful[excluded] = True
     return doubtful
 
 
-def _left_without(fit: GroupFit[State], used: Mask) -> FloatArray:
-    """What is left (m,) of the whitened squared residuals without each group of a mask in turn."""
+def _squares_without(fit: GroupFit[State], used: Mask) -> FloatArray:
+    """Whitened squared residuals (m,) left without each group of a mask in turn."""
     inside = fit.groups.subset(used)
     covariance = inside.covariance(fit.sigma)
     fitted = covariance_from(inside.information(fit.sigma))
     gradient = gram(np.linalg.solve(covariance, inside.jacobian), inside.residuals)
     residuals = inside.residuals - inside.jacobian @ (fitted @ gradient)
-    whole = np.einsum(
+    total = np.einsum(
         "mi,mi->", residuals, np.linalg.solve(covariance, residuals[..., None])[..., 0]
     )
-    taken = inside.jacobian @ fitted @ np.swapaxes(inside.jacobian, 1, 2)
-    left = np.full(len(used), np.inf)
-    left[used] = whole - squared_lengths(residuals, covariance - taken, covariance)[0]
-    return np.asarray(np.maximum(left, np.finfo(float).eps * whole))
+    leverage = inside.jacobian @ fitted @ np.swapaxes(inside.jacobian, 1, 2)
+    squares = np.full(len(used), np.inf)
+    squares[used] = total - squared_lengths(residuals, covariance - leverage, covariance)[0]
+    return np.asarray(np.maximum(squares, np.finfo(float).eps * total))
 
 
 def _is_explained(fit: GroupFit[State], expected_sigma: float) -> bool:

@@ -1,8 +1,8 @@
-"""Least squares over small groups of residuals, each of which is right or wrong as a whole.
+"""Least squares over small groups of residuals, each of which is an inlier or outlier as a whole.
 
 A group is one touch of a tool or one measured point: a few residuals [m] that share one error. The
-covariance of a group is what is known of it beforehand, plus one unknown level of noise per axis:
-`known + sigma^2 I`, with sigma by restricted maximum likelihood.
+covariance of a group is its stated one plus one unknown level of noise per axis: `known + sigma^2
+I`, with sigma by restricted maximum likelihood.
 """
 
 from collections.abc import Iterable
@@ -26,22 +26,22 @@ from visioncal.estimation.variance import (
 State = TypeVar("State")
 
 _ROUNDS = 10
-_SETTLED = 1e-10
-# Under this scaled eigenvalue ratio the groups do not determine a direction.
-_OPEN_RATIO = 1e-10
-# Noise levels are started from above: at least here [m].
+_CONVERGED = 1e-10
+# Scaled eigenvalue ratio below which a direction is undetermined.
+_NULL_RATIO = 1e-10
+# Least start of the noise level [m]: it is searched from above.
 _START_SIGMA = 5e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """A problem at one state: m groups of up to d residuals, which p unknowns explain.
+    """A problem linearised at one state: m groups of up to d residuals, by p unknowns.
 
     Attributes:
         residuals: (m, d) [m], zero where not observed.
-        jacobian: (m, d, p) their derivatives by the unknowns' steps, zero where not observed.
-        observed: (m, d) mask of the residuals that there are: groups may be smaller than d.
-        known: (m, d, d) covariance that is known beforehand [m^2]; zeros where nothing is.
+        jacobian: (m, d, p) by the unknowns' steps, zero where not observed.
+        observed: (m, d) mask of the existing residuals: groups may be smaller than d.
+        known: (m, d, d) stated covariance [m^2]; zeros where none is.
     """
 
     residuals: FloatArray
@@ -62,7 +62,7 @@ class Groups:
         )
 
     def covariance(self, sigma: float) -> FloatArray:
-        """Covariances (m, d, d) at a level of noise [m]; one where nothing was observed."""
+        """Covariances (m, d, d) at a noise level [m]; identity where nothing was observed."""
         return self._components().total(np.array([sigma]))
 
     def _components(self) -> Components:
@@ -73,7 +73,7 @@ class Groups:
         )
 
     def level(self, start: float, *, free: bool = True) -> tuple[float, float]:
-        """The most likely noise [m] and its negative log-likelihood; those of the start if held."""
+        """Maximum-likelihood noise [m] and its negative log-likelihood; at the start if held."""
         size = self.jacobian.shape[2]
         sigmas, value = estimate_sigmas(
             self.residuals,
@@ -86,29 +86,29 @@ class Groups:
         return float(sigmas[0]), value
 
     def information(self, sigma: float) -> FloatArray:
-        """Fisher information (p, p) on the unknowns at a level of noise [m]."""
+        """Fisher information (p, p) of the unknowns at a noise level [m]."""
         weighted = np.linalg.solve(self.covariance(sigma), self.jacobian)
         return gram(self.jacobian, weighted)
 
     @property
     def freedom(self) -> int:
-        """How many more residuals were observed than directions of the unknowns determined."""
+        """Degrees of freedom: residuals observed less directions determined."""
         values = spectrum(gram(self.jacobian, self.jacobian)).values
-        return int(self.observed.sum() - np.sum(values > _OPEN_RATIO * values[-1]))
+        return int(self.observed.sum() - np.sum(values > _NULL_RATIO * values[-1]))
 
 
 class GroupProblem(Protocol[State]):
-    """What is to be fitted: the unknowns are a state, and steps of (p,) numbers move it."""
+    """A problem to fit: the unknowns are a state, and steps of (p,) numbers move it."""
 
     def guesses(self) -> Iterable[State]:
-        """Gives starts: the first from all groups, more from small sets (see `robust.small_sets`).
+        """Yields starts: the first from all groups, more from small sets (see `robust.small_sets`).
 
-        Each must lie near the answer where its set is sound; others may be anywhere.
+        Each must lie near the solution if its set has no outliers; others may be anywhere.
         """
         ...
 
     def linearise(self, state: State) -> Groups:
-        """Gives the residuals of all m groups at a state, and their derivatives."""
+        """Residuals of all m groups at a state, and their Jacobian."""
         ...
 
     def move(self, state: State, step: FloatArray) -> State:
@@ -118,18 +118,17 @@ class GroupProblem(Protocol[State]):
 
 @dataclass(frozen=True, eq=False)
 class GroupFit(Generic[State]):
-    """The answer from some groups.
+    """Fit to some of the groups.
 
     Attributes:
-        state: The most likely unknowns.
-        covariance: (p, p) of their steps; a direction that the groups leave open has a large but
-            finite variance.
-        sigma: Most likely noise of one residual [m], beyond what is known beforehand. Where the
-            groups have no freedom left it is the expected one.
-        freedom: How many more residuals were used than unknowns determined.
-        groups: All groups at rest, used or not.
-        used: (m,) mask of the groups that it was made from.
-        settled: Whether the state came to rest.
+        state: The maximum-likelihood unknowns.
+        covariance: (p, p) of their steps; undetermined directions have a large but finite variance.
+        sigma: Maximum-likelihood noise of one residual [m], beyond the stated one; the expected one
+            where there are no degrees of freedom.
+        freedom: Degrees of freedom: residuals used less directions determined.
+        groups: All groups at the solution, used or not.
+        used: (m,) mask of the groups of the fit.
+        settled: Whether the state converged.
     """
 
     state: State
@@ -142,10 +141,9 @@ class GroupFit(Generic[State]):
 
     @property
     def gains(self) -> FloatArray:
-        """(m, p, d) how the unknowns' step moves with each group's residuals; zero if unused.
+        """(m, p, d) gain: derivative of the unknowns by each group's residuals; zero if unused.
 
-        By these an error that several groups share, and that their weights do not know of, is
-        carried to the answer.
+        It propagates an error that several groups share, and that their weights do not model.
         """
         weights = np.linalg.inv(self.groups.covariance(self.sigma))
         weighted = np.where(self.used[:, None, None], weights @ self.groups.jacobian, 0.0)
@@ -172,20 +170,21 @@ def fit_groups(
     start: State | None = None,
     expected_sigma: float = 0.0,
 ) -> GroupFit[State]:
-    """Fits the unknowns and the noise's level to some groups.
+    """Fits the unknowns and the noise level to some groups.
 
     Args:
-        problem: What is to be fitted.
+        problem: The problem to fit.
         used: (m,) mask of the groups to use; all where None.
-        start: Where to start; the problem's first guess where None.
-        expected_sigma: Level of noise that is taken where the groups leave no freedom for it [m].
+        start: Start; the problem's first guess where None.
+        expected_sigma: Noise level where there are no degrees of freedom [m].
     """
     state = next(iter(problem.guesses())) if start is None else start
     groups = problem.linearise(state)
     chosen = np.ones(len(groups), dtype=bool) if used is None else used
     sigma, settled = _rms(groups.subset(chosen)), False
     for _ in range(_ROUNDS):
-        # Held at the start: weights that follow the state would reward states with large noise.
+        # Weights are held during the descent: weights that follow the state would favour states
+        # with large noise.
         weights = np.asarray(np.linalg.inv(groups.covariance(sigma)), dtype=float)
         state, settled = descended(problem, state, chosen, weights)
         groups = problem.linearise(state)
@@ -235,4 +234,4 @@ def descended(
             lambda damping: problem.move(at, damped_step(information, gradient, damping)),
         )
 
-    return levenberg_marquardt(start, linearise, _SETTLED)
+    return levenberg_marquardt(start, linearise, _CONVERGED)

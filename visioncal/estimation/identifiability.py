@@ -1,9 +1,9 @@
-"""Identifiability: the errors of an arm that the stops determine, and that any posture would.
+"""Identifiability of an arm's errors: by given stops, and by any postures.
 
-Slopes are taken in units of the noise by rows and of the errors' own size by columns, and the
-frames at both ends of the chain, of which nothing is known, are taken out. A singular value is then
-how much better the stops know a direction than it was known before: over one, it is determined.
-Observability indices are of the same singular values.
+Jacobians are in units of the noise by rows and of the errors' prior size by columns, and the frames
+at both ends of the chain, without a prior, are projected out. A singular value is then the ratio of
+prior to measurement sigma of a direction: over one, it is determined. Observability indices are of
+the same singular values.
 """
 
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from scipy.linalg import svd
 
 from visioncal.core.types import FloatArray
 
-# Directions that move the pose by less than this share of the best determined move nothing.
+# Directions whose singular value is below this share of the largest are unidentifiable.
 LEAST_SHARE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """What stops determine of an arm.
+    """Identifiable and determined errors of an arm.
 
     Attributes:
-        columns: How many values are carried: the frames' and the arm's errors.
-        identifiable: How many of them, or of their combinations, any postures distinguish.
-        determined: How many of them the stops determine better than they were known before.
-        values: (L,) singular values of the arm's part of what is determined, in descending order.
+        columns: Number of unknowns: of the frames and of the arm's errors.
+        identifiable: Number of them, or of their combinations, that any postures could determine.
+        determined: Number of them that the stops determine better than the prior.
+        values: (L,) singular values of the determined directions of the arm, descending.
         missing: (p, k) the k directions of the arm's errors identifiable but not determined.
     """
 
@@ -38,20 +38,20 @@ class Identifiability:
 
 @dataclass(frozen=True, eq=False)
 class Jacobians:
-    """How what is seen moves with the frames at both ends and the arm's errors.
+    """Jacobians of the observations by the frames at both ends and by the arm's errors.
 
     Attributes:
         frames: (r, f) by the frames.
-        arm: (r, p) by the arm's errors, each in its own size.
+        arm: (r, p) by the arm's errors, in units of their prior size.
     """
 
     frames: FloatArray
     arm: FloatArray
 
     def free(self) -> tuple[int, FloatArray]:
-        """How many directions of the frames show, and (r, p) what of the arm they cannot imitate.
+        """Rank of the frames, and (r, p) the arm's Jacobian projected off them.
 
-        Both are exact where nothing is known of the frames.
+        Both are exact where the frames have no prior.
         """
         scale = np.linalg.norm(self.frames, axis=0)
         shown = scale > LEAST_SHARE * scale.max()
@@ -61,49 +61,44 @@ class Jacobians:
 
 
 def identifiability(stops: Jacobians, anywhere: Jacobians) -> Identifiability:
-    """Counts what stops determine, and what any stops could.
-
-    Args:
-        stops: Slopes at the stops.
-        anywhere: Slopes at postures all over the workspace.
-    """
-    most, free = anywhere.free()
-    sizes, turned = right_vectors(free)
-    can = turned[sizes > LEAST_SHARE * sizes[0]]
-    seen, values, here = _determined(stops)
-    # What is identifiable and not among what is determined; both are spanned by unit vectors.
-    missing = _singular(can.T - here.T @ (here @ can.T))[0]
+    """Counts the directions that stops determine, and that postures over the workspace could."""
+    frame_rank, free = anywhere.free()
+    sizes, vectors = right_vectors(free)
+    shown = vectors[sizes > LEAST_SHARE * sizes[0]]
+    frames_determined, values, determined = _determined(stops)
+    # The identifiable space without the determined one; both have orthonormal bases.
+    missing = _singular(shown.T - determined.T @ (determined @ shown.T))[0]
     return Identifiability(
         columns=stops.frames.shape[1] + stops.arm.shape[1],
-        identifiable=most + len(can) + stops.frames.shape[1] - anywhere.frames.shape[1],
-        determined=seen + len(values),
+        identifiable=frame_rank + len(shown) + stops.frames.shape[1] - anywhere.frames.shape[1],
+        determined=frames_determined + len(values),
         values=values,
-        missing=missing[:, : max(len(can) - len(values), 0)],
+        missing=missing[:, : max(len(shown) - len(values), 0)],
     )
 
 
 def count_determined(jacobian: Jacobians) -> int:
-    """How many values and combinations are determined better than they were known before."""
-    seen, values, _ = _determined(jacobian)
-    return seen + len(values)
+    """Number of directions determined better than the prior."""
+    frame_rank, values, _ = _determined(jacobian)
+    return frame_rank + len(values)
 
 
 def _determined(jacobian: Jacobians) -> tuple[int, FloatArray, FloatArray]:
-    """Directions of the frames, and values and directions (k, p) of the arm that are determined."""
-    seen, free = jacobian.free()
-    sizes, turned = right_vectors(free)
-    return seen, sizes[sizes > 1.0], turned[sizes > 1.0]
+    """Rank of the frames, and singular values and directions (k, p) of determined arm errors."""
+    frame_rank, free = jacobian.free()
+    sizes, vectors = right_vectors(free)
+    return frame_rank, sizes[sizes > 1.0], vectors[sizes > 1.0]
 
 
 def right_vectors(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Singular values (k,) of an (r, k) matrix, zeros among them, and (k, k) right vectors."""
+    """Singular values (k,) of an (r, k) matrix, including zeros, and (k, k) right vectors."""
     padded = np.vstack([matrix, np.zeros((matrix.shape[1],) * 2)])
-    _, sizes, turned = _singular(np.asarray(np.linalg.qr(padded, mode="r")))
-    return sizes, turned
+    _, sizes, vectors = _singular(np.asarray(np.linalg.qr(padded, mode="r")))
+    return sizes, vectors
 
 
 def _singular(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The thin singular value decomposition of a matrix that may lack directions."""
+    """Thin singular value decomposition of a matrix that may be rank deficient."""
     # Divide and conquer, which numpy has, does not converge on some of these.
     left, sizes, right = svd(matrix, full_matrices=False, lapack_driver="gesvd")
     return left, sizes, right
@@ -111,13 +106,13 @@ def _singular(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Indices:
-    """What has been proposed to compare sets of stops by; all are larger where stops are better.
+    """Observability indices, by which sets of stops are compared; larger is better.
 
-    With the singular values s_1 >= ... >= s_L of the slopes by what is determined, over m stops:
+    With the singular values s_1 >= ... >= s_L of the determined directions, over m stops:
 
     Attributes:
-        o1: `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14): the volume that noise
-            fills.
+        o1: `(s_1 ... s_L)^(1/L) / sqrt(m)` (Borm and Menq 1991, eq. 14): the noise ellipsoid's
+            volume.
         o2: `s_L / s_1`, one over the condition number (Driels and Pathre 1990).
         o3: `s_L` (Nahvi, Hollerbach and Hayward 1994).
         o4: `s_L^2 / s_1`, the noise amplification index (Nahvi and Hollerbach 1996, eq. 9).
@@ -137,12 +132,7 @@ class Indices:
 
     @classmethod
     def of(cls, values: FloatArray, stops: int) -> "Indices":
-        """Computes the indices.
-
-        Args:
-            values: (L,) singular values of what is determined, none of them zero.
-            stops: How many stops of the arm they are of.
-        """
+        """Computes the indices from (L,) nonzero singular values, and the number of stops."""
         least, greatest = float(values.min()), float(values.max())
         mean = float(np.exp(np.mean(np.log(values))))
         return cls(

@@ -1,12 +1,12 @@
-"""Functions of the joints: repeatable errors of each angle over its turn, beyond links and gears.
+"""Joint functions: periodic errors of each joint angle, beyond links and gears.
 
-Encoders and their mounts err by some tenths of a milliradian in a way that comes back every turn
-and is no low harmonic. Each joint's error is a periodic Gaussian process (MacKay 1998),
-`s^2 exp(-2 sin^2(d/2) / l^2)` for two angles d apart, carried as harmonics with the variances of
-that kernel's Fourier series; all joints have one size s and one length l. Beside it are twists of
-the links, gravity and the first two harmonics, each group with a size of its own. All sizes are by
-restricted likelihood with log-normal priors, the length on a grid (Gilmour, Thompson and Cullis
-1995 for the steps, Harville 1977 for the likelihood).
+Encoders and their mounts err by some tenths of a milliradian, repeatably over each turn, with more
+than low harmonics. Each joint's error is a periodic Gaussian process (MacKay 1998), `s^2 exp(-2
+sin^2(d/2) / l^2)` for two angles d apart, represented by harmonics with the variances of that
+kernel's Fourier series; all joints share one size s and one length l. Beside it are twists of the
+links, gravity and the first two harmonics, each group with a size of its own. All sizes are
+estimated by restricted likelihood with log-normal priors, the length on a grid (Gilmour, Thompson
+and Cullis 1995 for the steps, Harville 1977 for the likelihood).
 """
 
 from collections.abc import Mapping
@@ -32,19 +32,20 @@ from visioncal.estimation.variance import (
     most_likely,
 )
 
-# Twice the gain in log-likelihood over the same arm without them.
+# Least twice gain in log-likelihood over the same arm without them.
 SIGNIFICANT = 20.0
-# With all other sizes as they are without functions, these show at least such a share of that: of
-# functions that are just significant, half of it or more.
+# Least share of that gain with all other sizes held: functions that are just significant have half
+# of it or more.
 _LEAST_SHARE = 0.25
-# Lengths that are tried [rad], the longest first, and how many lengths' inverses of harmonics are
-# carried: beyond, three thousandths of the variance are left.
+# Lengths tried [rad], longest first, and the highest harmonic in inverse lengths: three thousandths
+# of the variance lie beyond.
 _LENGTHS_RAD, _CARRIED = (0.5, 0.25, 0.12, 0.06, 0.03), 3.0
-# After so many lengths that are less likely than a longer one no shorter one is tried.
+# Shorter lengths are not tried after this many that are less likely than a longer one.
 _WORSE = 2
-# Combinations of harmonics of which a unit moves all stops by less are not carried [rad, m].
-_SHOWN = 5e-3
-# Typical sizes of errors [rad], give or take a factor of e, and the torque of a spring's [N m].
+# Combinations of harmonics that move all stops by less per unit are dropped [rad, m].
+_LEAST_MOTION = 5e-3
+# Typical sizes of errors [rad], with a log-normal prior of a factor of e, and the torque of a
+# compliance's [N m].
 _TYPICAL = {
     "links": 7e-4,
     COMPLIANCE: 1e-4,
@@ -56,27 +57,27 @@ _TYPICAL = {
     HARMONICS: 2e-4,
 }
 _TORQUE_NM, _SPREAD, _START_RAD = 10.0, 1.0, 2e-4
-# A step that gains less of the log-likelihood is none.
+# Least gain in log-likelihood of a step; relative ridge of the information.
 _LITTLE, _RIDGE = 1e-2, 1e-12
-# Combinations of harmonics that residuals determine by less than this share of what is known of
-# them beforehand are no unknowns: they stay as open as they were.
+# Least ratio of data to prior information of combinations that are unknowns; others keep their
+# prior.
 _INFORMATIVE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class JointFunctions:
-    """What was found of the functions of an arm's joints.
+    """Estimated functions of an arm's joints.
 
     Attributes:
-        errors: The errors of the whole arm by block, with the sizes that were found beside them.
+        errors: The errors of the whole arm by block, with their re-estimated sizes.
         levels: (r, 2) of the robots' noise beside them; see `Noise`.
         sizes: (2 n k,) of sine and cosine of each joint and order from 2 on, relative to that of
             their block.
-        directions: (2 n k, r) what each value of their block makes of these: combinations that the
+        directions: (2 n k, r) Jacobian of these by the block's values: combinations that the
             observations determine.
         sigma_rad: Their size s [rad].
-        length_rad: Over which change of its angle a joint's error changes [rad].
-        gain: Twice the gain in log-likelihood over the arm as stated.
+        length_rad: Correlation length l over the joint angle [rad].
+        gain: Twice the gain in log-likelihood over the nominal arm.
     """
 
     errors: Mapping[str, ArmErrors]
@@ -89,7 +90,7 @@ class JointFunctions:
 
 
 def most_orders() -> int:
-    """How many orders of harmonics, from 2 on, the shortest length takes."""
+    """Number of orders of harmonics, from 2 on, for the shortest length."""
     return _orders_of(min(_LENGTHS_RAD))
 
 
@@ -112,54 +113,54 @@ def find_joint_functions(
     harmonics: FloatArray,
     torque_nm: float,
 ) -> JointFunctions | None:
-    """Looks for functions of the joints of one robot's arm.
+    """Estimates the joint functions of one robot's arm, if they are significant.
 
     Args:
         problem: The observations, without errors of this arm.
-        state: The answer with the nominal arm.
-        noise: The levels of the sensors; those of robots are sought anew.
+        state: The solution with the nominal arm.
+        noise: The noise levels; those of robots are re-estimated.
         robot: The robot.
-        bases: (s, 6, p) by stop, how the flange moves with the errors of each other block.
+        bases: (s, 6, p) by stop, Jacobian of the flange by the errors of each other block.
         harmonics: (s, 6, n, k, 2) the same for sine and cosine of each joint and order from 2 on.
-        torque_nm: The torque that a unit of a compliance is for [N m].
+        torque_nm: The torque of a unit compliance [N m].
 
     Returns:
-        The functions with all other errors of the arm; None where these explain about as much.
+        The functions with all other errors of the arm; None where the gain is not significant.
     """
-    nominal, place = robot_likelihood(problem, state, noise), problem.robots.index(robot)
-    plain = _ArmLikelihood.of(nominal, place, bases, _Waves.of(harmonics), torque_nm)
+    nominal, index = robot_likelihood(problem, state, noise), problem.robots.index(robot)
+    plain = _ArmLikelihood.of(nominal, index, bases, _Waves.of(harmonics), torque_nm)
     without = plain.most_likely(plain.start())
     if without is None:
         return None
-    # The longest length has no longer one to be worse than.
-    chosen, best, worse, weighed = None, without, -1, plain.weighed(without)
+    # The longest length has no longer one to compare with.
+    chosen, best, worse, weighted = None, without, -1, plain.weighed(without)
     for length in _LENGTHS_RAD:
-        arm = _ArmLikelihood.of(nominal, place, bases, _Waves.of(harmonics, length), torque_nm)
-        # Of what seems not to gain enough, the rest of the way does not matter.
-        _, gain = weighed.likely_size(arm.functions, arm.mine)
-        found = None
+        arm = _ArmLikelihood.of(nominal, index, bases, _Waves.of(harmonics, length), torque_nm)
+        # Skips the search where the gain seems too small.
+        _, gain = weighted.likely_size(arm.functions, arm.mine)
+        sizes = None
         if 2.0 * gain > _LEAST_SHARE * SIGNIFICANT:
-            found = arm.most_likely(
+            sizes = arm.most_likely(
                 np.append(best.logs[: len(without.logs)], np.log(_START_RAD)),
                 without.value - 0.5 * SIGNIFICANT,
             )
-        if found is None or (chosen is not None and found.value > best.value):
+        if sizes is None or (chosen is not None and sizes.value > best.value):
             worse += 1
         else:
-            chosen, best, worse = arm, found, 0
+            chosen, best, worse = arm, sizes, 0
         if worse == _WORSE:
             break
     if chosen is None or 2.0 * (without.value - best.value) < SIGNIFICANT:
         return None
-    # Springs that would yield against their load are none.
-    while (against := chosen.springs_of(best) < 0.0).any():
-        bases = {**bases, COMPLIANCE: bases[COMPLIANCE] * ~against}
-        stiffer = _ArmLikelihood.of(nominal, place, bases, chosen.waves, torque_nm)
-        found = stiffer.most_likely(best.logs)
-        if found is None:
+    # Negative compliances are set to zero.
+    while (negative := chosen.compliances_of(best) < 0.0).any():
+        bases = {**bases, COMPLIANCE: bases[COMPLIANCE] * ~negative}
+        constrained = _ArmLikelihood.of(nominal, index, bases, chosen.waves, torque_nm)
+        sizes = constrained.most_likely(best.logs)
+        if sizes is None:
             break
-        chosen, best = stiffer, found
-    return chosen.found(best, 2.0 * (nominal.white[1] - best.value))
+        chosen, best = constrained, sizes
+    return chosen.assembled(best, 2.0 * (nominal.white[1] - best.value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +168,12 @@ class _Waves:
     """The harmonics of a process as columns.
 
     Attributes:
-        columns: (s, 6, 2 n + r) how the flange moves with sine and cosine of order 2 of each joint,
-            and with r combinations of higher orders in units of the process.
-        series: (k + 1,) variances of the process's orders, from 1 on; of no process 0.
-        expanded: (2 n k, 2 n + r) what each column is of sine and cosine of each joint and order.
-        seconds: How many columns 2 n are of order 2.
-        length_rad: Of the process; 0 of none.
+        columns: (s, 6, 2 n + r) Jacobian of the flange by sine and cosine of order 2 of each joint,
+            and by r combinations of higher orders in units of the process.
+        series: (k + 1,) variances of the process's orders, from 1 on; zeros without a process.
+        expanded: (2 n k, 2 n + r) each column in terms of sine and cosine of each joint and order.
+        seconds: Number 2 n of columns of order 2.
+        length_rad: Length of the process; 0 of none.
     """
 
     columns: FloatArray
@@ -191,31 +192,31 @@ class _Waves:
         second = harmonics[:, :, :, 0].reshape(stops, 6, -1)
         higher = (harmonics[:, :, :, 1:orders] * sizes).reshape(6 * stops, -1)
         values, vectors = np.linalg.eigh(higher.T @ higher)
-        shown = vectors[:, values > _SHOWN**2]
-        shape = (joints, orders - 1, 2, shown.shape[1])
-        expanded = np.zeros((joints, orders, 2, 2 * joints + shown.shape[1]))
+        kept = vectors[:, values > _LEAST_MOTION**2]
+        shape = (joints, orders - 1, 2, kept.shape[1])
+        expanded = np.zeros((joints, orders, 2, 2 * joints + kept.shape[1]))
         expanded[:, 0, :, : 2 * joints] = np.eye(2 * joints).reshape(joints, 2, -1)
-        expanded[:, 1:, :, 2 * joints :] = sizes[..., None] * shown.reshape(shape)
-        columns = np.concatenate([second, (higher @ shown).reshape(stops, 6, -1)], axis=2)
+        expanded[:, 1:, :, 2 * joints :] = sizes[..., None] * kept.reshape(shape)
+        columns = np.concatenate([second, (higher @ kept).reshape(stops, 6, -1)], axis=2)
         rows = expanded.reshape(2 * joints * orders, -1)
         return cls(columns, series, rows, 2 * joints, length_rad)
 
 
 @dataclass(frozen=True, eq=False)
 class _ArmLikelihood:
-    """An arm with groups of errors whose sizes are sought.
+    """Likelihood of an arm with groups of errors of unknown sizes.
 
     Attributes:
         nominal: The likelihood without errors of the arm.
-        mine: (u,) the units of the robot: no other has anything of its errors.
-        own: (m, 6 w, p) how what these say moves with the unknowns, the arm's errors last.
-        others: (u - m, 6 w, p - q) the same of the others, without the arm's errors.
-        known: What is known of the unknowns besides.
+        mine: (u,) the units of the robot: no other depends on its errors.
+        own: (m, 6 w, p) Jacobian of these units by the unknowns, the arm's errors last.
+        others: (u - m, 6 w, p - q) that of the other units, without the arm's errors.
+        known: Prior information on the unknowns.
         names: The groups, in the order of the sizes.
-        shares: (q, g) which share of the variance of each error a group's is.
+        shares: (q, g) variance of each error per unit variance of each group.
         bases: The columns of each block but the harmonics.
         waves: The harmonics.
-        torque_nm: The torque that a unit of a compliance is for [N m].
+        torque_nm: The torque of a unit compliance [N m].
     """
 
     nominal: RobotLikelihood
@@ -256,16 +257,16 @@ class _ArmLikelihood:
 
     @property
     def random(self) -> slice:
-        """The places of the arm's errors among the unknowns."""
+        """Slice of the arm's errors among the unknowns."""
         return slice(self.others.shape[2], None)
 
     @property
     def functions(self) -> FloatArray:
-        """(m, 6 w, q) how what units say moves with the process, for a size of one."""
+        """(m, 6 w, q) Jacobian of the units by the process, for a size of one."""
         return np.asarray(self.own[:, :, self.random] * np.sqrt(self.shares[:, -1]))
 
     def weighed(self, step: "_SizesAt") -> Weighed:
-        """What units say, weighed by the levels and sizes of some step."""
+        """The units, weighted by some levels and sizes."""
         components, known = self.nominal.components, self.known
         levels, count = len(components.parts), self.others.shape[2]
         jacobian = np.zeros((*self.nominal.reduced.errors.shape, self.own.shape[2]))
@@ -281,13 +282,13 @@ class _ArmLikelihood:
             step.logs[:levels],
         )
 
-    def springs_of(self, step: "_SizesAt") -> FloatArray:
-        """(n,) the compliances at some step; none without any."""
-        at = 0
+    def compliances_of(self, step: "_SizesAt") -> FloatArray:
+        """(n,) the compliances at some sizes; empty without any."""
+        column = 0
         for name, base in self.bases.items():
             if name == COMPLIANCE:
-                return step.effects[at : at + base.shape[2]]
-            at += base.shape[2]
+                return step.effects[column : column + base.shape[2]]
+            column += base.shape[2]
         return np.zeros(0)
 
     def start(self) -> FloatArray:
@@ -303,7 +304,7 @@ class _ArmLikelihood:
         return np.log([_TYPICAL[name] * factor.get(name, 1.0) for name in self.names])
 
     def most_likely(self, start: FloatArray, enough: float = np.inf) -> "_SizesAt | None":
-        """Finds the most likely levels and sizes; None where there are none to start from."""
+        """Maximum-likelihood levels and sizes; None where the start is singular."""
         low, high = (np.full(len(start), np.log(value)) for value in (LEAST_SIGMA, MOST_SIGMA))
         try:
             return most_likely(self._likelihood, start, low, high, 0.0, enough, little=_LITTLE)[1]
@@ -324,76 +325,77 @@ class _ArmLikelihood:
         diagonal = np.arange(count, len(information))
         information[diagonal, diagonal] += 1.0 / variances
         inverse, log_determinant = _inverted(information)
-        pull = gram(weighted, residuals[mine]) + known.gradient
-        pull[:count] += gram(rest, residuals[~mine])
-        best, left = inverse @ pull, residuals.copy()
-        left[mine] -= self.own @ best
-        left[~mine] -= plain @ best[:count]
-        pulled = (weights @ left[:, :, None])[:, :, 0]
-        effects = best[self.random]
+        gradient = gram(weighted, residuals[mine]) + known.gradient
+        gradient[:count] += gram(rest, residuals[~mine])
+        estimate, residual_left = inverse @ gradient, residuals.copy()
+        residual_left[mine] -= self.own @ estimate
+        residual_left[~mine] -= plain @ estimate[:count]
+        weighted_residuals = (weights @ residual_left[:, :, None])[:, :, 0]
+        effects = estimate[self.random]
         value = 0.5 * float(
             np.linalg.slogdet(total)[1].sum()
             + log_determinant
             + np.log(variances).sum()
-            + np.einsum("ui,ui->", left, pulled)
-            + best @ (known.information @ best - 2.0 * known.gradient)
+            + np.einsum("ui,ui->", residual_left, weighted_residuals)
+            + estimate @ (known.information @ estimate - 2.0 * known.gradient)
             + np.sum(effects**2 / variances)
         )
         growth = 2.0 * sigmas[:, None, None] ** 2 * components.parts
-        taken = np.array([
+        traces = np.array([
             np.sum(inverse * weighted_gram(weighted, value[mine]))
             + np.sum(inverse[inner] * weighted_gram(rest, value[~mine]))
             for value in growth
         ])  # fmt: skip
         own = np.diagonal(weights, axis1=1, axis2=2)
-        by_levels = 0.5 * (np.einsum("kui,ui->k", growth, own - pulled**2) - taken)
-        asked = growth * pulled
-        owned = self.shares * squares
+        by_levels = 0.5 * (np.einsum("kui,ui->k", growth, own - weighted_residuals**2) - traces)
+        growth_residuals = growth * weighted_residuals
+        size_variances = self.shares * squares
         posterior = np.diag(inverse)[self.random] + effects**2
-        by_sizes = (1.0 / variances - posterior / variances**2) @ owned
-        # Products of the residuals' growth with each level and size, as the average information.
-        moved = 2.0 * owned * (effects / variances)[:, None]
-        grown = np.zeros((*residuals.shape, levels + len(squares)))
-        grown[..., :levels] = np.moveaxis(asked, 0, 2)
-        grown[mine, :, levels:] = self.own[:, :, self.random] @ moved
-        of_weights = gram(weighted, grown[mine])
-        of_weights[:count] += gram(rest, grown[~mine])
-        curvature = 0.5 * (gram(grown, weights @ grown) - of_weights.T @ inverse @ of_weights)
-        slope = np.concatenate([by_levels, by_sizes])
-        away = (logs[levels:] - self._typical) / _SPREAD
-        slope[levels:] += away / _SPREAD
-        curvature[levels:, levels:] += np.eye(len(away)) / _SPREAD**2
-        value += 0.5 * float(away @ away)
-        found = ratio_prior(range(levels // 2)).beside(Likely(value, slope, curvature), logs)
-        # Residuals fall as errors that are left out of the prediction grow.
-        return _SizesAt(found.value, found.slope, found.curvature, logs, -effects)
+        by_sizes = (1.0 / variances - posterior / variances**2) @ size_variances
+        # Working variates: derivatives of the covariance by each level and size times the weighted
+        # residuals; their products give the average information.
+        effect_growth = 2.0 * size_variances * (effects / variances)[:, None]
+        working = np.zeros((*residuals.shape, levels + len(squares)))
+        working[..., :levels] = np.moveaxis(growth_residuals, 0, 2)
+        working[mine, :, levels:] = self.own[:, :, self.random] @ effect_growth
+        projected = gram(weighted, working[mine])
+        projected[:count] += gram(rest, working[~mine])
+        curvature = 0.5 * (gram(working, weights @ working) - projected.T @ inverse @ projected)
+        gradients = np.concatenate([by_levels, by_sizes])
+        deviation = (logs[levels:] - self._typical) / _SPREAD
+        gradients[levels:] += deviation / _SPREAD
+        curvature[levels:, levels:] += np.eye(len(deviation)) / _SPREAD**2
+        value += 0.5 * float(deviation @ deviation)
+        full = ratio_prior(range(levels // 2)).beside(Likely(value, gradients, curvature), logs)
+        # Residuals have the opposite sign of the prediction.
+        return _SizesAt(full.value, full.slope, full.curvature, logs, -effects)
 
-    def found(self, step: "_SizesAt", gain: float) -> JointFunctions:
+    def assembled(self, step: "_SizesAt", gain: float) -> JointFunctions:
         """The errors of all blocks with the sizes at some step."""
         sizes = np.exp(step.logs[-len(self.names) :])
         variances, sigma = self.shares @ sizes**2, float(sizes[-1])
-        share, errors, at = gain / (len(self.bases) + 1), {}, 0
+        block_gain, errors, start = gain / (len(self.bases) + 1), {}, 0
         for name, basis in self.bases.items():
-            size_rad = float(np.sqrt(variances[at]))
-            errors[name] = ArmErrors(basis, size_rad, share, of_links=True)
-            at += basis.shape[2]
-        own, waves = np.sqrt(variances[at:]), self.waves
-        known = own[:, None] * self._determined(step.logs, own) / sigma
-        errors[HARMONICS] = ArmErrors(waves.columns @ known, sigma, share, of_links=True)
-        of_orders = np.sqrt(waves.series[1:])
-        of_orders[0] = own[0] / sigma
+            size_rad = float(np.sqrt(variances[start]))
+            errors[name] = ArmErrors(basis, size_rad, block_gain, of_links=True)
+            start += basis.shape[2]
+        own, waves = np.sqrt(variances[start:]), self.waves
+        determined = own[:, None] * self._determined(step.logs, own) / sigma
+        errors[HARMONICS] = ArmErrors(waves.columns @ determined, sigma, block_gain, of_links=True)
+        order_sizes = np.sqrt(waves.series[1:])
+        order_sizes[0] = own[0] / sigma
         return JointFunctions(
             errors,
             np.exp(step.logs[: -len(self.names)]).reshape(-1, 2),
-            np.tile(np.repeat(of_orders, 2), waves.seconds // 2),
-            waves.expanded @ known,
+            np.tile(np.repeat(order_sizes, 2), waves.seconds // 2),
+            waves.expanded @ determined,
             sigma,
             waves.length_rad,
             gain,
         )
 
     def _determined(self, logs: FloatArray, sizes: FloatArray) -> FloatArray:
-        """(q, r) unit vectors, in units of (q,) sizes, of harmonics that residuals determine."""
+        """(q, r) orthonormal combinations, in units of (q,) sizes, of determined harmonics."""
         components = self.nominal.components
         weights = np.linalg.inv(components.total(np.exp(logs[: len(components.parts)]))[self.mine])
         jacobian = self.own[:, :, -len(sizes) :] * sizes
@@ -403,10 +405,10 @@ class _ArmLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class _SizesAt(Likely):
-    """What is found at some logarithms of levels and sizes; its curvature is average information.
+    """Likelihood at some levels and sizes; its curvature is average information.
 
     Attributes:
-        logs: The logarithms.
+        logs: The logarithms of levels and sizes.
         effects: (q,) the most likely errors of the arm.
     """
 
@@ -415,10 +417,10 @@ class _SizesAt(Likely):
 
 
 def _inverted(information: FloatArray) -> tuple[FloatArray, float]:
-    """The inverse of (p, p) information, and the logarithm of its determinant.
+    """Inverse of (p, p) information, and the logarithm of its determinant.
 
     Raises:
-        LinAlgError: It has none.
+        LinAlgError: It is singular.
     """
     diagonal = np.diag(information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))

@@ -1,9 +1,9 @@
-"""An arm's own errors as unknowns of the chain: offsets of its joints, its links, its gears.
+"""Fits of the chain with an arm's errors as unknowns: joint offsets, links, gears, compliance.
 
-Every effect is a set of columns: how the flange moves with it at each stop. All columns are
-carried, however redundant, as random effects of one size a block, which restricted likelihood
-estimates: what the data cannot determine stays as stated, and what they can is estimated at its
-bound (Harville 1977, section 4, for the linear mixed model).
+Every effect is a set of columns: the flange's Jacobian at each stop. All columns are carried,
+however redundant, as random effects of one size per block, which restricted likelihood estimates:
+what the data do not determine stays nominal, and the rest is estimated at its bound (Harville 1977,
+section 4, for the linear mixed model).
 """
 
 from collections.abc import Mapping
@@ -28,11 +28,11 @@ from visioncal.estimation.solve import (
 
 @dataclass(frozen=True)
 class Blocks:
-    """What is free at a level.
+    """Free blocks of errors at a level.
 
     Attributes:
-        names: Blocks of the arm's errors, in the order in which they are looked for.
-        own: Those that make the level what it is: without one of them it is another.
+        names: Blocks of the arm's errors, in the order of the search.
+        own: Blocks that define the level: without any of them it is another.
     """
 
     names: tuple[str, ...]
@@ -57,15 +57,14 @@ _RIGID = Blocks((), ())
 
 @dataclass(frozen=True, eq=False)
 class LevelFit:
-    """The fit with the errors of one level of a robot's arm free.
+    """Fit with the errors of one level of a robot's arm free.
 
     Attributes:
-        errors: The errors by block; empty for the arm as stated.
-        fit: The unknowns and the noise.
-        gain: Twice the gain in log-likelihood over the arm as stated.
+        errors: The errors by block; empty for the nominal arm.
+        gain: Twice the gain in log-likelihood over the nominal arm.
         inside: (m, 6) residuals of the robot's observations (rotation [rad], translation [m]).
-        left_out: (m, 6) the same of each stop from a fit without it, to first order.
-        has_rotation: (m,) which of them say anything of a rotation.
+        left_out: (m, 6) leave-one-out residuals of each stop, to first order.
+        has_rotation: (m,) which observations include a rotation.
     """
 
     errors: Mapping[str, ArmErrors]
@@ -77,20 +76,18 @@ class LevelFit:
 
     @property
     def size(self) -> int:
-        """How many columns are carried."""
+        """Number of columns."""
         return sum(error.basis.shape[2] for error in self.errors.values())
 
 
 @dataclass(frozen=True, eq=False)
 class ArmTrials:
-    """Fits with errors of one robot's arm, each made once: levels begin with the same blocks.
+    """Cached fits with errors of one robot's arm: levels begin with the same blocks.
 
     Attributes:
         problem: The observations, without errors of this arm.
-        state: Where to start.
-        robot: The robot.
         bases: (s, 6, p) by stop, columns of each block of errors by its name.
-        noise: The noise's levels to start from; those from above where None.
+        noise: Starts of the noise levels; default starts where None.
     """
 
     problem: Problem
@@ -105,16 +102,16 @@ class ArmTrials:
     )
 
     def erring(self, errors: Mapping[str, ArmErrors]) -> Problem:
-        """The observations with errors of the arm among the unknowns."""
+        """The problem with errors of the arm among the unknowns."""
         effects = [error.effect(self.robot, name) for name, error in errors.items()]
         return self.problem.with_effects([*self.problem.effects, *effects])
 
     def fitted(self, errors: Mapping[str, ArmErrors]) -> Solution:
-        """The fit of that."""
+        """The fit with some errors of the arm."""
         key = tuple(errors.values())
         if key not in self._fits:
-            problem, fewer = self.erring(errors), self._fits.get(key[:-1])
-            state, noise = (self.state, self.noise) if fewer is None else (fewer.state, fewer.noise)
+            problem, base = self.erring(errors), self._fits.get(key[:-1])
+            state, noise = (self.state, self.noise) if base is None else (base.state, base.noise)
             added = problem.start_values[len(state.values) :]
             start = State(state.edges, np.concatenate([state.values, added]))
             self._fits[key] = fit_problem(problem, start, noise)
@@ -123,26 +120,26 @@ class ArmTrials:
     def found(
         self, among: Mapping[str, ArmErrors], basis: FloatArray, least: float = 0.0
     ) -> ArmErrors | None:
-        """Looks for errors of one more block that gain more than the least.
+        """Estimates the size of one more block's errors; None unless they gain more than `least`.
 
-        Its columns stay as long as this.
+        The basis must outlive this object.
         """
-        known = tuple(among.values())
-        key = id(basis), least, known
+        present = tuple(among.values())
+        key = id(basis), least, present
         if key not in self._found:
             fit = self.fitted(among)
-            if known not in self._likely:
-                self._likely[known] = robot_likelihood(self.erring(among), fit.state, fit.noise)
-            place = self.problem.robots.index(self.robot)
+            if present not in self._likely:
+                self._likely[present] = robot_likelihood(self.erring(among), fit.state, fit.noise)
+            index = self.problem.robots.index(self.robot)
             self._found[key] = find_arm_errors(
-                self._likely[known], place, basis, of_links=True, least=least
+                self._likely[present], index, basis, of_links=True, least=least
             )
         return self._found[key]
 
     def level(self, errors: Mapping[str, ArmErrors], gain: float) -> LevelFit:
-        """Puts a level's fit together."""
+        """Assembles a level's fit."""
         problem, fit = self.erring(errors), self.fitted(errors)
-        mine = rows_of(problem, self.robot)
+        rows = rows_of(problem, self.robot)
         rotation = [
             has and name not in problem.points
             for has, name in zip(
@@ -153,43 +150,38 @@ class ArmTrials:
             errors,
             fit,
             gain,
-            problem.linear(fit.state).residuals[mine],
-            left_out_residuals(problem, fit.state, fit.noise)[mine],
-            np.array(rotation, dtype=bool)[mine],
+            problem.linear(fit.state).residuals[rows],
+            left_out_residuals(problem, fit.state, fit.noise)[rows],
+            np.array(rotation, dtype=bool)[rows],
         )
 
 
 def fit_level(arm: ArmTrials, blocks: Blocks = _RIGID) -> LevelFit | None:
     """Fits all unknowns with some blocks of the errors of one robot's arm free.
 
-    Args:
-        arm: The observations, and what of the arm they may show.
-        blocks: Those to free; those that explain no more than chance stay out.
-
-    Returns:
-        The fit; None where nothing beyond chance makes it this level.
+    Blocks that are not significant stay out; None where no block that defines the level is.
     """
     if blocks.own and not arm.bases.keys() & set(blocks.own):
         return None
     errors: dict[str, ArmErrors] = {}
     gain, count = 0.0, -1
-    # What large errors of another block hid shows once these are free.
+    # Errors hidden by large ones of another block show once these are free.
     while len(errors) > count:
         count = len(errors)
         for name in (name for name in blocks.names if name in arm.bases and name not in errors):
-            found = arm.found(errors, arm.bases[name], SIGNIFICANT)
-            if found is not None:
-                gain += found.gain
-                errors = without_springs(arm, errors | {name: found})
+            block_errors = arm.found(errors, arm.bases[name], SIGNIFICANT)
+            if block_errors is not None:
+                gain += block_errors.gain
+                errors = without_springs(arm, errors | {name: block_errors})
     if blocks.own and not errors.keys() & set(blocks.own):
         return None
     return arm.level(errors, gain)
 
 
 def resized(arm: ArmTrials, fit: LevelFit) -> LevelFit:
-    """Estimates the size of each block's errors anew, beside those of all others.
+    """Re-estimates the size of each block's errors beside those of all others.
 
-    They were looked for one after the other: what explains the most takes too much at first.
+    They were found one after the other: the first takes a part of those that follow.
     """
     if len(fit.errors) < 2:
         return fit
@@ -201,17 +193,17 @@ def resized(arm: ArmTrials, fit: LevelFit) -> LevelFit:
 
 
 def without_springs(arm: ArmTrials, errors: Mapping[str, ArmErrors]) -> dict[str, ArmErrors]:
-    """Holds joints rigid that would yield against their load: the bound of a compliance is zero.
+    """Holds joints rigid whose fitted compliance is negative: its bound is zero.
 
-    An active set that only grows (Lawson and Hanson 1974, chapter 23, has the way back too, which
-    columns that hardly lean on one another do not need).
+    An active set that only grows (Lawson and Hanson 1974, chapter 23, can also release constraints,
+    which weakly correlated columns do not need).
     """
     kept = dict(errors)
     while COMPLIANCE in kept:
-        springs = kept[COMPLIANCE]
-        name = springs.effect(arm.robot, COMPLIANCE).name
-        bends = arm.erring(kept).values_of(name, arm.fitted(kept).state)
-        if not (bends < 0.0).any():
+        block = kept[COMPLIANCE]
+        name = block.effect(arm.robot, COMPLIANCE).name
+        compliances = arm.erring(kept).values_of(name, arm.fitted(kept).state)
+        if not (compliances < 0.0).any():
             break
-        kept[COMPLIANCE] = replace(springs, basis=springs.basis * (bends >= 0.0))
+        kept[COMPLIANCE] = replace(block, basis=block.basis * (compliances >= 0.0))
     return kept

@@ -1,10 +1,10 @@
-"""What a lens does beyond its model, as random effects: a smooth field, and focus that changes.
+"""Lens errors beyond the model, as random effects: a smooth field, and varying focus.
 
 A corner is displaced by `(b (d / d0 - 1) + j) (px - centre) + field(px)`: b is focus breathing, by
-the view's distance d over the mean one, j is focus jitter, one a view, and the field is a Gaussian
-process over the image, with a squared exponential of one length. Each has zero mean and a size of
-its own, which `lens_levels` estimates. Sizes are in units of the corners' noise: with these, what
-corners say stays that of corners of 1 px noise.
+the view's distance d over the mean one, j is focus jitter, one per view, and the field is a
+Gaussian process over the image with a squared exponential kernel of one length. Each has zero mean
+and a size of its own, which `lens_levels` estimates. Sizes are in units of the corners' noise:
+corners with these effects still have 1 px noise.
 """
 
 from dataclasses import dataclass
@@ -16,22 +16,23 @@ from visioncal.core.types import Camera, FloatArray
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.linalg import gram
 
-# Points an axis at which the field's modes are computed, and the share of its variance they keep.
+# Grid points per axis for the field's modes, and the share of its variance they keep.
 _POINTS, _KEPT = 64, 0.99
-# Directions that move all poses together by less than this share of a pose's variance move none.
+# Combinations that move all poses together by less than this share of a pose's variance are
+# neglected.
 _MOVED = 1e-2
 
 
 @dataclass(frozen=True)
 class LensLevels:
-    """Sizes of what a lens does beyond its model, over the noise of a corner's coordinate.
+    """Sizes of the lens errors beyond the model, over the noise of a corner's coordinate.
 
     Attributes:
-        field: Of the field, an axis; its standard deviation.
+        field: Standard deviation of the field, per axis.
         length: The field's length, as a share of the image's width.
-        breathing: Of the focal length's change as the distance doubles, as a share of it [1/px].
-        jitter: And from view to view [1/px].
-        gains: By how much twice the logarithm of the likelihood falls without each of the three.
+        breathing: Relative change of the focal length as the distance doubles [1/px].
+        jitter: Relative change of the focal length from view to view [1/px].
+        gains: Fall of twice the log-likelihood without each of the three.
     """
 
     field: float = 0.0
@@ -42,7 +43,7 @@ class LensLevels:
 
 
 def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> FloatArray:
-    """The modes of a field of size one, along one axis of the image: those of the other are alike.
+    """Modes of a unit field along one axis of the image; those along the other are equal.
 
     Args:
         px: (n, 2) corners [px].
@@ -50,7 +51,7 @@ def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> F
         length: The field's length, as a share of the width.
 
     Returns:
-        (n, e) displacements by coefficients of variance one.
+        (n, e) displacements for coefficients of variance one.
     """
     scale = length * resolution[0]
     (by_x, size_x), (by_y, size_y) = (
@@ -64,7 +65,7 @@ def field_modes(px: FloatArray, resolution: tuple[int, int], length: float) -> F
 
 
 def _modes(at: FloatArray, extent: float) -> tuple[FloatArray, FloatArray]:
-    """Modes along one axis at (n,) places in units of the length, and the variance of each."""
+    """Modes along one axis at (n,) positions in units of the length, and their variances."""
     grid, vectors, values = _grid_modes(extent)
     kernel = np.exp(-0.5 * (at[:, None] - grid) ** 2)
     return kernel @ (vectors / np.sqrt(values)), values / len(grid)
@@ -75,24 +76,24 @@ def _grid_modes(extent: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     grid = np.linspace(0.0, extent, _POINTS)
     values, vectors = np.linalg.eigh(np.exp(-0.5 * (grid[:, None] - grid) ** 2))
     kept = values > (1.0 - _KEPT) ** 2 * values[-1]
-    # Signs are chosen: coefficients that were stored are of the same modes on any machine.
+    # Fixed signs: stored coefficients are of the same modes on any machine.
     return grid, vectors[:, kept] * np.sign(vectors[0, kept]), values[kept]
 
 
 def zooms(stack: CornerStack, camera: Camera) -> FloatArray:
-    """(n, 2) how corners move with the focal length, by a share of it [px]."""
+    """(n, 2) derivative of the corners by the relative focal length [px]."""
     return np.asarray(stack.px - camera.matrix[2:])
 
 
 def depths_m(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
-    """(v,) mean distances of the views' corners along the camera's axis [m]."""
+    """(v,) mean depths of the views' corners along the camera's axis [m]."""
     turned = cam_from_target[:, 2, :3][stack.view_of]
     depth = np.sum(turned * stack.points, axis=1)
     return np.asarray(stack.sum_by_view(depth) / stack.counts + cam_from_target[:, 2, 3])
 
 
 def distances(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
-    """(v,) distances of the views' corners over the mean one, less one."""
+    """(v,) depths of the views over the mean one, less one."""
     far = depths_m(stack, cam_from_target)
     return np.asarray(far / far.mean() - 1.0)
 
@@ -100,7 +101,7 @@ def distances(stack: CornerStack, cam_from_target: FloatArray) -> FloatArray:
 def breathing_columns(
     stack: CornerStack, camera: Camera, cam_from_target: FloatArray, size: float
 ) -> FloatArray:
-    """(n, 2, 1) what breathing of some size displaces; (n, 2, 0) where it has none."""
+    """(n, 2, 1) displacement by breathing of some size; (n, 2, 0) for size zero."""
     if size == 0.0:
         return np.zeros((len(stack.px), 2, 0))
     far = distances(stack, cam_from_target)[stack.view_of]
@@ -110,7 +111,7 @@ def breathing_columns(
 def displacements(
     px: FloatArray, camera: Camera, far: FloatArray | float, levels: LensLevels
 ) -> FloatArray:
-    """What field and breathing displace, by coefficients of variance one.
+    """Displacements by field and breathing, for coefficients of variance one.
 
     Args:
         px: (n, 2) pixels.
@@ -119,29 +120,29 @@ def displacements(
         levels: The sizes.
 
     Returns:
-        (n, 2, m) in the unit of the levels; those of breathing, where it has a size, come last.
+        (n, 2, m) in the unit of the levels; breathing, if any, comes last.
     """
-    found = np.zeros((len(px), 2, 0))
+    columns = np.zeros((len(px), 2, 0))
     if levels.field > 0.0:
         modes = levels.field * field_modes(px, camera.resolution, levels.length)
-        found = np.einsum("ij,ne->nije", np.eye(2), modes).reshape(len(px), 2, -1)
+        columns = np.einsum("ij,ne->nije", np.eye(2), modes).reshape(len(px), 2, -1)
     if levels.breathing > 0.0:
         share = levels.breathing * np.broadcast_to(far, len(px))
         breath = share[:, None] * (px - camera.matrix[2:])
-        found = np.concatenate([found, breath[:, :, None]], axis=2)
-    return found
+        columns = np.concatenate([columns, breath[:, :, None]], axis=2)
+    return columns
 
 
 @dataclass(frozen=True, eq=False)
 class Coefficients:
-    """What corners say of coefficients of variance one, in units of the corners' noise.
+    """Estimated coefficients of variance one, in units of the corners' noise.
 
     Attributes:
         mean: (m,) the most likely ones.
-        slope: (m, k) how these move with what is shared.
-        open: (m, o) roots of their covariance, as far as poses move with them.
-        rest: (m, m - o) roots of what is left of it.
-        freedom: How many of them the corners determine.
+        slope: (m, k) their derivative by the shared unknowns.
+        open: (m, o) roots of their covariance that move poses.
+        rest: (m, m - o) roots of the rest of it.
+        freedom: Number of coefficients that the corners determine.
     """
 
     mean: FloatArray
@@ -159,27 +160,27 @@ class Coefficients:
         by_coefficients: FloatArray,
         poses: FloatArray,
     ) -> "Coefficients":
-        """Solves for them.
+        """Solves for the coefficients.
 
         Args:
-            information: (m, m) of the corners alone, the poses being free.
-            between: (m, k) that with what is shared.
+            information: (m, m) of the corners alone, the poses eliminated.
+            between: (m, k) that with the shared unknowns.
             gradient: (m,) of half the squared error.
-            by_coefficients: (v, 6, m) how poses move with them.
-            poses: (v, 6, 6) information on these.
+            by_coefficients: (v, 6, m) derivative of the poses by the coefficients.
+            poses: (v, 6, 6) information on the poses.
         """
         root = np.linalg.cholesky(information + np.eye(len(information)))
         both = np.column_stack([between, gradient, np.eye(len(root))])
         solved = np.linalg.solve(root.T, np.linalg.solve(root, both))
         inverse = solved[:, between.shape[1] + 1 :]
-        inward = np.linalg.inv(root).T
-        moved = by_coefficients @ inward
-        values, vectors = np.linalg.eigh(gram(moved, poses @ moved))
-        moving = values > _MOVED
+        inverse_root = np.linalg.inv(root).T
+        pose_changes = by_coefficients @ inverse_root
+        values, vectors = np.linalg.eigh(gram(pose_changes, poses @ pose_changes))
+        visible = values > _MOVED
         return cls(
             -solved[:, between.shape[1]],
             -solved[:, : between.shape[1]],
-            inward @ vectors[:, moving],
-            inward @ vectors[:, ~moving],
+            inverse_root @ vectors[:, visible],
+            inverse_root @ vectors[:, ~visible],
             float(len(root) - np.trace(inverse)),
         )

@@ -1,4 +1,4 @@
-"""The null space of an arm's parameters, in words: of any stops, and of these."""
+"""Null space of an arm's parameters, in words: of any stops, and of given ones."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from visioncal.robot import Robot, parallel_axes
 
 # Entries of a null direction below this share of its largest are rounding.
 _NOTHING = 1e-6
-# How much of a direction a parameter must make up, as a share of the most, to be named with it.
+# Least share of the largest for a parameter to be named, and most named.
 _NAMED_SHARE, _MOST_NAMED = 0.5, 3
 _WORDS = {
     "theta": "offset",
@@ -29,11 +29,11 @@ _WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class Null:
-    """The changes of a table's numbers that no stops of the arm can determine.
+    """Changes of a table's parameters that no stops of the arm can determine.
 
     Attributes:
-        directions: (r, k) reduced to row echelon form: each but for a few numbers is zero.
-        frames: (12, r) how the frames of the base and of what the arm carries make up for each.
+        directions: (r, k) in reduced row echelon form: only a few parameters are nonzero in each.
+        frames: (12, r) compensating changes of the base frame and of the carried frame.
     """
 
     directions: FloatArray
@@ -41,65 +41,55 @@ class Null:
 
 
 def null_of(jacobian: Jacobians) -> Null:
-    """Finds what no stops can determine.
-
-    Args:
-        jacobian: By the frames and by the table's numbers, at postures all over the workspace.
-    """
+    """Null space of a table's parameters, by Jacobians at postures all over the workspace."""
     _, free = jacobian.free()
-    sizes, turned = right_vectors(free)
-    directions = _echelon(turned[sizes <= LEAST_SHARE * sizes[0]])
-    made_up = np.linalg.lstsq(jacobian.frames, jacobian.arm @ directions.T, rcond=LEAST_SHARE)[0]
-    return Null(directions, np.asarray(made_up))
+    sizes, vectors = right_vectors(free)
+    directions = _echelon(vectors[sizes <= LEAST_SHARE * sizes[0]])
+    frames = np.linalg.lstsq(jacobian.frames, jacobian.arm @ directions.T, rcond=LEAST_SHARE)[0]
+    return Null(directions, np.asarray(frames))
 
 
 def _echelon(rows: FloatArray) -> FloatArray:
-    """Reduced row echelon form of (r, k) independent rows, the largest pivots first."""
+    """Reduced row echelon form of (r, k) independent rows, largest pivots first."""
     rows = rows.copy()
-    for at in range(len(rows)):
-        left = np.abs(rows[at:])
-        row, column = divmod(int(np.argmax(left)), left.shape[1])
-        rows[[at, at + row]] = rows[[at + row, at]]
-        rows[at] /= rows[at, column]
-        others = np.arange(len(rows)) != at
-        rows[others] -= np.outer(rows[others, column], rows[at])
+    for pivot in range(len(rows)):
+        magnitudes = np.abs(rows[pivot:])
+        row, column = divmod(int(np.argmax(magnitudes)), magnitudes.shape[1])
+        rows[[pivot, pivot + row]] = rows[[pivot + row, pivot]]
+        rows[pivot] /= rows[pivot, column]
+        others = np.arange(len(rows)) != pivot
+        rows[others] -= np.outer(rows[others, column], rows[pivot])
     return np.where(np.abs(rows) < _NOTHING, 0.0, rows)
 
 
 def imitated(numbers: Jacobians, arm: Jacobians, directions: FloatArray) -> FloatArray:
-    """The least changes of a table's numbers that do what some errors of the arm do.
+    """Least changes (k, n) of a table's parameters equivalent to (p, n) errors of the arm.
 
-    Args:
-        numbers: Slopes by the frames and by the table's numbers, at some postures.
-        arm: Slopes by the frames and by the arm's errors, at the same.
-        directions: (p, n) errors of the arm.
-
-    Returns:
-        (k, n) changes of the numbers, in the units of their slopes.
+    The Jacobians by the parameters and by the arm's errors are at the same postures.
     """
     (_, by_numbers), (_, by_arm) = numbers.free(), arm.free()
     return np.asarray(np.linalg.lstsq(by_numbers, by_arm @ directions, rcond=LEAST_SHARE)[0])
 
 
 def null_words(null: Null, parameters: Sequence[Parameter], robot: Robot) -> Iterator[str]:
-    """Says what no stops can determine, number by number."""
+    """Yields what no stops can determine, group by group of parameters."""
     for rows in _connected(null.directions):
         involved = np.flatnonzero(null.directions[rows].any(axis=0)).tolist()
-        named = [parameters[at] for at in involved]
-        if len(named) == 1:
+        parameters_named = [parameters[index] for index in involved]
+        if len(parameters_named) == 1:
             frame = _frame(null.frames[:, rows[0]])
-            yield f"{_thing(named[0], robot)} cannot be separated from the {frame} frame"
-        elif len(rows) < len(named) - 1:
-            left = len(named) - len(rows)
-            yield f"of {_listed(named, robot)} only {left} combinations are determined"
-        elif _is_sum(null.directions[rows][:, involved], named):
-            yield f"{_summed(named, robot)}: only their sum is determined"
+            yield f"{_thing(parameters_named[0], robot)} cannot be separated from the {frame} frame"
+        elif len(rows) < len(parameters_named) - 1:
+            left = len(parameters_named) - len(rows)
+            yield f"of {_listed(parameters_named, robot)} only {left} combinations are determined"
+        elif _is_sum(null.directions[rows][:, involved], parameters_named):
+            yield f"{_summed(parameters_named, robot)}: only their sum is determined"
         else:
-            yield f"{_listed(named, robot)}: only one combination of them is determined"
+            yield f"{_listed(parameters_named, robot)}: only one combination of them is determined"
 
 
 def _connected(directions: FloatArray) -> Iterator[list[int]]:
-    """Groups rows that have numbers in common, in the order of their first numbers."""
+    """Groups rows with parameters in common, in the order of their first parameters."""
     groups: list[tuple[list[int], set[int]]] = []
     for row, numbers in enumerate(directions):
         rows, columns = [row], set(np.flatnonzero(numbers).tolist())
@@ -112,13 +102,13 @@ def _connected(directions: FloatArray) -> Iterator[list[int]]:
 
 
 def _is_sum(directions: FloatArray, named: Sequence[Parameter]) -> bool:
-    """Whether all that is lost keeps the sum of numbers of one kind."""
-    alike = len({parameter.kind for parameter in named}) == 1
-    return alike and bool(np.abs(directions.sum(axis=1)).max() < _NOTHING)
+    """Whether the null directions preserve the sum of parameters of one kind."""
+    is_one_kind = len({parameter.kind for parameter in named}) == 1
+    return is_one_kind and bool(np.abs(directions.sum(axis=1)).max() < _NOTHING)
 
 
 def _frame(frames: FloatArray) -> str:
-    """The end of the arm whose frame makes up for a change of it."""
+    """The end of the arm whose frame compensates a change."""
     base, tool = np.linalg.norm(frames.reshape(2, 6), axis=1)
     return "tool" if tool > base else "base"
 
@@ -150,9 +140,9 @@ def _listed(named: Sequence[Parameter], robot: Robot) -> str:
 
 
 def dominant_words(changes: FloatArray, parameters: Sequence[Parameter], robot: Robot) -> str:
-    """Names the numbers that make up most of (k, n) changes of a table, in units of their size."""
+    """Names the parameters with the largest (k, n) changes of a table, in units of their size."""
     sizes = np.linalg.norm(changes, axis=1)
     largest = np.argsort(-sizes, kind="stable")[:_MOST_NAMED].tolist()
-    kept = sorted(at for at in largest if sizes[at] >= _NAMED_SHARE * sizes.max())
-    words = [_thing(parameters[at], robot) for at in kept]
+    kept = sorted(index for index in largest if sizes[index] >= _NAMED_SHARE * sizes.max())
+    words = [_thing(parameters[index], robot) for index in kept]
     return listed([*words, "others"] if len(words) < changes.shape[1] else words)

@@ -1,8 +1,8 @@
-"""Which measured point is which of the drawing: exchanged and shifted numbers, found by geometry.
+"""Correspondence of measured and drawn points: swapped and shifted numbers, by geometry.
 
-Distances between points do not depend on where the part stands. Where the points as they are
-numbered do not fit the drawing, and in another order they fit far better, the order is wrong. A
-pattern that looks the same from several sides fits in several orders: then geometry leaves it open.
+Distances between points do not depend on the part's pose. Where the stated correspondence does not
+fit the drawing, and another fits far better, the stated one is wrong. A symmetric pattern fits in
+several orders: then geometry does not determine the order.
 """
 
 from collections.abc import Sequence
@@ -19,19 +19,18 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.placing import LEAST_NOISE_M
 from visioncal.estimation.procrustes import align, procrustes_residual
 
-# So many orders are all tried: seven points of seven.
+# Exhaustive search up to this number of orders: seven points of seven.
 _EXHAUSTIVE = 5040
-# Triples of drawn points that are laid on one triangle of measured ones, pairs before them, and
-# places of the drawing that are looked at more closely.
+# Most triples of drawn points aligned with one measured triangle, most pairs considered for them,
+# and most alignments refined.
 _TRIPLES, _PAIRS, _PLACES = 500, 1000, 60
-# Triangles of measured points that are looked for in the drawing: one of them may hold a wrong
-# point.
+# Number of measured triangles searched for: one of them may contain a wrong point.
 _TRIANGLES = 2
-# A wrong order is claimed in one sound set of a thousand, at most; and an order is said to fit as
-# well as the best where noise would make the difference in one case of a hundred.
+# Share of sound sets in which a wrong order is claimed; and of noise at which an order fits as well
+# as the best.
 _FALSE_ALARM, _AS_GOOD = 1e-3, 1e-2
-# Of 13 and more points the orders are so many that the test, corrected for their number, would ask
-# for the impossible; those that noise could favour move a few points only.
+# From 13 points on the orders are so many that the corrected test would never reject; those that
+# noise could favour move a few points only.
 _MOST_TRIED = 10**9
 
 
@@ -40,13 +39,13 @@ class Numbering:
     """The order in which measured points fit a drawing.
 
     Attributes:
-        assignment: (n,) which drawn point each measured one is: `arange(n)` where the order is
-            the stated one. Of several that fit equally well it is the one that moves the fewest.
+        assignment: (n,) index of the drawn point of each measured one: `arange(n)` for the stated
+            order. Of several that fit equally well it is the one that moves the fewest.
         rms_m: Root mean square distance of the points in that order [m].
         stated_rms_m: The same in the stated order [m].
-        is_wrong: Whether the stated order fits so much worse that noise does not explain it.
-        equally_good: How many orders fit as well as the best one; 1 where it is unique. Of large
-            sets not all orders are tried, and this is the least number.
+        is_wrong: Whether the stated order fits significantly worse.
+        equally_good: Number of orders that fit as well as the best one; 1 where it is unique. Of
+            large sets not all orders are tried, and this is a lower bound.
     """
 
     assignment: IntArray
@@ -62,24 +61,20 @@ class Numbering:
 
     @property
     def moved(self) -> IntArray:
-        """The measured points that are others than stated."""
+        """The measured points that differ from the stated order."""
         return np.flatnonzero(self.assignment != np.arange(len(self.assignment)))
 
     def words(self, labels: Sequence[str]) -> str:
-        """Says what is wrong with the order: `P3 and P7 are exchanged`.
+        """Words for the difference from the stated order, if any: `P3 and P7 are exchanged`.
 
-        Args:
-            labels: (m,) names of the drawn points; the first n are the stated ones.
-
-        Returns:
-            The words; empty where the order is the stated one.
+        `labels` are the (m,) names of the drawn points; the first n are the stated ones.
         """
         moved, count, drawn = self.moved, len(self.assignment), len(labels)
         if not len(moved):
             return ""
         if len(moved) == 2 and set(moved) == set(self.assignment[moved]):
             return f"{labels[moved[0]]} and {labels[moved[1]]} are exchanged"
-        pairs = [f"{labels[at]} is {labels[self.assignment[at]]}" for at in moved]
+        pairs = [f"{labels[index]} is {labels[self.assignment[index]]}" for index in moved]
         listing = ", ".join(pairs)
         if count == drawn and np.array_equal(self.assignment, np.arange(count)[::-1]):
             return f"the order is reversed: {listing}"
@@ -94,57 +89,53 @@ class Numbering:
 def find_numbering(
     measured: FloatArray, nominal: FloatArray, noise_m: float = LEAST_NOISE_M
 ) -> Numbering:
-    """Looks for the order in which measured points fit a drawing.
+    """Finds the order in which measured points best fit a drawing.
 
-    All orders are tried where they are few. Else two large triangles of measured points are looked
-    for in the drawing by their sides, and each place where one fits gives the other points to
-    their nearest ones (Kuhn 1955, with all points at once).
+    Few orders are all tried. Else two large triangles of measured points are matched with the
+    drawing by their sides, and each alignment assigns the other points to their nearest ones (Kuhn
+    1955, with all points at once).
 
     Args:
         measured: (n, 3) in any frame [m], n at least 3.
-        nominal: (m, 3) of the drawing [m]; the first n are those that the measured points are said
-            to be, and any others were not measured, by what is said.
-        noise_m: What is known of a coordinate's noise [m].
+        nominal: (m, 3) of the drawing [m]; the first n are the stated partners, any others are
+            stated as not measured.
+        noise_m: Stated noise of a coordinate [m].
 
     Returns:
-        The best order, and how it compares with the stated one.
+        The best order, and its comparison with the stated one.
     """
     count = len(measured)
     stated = np.arange(count)
     orders = np.unique(np.vstack([stated, _orders(measured, nominal)]), axis=0)
     squares = procrustes_residual(measured[None], nominal[orders])
     freedom = 3.0 * count - 6.0
-    # What noise that is known beforehand leaves in any order counts as no difference.
+    # The misfit by stated noise makes no difference between orders.
     floor = freedom * max(noise_m, LEAST_NOISE_M) ** 2
     ratio = (squares + floor) / (squares.min() + floor)
     as_good = ratio < f_limit(_AS_GOOD, freedom, freedom)
     moves = (orders != stated).sum(axis=1)
     best = int(np.lexsort((squares, moves, ~as_good))[0])
-    at = int(np.flatnonzero(moves == 0)[0])
+    stated_row = int(np.flatnonzero(moves == 0)[0])
     # Corrected for the number of orders among which the best one was chosen.
     tried = min(perm(len(nominal), count), _MOST_TRIED)
     limit = f_limit(_FALSE_ALARM / tried, freedom, freedom)
+    # Exchanging two measurements of one drawn point gives no other order.
+    distinct = np.asarray(np.unique(nominal, axis=0, return_inverse=True)[1]).ravel()
     return Numbering(
         orders[best].astype(np.int64),
         float(np.sqrt(squares[best] / count)),
-        float(np.sqrt(squares[at] / count)),
-        bool(ratio[at] > limit and not as_good[at]),
-        # Two measurements of one drawn point may be exchanged without being another order.
-        len(np.unique(_places(nominal)[orders[as_good]], axis=0)),
+        float(np.sqrt(squares[stated_row] / count)),
+        bool(ratio[stated_row] > limit and not as_good[stated_row]),
+        len(np.unique(distinct[orders[as_good]], axis=0)),
     )
 
 
-def _places(nominal: FloatArray) -> IntArray:
-    """Numbers (m,) of the drawn points' places: the same where points coincide."""
-    return np.asarray(np.unique(nominal, axis=0, return_inverse=True)[1]).ravel()
-
-
 def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
-    """Orders (k, n) among which the best one is."""
+    """Candidate orders (k, n)."""
     count, drawn = len(measured), len(nominal)
     if perm(drawn, count) <= _EXHAUSTIVE:
         return np.array(list(permutations(range(drawn), count)))
-    found = []
+    orders = []
     free = np.arange(count)
     for _ in range(_TRIANGLES):
         if len(free) < 3:
@@ -153,18 +144,18 @@ def _orders(measured: FloatArray, nominal: FloatArray) -> IntArray:
         free = np.setdiff1d(free, triangle)
         triples = _similar_triples(measured[triangle], nominal)
         placed = apply(align(measured[triangle][None], nominal[triples]), nominal[None])
-        # No order is better than every point's nearest one.
+        # Lower bound of any order: every point's nearest one.
         lower = [float(_squares(measured, value).min(axis=1).sum()) for value in placed]
         nearest = np.argsort(lower, kind="stable")[:_PLACES]
-        found += [_nearest(measured, nominal, value) for value in placed[nearest]]
-    return np.array(found)
+        orders += [_nearest(measured, nominal, value) for value in placed[nearest]]
+    return np.array(orders)
 
 
 def _nearest(measured: FloatArray, nominal: FloatArray, placed: FloatArray) -> IntArray:
-    """Gives each measured point a drawn one of its own, near where the drawing is laid."""
+    """Assigns each measured point a distinct drawn one, near the aligned drawing."""
     for _ in range(2):
         order = linear_sum_assignment(_squares(measured, placed))[1]
-        # A triangle's few points lay the drawing less well than all of them.
+        # Realigned by all points, which is more accurate than by a triangle.
         placed = apply(align(measured, nominal[order]), nominal)
     return np.asarray(order)
 
@@ -175,7 +166,7 @@ def _squares(measured: FloatArray, placed: FloatArray) -> FloatArray:
 
 
 def _large_triangle(points: FloatArray) -> IntArray:
-    """Numbers (3,) of three points that span much: the two farthest, and the one most aside."""
+    """Indices (3,) of the two farthest points, and of the one farthest from their line."""
     pairs = np.array(list(combinations(range(len(points)), 2)))
     sides = points[pairs[:, 1]] - points[pairs[:, 0]]
     longest = int(np.argmax(np.sum(sides**2, axis=1)))

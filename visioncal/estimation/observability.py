@@ -1,4 +1,4 @@
-"""Observability of the two unknown edges: what the motion leaves undetermined, in words."""
+"""Observability of the unknown edges: directions that the motion leaves undetermined, in words."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -17,20 +17,20 @@ from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import fisher_information
 
-# Under this scaled eigenvalue ratio a direction is not determined by the motion at all.
+# Scaled eigenvalue ratio below which the motion does not determine a direction.
 _NULL_RATIO = 1e-8
-# Over these predicted sigmas at a typical noise, stops are too poor to calibrate with.
+# Largest predicted sigmas at a typical noise with which stops can calibrate.
 SIGMA_LIMIT_M, SIGMA_LIMIT_RAD = 5e-3, float(np.deg2rad(0.5))
-# Of most robots and corners, per axis. What data show beyond is no fault of the motion: exchanged
-# rows, another convention, wrong images. It is looked for, named, and judged by the verdict.
+# Typical noise of robots and corners, per axis. Larger noise is no fault of the motion but of
+# exchanged rows, another convention or wrong images; the verdict judges it.
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(float(np.deg2rad(0.05)), 1e-4), 0.2
-# A direction this close to an axis is called by the axis.
+# Least component along an axis for a direction to be called by it.
 _NEARLY_AXIS = 0.95
 FEWEST_VIEWS = 3
-# A robot that turns by less between all of its stops does not turn.
+# Least rotation of a robot between any of its stops.
 _STILL_RAD = float(np.deg2rad(0.5))
 _PAIRED = 300
-# What is wrong where unknowns that all views share are not determined, and what to do.
+# Cause and advice where unknowns common to all views are not determined.
 _UNDETERMINED = {
     "camera": (
         "the views do not determine lens and board well enough",
@@ -42,18 +42,18 @@ _UNDETERMINED = {
         "Add 3 or more stops in which the flange is tilted about different axes.",
     ),
 }
-# A null direction moves a part of an edge if it moves it by this much, of a length of one.
+# Least share of a unit null direction in a part of an edge that it makes undetermined.
 _PART_OF_NULL = 0.05
 
 
 @dataclass(frozen=True)
 class Direction:
-    """The direction of an edge that is known worst.
+    """The least certain direction of an edge.
 
     Attributes:
-        words: What it is, such as `the camera's offset along the tool's z`.
+        words: Its name, such as `the camera's offset along the tool's z`.
         sigma: Its predicted standard deviation [m or rad].
-        limit: The largest that is accepted, in the same unit.
+        limit: The largest accepted one, in the same unit.
         is_rotation: Whether it is an angle.
     """
 
@@ -70,7 +70,7 @@ class Direction:
 
 
 def title(mount: Mount) -> str:
-    """What messages about both edges begin with."""
+    """Prefix of messages about both edges."""
     return "instrument" if mount == "instrument" else "hand-eye"
 
 
@@ -83,16 +83,16 @@ def check_observability(
     *,
     looks: bool = False,
 ) -> None:
-    """Refuses motion that leaves a direction open.
+    """Refuses motion that leaves a direction undetermined.
 
     The motion is judged by its geometry, at a noise of at most `TYPICAL_NOISE` and `TYPICAL_PX`.
 
     Args:
-        problem: What the used views measured.
-        state: The answer.
+        problem: The used views.
+        state: The solution.
         noise: Of the residuals.
-        mount: Where the camera is.
-        pixel_px: By camera, the noise of a corner's coordinate that its poses are known to [px].
+        mount: Mounting of the camera.
+        pixel_px: By camera, the corner noise behind its poses' covariance [px].
         looks: Whether the first effect has to be determined, too: lens and board, or points.
 
     Raises:
@@ -102,13 +102,7 @@ def check_observability(
 
 
 def refuse_open_motion(problem: Problem, state: State, noise: Noise, mount: Mount) -> None:
-    """Refuses motion that leaves a direction open whatever the noise is, before anything is fitted.
-
-    Args:
-        problem: What the views measured.
-        state: Where a fit would start.
-        noise: As it starts.
-        mount: Where the camera is.
+    """Refuses motion that leaves a direction undetermined at any noise, before a fit.
 
     Raises:
         DegenerateError: A direction is numerically null.
@@ -119,15 +113,15 @@ def refuse_open_motion(problem: Problem, state: State, noise: Noise, mount: Moun
 
 @dataclass(frozen=True)
 class CellWords:
-    """How messages speak of a cell.
+    """Wording of messages about a cell.
 
     Attributes:
-        title: What they begin with.
-        names: What each unknown frame is called, and the frame that it hangs on.
-        motion: Says what is wrong with the motion, given the frame that it leaves open.
-        advice: Says what to do, given that frame and what of it is not determined at all, in words;
-            that may be nothing.
-        undetermined: What is wrong where the first effect is not determined, and what to do.
+        title: Prefix of messages.
+        names: Names of each unknown frame, and of its parent.
+        motion: Words for what is wrong with the motion, given the undetermined frame.
+        advice: Words for what to do, given that frame and its undetermined part in words, which may
+            be empty.
+        undetermined: Cause and advice where the first effect is not determined.
     """
 
     title: str
@@ -146,15 +140,9 @@ def check_determined(
     *,
     looks: bool = False,
 ) -> None:
-    """Refuses motion that leaves a direction of an unknown frame open.
+    """Refuses motion that leaves a direction of an unknown frame undetermined.
 
-    Args:
-        problem: The observations.
-        state: The answer.
-        noise: Of the residuals; see `check_observability`.
-        scene: The words.
-        pixel_px: As there.
-        looks: Whether the first effect has to be determined, too.
+    Arguments are those of `check_observability`; `scene` is the wording.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
@@ -177,13 +165,13 @@ def check_determined(
 def _at_typical_noise(
     problem: Problem, noise: Noise, pixel_px: Mapping[str, float]
 ) -> tuple[Problem, Noise]:
-    """The same observations at a noise that is typical, where these data show a larger one."""
+    """The same observations at a typical noise, where the data show a larger one."""
     shares = {name: min(1.0, TYPICAL_PX / px) for name, px in pixel_px.items()}
     seen, least = problem.observations, min(shares.values(), default=1.0)
-    by_row = np.array([shares.get(observer, 1.0) for observer in seen.observers])[:, None, None]
+    scale = np.array([shares.get(observer, 1.0) for observer in seen.observers])[:, None, None]
     typical = replace(
         problem,
-        observations=replace(seen, covariance=by_row**2 * seen.covariance),
+        observations=replace(seen, covariance=scale**2 * seen.covariance),
         effects=tuple(
             replace(
                 effect, known=replace(effect.known, information=effect.known.information / least**2)
@@ -198,10 +186,10 @@ def _at_typical_noise(
 def _refuse_null(problem: Problem, state: State, noise: Noise, scene: CellWords) -> None:
     """Refuses frames that are not determined at all."""
     counted = problem.counted
-    found = spectrum(fisher_information(problem, state, noise)[np.ix_(counted, counted)])
-    if found.ratio < _NULL_RATIO:
-        null = np.zeros((problem.size, int(np.sum(found.values < _NULL_RATIO * found.values[-1]))))
-        null[counted] = found.vectors[:, : null.shape[1]]
+    eigen = spectrum(fisher_information(problem, state, noise)[np.ix_(counted, counted)])
+    if eigen.ratio < _NULL_RATIO:
+        null = np.zeros((problem.size, int(np.sum(eigen.values < _NULL_RATIO * eigen.values[-1]))))
+        null[counted] = eigen.vectors[:, : null.shape[1]]
         frame, culprit = _null_direction(null, problem, state, scene)
         verb = "are" if " and " in culprit else "is"
         raise DegenerateError(
@@ -212,7 +200,7 @@ def _refuse_null(problem: Problem, state: State, noise: Noise, scene: CellWords)
 
 
 def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: CellWords) -> None:
-    """Refuses frames whose predicted sigmas are over the limit."""
+    """Refuses frames whose predicted sigmas exceed the limit."""
     covariance = covariance_among(fisher_information(problem, state, noise), problem.counted)
     beyond = [
         (frame, direction)
@@ -234,7 +222,7 @@ def _refuse_vague(problem: Problem, state: State, noise: Noise, scene: CellWords
 def _frame_directions(
     problem: Problem, state: State, covariance: FloatArray, frame: str, names: tuple[str, str]
 ) -> tuple[Direction, ...]:
-    """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
+    """Least certain directions of a frame: of its offset and, if it has one, of its rotation."""
     columns = problem.edge_columns(frame)
     edge = state.edges[problem.unknown[frame]]
     found = edge_directions(edge, covariance[columns, columns], *names)
@@ -242,7 +230,7 @@ def _frame_directions(
 
 
 def _scene(problem: Problem, mount: Mount) -> CellWords:
-    """How messages speak of one camera and one robot."""
+    """Wording of messages about one camera and one robot."""
     stops = np.unique(problem.observations.stops)
     flange = problem.poses[problem.robots[0]][stops]
     views, names = f"{len(stops)} used views", _names(problem, mount)
@@ -266,13 +254,9 @@ def _scene(problem: Problem, mount: Mount) -> CellWords:
 def directions(
     problem: Problem, state: State, covariance: FloatArray, mount: Mount
 ) -> tuple[Direction, ...]:
-    """The worst directions of the camera's edge and then of each target's, offset before rotation.
+    """Least certain directions of the camera's edge and of each target's, offset before rotation.
 
-    Args:
-        problem: What the views measured.
-        state: The answer.
-        covariance: (p, p) covariance of the unknowns.
-        mount: Where the camera is.
+    `covariance` is (p, p), of all unknowns.
     """
     return tuple(
         direction
@@ -284,32 +268,27 @@ def directions(
 def edge_directions(
     matrix: FloatArray, covariance: FloatArray, thing: str, frame: str
 ) -> tuple[Direction, Direction]:
-    """The worst directions of an edge: of its offset, and of its rotation.
+    """Least certain directions of an edge: of its offset, and of its rotation.
 
     Args:
         matrix: (4, 4) the edge.
         covariance: (6, 6) its covariance.
-        thing: What it places, in words.
-        frame: The frame that this hangs on, in words.
+        thing: Name of the frame it places.
+        frame: Name of the parent frame.
     """
-    found = []
+    directions = []
     for is_rotation in (False, True):
-        at = slice(0, 3) if is_rotation else slice(3, 6)
-        values, vectors = np.linalg.eigh(covariance[at, at])
+        block = slice(0, 3) if is_rotation else slice(3, 6)
+        values, vectors = np.linalg.eigh(covariance[block, block])
         limit = SIGMA_LIMIT_RAD if is_rotation else SIGMA_LIMIT_M
         words = _words(thing, frame, matrix[:3, :3] @ vectors[:, -1], is_rotation)
         sigma = float(np.sqrt(max(values[-1], 0.0)))
-        found.append(Direction(words, sigma, float(limit), is_rotation))
-    return found[0], found[1]
+        directions.append(Direction(words, sigma, float(limit), is_rotation))
+    return directions[0], directions[1]
 
 
 def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
-    """Refuses stops that cannot determine anything, however they lie.
-
-    Args:
-        problem: What the used views measured.
-        mount: Where the camera is.
-        views: How many these are.
+    """Refuses fewer stops, of a number of used views, than any calibration needs.
 
     Raises:
         DegenerateError: There are fewer than three stops.
@@ -338,10 +317,10 @@ def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
 def _null_direction(
     null: FloatArray, problem: Problem, state: State, scene: CellWords
 ) -> tuple[str, str]:
-    """The first frame that (p, k) null directions leave open, and what of it."""
+    """The first frame with (p, k) null directions, and its undetermined part in words."""
     for frame, edge in problem.unknown.items():
-        turn, start = state.edges[edge][:3, :3], problem.edge_columns(frame).start
-        rotation, translation = (turn @ null[start + at : start + at + 3] for at in (0, 3))
+        axes, start = state.edges[edge][:3, :3], problem.edge_columns(frame).start
+        rotation, translation = (axes @ null[start + at : start + at + 3] for at in (0, 3))
         parts = [
             _open_part(scene.names[frame], directions, is_rotation)
             for directions, is_rotation in ((translation, False), (rotation, True))
@@ -353,7 +332,7 @@ def _null_direction(
 
 
 def _open_part(names: tuple[str, str], directions: FloatArray, is_rotation: bool) -> str:
-    """Names what (3, k) null directions leave open of a rotation or an offset, if anything."""
+    """Names the part of a rotation or an offset in (3, k) null directions, if any."""
     vectors, sizes, _ = np.linalg.svd(directions)
     # Null vectors have unit length over all unknowns, a radian counting as a metre.
     rank = int(np.sum(sizes > _PART_OF_NULL))
@@ -365,18 +344,18 @@ def _open_part(names: tuple[str, str], directions: FloatArray, is_rotation: bool
 
 
 def _words(thing: str, frame: str, direction: FloatArray, is_rotation: bool) -> str:
-    """Says which component of which edge a direction in the edge's parent frame is."""
+    """Words for a direction of an edge, in its parent frame."""
     quantity = "rotation about" if is_rotation else "offset along"
     return f"{thing}'s {quantity} {frame}'s {axis_words(direction)}"
 
 
 def _names(problem: Problem, mount: Mount) -> dict[str, tuple[str, str]]:
-    """What each edge places, the camera's first, and the frame that it hangs on."""
+    """Names of the frames of the edges, the camera's first, and of their parents."""
     camera, *targets = problem.unknown
-    hangs = "the base" if mount == "eye-in-hand" else "the tool"
+    parent = "the base" if mount == "eye-in-hand" else "the tool"
     return {
         camera: (f"the {_sensor(mount)}", f"the {_frame(mount)}"),
-        **{target: (f"the {target.replace('_', ' ', 1)}", hangs) for target in targets},
+        **{target: (f"the {target.replace('_', ' ', 1)}", parent) for target in targets},
     }
 
 
@@ -386,27 +365,27 @@ def _sensor(mount: Mount) -> str:
 
 def axis_words(direction: FloatArray) -> str:
     """Names a direction (3,): `x`, or `direction (0.71, 0.71, 0.00)`."""
-    at = int(np.argmax(np.abs(direction)))
-    if abs(direction[at]) > _NEARLY_AXIS:
-        return "xyz"[at]
-    signed = direction * np.sign(direction[at])
+    axis = int(np.argmax(np.abs(direction)))
+    if abs(direction[axis]) > _NEARLY_AXIS:
+        return "xyz"[axis]
+    signed = direction * np.sign(direction[axis])
     return "direction ({:.2f}, {:.2f}, {:.2f})".format(*signed)
 
 
 def _frame(mount: Mount) -> str:
-    """The frame that the camera hangs on, in which the relative motions act."""
+    """The camera's parent frame, in which the relative motions act."""
     return "tool" if mount == "eye-in-hand" else "base"
 
 
 def _turns(robot: FloatArray) -> FloatArray:
     """Rotation vectors (p, 3) of the relative motions between all pairs of (m, 4, 4) poses [rad].
 
-    Of more poses than can be paired in a moment, those that turn least and most are among them.
+    Of many poses a subset is paired, which includes those that rotate least and most.
     """
     ranked = robot[np.argsort(rotation_angle(invert(robot[0]) @ robot))]
-    some = np.linspace(0, len(robot) - 1, min(len(robot), _PAIRED)).round().astype(np.int64)
-    i, j = np.triu_indices(len(some), 1)
-    relative = invert(ranked[some[j]]) @ ranked[some[i]]
+    chosen = np.linspace(0, len(robot) - 1, min(len(robot), _PAIRED)).round().astype(np.int64)
+    i, j = np.triu_indices(len(chosen), 1)
+    relative = invert(ranked[chosen[j]]) @ ranked[chosen[i]]
     return np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())
 
 
@@ -415,32 +394,29 @@ def _main_axis(turns: FloatArray) -> FloatArray:
 
 
 def turn_axis(turns: FloatArray) -> tuple[FloatArray, float, bool]:
-    """The main axis of turns, how far they turn beside it [deg], and whether that is little."""
+    """Main axis of rotations, the rotation beside it [deg], and whether that is small."""
     main = _main_axis(turns)
     aside = np.rad2deg(np.linalg.norm(turns - np.outer(turns @ main, main), axis=1).max())
     return main, float(aside), bool(aside < 0.1 * np.rad2deg(np.linalg.norm(turns, axis=1).max()))
 
 
 def open_offset(robot: FloatArray, thing: str, frame: str) -> str:
-    """What the turns of a robot about one axis leave open, in words; empty where there are more.
+    """The offset left undetermined by rotation about one axis, in words; empty for more axes.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of a chain, by whose differences it turns.
-        thing: What hangs by it.
-        frame: In which frame the robot's part turns, in words.
+    `robot` is its part (m, 4, 4) of a chain, which rotates in `frame`; `thing` is to be placed.
     """
     main, _, is_lone = turn_axis(_turns(robot))
     return _words(thing, frame, main, is_rotation=False) if is_lone else ""
 
 
 def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) -> str:
-    """Says what is wrong with the motion of a robot.
+    """Words for what is wrong with the motion of a robot.
 
     Args:
-        robot: (m, 4, 4) the robot's part of a chain, by whose differences it turns.
-        flange: (m, 4, 4) where its flange stood.
-        stops: What they are, in words.
-        frame: In which frame the robot's part turns, in words.
+        robot: (m, 4, 4) the robot's part of a chain.
+        flange: (m, 4, 4) poses of its flange.
+        stops: Name of the stops.
+        frame: Name of the frame in which the robot's part rotates.
     """
     turns = _turns(robot)
     largest_rad = np.linalg.norm(turns, axis=1).max()
@@ -464,18 +440,13 @@ def motion_words(robot: FloatArray, flange: FloatArray, stops: str, frame: str) 
 
 
 def turns_about_two_axes(robot: FloatArray) -> bool:
-    """Whether a robot's part of a chain (m, 4, 4), m of two or more, turns about two axes."""
+    """Whether a robot's part of a chain (m, 4, 4), m of two or more, rotates about two axes."""
     turns = _turns(robot)
     return bool(np.linalg.norm(turns, axis=1).max() >= _STILL_RAD) and not turn_axis(turns)[2]
 
 
 def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, str]:
-    """What leaves a calibration open whatever else is known, and what to do; empty where nothing.
-
-    Args:
-        base_from_flange: (m, 4, 4) where the flange stood, two times or more.
-        mount: Where the camera is.
-    """
+    """Why (m, 4, 4) flange poses alone leave a calibration undetermined, and advice; or empty."""
     robot = robot_part(base_from_flange, mount)
     if turns_about_two_axes(robot):
         return "", ""
@@ -485,7 +456,7 @@ def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, 
 
 
 def _or_measured(mount: Mount, culprit: str) -> str:
-    """A further advice for an arm that cannot tilt, as with four axes, and an open offset."""
+    """Further advice for an undetermined offset of an arm that cannot tilt, as with four axes."""
     if "offset along" not in culprit:
         return ""
     # A caliper reaches what is on the flange, and no instrument's origin.

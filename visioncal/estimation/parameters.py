@@ -1,4 +1,4 @@
-"""The numbers of a joint table that an arm's errors move: what users know an arm by."""
+"""Parameters of a joint table that an arm's errors change."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ _ROW = len(ROW_NAMES)
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a joint table that is not held.
+    """A free parameter of a joint table.
 
     Attributes:
         joint: Its row, from 0.
         kind: `theta`, `d`, `a`, `alpha`, `beta`, or `ratio`, `sine`, `cosine` of its function.
-        link: Which link it stands in: 0 for X_0, i for Z_i X_i.
+        link: Its link: 0 for X_0, i for Z_i X_i.
     """
 
     joint: int
@@ -44,12 +44,12 @@ class Parameter:
 
     @property
     def unit(self) -> float:
-        """What counts as much as a radian."""
+        """Equivalent of a radian."""
         return LEVER_M if self.is_length else 1.0
 
     @property
     def place(self) -> int:
-        """Where it stands among the numbers of a row and its joint's function."""
+        """Its index among the parameters of a row and its joint's function."""
         if self.kind in ROW_NAMES:
             return ROW_NAMES.index(self.kind)
         return _ROW + FUNCTION_NAMES.index(self.kind)
@@ -65,7 +65,7 @@ class Parameter:
 
 
 def free_parameters(model: ArmModel, table: DHTable) -> tuple[Parameter, ...]:
-    """The numbers of a table that a model's errors move, joint by joint."""
+    """The parameters of a table that a model's errors change, joint by joint."""
     placements, functions = model.changes(np.ones(len(model.values)))
     return tuple(_free(table, functions, links=bool(placements.any())))
 
@@ -75,7 +75,7 @@ def _free(table: DHTable, functions: FloatArray, *, links: bool) -> Iterator[Par
         link = joint if table.convention == "modified" else joint + 1
         if links:
             yield Parameter(joint, "theta", joint + 1)
-            # Between parallel axes beta stands for d.
+            # beta replaces d between parallel axes.
             if not table.parallel[joint + 1]:
                 yield Parameter(joint, "d", joint + 1)
             yield Parameter(joint, "a", link)
@@ -90,37 +90,30 @@ def _free(table: DHTable, functions: FloatArray, *, links: bool) -> Iterator[Par
 
 
 def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parameter]) -> FloatArray:
-    """How the numbers of the arm's table move with its errors.
+    """Jacobian (k, p) of a table's parameters by the arm's errors; `table_of(model.bare, ...)`.
 
-    Args:
-        model: The arm.
-        table: `table_of(model.bare, ...)`.
-        parameters: Those that are wanted.
-
-    Returns:
-        (k, p) derivatives, zero where the convention keeps a number and the base or the flange
-        takes its place.
+    It is zero where the convention fixes a parameter and the base or the flange changes instead.
     """
     steps = [model.changes(row) for row in np.eye(len(model.values))]
     placements, functions = (np.array(pair) for pair in zip(*steps, strict=True))
     rows = table_moves(model.bare, table, placements, functions)
     moves = np.zeros((len(parameters), len(steps)))
-    for at, parameter in enumerate(parameters):
+    for row, parameter in enumerate(parameters):
         if parameter.place >= _ROW:
-            moves[at] = functions[:, parameter.joint, parameter.place - _ROW]
+            moves[row] = functions[:, parameter.joint, parameter.place - _ROW]
         elif parameter.link:
-            moves[at] = rows[:, parameter.link - 1, parameter.place]
+            moves[row] = rows[:, parameter.link - 1, parameter.place]
     return moves
 
 
 def parameter_jacobian(
     table: DHTable, parameters: Sequence[Parameter], q: FloatArray, mounted: FloatArray
 ) -> FloatArray:
-    """How the reported frame moves with the numbers of a table.
+    """Jacobian of the reported frame by the parameters of a table.
 
     Args:
         table: The table.
-        parameters: Those that are wanted.
+        parameters: The selected parameters.
         q: (m, n) joint angles [rad].
         mounted: (4, 4) `flange_from_reported`.
 

@@ -1,4 +1,4 @@
-"""What a problem of a cell is made of: observations, effects, priors, values and noise."""
+"""Parts of a cell's problem: observations, effects, priors, state and noise."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -11,31 +11,29 @@ from visioncal.core.transforms import exp, inverse_right_jacobian, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.variance import Knowledge
 
-# Variances of a direction that a pose leaves open are above this [rad^2].
-_OPEN = 0.05
-# What the only robot of a cell is called.
+# Variances of undetermined directions of a pose are larger [rad^2].
+_UNDETERMINED_VARIANCE = 0.05
+# Name of the only robot of a cell.
 ROBOT = "robot"
-
-
-# Where an observation's covariance is a guess, its errors are up to so many times larger than that:
-# with tilt and distance.
+# Where an observation's covariance is a guess, its errors are up to this many times larger: with
+# tilt and distance.
 UNEVEN = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """What n observations measured.
+    """n measured poses.
 
     Attributes:
-        observers: (n,) the frame that measured.
-        observed: (n,) the frame whose place was measured.
+        observers: (n,) the observing frame.
+        observed: (n,) the observed frame.
         stops: (n,) the stop, numbered from 0.
-        sensors: (n,) whose noise level it is, numbered from 0; -1 where the covariance is known.
+        sensors: (n,) index of the sensor's noise level; -1 where the covariance is absolute.
         measured: (n, 4, 4) `observer_from_observed`.
         covariance: (n, 6, 6) of its right perturbation, at a sensor's level of one.
-        has_rotation: (n,) whether its rotation was measured; else its place alone.
-        is_uneven: (n,) whether its covariance is a guess: some are better than others, and nobody
-            says how much.
+        has_rotation: (n,) whether its rotation was measured; else its position alone.
+        is_uneven: (n,) whether its covariance is a guess, with unknown differences between
+            observations.
     """
 
     observers: tuple[str, ...]
@@ -52,12 +50,12 @@ class Observations:
 
     @cached_property
     def directions(self) -> IntArray:
-        """(n,) in how many directions each was measured: six at most."""
-        found = np.sum(np.linalg.eigvalsh(self.covariance) < _OPEN, axis=1)
-        return np.asarray(np.where(self.has_rotation, found, 3))
+        """(n,) number of directions that each determines: six at most."""
+        count = np.sum(np.linalg.eigvalsh(self.covariance) < _UNDETERMINED_VARIANCE, axis=1)
+        return np.asarray(np.where(self.has_rotation, count, 3))
 
     def take(self, rows: IntArray) -> "Observations":
-        """Returns those of (m,) rows."""
+        """Returns the observations of (m,) rows."""
         return Observations(
             tuple(self.observers[index] for index in rows.tolist()),
             tuple(self.observed[index] for index in rows.tolist()),
@@ -70,7 +68,7 @@ class Observations:
         )
 
     def renamed(self, frame: str, other: str, rows: Mask) -> "Observations":
-        """Returns them with a frame that has another name in the rows of an (n,) mask."""
+        """Returns the observations with a frame renamed in the rows of an (n,) mask."""
 
         def names(old: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(
@@ -81,25 +79,24 @@ class Observations:
         return replace(self, observers=names(self.observers), observed=names(self.observed))
 
     def involves(self, frame: str) -> Mask:
-        """(n,) which of them a frame observed or was observed in."""
+        """(n,) mask of those with a frame as observer or observed."""
         pairs = zip(self.observers, self.observed, strict=True)
         return np.array([frame in pair for pair in pairs], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A vector of k unknowns that moves many observations together.
+    """A vector of k unknowns that acts on many observations together.
 
     Attributes:
-        name: What it is of, as `lens and board` or `arm a`.
-        values: (k,) where the observations were linearised.
-        known: What is known of them beside the observations, as information (k, k) and half its
-            gradient (k,) at these values.
-        held: (k,) which of them stay there, and count in the covariance.
-        by_sensor: (n, 6, k) how the measured poses move with them, on their right; None for not.
-        flange_jacobian: By robot, (s, 6, k) how its flange moves at each stop, on its right.
-        concerned: (n,) the observations at which flanges move so; None for all.
-        random: How many of the last values are random coefficients of what no stop determines.
+        name: Its name, as `lens and board` or `arm a`.
+        values: (k,) linearisation point.
+        known: Prior, as information (k, k) and half its gradient (k,) at these values.
+        held: (k,) mask of the values that are held, and count in the covariance.
+        by_sensor: (n, 6, k) right Jacobian of the measured poses; None for zero.
+        flange_jacobian: By robot, (s, 6, k) right Jacobian of its flange at each stop.
+        concerned: (n,) the observations to which `flange_jacobian` applies; None for all.
+        random: Number of the last values that are random coefficients, which no stop determines.
     """
 
     name: str
@@ -119,7 +116,7 @@ class Effect:
         by_sensor: FloatArray | None = None,
         flange_jacobian: Mapping[str, FloatArray] = MappingProxyType({}),
     ) -> "Effect":
-        """An effect of free values, linearised where they are zero."""
+        """An effect of free values, linearised at zero."""
         size = len(known.gradient)
         return cls(
             name, np.zeros(size), known, np.zeros(size, dtype=bool), by_sensor, flange_jacobian
@@ -130,7 +127,7 @@ class Effect:
 
     @property
     def determined(self) -> "Effect":
-        """The effect as if its random coefficients were known."""
+        """The effect without its random coefficients."""
         kept = len(self) - self.random
         information = self.known.information[:kept, :kept]
         return replace(
@@ -143,7 +140,7 @@ class Effect:
         )
 
     def take(self, rows: IntArray) -> "Effect":
-        """Returns it for (m,) rows of the observations."""
+        """Returns the effect for (m,) rows of the observations."""
         return replace(
             self,
             by_sensor=None if self.by_sensor is None else self.by_sensor[rows],
@@ -151,33 +148,33 @@ class Effect:
         )
 
     def carried(self, by: FloatArray) -> "Effect":
-        """Returns it for poses measured elsewhere on what was observed, by (n, 6, 6) adjoints."""
+        """Returns the effect for poses of another point of the observed, by (n, 6, 6) adjoints."""
         return self if self.by_sensor is None else replace(self, by_sensor=by @ self.by_sensor)
 
     def of_stops(self, chosen: Mask) -> "Effect":
-        """Returns it for the stops of an (s,) mask."""
+        """Returns the effect for the stops of an (s,) mask."""
         flange_jacobian = {name: array[chosen] for name, array in self.flange_jacobian.items()}
         return replace(self, flange_jacobian=flange_jacobian)
 
     def jacobian_of_flange(self, robot: str, stops: IntArray) -> FloatArray:
-        """(n, 6, k) how a robot's flange moves at observations of (n,) stops."""
+        """(n, 6, k) Jacobian of a robot's flange at observations of (n,) stops."""
         if robot not in self.flange_jacobian:
             return np.zeros((len(stops), 6, len(self)))
-        found = self.flange_jacobian[robot][stops]
-        return found if self.concerned is None else found * self.concerned[:, None, None]
+        jacobian = self.flange_jacobian[robot][stops]
+        return jacobian if self.concerned is None else jacobian * self.concerned[:, None, None]
 
 
 @dataclass(frozen=True, eq=False)
 class FramePrior:
-    """Where one frame is in another that no robot parts from it, as a gauge or a drawing has it.
+    """Prior of one frame's pose in another with no robot between, by a gauge or a drawing.
 
     Attributes:
-        first: The frame in which it was measured.
-        second: The frame whose place it is.
-        axes: (c,) which components of its origin were measured, 0 for x, along the first's axes.
-        values_m: (c,) what was measured [m].
+        first: The reference frame.
+        second: The frame whose pose it is.
+        axes: (c,) measured components of its origin, 0 for x, along the first's axes.
+        values_m: (c,) their values [m].
         sigma_m: The standard deviation of each [m].
-        rotation: (3, 3) `first_from_second`, where that was measured, too.
+        rotation: (3, 3) `first_from_second`, if measured.
         sigma_rad: Its standard deviation about each axis [rad].
     """
 
@@ -191,17 +188,17 @@ class FramePrior:
 
     @property
     def name(self) -> str:
-        """What `[prior.NAME]` calls it."""
+        """NAME of its `[prior.NAME]`."""
         return f"{self.first}_from_{self.second}"
 
     @property
     def matrix(self) -> FloatArray | None:
-        """(4, 4) `first_from_second`; None where it is not known whole."""
+        """(4, 4) `first_from_second`; None where some of it is unknown."""
         if self.rotation is None or self.axes != (0, 1, 2):
             return None
-        found = np.eye(4)
-        found[:3, :3], found[:3, 3] = self.rotation, self.values_m
-        return found
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.values_m
+        return matrix
 
     def without(self, axis: int) -> "FramePrior":
         """Returns the prior without one of its measured components."""
@@ -214,51 +211,51 @@ class FramePrior:
             self, axes=tuple(index for index, _ in kept), values_m=tuple(value for _, value in kept)
         )
 
-    def whitened(self, found: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals (d,) in units of sigma, and their slopes (d, 6).
+    def whitened(self, estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Whitened residuals (d,), and their Jacobian (d, 6).
 
         Args:
-            found: (4, 4) `first_from_second` as it is estimated; the slopes are by its right
+            estimate: (4, 4) estimate of `first_from_second`; the Jacobian is by its right
                 perturbation.
         """
         rows = list(self.axes)
-        away = (found[rows, 3] - np.array(self.values_m)) / self.sigma_m
+        offset = (estimate[rows, 3] - np.array(self.values_m)) / self.sigma_m
         jacobian = np.concatenate(
-            [np.zeros((len(rows), 3)), found[rows, :3] / self.sigma_m], axis=1
+            [np.zeros((len(rows), 3)), estimate[rows, :3] / self.sigma_m], axis=1
         )
         if self.rotation is None:
-            return away, jacobian
+            return offset, jacobian
         between = np.eye(4)
-        between[:3, :3] = self.rotation.T @ found[:3, :3]
-        turn = log(between[None])
-        by_turn = inverse_right_jacobian(turn)[0, :3] / self.sigma_rad
+        between[:3, :3] = self.rotation.T @ estimate[:3, :3]
+        rotation = log(between[None])
+        jacobian_rotation = inverse_right_jacobian(rotation)[0, :3] / self.sigma_rad
         return (
-            np.concatenate([turn[0, :3] / self.sigma_rad, away]),
-            np.concatenate([by_turn, jacobian]),
+            np.concatenate([rotation[0, :3] / self.sigma_rad, offset]),
+            np.concatenate([jacobian_rotation, jacobian]),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Values of the unknowns: (e, 4, 4) `parent_from_frame` of each unknown frame, and (k,)."""
+    """Unknowns: (e, 4, 4) `parent_from_frame` of each unknown frame, and (k,) values."""
 
     edges: FloatArray
     values: FloatArray
 
     def moved(self, step: FloatArray) -> "State":
-        """Returns the unknowns after a (6 e + k,) step, on the right of the edges."""
+        """Returns the state after a (6 e + k,) step, on the right of the edges."""
         size = 6 * len(self.edges)
-        by = exp(step[:size].reshape(-1, 6))
-        return State(self.edges @ by, self.values + step[size:])
+        motions = exp(step[:size].reshape(-1, 6))
+        return State(self.edges @ motions, self.values + step[size:])
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations.
+    """Noise levels, as standard deviations.
 
     Attributes:
         robots: (r, 2) of each robot's flange, of rotation [rad] and translation [m], per axis.
-        sensors: (s,) by which each sensor's covariances are to be taken larger, as sigmas.
+        sensors: (s,) scale of each sensor's stated sigmas.
     """
 
     robots: FloatArray
@@ -266,5 +263,5 @@ class Noise:
 
     @classmethod
     def of_robot(cls, sigma_rad: float, sigma_m: float) -> "Noise":
-        """The noise of an only robot's flange, per axis, where that of all else is known."""
+        """Noise of a single robot's flange, per axis, without sensor levels."""
         return cls(np.array([[sigma_rad, sigma_m]]), np.zeros(0))

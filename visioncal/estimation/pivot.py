@@ -1,8 +1,8 @@
-"""A tool's tip and rotation from touches of fixed points: the pivot.
+"""Pivot calibration: a tool's tip and rotation from touches of fixed points.
 
-The linear solution starts a joint fit of the tool and of the touched points, whitened by what is
-known of the robot's noise, so that touches along the tool's axes carry the tip's uncertainty into
-its rotation. Touches that do not agree are left out (see `group_outliers`) and named.
+The linear solution starts a joint fit of the tool and of the touched points, whitened by the
+robot's stated noise, so that touches along the tool's axes propagate the tip's uncertainty into its
+rotation. Outlier touches are left out (see `group_outliers`) and named.
 """
 
 from dataclasses import dataclass, replace
@@ -31,14 +31,13 @@ from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, counted_n
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Touches, TouchProblem, TouchUnknowns, in_tool
 
-# A touch that errs fits another point by chance in one of a thousand.
+# Chance that an outlier touch fits another point.
 _FALSE_ALARM = 1e-3
 _NO_NOISE = Noise.of_robot(0.0, 0.0)
 
-# Under this scaled eigenvalue ratio the touches do not determine a direction at all.
+# Scaled eigenvalue ratio below which the touches do not determine a direction.
 _NULL_RATIO = 1e-8
-# Touches that scatter more than this are not careful ones [m]: what is undetermined is not the
-# motion's fault alone.
+# Largest scatter of careful touches [m]: beyond, the motion alone is not at fault.
 CARELESS_M = 1e-3
 _STILL_RAD = float(np.deg2rad(0.5))
 FEWEST_TOUCHES = 3
@@ -53,13 +52,13 @@ class PivotFit:
     """A tool from n touches of k points.
 
     Attributes:
-        agreement: Which touches agree, and their fit, in the tool's frame.
+        agreement: The inlier touches, and their fit, in the tool's frame.
         oriented: Whether the rotation was measured; else it is the flange's own.
         covariance: (6, 6) of the tool's right perturbation (rotation [rad], translation [m]); zero
             in the rotation where that was not measured.
         points_covariance: (k, 3, 3) of the touched points [m^2].
-        belongs_to: (n,) the other point that a touch fits which does not agree; None for none.
-        worst: The directions that are known worst: the tip's, then the rotation's if measured.
+        belongs_to: (n,) the other point that an outlier touch fits; None for none.
+        worst: The least certain directions: the tip's, then the rotation's if measured.
     """
 
     agreement: GroupInliers[TouchUnknowns]
@@ -71,7 +70,7 @@ class PivotFit:
 
     @property
     def flange_from_tool(self) -> FloatArray:
-        """(4, 4) the answer [m]."""
+        """(4, 4) the tool [m]."""
         return self.agreement.fit.state.flange_from_tool
 
     @property
@@ -81,7 +80,7 @@ class PivotFit:
 
     @property
     def sigma_m(self) -> float:
-        """Noise of a touch per axis [m], beyond what is known of the robot's."""
+        """Noise of a touch per axis [m], beyond the robot's stated one."""
         return self.agreement.fit.sigma
 
     @property
@@ -91,10 +90,10 @@ class PivotFit:
 
     @property
     def looks_inverse(self) -> bool:
-        """Whether the poses may be `flange_from_base`: the tip and the one point exchange then.
+        """Whether the poses may be `flange_from_base`, which exchanges the tip and the one point.
 
-        Touches of one point close both ways alike; a tip that is farther from the flange than the
-        point is from the base determines.
+        Touches of one point close either way; the poses look inverse where the tip is farther from
+        the flange than the point is from the base.
         """
         reach = float(np.linalg.norm(self.flange_from_tool[:3, 3]))
         return len(self.points) == 1 and reach > float(np.linalg.norm(self.points[0]))
@@ -103,22 +102,18 @@ class PivotFit:
 def fit_pivot(
     touches: Touches, noise: Noise = _NO_NOISE, expected_sigma_m: float | None = None
 ) -> PivotFit:
-    """Finds the tool on the flange.
+    """Fits the tool on the flange.
 
     Args:
         touches: Of kind `point`, three of one point or two each of two points at least; with those
             of kind `z` and `xz`, one each at least, the tool's rotation too.
-        noise: Known errors of the flange's pose, per axis; zero where unknown.
-        expected_sigma_m: Noise that a touch may be expected to have, per axis [m]; None where
-            unknown.
-
-    Returns:
-        The tool.
+        noise: Stated errors of the flange's pose, per axis; zero where unknown.
+        expected_sigma_m: Expected noise of a touch, per axis [m]; None where unknown.
 
     Raises:
         DataError: Touches are missing, or contradict each other: about the side of an axis, or
-            grossly and which is wrong is unknown.
-        DegenerateError: They leave a direction open; named with its predicted sigma.
+            grossly without an identifiable outlier.
+        DegenerateError: They leave a direction undetermined; named with its predicted sigma.
     """
     check_counts(touches)
     with one_blas_thread():
@@ -128,53 +123,53 @@ def fit_pivot(
 def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
     tips = touches.are("point")
     problem = TouchProblem(touches.subset(tips), noise, oriented=False)
-    found = agreeing_groups(problem, expected)
-    _check_doubt(problem, found)
-    worst = check_turning(problem, found.fit)
+    inliers = agreeing_groups(problem, expected)
+    _check_doubt(problem, inliers)
+    worst = check_turning(problem, inliers.fit)
     if not tips.all():
-        # Touches of the axes hold the tool's rotation alone: a consensus of few would fit them and
-        # nothing else, so they join those that agree about the tip.
-        agreed = np.ones(len(touches), dtype=bool)
-        agreed[tips] = found.agrees
+        # Touches of the axes alone determine the tool's rotation: a consensus of few would fit them
+        # and nothing else, so they join the inliers of the tip.
+        presumed = np.ones(len(touches), dtype=bool)
+        presumed[tips] = inliers.agrees
         problem = TouchProblem(touches, noise, oriented=True)
-        found = agreeing_groups(problem, expected, (agreed, problem.turned(found.fit.state)))
-        _check_sides(touches, found)
-        worst = check_turning(problem, found.fit)
-    level = counted_noise_m(found.fit, TOUCH_NOISE_M if expected is None else expected)
-    if level > found.fit.sigma:
-        covariance = covariance_from(found.fit.groups.subset(found.fit.used).information(level))
-        found = replace(found, fit=replace(found.fit, sigma=level, covariance=covariance))
-        worst = check_turning(problem, found.fit)
-    return _result(problem, found, worst)
+        inliers = agreeing_groups(problem, expected, (presumed, problem.turned(inliers.fit.state)))
+        _check_sides(touches, inliers)
+        worst = check_turning(problem, inliers.fit)
+    level = counted_noise_m(inliers.fit, TOUCH_NOISE_M if expected is None else expected)
+    if level > inliers.fit.sigma:
+        covariance = covariance_from(inliers.fit.groups.subset(inliers.fit.used).information(level))
+        inliers = replace(inliers, fit=replace(inliers.fit, sigma=level, covariance=covariance))
+        worst = check_turning(problem, inliers.fit)
+    return _result(problem, inliers, worst)
 
 
-def _check_doubt(problem: TouchProblem, found: GroupInliers[TouchUnknowns]) -> None:
-    """Refuses touches that contradict each other grossly where it is unknown which is wrong."""
-    if not found.doubtful.any() or found.fit.sigma < CARELESS_M:
+def _check_doubt(problem: TouchProblem, inliers: GroupInliers[TouchUnknowns]) -> None:
+    """Refuses touches that contradict each other grossly without an identifiable outlier."""
+    if not inliers.doubtful.any() or inliers.fit.sigma < CARELESS_M:
         return
-    touches, rows = problem.touches, np.flatnonzero(found.doubtful)
+    touches, rows = problem.touches, np.flatnonzero(inliers.doubtful)
     labels = [touches.labels[row] for row in rows]
-    belongs = _belonging(problem, found)
+    belongs = _belonging(problem, inliers)
     fitting = [
         f"touch {touches.labels[index]} fits point {touches.names[at]!r}"
         for index, at in enumerate(belongs)
-        if found.doubtful[index] and at is not None
+        if inliers.doubtful[index] and at is not None
     ]
     matches = f" ({', '.join(fitting)})" if fitting else ""
     raise DataError(
         f"tcp: touches {', '.join(labels)} contradict each other, at a scatter of "
-        f"{1e3 * found.fit.sigma:.3g} mm, and which of them is wrong is not known{matches}.",
+        f"{1e3 * inliers.fit.sigma:.3g} mm, and which of them is wrong is not known{matches}.",
         culprits=labels,
         next_step="Touch their point once or twice more, or correct its name.",
     )
 
 
-def _check_sides(touches: Touches, found: GroupInliers[TouchUnknowns]) -> None:
-    seen = in_tool(touches, found.fit.state)
-    for kind, along in (("z", seen[:, 2]), ("xz", seen[:, 0])):
-        these = found.agrees & np.array([name == kind for name in touches.kinds])
-        behind = [touches.labels[index] for index in np.flatnonzero(these & (along < 0.0))]
-        before = [touches.labels[index] for index in np.flatnonzero(these & (along > 0.0))]
+def _check_sides(touches: Touches, inliers: GroupInliers[TouchUnknowns]) -> None:
+    local = in_tool(touches, inliers.fit.state)
+    for kind, coordinates in (("z", local[:, 2]), ("xz", local[:, 0])):
+        used = inliers.agrees & np.array([name == kind for name in touches.kinds])
+        behind = [touches.labels[index] for index in np.flatnonzero(used & (coordinates < 0.0))]
+        before = [touches.labels[index] for index in np.flatnonzero(used & (coordinates > 0.0))]
         if behind:
             axis = kind[0]
             raise DataError(
@@ -187,51 +182,53 @@ def _check_sides(touches: Touches, found: GroupInliers[TouchUnknowns]) -> None:
 
 
 def _result(
-    problem: TouchProblem, found: GroupInliers[TouchUnknowns], worst: tuple[Direction, ...]
+    problem: TouchProblem, inliers: GroupInliers[TouchUnknowns], worst: tuple[Direction, ...]
 ) -> PivotFit:
-    fit, edge = found.fit, 6 if problem.oriented else 3
+    fit, edge = inliers.fit, 6 if problem.oriented else 3
     covariance = np.zeros((6, 6))
     covariance[6 - edge :, 6 - edge :] = fit.covariance[:edge, :edge]
     count = len(fit.state.points)
     blocks = fit.covariance[edge:, edge:].reshape(count, 3, count, 3)
     at = np.arange(count)
-    belongs = _belonging(problem, found)
-    return PivotFit(found, problem.oriented, covariance, blocks[at, :, at, :], belongs, worst)
+    belongs = _belonging(problem, inliers)
+    return PivotFit(inliers, problem.oriented, covariance, blocks[at, :, at, :], belongs, worst)
 
 
-def _belonging(problem: TouchProblem, found: GroupInliers[TouchUnknowns]) -> tuple[int | None, ...]:
-    """The other point that each disagreeing touch fits, as the touches beyond doubt have it."""
-    suspects = ~found.agrees | found.doubtful
-    fit = found.fit
-    if found.doubtful.any():
+def _belonging(
+    problem: TouchProblem, inliers: GroupInliers[TouchUnknowns]
+) -> tuple[int | None, ...]:
+    """The other point that each outlier touch fits, by the touches beyond doubt."""
+    suspects = ~inliers.agrees | inliers.doubtful
+    fit = inliers.fit
+    if inliers.doubtful.any():
         fit = fit_groups(problem, ~suspects, fit.state)
     belongs: list[int | None] = [None] * len(suspects)
-    for at in np.flatnonzero(suspects):
+    for row in np.flatnonzero(suspects):
         ratios = [
-            _mahalanobis_sq_at(problem, fit, int(at), index)
+            _mahalanobis_sq_at(problem, fit, int(row), index)
             for index in range(len(fit.state.points))
         ]
-        ratios[problem.touches.points[at]] = np.inf
+        ratios[problem.touches.points[row]] = np.inf
         best = int(np.argmin(ratios))
         if ratios[best] < 1.0:
-            belongs[at] = best
+            belongs[row] = best
     return tuple(belongs)
 
 
 def _mahalanobis_sq_at(
-    problem: TouchProblem, fit: GroupFit[TouchUnknowns], at: int, point: int
+    problem: TouchProblem, fit: GroupFit[TouchUnknowns], row: int, point: int
 ) -> float:
-    """Squared distance of one touch from where it had been if of a point, over its limit."""
+    """Squared distance of a touch from the prediction if it were of a point, over its limit."""
     if not np.any(fit.used & (problem.touches.points == point)):
         return float("inf")
-    moved = problem.touches.points.copy()
-    moved[at] = point
-    touched = replace(problem, touches=replace(problem.touches, points=moved))
+    points = problem.touches.points.copy()
+    points[row] = point
+    touched = replace(problem, touches=replace(problem.touches, points=points))
     groups = touched.linearise(fit.state)
-    rows = groups.observed[at]
-    residual, slope = groups.residuals[at][rows], groups.jacobian[at][rows]
+    rows = groups.observed[row]
+    residual, slope = groups.residuals[row][rows], groups.jacobian[row][rows]
     covariance = (
-        groups.covariance(fit.sigma)[at][np.ix_(rows, rows)] + slope @ fit.covariance @ slope.T
+        groups.covariance(fit.sigma)[row][np.ix_(rows, rows)] + slope @ fit.covariance @ slope.T
     )
     limit = f_limit(_FALSE_ALARM, len(residual), max(fit.freedom, 1))
     return float(residual @ np.linalg.solve(covariance, residual) / (len(residual) * limit))
@@ -255,40 +252,36 @@ def check_counts(touches: Touches) -> None:
             culprits=touches.names,
             next_step=_ADVICE,
         )
-    axes = [at for at, kind in enumerate(touches.kinds) if kind != "point"]
-    unknown = [at for at in axes if not counts[touches.points[at]]]
+    axes = [row for row, kind in enumerate(touches.kinds) if kind != "point"]
+    unknown = [row for row in axes if not counts[touches.points[row]]]
     if unknown:
         name = touches.names[touches.points[unknown[0]]]
         raise DataError(
             f"tcp: touch {touches.labels[unknown[0]]} of kind {touches.kinds[unknown[0]]} is of "
             f"point {name!r}, which no touch of kind point has met.",
-            culprits=[touches.labels[at] for at in unknown],
+            culprits=[touches.labels[row] for row in unknown],
             next_step=f"Touch {name!r} with the tip, too, or name the point that was touched.",
         )
-    kinds = {touches.kinds[at] for at in axes}
+    kinds = {touches.kinds[row] for row in axes}
     if len(kinds) == 1:
-        (there,) = kinds
-        missing = "xz" if there == "z" else "z"
+        (given,) = kinds
+        missing = "xz" if given == "z" else "z"
         raise DataError(
-            f"tcp: there are touches of kind {there} but none of kind {missing}: together they "
+            f"tcp: there are touches of kind {given} but none of kind {missing}: together they "
             "determine the tool's rotation, one alone does not.",
-            culprits=[touches.labels[at] for at in axes],
-            next_step=f"Add a touch of kind {missing}, or leave out those of kind {there}.",
+            culprits=[touches.labels[row] for row in axes],
+            next_step=f"Add a touch of kind {missing}, or leave out those of kind {given}.",
         )
 
 
 def check_turning(problem: TouchProblem, fit: GroupFit[TouchUnknowns]) -> tuple[Direction, ...]:
-    """Refuses touches that leave a direction open; otherwise returns the worst ones.
+    """Refuses touches that leave a direction undetermined; otherwise returns the worst ones.
 
-    Touches that disagree wildly are no fault of the motion: it is judged by a noise of at most the
-    limit, and what is beyond is the verdict's business.
-
-    Args:
-        problem: The touches.
-        fit: The answer from those that agree.
+    Wild disagreement of touches is no fault of the motion: it is judged by a noise of at most the
+    limit, and the rest is left to the verdict.
 
     Returns:
-        The worst known direction of the tip, and of the tool's rotation where that is sought.
+        The least certain direction of the tip, and of the tool's rotation where that is estimated.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
@@ -319,12 +312,12 @@ def _worst(
     values, vectors = np.linalg.eigh(tip)
     several = values[-2] > SIGMA_LIMIT_M**2
     words = "from the flange" if several else f"along the flange's {axis_words(vectors[:, -1])}"
-    found = [_direction(f"the tip's offset {words}", values[-1], SIGMA_LIMIT_M, is_rotation=False)]
+    worst = [_direction(f"the tip's offset {words}", values[-1], SIGMA_LIMIT_M, is_rotation=False)]
     if problem.oriented:
         values, vectors = np.linalg.eigh(covariance[:3, :3])
         words = f"the tool's rotation about its {axis_words(vectors[:, -1])}"
-        found.append(_direction(words, values[-1], SIGMA_LIMIT_RAD, is_rotation=True))
-    return tuple(found)
+        worst.append(_direction(words, values[-1], SIGMA_LIMIT_RAD, is_rotation=True))
+    return tuple(worst)
 
 
 def _direction(words: str, variance: float, limit: float, *, is_rotation: bool) -> Direction:
@@ -334,7 +327,7 @@ def _direction(words: str, variance: float, limit: float, *, is_rotation: bool) 
 def _cause(
     problem: TouchProblem, fit: GroupFit[TouchUnknowns], culprit: Direction
 ) -> tuple[str, str]:
-    """Why a direction is undetermined, and what to do about it."""
+    """Cause of an undetermined direction, and advice."""
     used = problem.touches.subset(fit.used)
     careful = [
         direction
@@ -356,10 +349,10 @@ def _cause(
 
 
 def _levers(used: Touches, fit: GroupFit[TouchUnknowns]) -> tuple[str, str]:
-    """Says how far from the tip the touches of the axes have their points."""
-    seen = np.abs(in_tool(used, fit.state))
-    along = 1e3 * seen[used.are("z"), 2].max()
-    aside = 1e3 * seen[used.are("xz"), 0].max()
+    """Levers of the touches of the axes, in words, and advice."""
+    local = np.abs(in_tool(used, fit.state))
+    along = 1e3 * local[used.are("z"), 2].max()
+    aside = 1e3 * local[used.are("xz"), 0].max()
     return (
         f"the touches of kind z have their point at most {figure(along)} mm from the tip, and "
         f"those of kind xz at most {figure(aside)} mm beside the tool's z axis"
@@ -367,7 +360,7 @@ def _levers(used: Touches, fit: GroupFit[TouchUnknowns]) -> tuple[str, str]:
 
 
 def _motion(used: Touches) -> str:
-    """Says what is wrong with the motion, of touches of one and the same point."""
+    """Words for what is wrong with the motion, of touches of the same point."""
     turns = _turns(used.subset(used.are("point")))
     angles = np.linalg.norm(turns, axis=1)
     largest, count = np.rad2deg(angles.max()), int(used.are("point").sum())
@@ -390,8 +383,8 @@ def _motion(used: Touches) -> str:
 
 def _turns(touches: Touches) -> FloatArray:
     """Rotation vectors (p, 3) in the flange between all pairs of touches of one point [rad]."""
-    one, other = np.triu_indices(len(touches), 1)
-    same = touches.points[one] == touches.points[other]
+    first, second = np.triu_indices(len(touches), 1)
+    same = touches.points[first] == touches.points[second]
     poses = touches.base_from_flange
-    relative = invert(poses[other[same]]) @ poses[one[same]]
+    relative = invert(poses[second[same]]) @ poses[first[same]]
     return np.asarray(Rotation.from_matrix(relative[:, :3, :3]).as_rotvec())

@@ -1,4 +1,4 @@
-"""How well a frame is placed: its worst directions in words, and when they are too poor."""
+"""Certainty of a placed frame: its worst directions in words, and their limits."""
 
 from collections.abc import Sequence
 
@@ -12,31 +12,31 @@ from visioncal.estimation.groups import GroupFit, State
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD, Direction, axis_words
 
-# No instrument of a cell is better [m]: exact coordinates would otherwise be judged by rounding.
+# Least noise of any instrument [m]: exact coordinates would otherwise be judged by rounding.
 LEAST_NOISE_M = 1e-6
-# A careful touch by hand [m]: geometry is judged by it where nothing determines the noise.
+# A careful touch by hand [m]: the noise where nothing determines it.
 TOUCH_NOISE_M = 1e-4
-# Fewer residuals to spare agree too well by chance to estimate the noise: a single one is within a
-# tenth of its sigma in one frame of twelve. Features that were touched twice leave so many.
+# Fewest degrees of freedom that estimate the noise: a single residual is within a tenth of its
+# sigma in one frame of twelve. Features that were touched twice leave six.
 _ENOUGH = 6
-# Squared extents of points whose ratio is under this are a line.
+# Ratio of squared extents below which points are collinear.
 LEAST_RATIO = 1e-8
 
 
 def noise_words(sigma_m: float | None) -> str:
-    """Says by which noise geometry was judged: `a noise of 0.1 mm, which nothing contradicts`."""
+    """Words for the noise by which geometry was judged: `at a noise of 0.1 mm`."""
     if sigma_m is None:
         return f"at a noise of {1e3 * TOUCH_NOISE_M:g} mm, taken because nothing determines it"
     return f"at a noise of {figure(1e3 * sigma_m)} mm"
 
 
 def counted_noise_m(fit: GroupFit[State], expected_m: float) -> float:
-    """Says what noise of a touch counts [m]: with few to spare no less than is expected."""
+    """Noise of a touch that counts [m]: with few degrees of freedom at least the expected one."""
     return fit.sigma if fit.freedom >= _ENOUGH else max(fit.sigma, expected_m)
 
 
 def assumed_words(noise_m: float, stated_m: float | None) -> str:
-    """Says that a sigma rests on a noise that is assumed, as a sentence behind another's blank."""
+    """Sentence that a sigma rests on an assumed noise, with a leading blank; else empty."""
     if stated_m is not None or noise_m != TOUCH_NOISE_M:
         return ""
     return (
@@ -46,7 +46,7 @@ def assumed_words(noise_m: float, stated_m: float | None) -> str:
 
 
 def left_out_words(labels: Sequence[str], used: Mask) -> str:
-    """Says what was left out: `without P3, which does not agree with the others, `, or nothing."""
+    """Words for what was left out: `without P3, which does not agree with the others, `."""
     names = [name for name, stays in zip(labels, used, strict=True) if not stays]
     verb = "does" if len(names) == 1 else "do"
     return f"without {some_of(names)}, which {verb} not agree with the others, " if names else ""
@@ -55,18 +55,18 @@ def left_out_words(labels: Sequence[str], used: Mask) -> str:
 def worst_directions(
     fit: GroupFit[State], base_from_fixture: FloatArray, centre: FloatArray, sigma_m: float | None
 ) -> tuple[Direction, Direction]:
-    """Finds the worst known offset and rotation of a fixture.
+    """The least certain offset and rotation of a fixture.
 
-    Points that disagree wildly are no fault of the geometry: it is judged by a noise of at most
-    the limit, and at least of a micrometre.
+    Wild disagreement of points is no fault of the geometry: it is judged by a noise of at most the
+    limit, and at least of a micrometre.
 
     Args:
-        fit: Whose first six unknowns are the fixture's right perturbation (rotation, translation).
-        base_from_fixture: (4, 4) the answer.
-        centre: (3,) where the offset counts, in the fixture's frame [m]: amid the points, since a
-            drawing's origin may be far away.
-        sigma_m: Noise of one coordinate [m], beyond what is known beforehand; None where nothing
-            determines it.
+        fit: Its first six unknowns are the fixture's right perturbation (rotation, translation).
+        base_from_fixture: (4, 4) the solution.
+        centre: (3,) reference point of the offset, in the fixture's frame [m]: amid the points,
+            since a drawing's origin may be far away.
+        sigma_m: Noise of one coordinate [m], beyond the stated one; None where nothing determines
+            it.
 
     Returns:
         The offset's worst direction in the base, and the rotation's in the fixture.
@@ -83,14 +83,14 @@ def worst_of(
     parent: str,
     centre: FloatArray | None = None,
 ) -> tuple[Direction, Direction]:
-    """Finds the worst known offset and rotation of a frame.
+    """The least certain offset and rotation of a frame.
 
     Args:
         matrix: (4, 4) the frame in its parent.
         covariance: (6, 6) covariance of its right perturbation (rotation [rad], translation [m]).
-        thing: What the frame is of, for messages.
-        parent: What it hangs on, likewise.
-        centre: (3,) where the offset counts, in the frame [m]; its origin where None.
+        thing: Name of the frame's object, for messages.
+        parent: Name of the parent, likewise.
+        centre: (3,) reference point of the offset, in the frame [m]; its origin where None.
 
     Returns:
         The offset's worst direction in the parent, and the rotation's in the frame itself.

@@ -1,10 +1,10 @@
-"""A fixture's frame from measured points and the drawing's coordinates of the same points.
+"""Fixture frame from measured points and the drawing's coordinates of the same points.
 
-Each point says `measured = base_from_fixture * nominal`, up to the noise that is known of it and
-one level of noise that is common to all and estimated. Scale is estimated beside, never absorbed.
+Each point obeys `measured = base_from_fixture * nominal`, up to its stated noise and one common
+noise level, which is estimated. Scale is estimated separately, never absorbed.
 
-A line of points, another unit and a left-handed drawing are found before anything is fitted: no
-choice of points would mend them.
+Collinear points, another unit and a left-handed drawing are found before the fit: no selection of
+points would correct them.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -39,15 +39,15 @@ from visioncal.estimation.procrustes import (
 )
 from visioncal.estimation.robust import small_sets
 
-# A sound set of a thousand is called mirrored, or its scale different from one.
+# Share of sound sets that are called mirrored, or of another scale.
 _FALSE_ALARM = 1e-3
-# Points that reach so much less far aside than along are nearly on a line.
+# Ratio of extents below which points are nearly collinear.
 _SLENDER = 0.1
 
 FEWEST_POINTS = 3
-# A ratio of lengths this near to that of two units is no chance: no part is off by so much.
+# Relative tolerance of a ratio of lengths about that of two units: no part is off by so much.
 _UNIT_TOLERANCE = 0.1
-# Two units (small, large) that are taken for each other.
+# Pairs of units (small, large) that are confused.
 _MIXED_UNITS = (
     ("mm", "m"),
     ("mm", "inch"),
@@ -60,14 +60,14 @@ _MIXED_UNITS = (
 
 @dataclass(frozen=True, eq=False)
 class PointPairs:
-    """Measured points and the drawing's coordinates of them, n in all.
+    """Measured points and their coordinates in the drawing, n in all.
 
     Attributes:
-        labels: (n,) the points' names; one that was measured several times is there several times.
+        labels: (n,) the points' names, repeated for repeated measurements.
         measured: (n, 3) in the base [m].
-        covariances: (n, 3, 3) what is known of their noise [m^2]; zeros where nothing is.
+        covariances: (n, 3, 3) stated covariance of their noise [m^2]; zeros where none is.
         nominal: (n, 3) in the fixture's frame [m].
-        nominal_sigma_m: (n,) how well the part keeps to its drawing, per axis [m].
+        nominal_sigma_m: (n,) tolerance of the part to its drawing, per axis, as a sigma [m].
         spare_labels: (k,) names of drawn points that were not measured.
         spare: (k, 3) their coordinates in the fixture's frame [m].
     """
@@ -112,9 +112,9 @@ class PointPairs:
 
     @property
     def known(self) -> FloatArray:
-        """(n, 3, 3) what is known of each point's noise, measured and drawn together [m^2].
+        """(n, 3, 3) stated covariance of each point, measured and drawn together [m^2].
 
-        A part's deviation from its drawing is alike in all directions, however it is turned.
+        A part's deviation from its drawing is isotropic, so that its rotation does not matter.
         """
         return np.asarray(
             self.covariances + self.nominal_sigma_m[:, None, None] ** 2 * np.eye(3), dtype=float
@@ -122,16 +122,16 @@ class PointPairs:
 
     @property
     def known_noise_m(self) -> float:
-        """The known noise of a coordinate, root mean square over all [m]."""
+        """The stated noise of a coordinate, root mean square over all [m]."""
         return float(np.sqrt(np.trace(self.known, axis1=1, axis2=2).mean() / 3.0))
 
 
 def check_pairs(pairs: PointPairs) -> None:
-    """Refuses points that cannot place anything.
+    """Refuses points that cannot determine a frame.
 
     Raises:
-        DataError: Fewer than three points, numbers that are none, or another unit.
-        DegenerateError: The points lie on a line, or in one place.
+        DataError: Fewer than three points, missing numbers, or another unit.
+        DegenerateError: The points are collinear or coincident.
     """
     if len(pairs) < FEWEST_POINTS:
         raise DataError(
@@ -142,7 +142,7 @@ def check_pairs(pairs: PointPairs) -> None:
         )
     bad = ~np.isfinite(pairs.measured).all(axis=1) | ~np.isfinite(pairs.nominal).all(axis=1)
     if bad.any():
-        names = [pairs.labels[at] for at in np.flatnonzero(bad)]
+        names = [pairs.labels[index] for index in np.flatnonzero(bad)]
         raise DataError(
             f"fixture: point {some_of(names)}: a coordinate is missing.", culprits=names
         )
@@ -154,28 +154,25 @@ def check_pairs(pairs: PointPairs) -> None:
 def determines_hand(measured: FloatArray, nominal: FloatArray, noise_m: float) -> bool:
     """Whether points (n, 3) distinguish a drawing of them (n, 3) from its mirror image.
 
-    Points in one plane have no hand: mirrored they are the same points seen from behind, and the
-    frame's z axis points the other way. They do not show that.
+    Coplanar points have no handedness: mirrored they are the same points seen from behind, with the
+    frame's z axis reversed.
 
     Args:
         measured: In the base [m].
         nominal: In the fixture's frame [m].
-        noise_m: What is known of a coordinate's noise [m].
+        noise_m: Stated noise of a coordinate [m].
     """
     as_drawn, flipped, limit = _hands(measured, nominal, noise_m)
     return flipped > limit * as_drawn
 
 
 def check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
-    """Refuses points that are the mirror image of the drawing.
+    """Refuses points that are the mirror image of the drawing, at a stated noise [m].
 
-    Args:
-        pairs: The points.
-        numbering: The order in which they fit best.
-        noise_m: What is known of a coordinate's noise [m].
+    `numbering` is the order in which they fit best.
 
     Raises:
-        DataError: Mirrored, the points fit so much better that noise does not explain it.
+        DataError: Mirrored, the points fit significantly better.
     """
     as_drawn, flipped, limit = _hands(pairs.measured, pairs.nominal, noise_m)
     reordered = float(procrustes_residual(pairs.measured, pairs.drawn[numbering.assignment]))
@@ -197,7 +194,7 @@ def check_hand(pairs: PointPairs, numbering: Numbering, noise_m: float) -> None:
 
 
 def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[float, float, float]:
-    """Squared misfits of the drawing and of its mirror image [m^2], and how far they may differ."""
+    """Squared misfits of the drawing and of its mirror image [m^2], and their ratio's limit."""
     freedom, floor = 3.0 * len(measured) - 6.0, _floor(len(measured), noise_m)
     return (
         float(procrustes_residual(measured, nominal)) + floor,
@@ -207,12 +204,12 @@ def _hands(measured: FloatArray, nominal: FloatArray, noise_m: float) -> tuple[f
 
 
 def _floor(count: int, noise_m: float) -> float:
-    """Squared misfit [m^2] that is noise in any case: it sets no two fits apart."""
+    """Squared misfit [m^2] by noise, added to both sides of a ratio."""
     return (3.0 * count - 6.0) * max(noise_m, LEAST_NOISE_M) ** 2
 
 
 def line_words(points: FloatArray, whose: str) -> str:
-    """Says how near points (n, 3) are to a line: `the drawn points lie within 0.2 mm of a line`."""
+    """Words for near collinearity of (n, 3): `the drawn points lie within 0.2 mm of a line`."""
     centred = points - points.mean(axis=0)
     axis = spreads(points)[1][0]
     aside = np.linalg.norm(centred - np.outer(centred @ axis, axis), axis=1).max()
@@ -240,7 +237,7 @@ def _check_line(points: FloatArray, whose: str, labels: Sequence[str]) -> None:
 
 
 def _check_units(pairs: PointPairs) -> None:
-    """Compares the typical distances: whatever the numbering, and with a few points wrong."""
+    """Compares typical distances, which do not depend on the numbering or a few outliers."""
     ratio = _typical_distance(pairs.measured) / _typical_distance(pairs.nominal)
     for small, large in _MIXED_UNITS:
         factor = UNITS_M[large] / UNITS_M[small]
@@ -262,12 +259,12 @@ def _typical_distance(points: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Scale:
-    """How much larger the measured part is than the drawn one, where that is left free.
+    """Scale of the measured part relative to the drawing, if left free.
 
     Attributes:
         value: Measured over drawn.
         sigma: Its standard deviation.
-        differs: Whether it is another than one, beyond noise.
+        differs: Whether it differs significantly from one.
     """
 
     value: float
@@ -277,7 +274,7 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class FixturePlacement:
-    """Where the drawing lies: (4, 4) `base_from_fixture`, behind a scale of the drawing."""
+    """Pose of the drawing: (4, 4) `base_from_fixture`, applied after a scale of the drawing."""
 
     base_from_fixture: FloatArray
     scale: float
@@ -288,14 +285,14 @@ class PointFit:
     """A fixture's frame from n points.
 
     Attributes:
-        agreement: Which points agree and their fit, without any scale. Its residuals are measured
+        agreement: The inlier points and their fit, without any scale. Its residuals are measured
             less drawn, in the base [m].
-        scale: What the scale would be.
-        numbering: In which order the points fit the drawing; one that was measured several times
-            counts once, at its first place.
-        hand_known: Whether mirrored points would have been found: else they lie in one plane, and
-            the fixture's z axis may as well point the other way.
-        worst: The worst known offset, amid the points, and the worst known rotation.
+        scale: The scale if it were free.
+        numbering: The order in which the points fit the drawing best; repeated measurements count
+            once, at their first place.
+        hand_known: Whether mirrored points would have been found: coplanar points leave the sign of
+            the fixture's z axis open.
+        worst: The least certain offset, amid the points, and the least certain rotation.
     """
 
     agreement: GroupInliers[FixturePlacement]
@@ -316,19 +313,19 @@ class PointFit:
 
     @property
     def by_points(self) -> FloatArray:
-        """(n, 6, 3) how the frame's right perturbation moves with each measured point."""
+        """(n, 6, 3) Jacobian of the frame's right perturbation by each measured point."""
         return self.agreement.fit.gains
 
 
 @dataclass(frozen=True, eq=False)
 class PointProblem:
-    """Points on their drawing, with the drawing's scale free or held at one."""
+    """Fit of points to their drawing, with the drawing's scale free or held at one."""
 
     pairs: PointPairs
     scaled: bool
 
     def guesses(self) -> Iterator[FixturePlacement]:
-        """Gives closed forms from all points, and from small sets."""
+        """Closed forms from all points, and from small sets."""
         yield self._closed_form(np.arange(len(self.pairs)))
         for rows in small_sets(len(self.pairs), FEWEST_POINTS):
             yield self._closed_form(rows)
@@ -339,7 +336,7 @@ class PointProblem:
         return FixturePlacement(align(measured, scale * nominal), scale)
 
     def linearise(self, state: FixturePlacement) -> Groups:
-        """Residuals (n, 3) in the base, and their derivatives by the perturbation and the scale.
+        """Residuals (n, 3) in the base, and their Jacobian by the perturbation and the scale.
 
         `R (s p + w x s p + v) + t`, so that a step (w, v) moves the residual by `R (sp x w) - R v`,
         and one of the scale by `-R p`.
@@ -365,28 +362,25 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
     """Fits a fixture's frame to points of its drawing.
 
     Weighted least squares from the closed form (Arun, Huang and Blostein 1987; Umeyama 1991), with
-    the points' own covariances, the noise's level by restricted maximum likelihood, and the points
-    that do not agree with the others left out.
+    the points' own covariances, the noise level by restricted maximum likelihood, and outliers
+    rejected.
 
     Args:
         pairs: The points.
-        expected_noise_m: Noise that is to be expected of a coordinate beyond what is known of each
-            point [m]; None where nobody knows.
-
-    Returns:
-        The frame, and what else the points determine.
+        expected_noise_m: Expected noise of a coordinate beyond the stated one of each point [m];
+            None where unknown.
 
     Raises:
         DataError: Too few points, another unit, mirrored or wrongly numbered points, or points that
             do not fit the drawing at all.
-        DegenerateError: The points are on a line, or nearly so.
+        DegenerateError: The points are collinear, or nearly so.
     """
     points = pairs.merged()
     check_pairs(points)
     noise = float(np.hypot(pairs.known_noise_m, expected_noise_m or 0.0))
     numbering = find_numbering(points.measured, points.drawn, noise)
     check_hand(points, numbering, noise)
-    agreement, scale = _agreeing(pairs, expected_noise_m)
+    agreement, scale = _fit_inliers(pairs, expected_noise_m)
     _check_numbering(
         points, numbering, {pairs.labels[index] for index in np.flatnonzero(agreement.agrees)}
     )
@@ -405,28 +399,28 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
     return PointFit(agreement, scale, numbering, hand_known, worst)
 
 
-def _agreeing(
+def _fit_inliers(
     pairs: PointPairs, expected_noise_m: float | None
 ) -> tuple[GroupInliers[FixturePlacement], Scale]:
-    """Finds the points that agree, without accusing those that only a scale sets apart."""
+    """Finds the inliers, without rejecting points that only a scale contradicts."""
     rigid = agreeing_groups(PointProblem(pairs, scaled=False), expected_noise_m)
-    if not _sound(rigid).all():
+    if not _is_inlier(rigid).all():
         scaled = agreeing_groups(PointProblem(pairs, scaled=True), expected_noise_m)
         scale = _scale_of(scaled.fit)
-        if scale.differs and _sound(scaled).sum() > _sound(rigid).sum():
+        if scale.differs and _is_inlier(scaled).sum() > _is_inlier(rigid).sum():
             fit = fit_groups(PointProblem(pairs, scaled=False), scaled.agrees)
             return _as_scaled(scaled, fit), scale
     return rigid, _scale_of(fit_groups(PointProblem(pairs, scaled=True), rigid.agrees))
 
 
-def _sound(agreement: GroupInliers[FixturePlacement]) -> Mask:
+def _is_inlier(agreement: GroupInliers[FixturePlacement]) -> Mask:
     return agreement.agrees & ~agreement.doubtful
 
 
 def _as_scaled(
     scaled: GroupInliers[FixturePlacement], fit: GroupFit[FixturePlacement]
 ) -> GroupInliers[FixturePlacement]:
-    """What agrees behind a scale, with the fit that has none: noise does not explain that one."""
+    """Inliers with a free scale, with the fit without it, which noise does not explain."""
     return GroupInliers(
         fit, fit.used, scaled.mahalanobis_sq, scaled.limit, scaled.doubtful, explained=False
     )
@@ -435,12 +429,12 @@ def _as_scaled(
 def _scale_of(fit: GroupFit[FixturePlacement]) -> Scale:
     value, sigma = fit.state.scale, float(np.sqrt(fit.covariance[6, 6]))
     chance = t_chance((value - 1.0) / sigma, max(fit.freedom, 1))
-    # Points through their middle are no drawing of another size: exchanged names fit like that.
+    # A negative scale is no drawing of another size: exchanged names fit like that.
     return Scale(value, sigma, value > 0.0 and chance < _FALSE_ALARM)
 
 
 def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[str]) -> None:
-    """Refuses a wrong order, unless just the points that are out of order were left out."""
+    """Refuses a wrong order, unless the points out of order were rejected anyway."""
     moved = [pairs.labels[at] for at in numbering.moved]
     if not numbering.is_wrong or not any(value in agree for value in moved):
         return
@@ -458,15 +452,15 @@ def _check_numbering(pairs: PointPairs, numbering: Numbering, agree: Collection[
 
 
 def _no_fit(pairs: PointPairs, fit: GroupFit[FixturePlacement], scale: Scale) -> DataError:
-    """The points contradict the drawing by so much that no frame follows, whatever their places."""
-    off = np.linalg.norm(fit.groups.residuals, axis=1)
-    rms_mm, worst = 1e3 * np.sqrt(np.mean(off**2)), int(np.argmax(off))
+    """Error for points that contradict the drawing too much for any frame."""
+    distances = np.linalg.norm(fit.groups.residuals, axis=1)
+    rms_mm, worst = 1e3 * np.sqrt(np.mean(distances**2)), int(np.argmax(distances))
     scaled = pairs.nominal[fit.used] * scale.value
     left = np.sqrt(procrustes_residual(pairs.measured[fit.used], scaled) / fit.used.sum())
     hint = f" A drawing {scale.value:.4g} times as large would fit to {figure(1e3 * left)} mm."
     return DataError(
         f"fixture: the points do not fit the drawing: they are {rms_mm:.3g} mm off (root mean "
-        f"square), most of all {pairs.labels[worst]} with {1e3 * off[worst]:.3g} mm."
+        f"square), most of all {pairs.labels[worst]} with {1e3 * distances[worst]:.3g} mm."
         f"{hint if scale.differs else ''}",
         culprits=[pairs.labels[worst]],
         next_step="Check the drawing's coordinates, the points' names and how they were measured.",

@@ -1,20 +1,20 @@
-"""Errors of an arm without joint angles: processes over its postures, and over time.
+"""Arm errors without joint angles: Gaussian processes over posture, and over time.
 
-What such an arm does wrong follows its posture, or lasts from stop to stop: residuals are not white
-noise, and the mean of many is not as good as their number says. Several models of it are weighed by
-their restricted likelihood (Bayesian model averaging; Hoeting et al. 1999), and none is chosen:
+The errors of such an arm depend on its posture, or persist from stop to stop: residuals are not
+white noise, and their mean converges more slowly than their number suggests. Several models are
+averaged by their restricted likelihood (Bayesian model averaging; Hoeting et al. 1999):
 
-    white       nothing but noise from stop to stop
-    scatter     the same of the flange as well, where that of observed poses is one with it; both
-                then share a weight
+    white       independent noise from stop to stop
+    scatter     the same of the flange as well, where that of observed poses is combined with it;
+                both then share a weight
     basis       smooth functions of the posture, see `arm.pose_basis`
-    posture     Gaussian processes over the posture, one of the flange and one of the base, over a
+    posture     Gaussian processes over the posture, one of the flange and one of the base, of a
                 short or a long range (Rasmussen and Williams 2006)
     time        an Ornstein-Uhlenbeck process over the stops, of a short or a long memory
     drift       the flange and the base move evenly from the first stop to the last
-    both        the likeliest two of these
+    both        the most likely two of these
 
-The answer stays that of white noise; its covariance is theirs.
+The solution stays that of white noise; its covariance is the average of the models'.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,10 +33,10 @@ from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import RATIO_PRIOR, normal_equations, robot_likelihood
 from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Likely
 
-# Postures are as far apart by so much of a place as by a radian of a direction [m].
+# Distance between postures equivalent to a rotation by a radian [m].
 _REACH_M = 0.5
-# Ranges of the processes over the posture [rad], and memories of those over time [stops]. One
-# longer than a session shows as wandering whose whole size is open: a hundred stands for it.
+# Ranges of the processes over the posture [rad], and memories of those over time [stops]. The size
+# of a memory longer than the session is undetermined: a hundred stands for it.
 _RANGES, _MEMORIES = (0.15, 0.4, 1.0, 2.8), (3.0, 10.0, 30.0, 100.0)
 _PRIOR = {
     "white": 1 / 4,
@@ -46,34 +46,34 @@ _PRIOR = {
     "drift": 1 / 16,
     "both": 1 / 16,
 }
-# Models of less weight are left out.
+# Least weight of a model.
 _NO_WEIGHT = 1e-4
-# Fewer stops have hardly more residuals than the edges and the noise take.
+# Fewer stops have hardly more residuals than edges and noise have parameters.
 _FEWEST_STOPS = 6
-# Unknowns of stops whose errors are weighed together: the work grows with their cube.
+# Most rows of a block with joint covariance: the work grows with their cube.
 _MOST_ROWS = 360
-# So many blocks, spread over the session, determine the sizes: the rest counts as known noise.
+# Most blocks, spread over the session, that determine the sizes; others count as known noise.
 _MOST_BLOCKS = 5
-# Columns that stand for the errors of all stops; what they leave counts as noise.
+# Most columns that represent the errors of all stops; the remainder counts as noise.
 _MOST_COLUMNS = 360
-# Parts of the postures that are left out in turn.
+# Number of posture clusters for cross-validation.
 _CLUSTERS = 5
-# Variances of so little of the whole are rounding.
+# Variances below this share of the total are rounding.
 _FACTORED = 1e-6
-# A process begins at such a share of the noise, and is none at the other.
-_BEGINS, _NOTHING = 0.7, 1e-2
-_ITERATIONS, _SETTLED, _WORST_DAMPING, _LONGEST_STEP = 30, 5e-3, 1e4, 1.5
+# Start of a process's size in units of the noise, and the size that counts as zero.
+_START_SIZE, _NOTHING = 0.7, 1e-2
+_ITERATIONS, _CONVERGED, _WORST_DAMPING, _LONGEST_STEP = 30, 5e-3, 1e4, 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class _Process:
-    """Errors of which `size^2 kernel_ij at_i at_j'` is common to stops i and j.
+    """Errors with the covariance `size^2 kernel_ij at_i at_j'` between stops i and j.
 
     Attributes:
-        kernel: (s, s) how alike they are.
-        at: (s, 6, q) how each of q independent ones moves the flange at each stop.
+        kernel: (s, s) correlation of the stops.
+        at: (s, 6, q) Jacobian of the flange at each stop by q independent errors.
         size: Their standard deviation, in units of `at`.
-        lasts: Whether they are alike by the time of stops, not by their postures.
+        lasts: Whether they are correlated over time, not over the posture.
     """
 
     kernel: FloatArray
@@ -82,10 +82,10 @@ class _Process:
     lasts: bool = False
 
     def between(self, some: IntArray, others: IntArray) -> FloatArray:
-        """(a, b, 6, 6) the covariance of what is at some stops and at others."""
-        alike = self.size**2 * self.kernel[np.ix_(some, others)]
-        moved = np.tensordot(self.at[some], self.at[others], axes=(2, 2))
-        return np.asarray(alike[:, :, None, None] * np.swapaxes(moved, 1, 2))
+        """(a, b, 6, 6) covariance between the flange at some stops and at others."""
+        correlation = self.size**2 * self.kernel[np.ix_(some, others)]
+        products = np.tensordot(self.at[some], self.at[others], axes=(2, 2))
+        return np.asarray(correlation[:, :, None, None] * np.swapaxes(products, 1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +94,10 @@ class _Model:
 
     Attributes:
         kind: A key of the priors.
-        prior: Its own.
-        processes: What is beside the noise.
-        white: (2,) the noise, of rotation [rad] and place [m].
-        value: The negative restricted log-likelihood of the likeliest sizes.
+        prior: Its prior probability.
+        processes: The processes beside white noise.
+        white: (2,) the noise, of rotation [rad] and position [m].
+        value: The negative restricted log-likelihood at the most likely sizes.
     """
 
     kind: str
@@ -108,49 +108,46 @@ class _Model:
 
     @property
     def evidence(self) -> float:
-        """The logarithm of its weight, but for what all models have in common."""
+        """The logarithm of its weight, up to a constant common to all models."""
         return float(np.log(self.prior) - self.value - len(self.processes))
 
 
 def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -> ArmErrors | None:
-    """Weighs models of what an arm without joint angles does wrong.
+    """Averages models of the errors of an arm without joint angles, from the white-noise solution.
 
-    Args:
-        problem: The observations.
-        state: The answer under white noise.
-        noise: Its levels; those of the sensors and of other robots are kept.
-        robot: The robot.
+    The noise levels of the sensors and of other robots are kept.
 
     Returns:
-        Its errors, and the noise beside them, both as means over all models; None of too few stops.
+        Its errors, and the noise beside them, both averaged over all models; None for too few
+        stops.
     """
     observed = stops_of(problem, robot)
     if len(observed) < _FEWEST_STOPS:
         return None
     poses = problem.poses[robot]
-    stood = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
-    likelihood = _Likelihood.of(problem, state, noise, robot, stood)
+    posed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+    likelihood = _Likelihood.of(problem, state, noise, robot, posed)
     levels = np.maximum(noise.robots[problem.robots.index(robot)], LEAST_SIGMA)
     white = likelihood.maximised(_Model("white", _PRIOR["white"], (), levels))
     independent = [white]
     if problem.is_combined:
-        scatter = likelihood.maximised(_scatter(len(stood), white.white))
+        scatter = likelihood.maximised(_scatter(len(posed), white.white))
         independent = [replace(model, prior=_PRIOR["white"] / 2) for model in (white, scatter)]
-    seen = np.searchsorted(stood, observed)
-    others = _models(poses[stood], white.white, seen)
+    observed_rows = np.searchsorted(posed, observed)
+    others = _models(poses[posed], white.white, observed_rows)
     models = [*independent, *map(likelihood.maximised, others)]
-    likeliest = [
+    best_models = [
         max((model for model in models if model.kind == kind), key=lambda model: model.evidence)
         for kind in ("posture", "time")
     ]
-    both = tuple(process for model in likeliest for process in model.processes)
+    both = tuple(process for model in best_models for process in model.processes)
     models.append(likelihood.maximised(_Model("both", _PRIOR["both"], both, white.white)))
     logs = np.array([model.evidence for model in models])
     shares = np.exp(logs - logs.max())
-    unlikely = min(model.value + len(model.processes) for model in independent)
-    # A drift has its own test, and is no error of the arm.
+    independent_value = min(model.value + len(model.processes) for model in independent)
+    # Drift has its own test, and is no error of the arm.
     of_arm = [value for value, model in zip(logs, models, strict=True) if model.kind != "drift"]
-    gain = 2.0 * float(np.logaddexp.reduce(of_arm) + unlikely)
+    gain = 2.0 * float(np.logaddexp.reduce(of_arm) + independent_value)
     weights = np.where(shares / shares.sum() > _NO_WEIGHT, shares, 0.0)
     weights /= weights.sum()
     pairs = [pair for pair in zip(models, weights.tolist(), strict=True) if pair[1]]
@@ -162,13 +159,13 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     kinds = [
         [process for process in processes if process.lasts is lasts] for lasts in (False, True)
     ]
-    most = _MOST_COLUMNS // 6 // max(sum(map(bool, kinds)), 1)
-    by_posture, in_time = (_columns(some, len(stood), seen, most) for some in kinds)
-    squares = sum((weight * model.white**2 for model, weight in pairs), by_posture[1] + in_time[1])
+    most_stops = _MOST_COLUMNS // 6 // max(sum(map(bool, kinds)), 1)
+    by_posture, in_time = (_columns(some, len(posed), observed_rows, most_stops) for some in kinds)
+    left = sum((weight * model.white**2 for model, weight in pairs), by_posture[1] + in_time[1])
     columns, lasting = np.concatenate([by_posture[0], in_time[0]], axis=2), in_time[0].shape[2]
     basis = np.zeros((len(poses), 6, columns.shape[2]))
-    basis[stood] = columns
-    beside = np.sqrt(squares)
+    basis[posed] = columns
+    beside = np.sqrt(left)
     found = ArmErrors(basis, 1.0, gain, of_links=False, white=beside, look=levels, lasting=lasting)
     return replace(found, away=left_out_clusters(problem, state, noise, robot, found))
 
@@ -176,38 +173,38 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
 def left_out_clusters(
     problem: Problem, state: State, noise: Noise, robot: str, errors: ArmErrors
 ) -> FloatArray | None:
-    """What looks err by whose postures are far from those in the fit.
+    """Cross-validated errors at postures far from those of the fit.
 
-    The stops are parted by posture, and each part is predicted from a fit to the others: to first
-    order, and with the noise and the errors as they were found from all.
+    The stops are clustered by posture, and each cluster is predicted from a fit to the others: to
+    first order, with the noise and the errors estimated from all.
 
     Returns:
-        (2, 2) roots of mean squares of rotation [rad] and place [m], as found and as predicted;
-        None of too few stops.
+        (2, 2) root mean squares of rotation [rad] and position [m], measured and predicted; None
+        for too few stops.
     """
     stops, rows = stops_of(problem, robot), np.flatnonzero(rows_of(problem, robot))
     if len(stops) < 2 * _CLUSTERS:
         return None
-    of_stop = posture_clusters(problem.poses[robot][stops])
-    clusters = of_stop[np.searchsorted(stops, problem.observations.stops[rows])]
+    cluster_of_stop = posture_clusters(problem.poses[robot][stops])
+    clusters = cluster_of_stop[np.searchsorted(stops, problem.observations.stops[rows])]
     widened = problem.with_effects([*problem.effects, errors.effect(robot)])
-    there = State(state.edges, np.append(state.values, np.zeros(errors.basis.shape[2])))
+    widened_state = State(state.edges, np.append(state.values, np.zeros(errors.basis.shape[2])))
     size, squares, levels = problem.size, np.zeros((2, 2, 3)), noise.robots.copy()
     white = levels[problem.robots.index(robot)] if errors.white is None else errors.white
     levels[problem.robots.index(robot)] = white
-    beside = replace(noise, robots=levels)
+    noise_beside = replace(noise, robots=levels)
     for cluster in range(_CLUSTERS):
         held = np.zeros(len(problem), dtype=bool)
         held[rows[clusters == cluster]] = True
         rest, left_out = widened.subset(~held), widened.subset(held)
-        information, gradient = normal_equations(rest, there, noise)
+        information, gradient = normal_equations(rest, widened_state, noise)
         fitted = covariance_among(information[:size, :size], problem.moving)
-        linear = left_out.linear(there)
+        linear = left_out.linear(widened_state)
         jacobian, by_arm = np.split(linear.jacobian, [size], axis=2)
         residuals = linear.residuals - jacobian @ (fitted @ gradient[:size])
         by_arm = errors.sigma * (by_arm - jacobian @ (fitted @ information[:size, size:]))
         fitted = fitted + less_noise(problem.subset(~held), state, noise, robot, white)
-        predicted = left_out.total_covariance(linear, beside)
+        predicted = left_out.total_covariance(linear, noise_beside)
         predicted += by_arm @ np.swapaxes(by_arm, 1, 2)
         predicted += jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
         squares[0] += np.sum(residuals**2, axis=0).reshape(2, 3)
@@ -216,108 +213,103 @@ def left_out_clusters(
 
 
 def posture_clusters(poses: FloatArray) -> IntArray:
-    """(s,) parts of (s, 4, 4) postures: each belongs to the nearest of five that are far apart.
+    """(s,) cluster of each of (s, 4, 4) postures: the nearest of five that are far apart.
 
     These are chosen by farthest-point clustering (Gonzalez 1985).
     """
-    away = _squared_distances(poses)
-    seeds = [int(np.argmax(away.sum(axis=1)))]
+    distance_sq = _squared_distances(poses)
+    seeds = [int(np.argmax(distance_sq.sum(axis=1)))]
     for _ in range(_CLUSTERS - 1):
-        seeds.append(int(np.argmax(away[seeds].min(axis=0))))
-    return np.asarray(np.argmin(away[seeds], axis=0))
+        seeds.append(int(np.argmax(distance_sq[seeds].min(axis=0))))
+    return np.asarray(np.argmin(distance_sq[seeds], axis=0))
 
 
 def _scatter(count: int, white: FloatArray) -> _Model:
-    """Noise of the flange from stop to stop, which turns and shifts what is far from it alike."""
+    """Noise of the flange from stop to stop, which acts on distant frames with its lever."""
     flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (count, 6, 6))
-    process = _Process(np.eye(count), flange, _BEGINS)
+    process = _Process(np.eye(count), flange, _START_SIZE)
     return _Model("scatter", _PRIOR["white"], (process,), white)
 
 
-def _models(poses: FloatArray, white: FloatArray, seen: IntArray) -> Iterator[_Model]:
-    """All models but independent noise, and both kinds of processes at once.
+def _models(poses: FloatArray, white: FloatArray, observed: IntArray) -> Iterator[_Model]:
+    """Yields all models except independent noise and the combination of both processes.
 
     Args:
-        poses: (s, 4, 4) all postures at which the robot stood.
-        white: (2,) the noise, of rotation [rad] and place [m].
-        seen: Those at which something was observed.
+        poses: (s, 4, 4) all postures of the robot.
+        white: (2,) the noise, of rotation [rad] and position [m].
+        observed: Those at which something was observed.
     """
     flange = np.broadcast_to(np.diag(np.repeat(white, 3)), (len(poses), 6, 6))
     level = float(np.sqrt(np.mean(np.square(white / TWIST_UNITS[[0, 3]]))))
     base = level * adjoint(invert(poses)) * TWIST_UNITS
-    smooth = _Process(np.ones((len(poses),) * 2), level * pose_basis(poses), _BEGINS)
+    smooth = _Process(np.ones((len(poses),) * 2), level * pose_basis(poses), _START_SIZE)
     yield _Model("basis", _PRIOR["basis"], (smooth,), white)
     both = np.concatenate([flange, base], axis=2)
-    away = _squared_distances(poses)
+    distance_sq = _squared_distances(poses)
     for length in _RANGES:
-        kernel = np.exp(-away / (2.0 * length**2))
-        processes = (_Process(kernel, both, _BEGINS),)
+        kernel = np.exp(-distance_sq / (2.0 * length**2))
+        processes = (_Process(kernel, both, _START_SIZE),)
         yield _Model("posture", _PRIOR["posture"] / len(_RANGES), processes, white)
     order = np.arange(len(poses))
     for memory in _MEMORIES:
         kernel = np.exp(-np.abs(order[:, None] - order) / memory)
-        process = _Process(kernel, flange, _BEGINS, lasts=True)
+        process = _Process(kernel, flange, _START_SIZE, lasts=True)
         yield _Model("time", _PRIOR["time"] / len(_MEMORIES), (process,), white)
-    evenly = (order - seen.mean()) / seen.std()
-    process = _Process(np.outer(evenly, evenly), both, _BEGINS, lasts=True)
+    centred_order = (order - observed.mean()) / observed.std()
+    process = _Process(np.outer(centred_order, centred_order), both, _START_SIZE, lasts=True)
     yield _Model("drift", _PRIOR["drift"], (process,), white)
 
 
 def _squared_distances(poses: FloatArray) -> FloatArray:
-    """(s, s) how far postures are apart, squared; 2 (1 - cos) of an angle [rad^2]."""
-    places, turns = poses[:, :3, 3] / _REACH_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0)
-    at = np.concatenate([places, turns], axis=1)
-    return np.asarray(np.sum((at[:, None] - at) ** 2, axis=2))
+    """(s, s) squared distances of postures; 2 (1 - cos) of an angle [rad^2]."""
+    places, turns = (poses[:, :3, 3] / _REACH_M, poses[:, :3, :3].reshape(-1, 9) / np.sqrt(2.0))
+    features = np.concatenate([places, turns], axis=1)
+    return np.asarray(np.sum((features[:, None] - features) ** 2, axis=2))
 
 
 def _columns(
     processes: Sequence[_Process], count: int, observed: IntArray, most: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Factors the covariance of processes by blocks of stops, those that leave most first.
-
-    Args:
-        processes: The processes.
-        count: How many stops s there are.
-        observed: (m,) those that were observed.
-        most: How many stops may have columns.
+    """Factors the covariance of processes by blocks of stops, largest remainder first.
 
     Returns:
-        (s, 6, c) columns, and (2,) the variance that they leave, in the mean of those observed.
+        (s, 6, c) columns of at most `most` stops, and (2,) the mean variance that they leave at
+        (m,) observed stops.
     """
-    every, columns = np.arange(count), np.zeros((count, 6, 0))
-    left = np.zeros((count, 6, 6))
+    all_stops, columns = np.arange(count), np.zeros((count, 6, 0))
+    remainder = np.zeros((count, 6, 6))
     for process in processes:
-        left += process.size**2 * process.at @ np.swapaxes(process.at, 1, 2)
-    whole = np.diagonal(left[observed].mean(axis=0)).reshape(2, 3).mean(axis=1)
-    scale = np.repeat(np.sqrt(np.maximum(whole, LEAST_SIGMA**2)), 3)
+        remainder += process.size**2 * process.at @ np.swapaxes(process.at, 1, 2)
+    total = np.diagonal(remainder[observed].mean(axis=0)).reshape(2, 3).mean(axis=1)
+    scale = np.repeat(np.sqrt(np.maximum(total, LEAST_SIGMA**2)), 3)
     for _ in range(min(len(observed), most) if processes else 0):
-        sizes = np.diagonal(left[observed], axis1=1, axis2=2) / scale**2
-        at = int(observed[np.argmax(sizes.sum(axis=1))])
-        values, vectors = np.linalg.eigh(left[at] / np.outer(scale, scale))
+        sizes = np.diagonal(remainder[observed], axis1=1, axis2=2) / scale**2
+        pivot = int(observed[np.argmax(sizes.sum(axis=1))])
+        values, vectors = np.linalg.eigh(remainder[pivot] / np.outer(scale, scale))
         if values[-1] < _FACTORED:
             break
         kept = values > _FACTORED
-        cross = -columns @ columns[at].T
+        cross = -columns @ columns[pivot].T
         for process in processes:
-            cross += process.between(every, np.array([at]))[:, 0]
-        found = cross / scale @ (vectors[:, kept] / np.sqrt(values[kept]))
-        columns = np.concatenate([columns, found], axis=2)
-        left -= found @ np.swapaxes(found, 1, 2)
-    mean = np.diagonal(left[observed].mean(axis=0))
+            cross += process.between(all_stops, np.array([pivot]))[:, 0]
+        added = cross / scale @ (vectors[:, kept] / np.sqrt(values[kept]))
+        columns = np.concatenate([columns, added], axis=2)
+        remainder -= added @ np.swapaxes(added, 1, 2)
+    mean = np.diagonal(remainder[observed].mean(axis=0))
     return columns, np.maximum(mean.reshape(2, 3).mean(axis=1), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class _StopBlock:
-    """Stops whose errors are weighed together.
+    """Stops with a joint covariance.
 
     Attributes:
-        stops: (u,) the stop of each unit, among those at which the robot stood.
-        errors: (n,) what the units say of their flanges' errors.
-        jacobian: (n, p) how that moves with the unknowns.
-        known: (n, n) its covariance without the robot's own errors.
-        white: (2, n) what the robot's rotation and place add to its diagonal.
-        by_flange: (u, n / u, 6) how it moves with the robot's flange.
+        stops: (u,) the stop of each unit, among those with a pose.
+        errors: (n,) reduced residuals of the units.
+        jacobian: (n, p) by the unknowns.
+        known: (n, n) covariance without the robot's own errors.
+        white: (2, n) contribution of the robot's rotation and position noise to its diagonal.
+        by_flange: (u, n / u, 6) Jacobian by the robot's flange.
     """
 
     stops: IntArray
@@ -328,10 +320,10 @@ class _StopBlock:
     by_flange: FloatArray
 
     def common(self, process: _Process) -> FloatArray:
-        """(n, n) what a process of unit size adds to the covariance."""
-        among = replace(process, size=1.0).between(self.stops, self.stops)
-        turned = self.by_flange[:, None] @ among @ np.swapaxes(self.by_flange, 1, 2)
-        return np.asarray(np.swapaxes(turned, 1, 2).reshape(self.known.shape))
+        """(n, n) covariance by a process of unit size."""
+        flange_covariance = replace(process, size=1.0).between(self.stops, self.stops)
+        covariance = self.by_flange[:, None] @ flange_covariance @ np.swapaxes(self.by_flange, 1, 2)
+        return np.asarray(np.swapaxes(covariance, 1, 2).reshape(self.known.shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,8 +338,8 @@ class _Likelihood:
     """The restricted likelihood of one robot's errors.
 
     Attributes:
-        blocks: Its stops; those of different blocks count as independent.
-        information: (p, p) on the unknowns by all else.
+        blocks: Its stops; different blocks count as independent.
+        information: (p, p) on the unknowns by everything else.
         gradient: (p,) of that.
     """
 
@@ -357,51 +349,51 @@ class _Likelihood:
 
     @classmethod
     def of(
-        cls, problem: Problem, state: State, noise: Noise, robot: str, stood: IntArray
+        cls, problem: Problem, state: State, noise: Noise, robot: str, posed: IntArray
     ) -> "_Likelihood":
         """Linearises the observations; arguments are those of `find_pose_errors`."""
-        place, count = problem.robots.index(robot), len(problem.poses[robot])
+        index, count = problem.robots.index(robot), len(problem.poses[robot])
         moves = np.zeros((count, 6, 6))
-        moves[stood] = np.eye(6)
-        likelihood = robot_likelihood(problem, state, noise).beside(place, moves)
+        moves[posed] = np.eye(6)
+        likelihood = robot_likelihood(problem, state, noise).beside(index, moves)
         jacobian = likelihood.reduced.jacobian[:, :, likelihood.moving]
         jacobian, by_flange = jacobian[:, :, :-6], jacobian[:, :, -6:]
         information = likelihood.known.information[:-6, :-6].copy()
         gradient = likelihood.known.gradient[:-6].copy()
         levels = noise.robots.copy()
-        levels[place] = 0.0
+        levels[index] = 0.0
         others = problem.error_covariance(replace(noise, robots=levels))
         known = likelihood.reduced.covariance + others
         errors, parts = likelihood.reduced.errors, likelihood.components.parts
         members, stops, width = likelihood.members, likelihood.stops, errors.shape[1]
-        units = np.flatnonzero((members == place).any(axis=1))
+        units = np.flatnonzero((members == index).any(axis=1))
         units = units[np.argsort(stops[units], kind="stable")]
         every = np.array_split(units, -(-len(units) * width // _MOST_ROWS))
         spread = np.linspace(0, len(every) - 1, min(len(every), _MOST_BLOCKS)).round().astype(int)
         chosen = [every[at] for at in spread]
         rest = np.setdiff1d(np.arange(len(members)), np.concatenate(chosen))
-        whole = likelihood.reduced.covariance[rest] + problem.error_covariance(noise)[rest]
-        weighted = np.linalg.solve(whole, jacobian[rest])
+        total = likelihood.reduced.covariance[rest] + problem.error_covariance(noise)[rest]
+        weighted = np.linalg.solve(total, jacobian[rest])
         information += np.einsum("uip,uiq->pq", weighted, jacobian[rest])
         gradient += np.einsum("uip,ui->p", weighted, errors[rest])
         blocks = []
         for rows in chosen:
-            own = np.zeros((len(rows), width, len(rows), width))
-            own[np.arange(len(rows)), :, np.arange(len(rows))] = known[rows]
+            covariance = np.zeros((len(rows), width, len(rows), width))
+            covariance[np.arange(len(rows)), :, np.arange(len(rows))] = known[rows]
             blocks.append(
                 _StopBlock(
-                    np.searchsorted(stood, stops[rows]),
+                    np.searchsorted(posed, stops[rows]),
                     errors[rows].ravel(),
                     jacobian[rows].reshape(-1, jacobian.shape[2]),
-                    own.reshape((len(rows) * width,) * 2),
-                    parts[2 * place : 2 * place + 2, rows].reshape(2, -1),
+                    covariance.reshape((len(rows) * width,) * 2),
+                    parts[2 * index : 2 * index + 2, rows].reshape(2, -1),
                     by_flange[rows],
                 )
             )
         return cls(tuple(blocks), information, gradient)
 
     def maximised(self, model: _Model) -> _Model:
-        """The model with its likeliest sizes, by Newton's steps from those that it has."""
+        """The model with maximum-likelihood sizes, by Newton steps from its present ones."""
         common = [
             np.array([block.common(process) for process in model.processes])
             for block in self.blocks
@@ -414,22 +406,22 @@ class _Likelihood:
                 break
             curvature = now.curvature + damping * np.diag(np.diag(now.curvature) + 1e-6)
             step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
-            there = self._step(common, np.clip(now.logs + step, np.log(least), np.log(MOST_SIGMA)))
-            if there is None or there.value > now.value:
+            trial = self._step(common, np.clip(now.logs + step, np.log(least), np.log(MOST_SIGMA)))
+            if trial is None or trial.value > now.value:
                 damping *= 10.0
                 continue
-            gained, now, damping = now.value - there.value, there, damping / 10.0
-            if gained < _SETTLED:
+            gained, now, damping = now.value - trial.value, trial, damping / 10.0
+            if gained < _CONVERGED:
                 break
         if now is None:
             return model
-        found = np.exp(now.logs)
-        pairs = zip(model.processes, found[2:].tolist(), strict=True)
+        sigmas = np.exp(now.logs)
+        pairs = zip(model.processes, sigmas[2:].tolist(), strict=True)
         processes = tuple(replace(process, size=size) for process, size in pairs)
-        return replace(model, processes=processes, white=found[:2], value=now.value)
+        return replace(model, processes=processes, white=sigmas[:2], value=now.value)
 
     def _step(self, common: Sequence[FloatArray], logs: FloatArray) -> _LikelihoodAt | None:
-        """The likelihood there; None where levels are too far apart for it."""
+        """The likelihood at some sizes; None where the covariance is numerically singular."""
         squares, count = np.exp(2.0 * logs), len(logs)
         information, gradient = self.information.copy(), self.gradient.copy()
         value, solved = 0.0, []
@@ -448,23 +440,23 @@ class _Likelihood:
             value += 2.0 * float(np.log(np.diag(factor)).sum()) + float(block.errors @ pulled)
             solved.append((inverse, weighted, pulled))
         root = covariance_root(information)
-        best = root @ (root.T @ gradient)
-        value -= 2.0 * float(np.linalg.slogdet(root)[1]) + float(gradient @ best)
-        slope, average = np.zeros(count), np.zeros((count, count))
-        taken = np.zeros((len(root), count))
+        estimate = root @ (root.T @ gradient)
+        value -= 2.0 * float(np.linalg.slogdet(root)[1]) + float(gradient @ estimate)
+        gradients, average = np.zeros(count), np.zeros((count, count))
+        projected = np.zeros((len(root), count))
         for block, parts, (inverse, weighted, pulled) in zip(
             self.blocks, common, solved, strict=True
         ):
-            left_over = pulled - weighted @ best
+            left_over = pulled - weighted @ estimate
             by_root = weighted @ root
             left = inverse - by_root @ by_root.T
             of_white = block.white * left_over
-            grown = np.concatenate([of_white, parts @ left_over]) if len(parts) else of_white
+            working = np.concatenate([of_white, parts @ left_over]) if len(parts) else of_white
             traces = [*(block.white @ np.diag(left)), *(np.sum(left * part) for part in parts)]
-            slope += squares * (np.array(traces) - grown @ left_over)
-            grown = 2.0 * squares[:, None] * grown
-            average += grown @ inverse @ grown.T
-            taken += by_root.T @ grown.T
-        curvature = 0.5 * (average - taken.T @ taken)
-        found = RATIO_PRIOR.beside(Likely(0.5 * value, slope, curvature), logs)
-        return _LikelihoodAt(found.value, found.slope, found.curvature, logs)
+            gradients += squares * (np.array(traces) - working @ left_over)
+            working = 2.0 * squares[:, None] * working
+            average += working @ inverse @ working.T
+            projected += by_root.T @ working.T
+        curvature = 0.5 * (average - projected.T @ projected)
+        full = RATIO_PRIOR.beside(Likely(0.5 * value, gradients, curvature), logs)
+        return _LikelihoodAt(full.value, full.slope, full.curvature, logs)

@@ -1,6 +1,6 @@
-"""Poses of a target from its corners, the camera being known: all views at once.
+"""Target poses from corners with a known camera, batched over all views.
 
-A planar target has two first guesses, which look almost alike.
+A planar target has two closed-form solutions, which look almost alike.
 """
 
 from dataclasses import dataclass
@@ -14,28 +14,28 @@ from visioncal.estimation.corners import CornerStack, Reprojection, reproject
 from visioncal.estimation.linalg import damped_step
 from visioncal.vision.camera import normalise
 
-# A homography takes four points. Nearer to a line than this share of the target is on it.
+# Least points of a homography; relative distance from a line below which points are collinear.
 _FEWEST, _ON_LINE = 4, 1e-6
-# Points whose depth is under this share of their width are as good as in a plane.
+# Ratio of depth to width below which points count as coplanar.
 _FLAT = 0.1
 _ITERATIONS = 30
-# A step [rad or m] so small that the next, some hundred times smaller, is nothing beside any noise.
-_SETTLED = 1e-6
-# Views whose step is of rounding no longer go along with others.
-_AT_REST = 1e-8
+# Converged step [rad or m]: the next, some hundred times smaller, is negligible beside any noise.
+_CONVERGED = 1e-6
+# Step below which a view no longer iterates with others: it is rounding.
+_IDLE_STEP = 1e-8
 _START_DAMPING = 1e-6
-# At rest, costs differ by rounding: that is no reason to stay.
+# Relative rounding of converged costs, which must not reject a step.
 _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarPoses:
-    """Guesses for v views.
+    """Closed-form poses of v views.
 
     Attributes:
         first: (v, 4, 4) the better `cam_from_target`.
         second: (v, 4, 4) the other; equal where there is one.
-        solved: (v,) whether there is any; the poses of the others mean nothing.
+        solved: (v,) whether there is any; the poses of other views are meaningless.
     """
 
     first: FloatArray
@@ -44,19 +44,19 @@ class PlanarPoses:
 
 
 def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
-    """Solves each view's pose in closed form, by OpenCV.
+    """Solves each view's pose in closed form, with OpenCV.
 
-    Points of a plane by IPPE (Collins and Bartoli 2014), others by SQPnP (Terzakis and Lourakis
+    Coplanar points by IPPE (Collins and Bartoli 2014), others by SQPnP (Terzakis and Lourakis
     2020).
 
     Returns:
-        Both solutions. There is none where the lens cannot be inverted at the corners, or where
-        they do not determine a pose.
+        Both solutions; none where the lens cannot be inverted at the corners, or where they do not
+        determine a pose.
     """
     plane = normalise(camera, stack.px)
     poses = np.tile(np.eye(4), (2, len(stack.views), 1, 1))
     solved = np.zeros(len(stack.views), dtype=bool)
-    for at, (start, count) in enumerate(zip(stack.starts, stack.counts, strict=True)):
+    for view, (start, count) in enumerate(zip(stack.starts, stack.counts, strict=True)):
         rows = slice(start, start + count)
         usable = np.isfinite(plane[rows]).all(axis=1)
         points = stack.points[rows][usable]
@@ -70,18 +70,18 @@ def planar_poses(stack: CornerStack, camera: Camera) -> PlanarPoses:
             None,
             flags=cv2.SOLVEPNP_SQPNP if flat is None else cv2.SOLVEPNP_IPPE,
         )
-        found = [
+        solutions = [
             _pose(np.asarray(rotation, float), np.asarray(translation, float))
             for rotation, translation in zip(rotations, translations, strict=True)
         ]
-        if found and np.isfinite(found).all():
-            solved[at] = True
-            poses[0, at], poses[1, at] = found[0], found[-1]
+        if solutions and np.isfinite(solutions).all():
+            solved[view] = True
+            poses[0, view], poses[1, view] = solutions[0], solutions[-1]
     return PlanarPoses(poses[0], poses[1], solved)
 
 
 def _flattened(points: FloatArray) -> FloatArray | None:
-    """(n, 3) points in the plane that is nearest to them; None where that is not near."""
+    """(n, 3) points projected on their best plane; None where they are not near one."""
     if not points[:, 2].any():
         return points
     middle = points.mean(axis=0)
@@ -94,15 +94,15 @@ def _flattened(points: FloatArray) -> FloatArray | None:
 def determines_pose(points: FloatArray) -> bool:
     """Whether (n, 3) points determine a pose: at least two lie off every line.
 
-    A line that all but one lie on passes through two of any three: three lines are enough to try.
+    A line through all points but one contains two of any three: three lines are enough to try.
     """
     if len(points) < _FEWEST:
         return False
     starts, span = points[[0, 0, 1]], float(np.ptp(points, axis=0).max())
     along = points[[1, 2, 2]] - starts
-    # Of every view: `np.cross` takes ten times as long.
-    away = np.linalg.norm((points - starts[:, None]) @ skew(along), axis=2)
-    is_off = away > _ON_LINE * span * np.linalg.norm(along, axis=1)[:, None]
+    # Called for every view: `np.cross` takes ten times as long.
+    distances = np.linalg.norm((points - starts[:, None]) @ skew(along), axis=2)
+    is_off = distances > _ON_LINE * span * np.linalg.norm(along, axis=1)[:, None]
     return bool(np.all(is_off.sum(axis=1) >= 2))
 
 
@@ -129,16 +129,7 @@ class PoseFit:
 
 
 def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -> PoseFit:
-    """Minimises each view's reprojection error by Levenberg-Marquardt.
-
-    Args:
-        stack: The corners.
-        camera: The intrinsics, held.
-        cam_from_target: (v, 4, 4) starts.
-
-    Returns:
-        The poses with their information.
-    """
+    """Minimises each view's reprojection error by Levenberg-Marquardt, from (v, 4, 4) starts."""
     damping = np.full(len(cam_from_target), _START_DAMPING)
     return _descended(stack, camera, cam_from_target, damping, _ITERATIONS)
 
@@ -146,19 +137,19 @@ def fit_poses(stack: CornerStack, camera: Camera, cam_from_target: FloatArray) -
 def _descended(
     stack: CornerStack, camera: Camera, poses: FloatArray, damping: FloatArray, iterations: int
 ) -> PoseFit:
-    """Takes so many steps at most; few views that go on longer than the others go on alone."""
-    now = reproject(stack, camera, poses, lens=False)
-    cost = stack.sum_by_view(np.sum(now.residuals**2, axis=1))
-    information, gradient = _normal_equations(stack, now)
+    """Iterates up to a number of steps; once most views have converged, only the others go on."""
+    current = reproject(stack, camera, poses, lens=False)
+    cost = stack.sum_by_view(np.sum(current.residuals**2, axis=1))
+    information, gradient = _normal_equations(stack, current)
     for done in range(iterations):
         step = damped_step(information, gradient, damping[:, None])
         candidate = poses @ exp(step)
-        if np.all(np.abs(step) < _SETTLED):
+        if np.all(np.abs(step) < _CONVERGED):
             poses = candidate
             break
-        moving = np.any(np.abs(step) >= _AT_REST, axis=1)
+        moving = np.any(np.abs(step) >= _IDLE_STEP, axis=1)
         if 2 * moving.sum() <= len(moving):
-            corners, residuals = moving[stack.view_of], now.residuals.copy()
+            corners, residuals = moving[stack.view_of], current.residuals.copy()
             rest = _descended(
                 stack.keep(corners), camera, poses[moving], damping[moving], iterations - done
             )
@@ -166,19 +157,21 @@ def _descended(
             poses[moving], information[moving] = rest.cam_from_target, rest.information
             residuals[corners] = rest.residuals
             return PoseFit(poses, information, residuals)
-        then = reproject(stack, camera, candidate, lens=False)
-        cost_then = stack.sum_by_view(np.sum(then.residuals**2, axis=1))
-        better = cost_then <= cost * (1.0 + _ROUNDING)
+        trial = reproject(stack, camera, candidate, lens=False)
+        trial_cost = stack.sum_by_view(np.sum(trial.residuals**2, axis=1))
+        better = trial_cost <= cost * (1.0 + _ROUNDING)
         poses = np.where(better[:, None, None], candidate, poses)
-        cost = np.where(better, cost_then, cost)
+        cost = np.where(better, trial_cost, cost)
         damping = np.clip(np.where(better, damping / 10, damping * 10), 1e-12, 1e6)
-        now = then if better.all() else reproject(stack, camera, poses, lens=False)
-        information, gradient = _normal_equations(stack, now)
-    return PoseFit(poses, information, now.residuals)
+        current = trial if better.all() else reproject(stack, camera, poses, lens=False)
+        information, gradient = _normal_equations(stack, current)
+    return PoseFit(poses, information, current.residuals)
 
 
-def _normal_equations(stack: CornerStack, at: Reprojection) -> tuple[FloatArray, FloatArray]:
-    """Sums (v, 6, 6) information and (v, 6) gradient over each view's corners."""
-    both = np.concatenate([at.by_pose, at.residuals[:, :, None]], axis=2)
-    products = stack.products_by_view(at.by_pose, both)
+def _normal_equations(
+    stack: CornerStack, reprojection: Reprojection
+) -> tuple[FloatArray, FloatArray]:
+    """Information (v, 6, 6) and gradient (v, 6) of each view's corners."""
+    columns = np.concatenate([reprojection.by_pose, reprojection.residuals[:, :, None]], axis=2)
+    products = stack.products_by_view(reprojection.by_pose, columns)
     return products[:, :, :6], products[:, :, 6]

@@ -1,9 +1,9 @@
-"""The search for outliers, whatever is fitted: least trimmed squares, then F tests.
+"""Outlier search for any fit: least trimmed squares, then F tests.
 
-It starts from the state under which the nearest half of all units is nearest (least trimmed
-squares: Rousseeuw 1984), found by concentration steps (Rousseeuw and Van Driessen 1999). Then units
-go in and out one at a time, by their deletion residuals (Cook and Weisberg 1982, section 2.2). A
-unit is right or wrong as a whole: a view, a touch, a point, an image.
+It starts from the state with the least sum of distances of the nearest half of all units (least
+trimmed squares: Rousseeuw 1984), found by concentration steps (Rousseeuw and Van Driessen 1999).
+Then units are included or excluded one at a time, by their deletion residuals (Cook and Weisberg
+1982, section 2.2). A unit is an inlier or outlier as a whole: a view, a touch, a point, an image.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -21,20 +21,20 @@ Fit = TypeVar("Fit")
 State = TypeVar("State")
 
 _ROUNDS = 10
-# With 40 % of the units wrong, all 60 sets of three contain a wrong one with probability 3e-7.
+# Number of small sets: with 40 % outliers, all 60 sets of three contain one with probability 3e-7.
 _SETS = 60
-# A sound unit beside the core is missed with this chance, until units are looked at one by one.
+# Chance that an inlier is missed before units are tested one by one.
 _MISSED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """How far each of m units is from what the others predict.
+    """Distance of each of m units from the prediction of the others.
 
     Attributes:
         squares: (m,) squared Mahalanobis distances.
-        directions: (m,) in how many directions the others predict the unit.
-        limit: (m,) largest square that noise may give.
+        directions: (m,) number of predicted directions of the unit.
+        limit: (m,) largest square of noise.
     """
 
     squares: FloatArray
@@ -43,24 +43,24 @@ class Distances:
 
     @property
     def beyond(self) -> FloatArray:
-        """(m,) the squares as shares of what they may be."""
+        """(m,) the squares over their limits."""
         return np.asarray(self.squares / self.limit)
 
 
 class Robust(Protocol[Fit]):
-    """What is fitted to units, some of which may be outliers."""
+    """A fit to units, some of which may be outliers."""
 
     def fit(self, used: Mask, start: Fit) -> Fit:
-        """Fits the unknowns and the noise to the units of a mask, from another fit's unknowns."""
+        """Fits the unknowns and the noise to the units of a mask, starting at another fit."""
         ...
 
     def distances(self, used: Mask, fit: Fit) -> Distances:
-        """Gives how far all units are, by a fit of those of a mask."""
+        """Distances of all units, for a fit of those of a mask."""
         ...
 
 
 def small_sets(count: int, size: int) -> Iterator[IntArray]:
-    """Gives sets of `size` of `count` units: all that there are, or sixty by chance."""
+    """Yields sets of `size` of `count` units: all of them, or sixty at random."""
     if comb(count, size) <= _SETS:
         yield from (np.array(rows) for rows in combinations(range(count), size))
         return
@@ -69,20 +69,20 @@ def small_sets(count: int, size: int) -> Iterator[IntArray]:
 
 
 def half_of(count: int) -> int:
-    """How many of some units the start goes by: one more than half."""
+    """Size of the trimmed set: one more than half."""
     return (count + 1) // 2 + 1
 
 
-def nearest(away: FloatArray, count: int) -> Mask:
+def nearest(distances: FloatArray, count: int) -> Mask:
     """(m,) mask of the nearest units."""
-    mask = np.zeros(len(away), dtype=bool)
-    mask[np.argsort(away)[:count]] = True
+    mask = np.zeros(len(distances), dtype=bool)
+    mask[np.argsort(distances)[:count]] = True
     return mask
 
 
-def trimmed_sum(away: FloatArray, count: int) -> float:
+def trimmed_sum(distances: FloatArray, count: int) -> float:
     """The sum of the distances of the nearest units."""
-    return float(np.sort(away)[:count].sum())
+    return float(np.sort(distances)[:count].sum())
 
 
 def trimmed_start(
@@ -92,57 +92,57 @@ def trimmed_start(
     count: int,
     followed: int = 5,
 ) -> tuple[Mask, State]:
-    """Finds the units that are nearest to what they alone say.
+    """Least-trimmed-squares start: the units nearest to the state that they determine.
 
     Args:
         starts: States to try, of all units and of small sets.
-        away: Gives the distances (m,) of all units under a state, in any unit.
+        away: Distances (m,) of all units under a state, in any unit.
         solve: Solves from the units of an (m,) mask, near a state.
-        count: How many units are taken for inliers.
-        followed: How many of the starts are followed up by concentration steps, the best first.
+        count: Number of units taken for inliers.
+        followed: Number of starts refined by concentration steps, best first.
 
     Returns:
-        (m,) mask of these units, and the state that they agree on.
+        (m,) mask of these units, and their state.
     """
-    found = [(start, away(start)) for start in starts]
-    found.sort(key=lambda pair: trimmed_sum(pair[1], count))
-    refined = [_concentrated(*pair, away, solve, count) for pair in found[:followed]]
+    candidates = [(start, away(start)) for start in starts]
+    candidates.sort(key=lambda pair: trimmed_sum(pair[1], count))
+    refined = [_concentrated(*pair, away, solve, count) for pair in candidates[:followed]]
     return min(refined, key=lambda pair: pair[0])[1:]
 
 
 def _concentrated(
     state: State,
     distances: FloatArray,
-    away: Callable[[State], FloatArray],
+    distances_of: Callable[[State], FloatArray],
     solve: Callable[[Mask, State], State],
     count: int,
 ) -> tuple[float, Mask, State]:
-    """Solves from the nearest units while that brings them nearer; gives how near they are first.
+    """Concentration steps while the trimmed sum falls; returns that, the mask and the state.
 
-    What is solved for may be another measure than the distances: their sum may rise.
+    `solve` may minimise another measure than the distances: their sum may rise.
     """
     least, mask = trimmed_sum(distances, count), nearest(distances, count)
     for _ in range(_ROUNDS):
-        then = solve(mask, state)
-        distances = away(then)
+        trial = solve(mask, state)
+        distances = distances_of(trial)
         if (lower := trimmed_sum(distances, count)) >= least:
             break
-        least, mask, state = lower, nearest(distances, count), then
+        least, mask, state = lower, nearest(distances, count), trial
     return least, mask, state
 
 
 def widened(
     search: Robust[Fit], used: Mask, fit: Fit, among: Mask | None = None
 ) -> tuple[Mask, Fit]:
-    """Takes all units within reach of the noise, and fits to them, in turn.
+    """Includes all units within the noise's reach and refits, until the set is stable.
 
     Args:
-        search: What is fitted.
-        used: (m,) units that are inliers.
+        search: The fit.
+        used: (m,) inlier mask.
         fit: Their fit.
-        among: (m,) the units to choose from, of which most are inliers; the noise is scaled by
-            their median, because that of the nearest half is less than that of all. Where None, all
-            are chosen from, within their limits at the noise of those that are used.
+        among: (m,) the candidates, mostly inliers; the noise is scaled by their median, because the
+            nearest half has less noise than all. Where None, all are candidates, within their
+            limits at the noise of the used ones.
     """
     fewest = int(used.sum()) if among is not None else 1
     for _ in range(_ROUNDS):
@@ -163,17 +163,17 @@ def widened(
 def settled(
     search: Robust[Fit], used: Mask, fit: Fit, fewest: int, suspect: float
 ) -> tuple[Mask, Fit]:
-    """Takes units in and out one at a time, with the noise estimated anew, until none moves.
+    """Includes or excludes units one at a time, with the noise re-estimated, until stable.
 
-    Of hundreds, one in a hundred goes in at a time.
+    Of hundreds of units, one in a hundred is included at a time.
 
     Args:
-        search: What is fitted.
-        used: (m,) units that are thought to be inliers.
+        search: The fit.
+        used: (m,) presumed inliers.
         fit: Their fit.
-        fewest: So many are left in.
-        suspect: A unit is judged once more, by noise that it has no say in, where its square comes
-            within this share of the limit.
+        fewest: Fewest inliers.
+        suspect: Share of the limit from which a unit is tested again, with noise estimated without
+            it.
     """
     step = max(len(used) // 100, 1)
     for _ in range(2 * len(used)):
@@ -191,8 +191,8 @@ def settled(
             break
         fewer = used.copy()
         fewer[worst] = False
-        again = search.fit(fewer, fit)
-        if search.distances(fewer, again).beyond[worst] <= 1.0:
+        refit = search.fit(fewer, fit)
+        if search.distances(fewer, refit).beyond[worst] <= 1.0:
             break
-        used, fit = fewer, again
+        used, fit = fewer, refit
     return used, fit

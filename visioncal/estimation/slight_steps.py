@@ -1,6 +1,6 @@
-"""Moves that hide in the noise of each observation, and steps of a joint, of a size or of a board.
+"""Moves within the noise of single observations, and steps of a joint, of a size or of a board.
 
-They are found by Rao's score test of a step at every stop (as Page 1955 asks for a change), and are
+They are found by Rao's score test of a step at every stop (a change-point test, Page 1955), and
 kept by the evidence of a fit with the step. `moves` finds those that are larger than the noise.
 """
 
@@ -39,29 +39,29 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.variance import Knowledge
 
-# A step that the other unknowns take up to this share of its information is no step of its own.
-_TAKEN = 1e-6
-# Sizes of boards that are exchanged differ by such shares.
+# Least information of a step beside the other unknowns, as a share of that without them.
+_LEAST_INFORMATION = 1e-6
+# Relative size differences of exchanged boards.
 _SHARES = (1e-3, 1e-2, 1e-1)
-# Runs of stops that begin or end so many away from a step show the same; so many stops are tried.
-_SAME, _PARTS = 2, 60
-# Beside a step, views on either side of it are as far off as others are, or up to so many times.
+# Runs of stops that begin or end this near to a step show the same one; most boundaries tried.
+_SAME_WITHIN, _PARTS = 2, 60
+# Largest ratio of the residuals beside a step to others.
 _ALIKE = 3.0
-# Noise is left, however much a step explains.
+# Largest share of the residuals that a step explains.
 _MOST_EXPLAINED = 0.99
 
 
 @dataclass(frozen=True, eq=False)
 class Slip:
-    """A joint whose offset is another one from some stop on.
+    """A step of a joint's offset at some stop.
 
     Attributes:
-        robot: Its robot, as the problem has it.
-        joint: The joint, numbered from 0.
-        stop: The first stop with the other offset.
-        step_rad: By how much farther it stands from then on than it reads [rad].
-        sigma_rad: How well that is known [rad].
-        mahalanobis_sq: The evidence for it.
+        robot: Its robot, as the problem names it.
+        joint: Index of the joint.
+        stop: The first stop with the new offset.
+        step_rad: Increase of actual minus reported angle [rad].
+        sigma_rad: Its standard deviation [rad].
+        mahalanobis_sq: The test statistic.
     """
 
     robot: str
@@ -74,14 +74,14 @@ class Slip:
 
 @dataclass(frozen=True, eq=False)
 class Resized:
-    """A board that has another size from some stop on, as where a print was exchanged.
+    """A step of a board's size at some stop, as where a print was exchanged.
 
     Attributes:
-        frame: The board, as the problem knows it.
-        stop: The first stop with the other size.
-        share: By how much larger it is from then on.
-        sigma: How well that is known.
-        mahalanobis_sq: The evidence for it.
+        frame: The board, as the problem names it.
+        stop: The first stop with the new size.
+        share: Relative increase of the size.
+        sigma: Its standard deviation.
+        mahalanobis_sq: The test statistic.
     """
 
     frame: str
@@ -92,63 +92,55 @@ class Resized:
 
 
 def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mask] | None:
-    """The other size of a board that some observations ask for together.
-
-    Args:
-        problem: All n observations.
-        fit: The unknowns and the noise, by others.
-        some: (n,) which observations.
+    """The new size of a board that (n,) some observations agree on, by a fit of others.
 
     Returns:
-        By which share it is larger, and for each of them whether noise explains what is left; None
-        where they are not of one board.
+        The relative increase, and for each of them whether noise explains the rest; None where they
+        are not of one board.
     """
     pairs = zip(problem.observations.observed, some.tolist(), strict=True)
-    board, *others = {frame for frame, mine in pairs if mine}
+    board, *others = {frame for frame, chosen in pairs if chosen}
     if others or not board.startswith("target"):
         return None
-    away = problem.measured(fit.state)[some, :3, 3]
-    there = problem.predicted(fit.state)[some, :3, 3]
-    share = float(np.median(np.sum(there * away, axis=1) / np.sum(away**2, axis=1))) - 1.0
-    wider = problem.with_effects([*problem.effects, _of_size(problem, fit, board, some)])
+    measured = problem.measured(fit.state)[some, :3, 3]
+    predicted = problem.predicted(fit.state)[some, :3, 3]
+    ratios = np.sum(predicted * measured, axis=1) / np.sum(measured**2, axis=1)
+    share = float(np.median(ratios)) - 1.0
+    widened = problem.with_effects([*problem.effects, _of_size(problem, fit, board, some)])
     resized = replace(fit, state=State(fit.state.edges, np.append(fit.state.values, share)))
-    return share, explained_by_noise(wider, resized, len(problem))[some]
+    return share, explained_by_noise(widened, resized, len(problem))[some]
 
 
 def slight_move(
     problem: Problem, fit: Solution, movable: Sequence[str], *, kinds: int = 1
 ) -> Move | None:
-    """The most significant step of a frame at any stop; None where noise explains all of them.
+    """The most significant step of a frame at any stop; None where none is significant.
 
-    Args:
-        problem: The observations that agree.
-        fit: The unknowns and the noise.
-        movable: Frames that may have moved.
-        kinds: Of how many kinds of residuals, rotations and places, it may be in one alone. The
-            noise of each is estimated apart: by one of two, a step has to explain half as much,
-            and noise explains it more often than is stated.
+    `kinds` is the number of kinds of residuals, rotations and positions, if it may be in one alone.
+    The noise of each is estimated separately: in one of two, a step has to explain half as much,
+    and noise explains it more often than stated.
     """
     columns = np.array([np.r_[problem.edge_columns(name)] for name in movable]).reshape(-1, 6)
     tried = int(problem.observations.stops.max()) + 1
-    spread = np.array([_spread_of_means(problem, name) for name in movable])
+    variance_ratio = np.array([_variance_ratio(problem, name) for name in movable])
     between = [_between(problem, problem.observations.involves(name)) for name in movable]
     freedom = _residual_freedom(problem, fit) / kinds
     best, limit = None, move_limit(problem, len(movable) * tried, kinds)
     for scored in _scored(problem, fit, columns, between):
         values = scaled_values(scored.alone)
-        clear = (values[:, 0] >= _TAKEN * values[:, -1]) & (values[:, -1] > 0.0)
-        clear &= scaled_values(scored.own)[:, 0] >= _TAKEN
-        squares = np.where(clear, scored.squares, 0.0) / spread[scored.seen, scored.stop]
-        tested = _beside_itself(squares, freedom, 6)
-        place = int(tested.argmax())
-        if tested[place] > limit:
+        testable = (values[:, 0] >= _LEAST_INFORMATION * values[:, -1]) & (values[:, -1] > 0.0)
+        testable &= scaled_values(scored.own)[:, 0] >= _LEAST_INFORMATION
+        squares = np.where(testable, scored.squares, 0.0) / variance_ratio[scored.seen, scored.stop]
+        statistics = _as_f_tests(squares, freedom, 6)
+        index = int(statistics.argmax())
+        if statistics[index] > limit:
             best = (
-                movable[scored.seen[place]],
+                movable[scored.seen[index]],
                 scored.stop,
-                scored.steps[place],
-                float(squares[place]),
+                scored.steps[index],
+                float(squares[index]),
             )
-            limit = tested[place]
+            limit = statistics[index]
     if best is None:
         return None
     frame, stop, step, square = best
@@ -158,42 +150,33 @@ def slight_move(
 def slipped_joint(
     problem: Problem, fit: Solution, offsets: Mapping[str, FloatArray]
 ) -> Slip | None:
-    """The most significant step of a joint's offset at any stop; None where noise explains all.
+    """The most significant step of a joint's offset at any stop; None if none is significant.
 
-    Args:
-        problem: The observations that agree.
-        fit: The unknowns and the noise.
-        offsets: (s, 6, n) by robot, how its flange moves at each stop with the offset of each of
-            its n joints.
+    `offsets` are (s, 6, n) by robot: Jacobians of its flange at each stop by its n joint offsets.
     """
     joints = [(robot, at) for robot, offset in offsets.items() for at in range(offset.shape[2])]
     between = [_between(problem, rows_of(problem, robot)) for robot, _ in joints]
-    found = _most_significant(problem, fit, _of_joints(offsets), between)
-    if found is None:
+    step = _most_significant(problem, fit, _of_joints(offsets), between)
+    if step is None:
         return None
-    robot, joint = joints[found.which]
-    return Slip(robot, joint, found.stop, found.step, found.sigma, found.mahalanobis_sq)
+    robot, at = joints[step.which]
+    return Slip(robot, at, step.stop, step.step, step.sigma, step.mahalanobis_sq)
 
 
 def resized_board(problem: Problem, fit: Solution) -> Resized | None:
-    """The most significant step of a board's size at any stop; None where noise explains all.
-
-    Args:
-        problem: The observations that agree.
-        fit: The unknowns and the noise.
-    """
+    """The most significant step of a board's size at any stop; None if none is significant."""
     boards = [frame for frame in problem.unknown if frame.startswith("target")]
     effects = [_of_size(problem, fit, board) for board in boards]
     between = [_between(problem, problem.observations.involves(board)) for board in boards]
-    found = _most_significant(problem, fit, effects, between)
-    if found is None:
+    step = _most_significant(problem, fit, effects, between)
+    if step is None:
         return None
-    return Resized(boards[found.which], found.stop, found.step, found.sigma, found.mahalanobis_sq)
+    return Resized(boards[step.which], step.stop, step.step, step.sigma, step.mahalanobis_sq)
 
 
 @dataclass(frozen=True)
 class _ValueStep:
-    """A step of one of several values at a stop, with its sigma and the evidence for it."""
+    """A step of one of several values at a stop, with its sigma and test statistic."""
 
     which: int
     stop: int
@@ -205,13 +188,9 @@ class _ValueStep:
 def _most_significant(
     problem: Problem, fit: Solution, effects: Sequence[Effect], between: Sequence[IntArray]
 ) -> _ValueStep | None:
-    """The most significant step of a value of some effects; None where noise explains all.
+    """The most significant step of a value of some effects; None if none is significant.
 
-    Args:
-        problem: The observations that agree.
-        fit: The unknowns and the noise.
-        effects: The effects, which the problem does not have.
-        between: The stops at which each of their values may step.
+    `between` are the stops at which each of their values may step.
     """
     count = len(between)
     if not count:
@@ -221,61 +200,58 @@ def _most_significant(
     freedom = _residual_freedom(problem, fit)
     best, limit = None, float(f_limit(FALSE_MOVE / tried, 1, freedom))
     for scored in _scored(problem, fit, columns, between, effects):
-        alone, own = scored.alone[:, 0, 0], scored.own[:, 0, 0]
-        squares = np.where(own > _TAKEN * alone, scored.squares, 0.0)
-        tested = _beside_itself(squares, freedom, 1)
-        place = int(tested.argmax())
-        if tested[place] > limit:
-            limit = tested[place]
-            step, sigma = float(scored.steps[place, 0]), float(own[place] ** -0.5)
-            which = int(scored.seen[place])
-            best = _ValueStep(which, scored.stop, step, sigma, float(squares[place]))
+        alone, marginal = scored.alone[:, 0, 0], scored.own[:, 0, 0]
+        squares = np.where(marginal > _LEAST_INFORMATION * alone, scored.squares, 0.0)
+        statistics = _as_f_tests(squares, freedom, 1)
+        index = int(statistics.argmax())
+        if statistics[index] > limit:
+            limit = statistics[index]
+            step, sigma = float(scored.steps[index, 0]), float(marginal[index] ** -0.5)
+            which = int(scored.seen[index])
+            best = _ValueStep(which, scored.stop, step, sigma, float(squares[index]))
     return best
 
 
 def _of_joints(offsets: Mapping[str, FloatArray]) -> list[Effect]:
-    """Offsets of joints, by robot."""
+    """Offsets of joints as effects, by robot."""
     return [
         Effect.free(
-            f"offsets of {robot}", _nothing(offset.shape[2]), flange_jacobian={robot: offset}
+            f"offsets of {robot}", _no_prior(offset.shape[2]), flange_jacobian={robot: offset}
         )
         for robot, offset in offsets.items()
     ]
 
 
 def _of_size(problem: Problem, fit: Solution, board: str, some: Mask | None = None) -> Effect:
-    """The size of a board in (n,) some observations: a larger one is farther off by as much."""
-    seen = problem.observations
-    mine = np.array([frame == board for frame in seen.observed])
-    mine &= True if some is None else some
+    """Effect of a board's size in (n,) some observations, proportional to its distance."""
+    observations = problem.observations
+    rows = np.array([frame == board for frame in observations.observed])
+    rows &= True if some is None else some
     measured = problem.measured(fit.state)
-    by_size = np.zeros((len(seen), 6, 1))
-    away = np.swapaxes(measured[:, :3, :3], 1, 2) @ measured[:, :3, 3:]
-    by_size[:, 3:] = np.where(mine[:, None, None], away, 0.0)
-    return Effect.free(f"size of {board}", _nothing(1), by_size)
+    jacobian = np.zeros((len(observations), 6, 1))
+    positions = np.swapaxes(measured[:, :3, :3], 1, 2) @ measured[:, :3, 3:]
+    jacobian[:, 3:] = np.where(rows[:, None, None], positions, 0.0)
+    return Effect.free(f"size of {board}", _no_prior(1), jacobian)
 
 
-def _nothing(count: int) -> Knowledge:
-    """Knowledge of so many values of which nothing is known."""
+def _no_prior(count: int) -> Knowledge:
+    """Zero information on some values."""
     return Knowledge(np.zeros((count, count)), np.zeros(count))
 
 
-def _beside_itself(squares: FloatArray, freedom: float, numbers: int) -> FloatArray:
-    """A score test's squares, of so many numbers, as F tests have them: by the noise beside them.
+def _as_f_tests(squares: FloatArray, freedom: float, numbers: int) -> FloatArray:
+    """Converts score statistics of `numbers` values to F statistics.
 
-    What is tested is in the noise that the score is measured by, which bounds the score.
+    The noise of the score includes the tested step, which bounds the score.
     """
-    left = np.maximum(freedom - squares, (1.0 - _MOST_EXPLAINED) * freedom)
-    return squares * max(freedom - numbers, 1.0) / left
+    remaining = np.maximum(freedom - squares, (1.0 - _MOST_EXPLAINED) * freedom)
+    return squares * max(freedom - numbers, 1.0) / remaining
 
 
 def log_gain(problem: Problem, fit: Solution, mahalanobis_sq: float) -> float:
-    """Twice what an effect gains of the log-likelihood, the noise being that beside it.
+    """Twice the gain in log-likelihood by an effect, with the noise re-estimated.
 
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the effect.
-        mahalanobis_sq: Its evidence by Rao's score test.
+    `mahalanobis_sq` is its statistic by Rao's score test, at the fit without it.
     """
     freedom = _residual_freedom(problem, fit)
     share = min(mahalanobis_sq / freedom, _MOST_EXPLAINED)
@@ -283,71 +259,59 @@ def log_gain(problem: Problem, fit: Solution, mahalanobis_sq: float) -> float:
 
 
 def with_step(problem: Problem, fit: Solution, step: Move | Resized) -> tuple[Problem, Solution]:
-    """The problem in which something is otherwise from some stop on, and its fit."""
+    """The problem with a step from some stop on, and its fit."""
     if isinstance(step, Move):
-        wider, start = moved(problem, fit, step)
+        widened, start = moved(problem, fit, step)
     else:
         effect = _of_size(problem, fit, step.frame, problem.observations.stops >= step.stop)
-        wider = problem.with_effects([*problem.effects, effect])
+        widened = problem.with_effects([*problem.effects, effect])
         values = np.append(fit.state.values, step.share)
         start = replace(fit, state=State(fit.state.edges, values))
-    return wider, fit_problem(wider, start.state, start.noise)
+    return widened, fit_problem(widened, start.state, start.noise)
 
 
 def leaves_noise(problem: Problem, fit: Solution, step: Move | Resized) -> bool:
-    """Whether what a step leaves of the residuals on either side of it is as large as elsewhere.
+    """Whether the residuals beside a step are as small as elsewhere, once it is fitted.
 
-    Views at an end of the session that are wrong, each otherwise, gain by a step, and stay wrong.
-
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the step.
-        step: What is otherwise from some stop on.
+    A few wrong views at an end of the session gain by a step, and stay wrong. The given fit is that
+    without the step.
     """
-    wider, there = with_step(problem, fit, step)
-    squares, behind = by_noise_alone(wider, there), problem.observations.stops >= step.stop
-    mine, most = problem.observations.involves(step.frame), _ALIKE**2 * np.median(squares)
-    return all(np.median(squares[mine & side]) < most for side in (behind, ~behind))
+    widened, step_fit = with_step(problem, fit, step)
+    squares, behind = by_noise_alone(widened, step_fit), problem.observations.stops >= step.stop
+    involved, limit = problem.observations.involves(step.frame), _ALIKE**2 * np.median(squares)
+    return all(np.median(squares[involved & side]) < limit for side in (behind, ~behind))
 
 
 def evidence_gain(
     problem: Problem, fit: Solution, step: Move | Resized
 ) -> tuple[float, Problem, Solution]:
-    """Twice the logarithm of a step's Bayes factor: by a fit with it, whose noise is its own.
+    """Twice the log Bayes factor of a step: by a fit with it, with its own noise.
 
-    `log_gain` has one level of noise for rotations and places. A camera that was pushed is in that
-    of places alone, of which the score has no more than a half.
-
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the step.
-        step: What is otherwise from some stop on.
-
-    Returns:
-        The gain, and the problem with the step and its fit.
+    `log_gain` has one noise level for rotations and positions. A pushed camera shows in positions
+    alone, which are only half of the score. Returns also the problem with the step and its fit.
     """
-    wider, there = with_step(problem, fit, step)
-    # Of sensors' levels the likelihood knows one share: they are the same for both.
+    widened, step_fit = with_step(problem, fit, step)
+    # The sensors' levels are held, the same for both.
     before, after = (
-        robot_likelihood(part, state, there.noise).least_unlikely
-        for part, state in ((problem, fit.state), (wider, there.state))
+        robot_likelihood(part, state, step_fit.noise).least_unlikely
+        for part, state in ((problem, fit.state), (widened, step_fit.state))
     )
-    known = fitted_covariance(wider, there.state, there.noise)
-    # Restricted likelihood integrates over a change of any size, all as likely; these come in all
-    # orders of magnitude.
+    covariance_all = fitted_covariance(widened, step_fit.state, step_fit.noise)
+    # Restricted likelihood has a flat prior on the change; actual changes come in all orders of
+    # magnitude.
     if isinstance(step, Move):
-        change, covariance = fitted_change(wider, there, known, step)
+        change, covariance = fitted_change(widened, step_fit, covariance_all, step)
         sizes, units = SIZES_M, np.repeat([TURN_PER_M, 1.0], 3)
     else:
-        change, covariance = there.state.values[-1:], known[-1:, -1:]
+        change, covariance = step_fit.state.values[-1:], covariance_all[-1:, -1:]
         sizes, units = _SHARES, np.ones(1)
-    likely = []
+    log_likelihoods = []
     for size in sizes:
         total = covariance + np.diag((size * units) ** 2)
         square = float(change @ np.linalg.solve(total, change))
-        likely.append(-0.5 * (float(np.linalg.slogdet(total)[1]) + square))
-    prior = float(np.logaddexp.reduce(likely) - np.log(len(likely)))
-    return 2.0 * (before - after + prior), wider, there
+        log_likelihoods.append(-0.5 * (float(np.linalg.slogdet(total)[1]) + square))
+    prior = float(np.logaddexp.reduce(log_likelihoods) - np.log(len(log_likelihoods)))
+    return 2.0 * (before - after + prior), widened, step_fit
 
 
 def step_covariance(
@@ -356,18 +320,12 @@ def step_covariance(
     step: Move | Slip | Resized,
     offsets: Mapping[str, FloatArray],
 ) -> FloatArray:
-    """What a step that a fit does not have adds to its covariance (p, p).
+    """Covariance (p, p) added for a step that a fit does not model.
 
-    The answer is between what holds before the step and what holds from then on, of which each is
-    as likely to be asked for: the mean of its squared distances.
-
-    Args:
-        problem: The observations that agree.
-        fit: The unknowns and the noise, without the step.
-        step: What moved at once.
-        offsets: As of `slipped_joint`.
+    The solution lies between the states before and after the step, which are equally likely to be
+    needed: the mean of the squared distances from both. `offsets` are as of `slipped_joint`.
     """
-    after, places, effects = np.zeros(problem.size), np.array([step.stop]), list[Effect]()
+    after, stops, effects = np.zeros(problem.size), np.array([step.stop]), list[Effect]()
     if isinstance(step, Move):
         columns = np.r_[problem.edge_columns(step.frame)]
         change = after[columns] = log(step.change)
@@ -377,23 +335,23 @@ def step_covariance(
     else:
         effects = _of_joints({step.robot: offsets[step.robot]})
         columns, change = np.array([problem.size + step.joint]), np.array([step.step_rad])
-    (found,) = _scored(problem, fit, columns[None], [places], effects)
-    before = found.following[0] @ change
+    (scored,) = _scored(problem, fit, columns[None], [stops], effects)
+    before = scored.following[0] @ change
     return (np.outer(before, before) + np.outer(before + after, before + after)) / 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """Steps of k unknowns, c numbers each, at one stop, by Rao's score test.
+    """Score tests of steps of k unknowns, c numbers each, at one stop.
 
     Attributes:
         stop: The stop.
-        seen: (k,) which of the unknowns that are asked for.
-        alone: (k, c, c) information on each, were all else known.
-        own: (k, c, c) that beside all else.
-        following: (k, p, c) how the unknowns of the fit would move with each.
-        steps: (k, c) the likeliest ones.
-        squares: (k,) the evidence for them.
+        seen: (k,) indices of the tested unknowns.
+        alone: (k, c, c) information on each, all else held.
+        own: (k, c, c) marginal information on each.
+        following: (k, p, c) response of the fit's unknowns to each.
+        steps: (k, c) the most likely steps.
+        squares: (k,) the test statistics.
     """
 
     stop: int
@@ -412,109 +370,100 @@ def _scored(
     between: Sequence[IntArray],
     effects: Sequence[Effect] = (),
 ) -> Iterator[_Scored]:
-    """The steps of some unknowns at the stops at which they may be, the last first.
+    """Yields score tests of steps of some unknowns, stop by stop, the last first.
 
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise.
-        columns: (u, c) the columns of each; those of `effects` are behind the problem's.
-        between: The stops at which each may step.
-        effects: What the problem does not have.
+    `columns` are (u, c), those of `effects` behind the problem's; `between` are the stops at which
+    each may step.
     """
     errors, size = RepeatErrors.of(problem, fit), problem.size
-    wider = problem.with_effects([*problem.effects, *effects])
-    values = np.append(fit.state.values, np.zeros(wider.size - size))
-    there = replace(fit, state=State(fit.state.edges, values))
-    seen: dict[int, list[int]] = defaultdict(list)
-    for place, stops in enumerate(between):
+    widened = problem.with_effects([*problem.effects, *effects])
+    values = np.append(fit.state.values, np.zeros(widened.size - size))
+    start = replace(fit, state=State(fit.state.edges, values))
+    tested_at: dict[int, list[int]] = defaultdict(list)
+    for index, stops in enumerate(between):
         for stop in stops.tolist():
-            seen[stop].append(place)
-    for stop, information, gradient in equations_from(wider, there, errors, columns.ravel()):
-        if stop not in seen:
+            tested_at[stop].append(index)
+    for stop, information, gradient in equations_from(widened, start, errors, columns.ravel()):
+        if stop not in tested_at:
             continue
-        mine = np.array(seen[stop])
-        every = information.reshape(*columns.shape, -1)[mine]
-        alone = np.take_along_axis(every, columns[mine, None], axis=2)
-        across = np.delete(every, np.s_[size : wider.size], axis=2)
-        asked = gradient.reshape(columns.shape)[mine]
-        own, following, steps, squares = _score(alone, across, asked, errors.covariance)
-        yield _Scored(stop, mine, alone, own, following[:, :size], steps, squares)
+        tested = np.array(tested_at[stop])
+        information_rows = information.reshape(*columns.shape, -1)[tested]
+        alone = np.take_along_axis(information_rows, columns[tested, None], axis=2)
+        across = np.delete(information_rows, np.s_[size : widened.size], axis=2)
+        gradients = gradient.reshape(columns.shape)[tested]
+        own, following, steps, squares = _score(alone, across, gradients, errors.covariance)
+        yield _Scored(stop, tested, alone, own, following[:, :size], steps, squares)
 
 
 def _score(
-    alone: FloatArray, across: FloatArray, asked: FloatArray, covariance: FloatArray
+    alone: FloatArray, across: FloatArray, gradients: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Rao's score test of k changes, of c numbers each.
 
     Args:
-        alone: (k, c, c) information on each, were all else known.
-        across: (k, c, p) that which it has in common with the p unknowns of the fit.
-        asked: (k, c) the gradients.
+        alone: (k, c, c) information on each, all else held.
+        across: (k, c, p) cross information with the p unknowns of the fit.
+        gradients: (k, c) of each.
         covariance: (p, p) of these unknowns.
 
     Returns:
-        (k, c, c) information beside all else, (k, p, c) how the unknowns would move with each,
-        (k, c) the likeliest ones, and (k,) the evidence for them.
+        (k, c, c) marginal information, (k, p, c) response of the unknowns to each, (k, c) the most
+        likely changes, and (k,) the test statistics.
     """
     following = -covariance @ np.swapaxes(across, 1, 2)
-    own = alone + across @ following
-    steps = -(covariance_from(own) @ asked[..., None])[..., 0]
-    return own, following, steps, -np.sum(steps * asked, axis=1)
+    marginal = alone + across @ following
+    steps = -(covariance_from(marginal) @ gradients[..., None])[..., 0]
+    return marginal, following, steps, -np.sum(steps * gradients, axis=1)
 
 
 def differs_elsewhere(problem: Problem, fit: Solution, move: Move) -> bool:
-    """Whether some other run of stops differs from the rest by more than what follows a move.
+    """Whether another run of stops differs from the rest by more than the stops after a move.
 
-    Stops that follow each other have postures that are alike, and an arm's errors follow these:
-    then one part of a programme differs from the rest as much as another.
-
-    Args:
-        problem: The observations.
-        fit: The unknowns and the noise, without the move.
-        move: The step that noise does not explain.
+    Successive stops have similar postures, on which an arm's errors depend: one part of a programme
+    then differs from the rest as much as another. The given fit is that without the move.
     """
     errors, columns = RepeatErrors.of(problem, fit), np.r_[problem.edge_columns(move.frame)]
     sums = {stop: both for stop, *both in equations_from(problem, fit, errors, columns)}
     stops = np.unique(problem.observations.stops[problem.observations.involves(move.frame)])
     begins = np.unique(np.linspace(0, len(stops) - 1, min(len(stops), _PARTS)).astype(int))
-    at = int(np.searchsorted(stops, move.stop))
+    move_index = int(np.searchsorted(stops, move.stop))
     first, behind = np.triu_indices(len(begins), 1)
-    begun, ended = begins[first], begins[behind]
-    away = np.minimum(
-        np.maximum(begun, np.abs(ended - at)),
-        np.maximum(np.abs(begun - at), len(stops) - ended),
+    run_starts, run_ends = begins[first], begins[behind]
+    distance = np.minimum(
+        np.maximum(run_starts, np.abs(run_ends - move_index)),
+        np.maximum(np.abs(run_starts - move_index), len(stops) - run_ends),
     )
-    apart = (away > _SAME) & (ended - begun >= FEWEST)
-    every, gradients = (
+    tested = (distance > _SAME_WITHIN) & (run_ends - run_starts >= FEWEST)
+    information, gradients = (
         np.array([sums[stop][k] for stop in stops[begins].tolist()]) for k in (0, 1)
     )
-    # What follows the move comes first.
-    across = np.stack([sums[move.stop][0], *(every[first] - every[behind])[apart]])
-    asked = np.stack([sums[move.stop][1], *(gradients[first] - gradients[behind])[apart]])
+    # The first entry is the move itself.
+    across = np.stack([sums[move.stop][0], *(information[first] - information[behind])[tested]])
+    asked = np.stack([sums[move.stop][1], *(gradients[first] - gradients[behind])[tested]])
     *_, squares = _score(across[:, :, columns], across, asked, errors.covariance)
     return bool((squares[1:] > squares[0]).any())
 
 
 def _residual_freedom(problem: Problem, fit: Solution) -> float:
-    """Degrees of freedom of residuals: what is known besides of unknowns leaves some to them."""
-    known = problem.knowledge(fit.state).information
-    share = float(np.sum(fitted_covariance(problem, fit.state, fit.noise) * known))
-    taken = float(np.sum(problem.moving)) - share
-    return max(float(problem.observations.directions.sum()) - taken, 6.0)
+    """Degrees of freedom of the residuals; unknowns with a prior take less than one each."""
+    prior = problem.knowledge(fit.state).information
+    prior_share = float(np.sum(fitted_covariance(problem, fit.state, fit.noise) * prior))
+    determined = float(np.sum(problem.moving)) - prior_share
+    return max(float(problem.observations.directions.sum()) - determined, 6.0)
 
 
 def _between(problem: Problem, rows: Mask) -> IntArray:
-    """The stops with enough others, of (n,) some observations, before them and from them on."""
+    """Stops with enough stops of (n,) some observations before and after."""
     return np.asarray(np.unique(problem.observations.stops[rows])[FEWEST : 1 - FEWEST])
 
 
-def _spread_of_means(problem: Problem, frame: str) -> FloatArray:
-    """(s,) how much more a step of a frame before each stop may vary, if its views are uneven."""
-    # Of the n views of the shorter side one may err by `UNEVEN` times what the others do. With one
-    # robot the step itself is in the noise of all, which bounds the evidence for it.
-    seen = problem.observations
-    mine = seen.involves(frame) & seen.is_uneven & (not problem.is_combined)
-    counts = np.bincount(seen.stops[mine], minlength=int(seen.stops.max()) + 1)
+def _variance_ratio(problem: Problem, frame: str) -> FloatArray:
+    """(s,) variance ratio of a frame's step before each stop, if its views are uneven."""
+    # One of the n views of the shorter side may have `UNEVEN` times the error of the others. With
+    # one robot the step itself is in the noise, which bounds its evidence.
+    observations = problem.observations
+    uneven = observations.involves(frame) & observations.is_uneven & (not problem.is_combined)
+    counts = np.bincount(observations.stops[uneven], minlength=int(observations.stops.max()) + 1)
     before = np.cumsum(counts) - counts
     shorter = np.minimum(before, counts.sum() - before)
-    return np.asarray(1.0 + (UNEVEN**2 - 1.0) * (mine.any() / np.maximum(shorter, 1)))
+    return np.asarray(1.0 + (UNEVEN**2 - 1.0) * (uneven.any() / np.maximum(shorter, 1)))

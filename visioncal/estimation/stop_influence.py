@@ -1,4 +1,4 @@
-"""The influence of each stop: how much worse the arm would be known without it."""
+"""Influence of each stop: growth of the arm's uncertainty without it."""
 
 import numpy as np
 
@@ -17,21 +17,20 @@ def stop_influence(
     place: FloatArray,
     free: IntArray,
 ) -> FloatArray:
-    """By which share the mean variance of some places would grow without each stop.
+    """Relative growth of the mean variance of some positions without each stop.
 
     The mean variance over a region is the criterion of I-optimality (Atkinson, Donev and Tobias
-    2007, section 10.6). Leaving a stop out takes its rows away, so the covariance without it
-    follows from that of all stops (Woodbury's identity) exactly, with the noise and the knowledge
-    beforehand as they are.
+    2007, section 10.6). Leaving a stop out removes its rows, so the covariance without it follows
+    exactly from that of all stops (Woodbury's identity), with the noise and the priors unchanged.
 
     Args:
         problem: The observations.
-        state: The answer.
+        state: The solution.
         noise: Its levels.
         stops: (m,) the stops to be left out in turn.
-        place: (k, 3, f) derivatives of the places by the free unknowns.
-        free: (f,) which of the unknowns these are; others are held, such as the board's size, of
-            which no stop determines much.
+        place: (k, 3, f) derivatives of the positions by the free unknowns.
+        free: (f,) columns of these; others are held, such as the board's size, which single stops
+            hardly determine.
 
     Returns:
         (m,) shares; large where a stop alone determines something.
@@ -42,9 +41,9 @@ def stop_influence(
     jacobian = whitened(problem, state, noise)[1][:, :, free]
     mean = gram(place, place) / len(place)
     growth = np.zeros(len(stops))
-    for at, stop in enumerate(stops.tolist()):
+    for index, stop in enumerate(stops.tolist()):
         rows = jacobian[problem.observations.stops == stop].reshape(-1, len(free))
         gain = rows @ fitted
-        left = covariance_from(np.eye(len(rows)) - gain @ rows.T)
-        growth[at] = np.sum(left * (gain @ mean @ gain.T))
+        remaining = covariance_from(np.eye(len(rows)) - gain @ rows.T)
+        growth[index] = np.sum(remaining * (gain @ mean @ gain.T))
     return np.asarray(growth / np.sum(fitted * mean))

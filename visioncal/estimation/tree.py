@@ -1,8 +1,8 @@
-"""The frames of a whole cell as a tree, and the way from any of them to any other.
+"""Frame tree of a cell, and the paths between its frames.
 
-Every frame hangs on its parent by an edge that is unknown, known, or a robot. Frames that no robot
-parts are one body: what stands in the cell, and what each flange carries. Ways of one kind, from
-observers to what they observed, are worked on at once.
+Every frame is attached to its parent by an edge that is unknown, known, or a robot. Frames with no
+robot between form one body: the stationary frames, and those on each flange. Paths of one
+structure, from observers to observed frames, are evaluated together.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -16,12 +16,12 @@ from visioncal.core.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """How a frame hangs on its parent: by neither a robot nor a known transform, it is unknown.
+    """Edge from a frame to its parent; unknown if neither a robot nor a known transform.
 
     Attributes:
-        parent: The frame that it hangs on.
+        parent: The parent frame.
         robot: The robot whose pose `parent_from_frame` is; empty where none is.
-        known: (4, 4) `parent_from_frame`, where that is known.
+        known: (4, 4) `parent_from_frame`, if known.
     """
 
     parent: str
@@ -30,19 +30,18 @@ class Branch:
 
     @property
     def is_unknown(self) -> bool:
-        """Whether it is to be estimated."""
+        """Whether it is estimated."""
         return not self.robot and self.known is None
 
 
 @dataclass(frozen=True)
 class PathStep:
-    """One edge of a way through the tree.
+    """One edge of a path through the tree.
 
     Attributes:
-        frame: The child at its end, which it is named by.
-        robot: The robot that it is; empty where it is none.
-        is_up: Whether it is gone from the parent to the child's frame against the edge's own sense:
-            as `frame_from_parent`.
+        frame: The edge's child frame, which names it.
+        robot: The edge's robot; empty for none.
+        is_up: Whether it is traversed from the child to the parent, as `frame_from_parent`.
     """
 
     frame: str
@@ -55,8 +54,8 @@ class Tree:
     """The frames of a cell.
 
     Attributes:
-        root: The frame that hangs on nothing.
-        branches: How every other frame hangs, by its name.
+        root: The frame without a parent.
+        branches: Edge of every other frame, by its name.
     """
 
     root: str
@@ -83,12 +82,12 @@ class Tree:
         return {branch.robot: branch.parent for branch in self.branches.values() if branch.robot}
 
     def with_known(self, frame: str, matrix: FloatArray) -> "Tree":
-        """Returns the tree with one edge that is no longer asked for."""
+        """Returns the tree with one edge held at a known transform."""
         branch = replace(self.branches[frame], known=matrix)
         return replace(self, branches={**self.branches, frame: branch})
 
     def without(self, frames: Collection[str]) -> "Tree":
-        """Returns the tree without some frames, and without all that hangs on these."""
+        """Returns the tree without some frames and their descendants."""
         kept = {
             name: branch
             for name, branch in self.branches.items()
@@ -97,19 +96,19 @@ class Tree:
         return replace(self, branches=kept)
 
     def with_twin(self, frame: str, twin: str) -> "Tree":
-        """Returns the tree with one more frame that hangs where another does, by its own edge."""
-        branch = Branch(self.branches[frame].parent)
-        return replace(self, branches={**self.branches, twin: branch})
+        """Returns the tree with one more frame on the parent of another, by an unknown edge."""
+        edge = Branch(self.branches[frame].parent)
+        return replace(self, branches={**self.branches, twin: edge})
 
     def above(self, frame: str) -> Iterator[str]:
-        """A frame, and all that it hangs on in turn."""
+        """A frame and its ancestors, up to the root."""
         while frame != self.root:
             yield frame
             frame = self.branches[frame].parent
         yield frame
 
     def body(self, frame: str) -> str:
-        """The frame that a frame's body is named by: the root, or a flange."""
+        """The frame that names a frame's body: the root, or a flange."""
         return next(
             name for name in self.above(frame) if name == self.root or self.branches[name].robot
         )
@@ -128,15 +127,14 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class Stride:
-    """One step of m ways, each by its own edge.
+    """One step of m paths, each by its own edge.
 
     Attributes:
-        is_up: Whether the edges are gone against their own sense.
-        edges: (m,) which unknown edges they are; empty where they are known, or a robot's.
-        poses: (m, 4, 4) what they are in the sense in which they are gone, where they are known, or
-            a robot's.
-        moves: (m, 6, k) how they move with all effects; None where they do not.
-        slots: (m,) in which place of its unit's errors a robot's flange errs; -1 where it does not.
+        is_up: Whether the edges are traversed from child to parent.
+        edges: (m,) indices of unknown edges; empty for known edges and robots.
+        poses: (m, 4, 4) transforms in the direction of the path, for known edges and robots.
+        moves: (m, 6, k) their Jacobian by all effects; None for zero.
+        slots: (m,) index of a robot's flange error within its unit; -1 for none.
     """
 
     is_up: bool
@@ -146,23 +144,23 @@ class Stride:
     slots: IntArray
 
     def backward(self, edges: FloatArray, change: FloatArray) -> FloatArray:
-        """(m, 4, 4) the inverse of the edges as they are gone, effects having changed by (k,)."""
+        """(m, 4, 4) inverse transforms of the step, after a change (k,) of the effects."""
         if len(self.edges):
-            found = edges[self.edges]
-            return found if self.is_up else invert(found)
+            edge = edges[self.edges]
+            return edge if self.is_up else invert(edge)
         if self.moves is None or not change.any():
             return self.poses
-        moved = exp((-1.0 if not self.is_up else 1.0) * (self.moves @ change))
-        return np.asarray(self.poses @ moved if self.is_up else moved @ self.poses)
+        motion = exp((-1.0 if not self.is_up else 1.0) * (self.moves @ change))
+        return np.asarray(self.poses @ motion if self.is_up else motion @ self.poses)
 
 
 @dataclass(frozen=True, eq=False)
 class TreePaths:
-    """Ways of m observations that are made of the same kinds of steps.
+    """Paths of m observations with the same structure.
 
     Attributes:
         rows: (m,) the observations, group by group.
-        groups: Which groups of observations these are, and where their rows stand among them.
+        groups: Indices of the groups of observations, and their slices of the rows.
         strides: The steps, from the observer on.
     """
 
@@ -172,20 +170,22 @@ class TreePaths:
 
     def backward(self, edges: FloatArray, change: FloatArray) -> FloatArray:
         """(m, 4, 4) `observed_from_observer`."""
-        found = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4))
+        product = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4))
         for stride in reversed(self.strides):
-            found = found @ stride.backward(edges, change)
-        return found
+            product = product @ stride.backward(edges, change)
+        return product
 
     def moved(self, edges: FloatArray, change: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-        """What `backward` gives, and (m, 6, 6) how the observed frames move with each step's edges.
+        """`backward`, and (m, 6, 6) Jacobians of the observed frames by each step's edges.
 
-        An edge moves on its right: at its end, or at its start where it is gone up.
+        An edge is perturbed on its right: at its end, or at its start where it is traversed up.
         """
-        back, found = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4)), []
+        back, jacobians = np.broadcast_to(np.eye(4), (len(self.rows), 4, 4)), []
         for stride in reversed(self.strides):
-            behind, back = back, back @ stride.backward(edges, change)
-            counts = len(stride.edges) or stride.moves is not None or (stride.slots >= 0).any()
+            before, back = back, back @ stride.backward(edges, change)
+            varies = len(stride.edges) or stride.moves is not None or (stride.slots >= 0).any()
             none = np.zeros((len(self.rows), 6, 0))
-            found.append((-adjoint(back) if stride.is_up else adjoint(behind)) if counts else none)
-        return back, found[::-1]
+            jacobians.append(
+                (-adjoint(back) if stride.is_up else adjoint(before)) if varies else none
+            )
+        return back, jacobians[::-1]

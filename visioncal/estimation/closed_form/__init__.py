@@ -1,10 +1,9 @@
-"""Closed-form hand-eye solvers: a start for the joint fit, and a second opinion of it.
+"""Closed-form hand-eye solvers: starts for the joint fit, and a second opinion on it.
 
-`SOLVERS` names those of any motion, and `lone_axis` is for turns about one axis; each is one file,
-those of linear systems together. They take (m, 4, 4)
-robot poses `R_i` and `cam_from_target` poses `C_i` and solve `R_i @ X @ C_i = Z`; see
-`closed_form.handeye`. Motion too poor to determine X gives a finite and poor answer here; it is
-refused by name where the Fisher information is known.
+`SOLVERS` holds those for general motion; `lone_axis` is for rotation about one axis. All take (m,
+4, 4) robot poses `R_i` and `cam_from_target` poses `C_i` and solve `R_i @ X @ C_i = Z`; see
+`closed_form.handeye`. Motion too poor to determine X gives a finite but poor solution here; it is
+refused later, where the Fisher information is known.
 """
 
 from collections.abc import Mapping

@@ -26,8 +26,8 @@ def _squares() -> FloatArray:
 
 _SQUARES = _squares()
 
-# Of a unit 8-vector (q, q'): with less for q, X would lie a kilometre away. The motion then
-# determines no q', and the null space holds little else.
+# Least squared norm of q in the unit 8-vector (q, q'): with less, X would be a kilometre long. The
+# motion then does not determine q', and the null space contains little else.
 _SMALLEST_PART = 1e-6
 
 
@@ -36,14 +36,13 @@ def daniilidis(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X's dual quaternion in the null space of the screws' equations.
 
     With a, b the vector parts of a pair's quaternions and a', b' those of their dual parts, X's
-    dual quaternion (q, q') is in the null space of the rows [S, 0] and [S', S], where
-    S q = a q - q b (eq. 31); the two smallest singular vectors span it. Within that plane
-    q . q' = 0 and |q| = 1 (eqs. 34, 35) choose the point. The paper leaves the scalar row of
-    a q - q b out as redundant; with it the outcome does not hang on the choice of axes.
+    dual quaternion (q, q') is in the null space of the rows [S, 0] and [S', S], where S q = a q - q
+    b (eq. 31); the two smallest singular vectors span it. Within that plane q . q' = 0 and |q| = 1
+    (eqs. 34, 35) select the solution. The paper omits the scalar row of a q - q b as redundant;
+    with it the result does not depend on the choice of axes.
 
-    The rotation is that point's. Its q' would give the translation, too, but carries the noise
-    of both screws' moments: the translation is solved for again with the rotation known.
-    One metre weighs as much as one radian.
+    Only the rotation is taken from it: q' carries the noise of both screws' moments, so the
+    translation is solved for again with the rotation known. One metre weighs as much as one radian.
     """
     squares = _screw_equations(robot, camera)
     quaternion = _study_point(np.linalg.eigh(squares)[1][:, :2])[:4]
@@ -98,9 +97,9 @@ def _dual_products(
 
 def _study_point(plane: FloatArray) -> FloatArray:
     """The (8,) unit vector in the plane of two orthonormal columns that is a rigid transform."""
-    # q . q' is a quadratic form in the combination. In its eigenvectors' frame its zeros are square
-    # roots of eigenvalues: no division, and no negative discriminant where noise has left it
-    # without real zeros; then the combination nearest to zero is taken. Of the two zeros one is the
+    # q . q' is a quadratic form in the combination's coefficients. In its eigenvectors' basis its
+    # zeros are square roots of eigenvalues: no division, and no negative discriminant where noise
+    # leaves no real zeros; then the nearest combination is taken. Of the two zeros one is the
     # solution and the other has q = 0. The vector is zero where the form is.
     form = plane[:4].T @ plane[4:]
     (low, high), vectors = np.linalg.eigh(form + form.T)

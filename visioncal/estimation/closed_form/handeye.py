@@ -1,4 +1,4 @@
-"""What every closed-form hand-eye solver takes and gives.
+"""Conventions and input checks of all closed-form hand-eye solvers.
 
 A view i pairs a robot pose `R_i` with a camera pose `C_i = cam_from_target`. Two transforms are
 unknown and obey `R_i @ X @ C_i = Z`:
@@ -39,15 +39,15 @@ Solver: TypeAlias = Callable[[FloatArray, FloatArray], HandEye]
 
 
 def solver(solve: Solver) -> Solver:
-    """Has a closed form make sure that its views can be paired and are numbers.
+    """Decorates a closed form with checks of its input.
 
     Args:
         solve: The closed form, of (m, 4, 4) robot poses `R_i` and `cam_from_target` of the same
-            views [m]; it gives X and Z.
+            views [m]; it returns X and Z.
 
     Returns:
-        The same for views of any numbers. It raises a DataError where shapes do not fit or a pose
-        has an entry that is not a finite number, and a DegenerateError of fewer than two views.
+        The checked solver. It raises a DataError where shapes do not match or a pose has an entry
+        that is not finite, and a DegenerateError for fewer than two views.
     """
 
     @wraps(solve)

@@ -21,11 +21,11 @@ _CORRELATION = np.einsum("nkr,ncl->klrc", *_VECTORS).reshape(9, 16)
 def horaud(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X's quaternion as an eigenvector.
 
-    A pair says a q = q b, with a and b the vector parts of both relative rotations. The sum of
+    A pair obeys a q = q b, with a and b the vector parts of both relative rotations. The sum of
     |Q(a) q - W(b) q|^2, with the matrices Q and W of the paper's appendix A, is smallest at the
     eigenvector of sum Q(a)^T W(b), symmetric for pure vectors, that belongs to its largest
     eigenvalue. The paper's a and b are unit axes; here they keep their length sin(angle / 2),
-    which weighs the pairs as their noise asks.
+    which weights the pairs by their noise.
     """
     pairs = rotation_pairs(robot, camera)
     matched = (pairs.weight * pairs.robot[1:]) @ pairs.camera[1:].T

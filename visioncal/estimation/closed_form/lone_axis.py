@@ -1,9 +1,9 @@
-"""Motion that turns about one axis alone, as that of an arm with four axes.
+"""Hand-eye solver for rotation about one axis only, as of an arm with four axes.
 
-The relative rotations of robot and camera share one axis each, so X's rotation is known up to a
-turn about the robot's. What the robot moves by determines it: the target's place in the robot's
-frame is linear in the turn's cosine and sine and in X's translation, whose component along the
-axis stays open.
+The relative rotations of robot and camera have one axis each, so X's rotation is known up to a
+rotation about the robot's axis. The robot's translations determine that: the target's position in
+the robot's frame is linear in the rotation's cosine and sine and in X's translation, whose
+component along the axis remains undetermined.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from visioncal.estimation.closed_form.translation import complete, mean_camera
 
 @solver
 def lone_axis(robot: FloatArray, camera: FloatArray) -> HandEye:
-    """Solves for X where all relative rotations have one axis; what stays open is zero."""
+    """Solves for X where all relative rotations have one axis; undetermined components are zero."""
     pairs = rotation_pairs(robot, camera)
     matched = (pairs.weight * pairs.robot[1:]) @ pairs.camera[1:].T
     axes, _, _ = np.linalg.svd(matched)

@@ -17,10 +17,9 @@ from visioncal.estimation.closed_form.translation import complete
 def park(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X by matching the logarithms of relative rotations.
 
-    With log A = [alpha], log B = [beta] a pair says alpha = R_X beta. The minimum of the squared
+    With log A = [alpha], log B = [beta] a pair obeys alpha = R_X beta. The minimum of the squared
     differences is (M^T M)^(-1/2) M^T with M = sum beta alpha^T, the paper's closed form for noisy
-    pairs. It is taken from the singular value decomposition of M^T, which also serves where M
-    has lost its rank.
+    pairs. The singular value decomposition of M^T gives it even where M is rank deficient.
     """
     pairs = rotation_pairs(robot, camera)
     alpha, beta = _half_logarithms(pairs.robot), _half_logarithms(pairs.camera)

@@ -1,7 +1,7 @@
-"""Unit quaternions (w, x, y, z) in batches, as far as the solvers need them.
+"""Batched unit quaternions (w, x, y, z).
 
-Products with whole batches are single matrix products here: at 20 views the overhead of a call
-costs more than its arithmetic.
+Products with whole batches are single matrix products: at 20 views the overhead of a call costs
+more than its arithmetic.
 """
 
 import numpy as np

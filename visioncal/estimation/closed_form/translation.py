@@ -1,13 +1,13 @@
-"""The step that most solvers share: both translations and Z, once X's rotation is known.
+"""Translations and Z for a known rotation of X: the last step of most solvers.
 
 The equation is (A_R - I) t_X = R_X t_B - t_A of Tsai and Lenz (1989), eq. 15, which later authors
 share, over all pairs of views. Where rotations agree, a pair's residual is the difference between
-what both views say about the place of one point of the target, so the sum over all pairs is m
-times the scatter of m places about their mean: linear in the number of views.
+both views' positions of one target point, so the sum over all pairs is m times the scatter of m
+positions about their mean: linear in the number of views.
 
 Noise makes the choice of that point matter. At the target's origin the robot's rotation noise has
-the lever from target to flange; at the camera's centre, to which t_B amounts, the camera's has
-the same lever. Of the points between both, the one is taken that the views place most repeatably.
+the lever from target to flange; at the camera's centre, which t_B amounts to, the camera's has the
+same lever. The point between both with the least scatter is used.
 """
 
 import numpy as np
@@ -16,21 +16,21 @@ from visioncal.core.transforms import compose, nearest_rotation
 from visioncal.core.types import FloatArray
 from visioncal.estimation.closed_form.handeye import HandEye
 
-# A direction that the views turn by less than this (root mean square) shows the robot's noise,
-# which would move X by metres; noise is up to 0.5 mrad, useful motion begins at 10 mrad.
+# Least rotation (root mean square) about a direction: less is the robot's noise, which would move X
+# by metres. Noise is up to 0.5 mrad, useful motion begins at 10 mrad.
 _SMALLEST_TURN_RAD = 2e-3
 
 
 def smallest_solution(normal: FloatArray, right: FloatArray, noise: float) -> FloatArray:
-    """Solves `normal @ x = right` for the shortest x.
+    """Minimum-norm solution of `normal @ x = right`, truncated at the noise.
 
     Args:
         normal: (n, n) symmetric and positive semidefinite.
         right: (n,) or (n, k) right-hand sides.
-        noise: An eigenvalue up to this one says nothing.
+        noise: Eigenvalues up to this one are discarded.
 
     Returns:
-        x of the shape of `right`, without any component along which the eigenvalue is within noise.
+        x of the shape of `right`, without components along discarded eigenvectors.
     """
     values, vectors = np.linalg.eigh(normal)
     seen = vectors[:, values > noise]
@@ -38,7 +38,7 @@ def smallest_solution(normal: FloatArray, right: FloatArray, noise: float) -> Fl
 
 
 def mean_camera(camera: FloatArray) -> FloatArray:
-    """The (3,) mean of the camera's centres in the target frame [m] of (m, 4, 4) poses."""
+    """The (3,) mean of the camera centres in the target frame [m], of (m, 4, 4) poses."""
     m = len(camera)
     rotation, translation = camera[:, :3, :3], camera[:, :3, 3]
     return np.asarray(translation.reshape(3 * m) @ rotation.reshape(3 * m, 3) / -m)
@@ -50,30 +50,30 @@ def complete(
     rotation_x: FloatArray,
     rotation_z: FloatArray | None = None,
 ) -> HandEye:
-    """Finds what X's rotation leaves open, by least squares over all pairs of views.
+    """Solves for both translations and Z's rotation, by least squares over all pairs of views.
 
     Args:
         robot: (m, 4, 4) robot poses `R_i` [m].
         camera: (m, 4, 4) `cam_from_target` [m].
         rotation_x: (3, 3) rotation of X.
-        rotation_z: (3, 3) rotation of Z; absent, it is the chordal mean of `R_i X C_i`.
+        rotation_z: (3, 3) rotation of Z; if None, the chordal mean of `R_i X C_i`.
 
     Returns:
-        X and Z. Components of X's translation that the motion does not show are zero.
+        X and Z. Components of X's translation that the motion does not determine are zero.
     """
     m = len(robot)
     turns = robot[:, :3, :3]
     towards = mean_camera(camera)
-    # Column 0 is for the target's origin; column 1 is what a step from it to the camera adds.
-    seen = np.empty((m, 3, 2))
-    seen[:, :, 0] = camera[:, :3, 3]
-    seen[:, :, 1] = camera[:, :3, :3] @ towards
-    places = turns @ (rotation_x @ seen)
-    places[:, :, 0] += robot[:, :3, 3]
+    # Column 0 is the target's origin; column 1 the step from it to the camera.
+    columns = np.empty((m, 3, 2))
+    columns[:, :, 0] = camera[:, :3, 3]
+    columns[:, :, 1] = camera[:, :3, :3] @ towards
+    positions = turns @ (rotation_x @ columns)
+    positions[:, :, 0] += robot[:, :3, 3]
 
-    mean_turn, mean_place = turns.sum(axis=0) / m, places.sum(axis=0) / m
+    mean_turn, mean_position = turns.sum(axis=0) / m, positions.sum(axis=0) / m
     deviations = (turns - mean_turn).reshape(3 * m, 3)
-    scatter = (places - mean_place).reshape(3 * m, 2)
+    scatter = (positions - mean_position).reshape(3 * m, 2)
     cut = m * _SMALLEST_TURN_RAD**2
     shifts = -smallest_solution(deviations.T @ deviations, deviations.T @ scatter, cut)
     step = _steadiest_step(scatter + deviations @ shifts)
@@ -81,8 +81,8 @@ def complete(
     translation_x = shifts[:, 0] + step * shifts[:, 1]
     if rotation_z is None:
         rotation_z = nearest_rotation((turns @ rotation_x @ camera[:, :3, :3]).sum(axis=0))
-    place = mean_place[:, 0] + step * mean_place[:, 1] + mean_turn @ translation_x
-    translation_z = place - rotation_z @ (step * towards)
+    position = mean_position[:, 0] + step * mean_position[:, 1] + mean_turn @ translation_x
+    translation_z = position - rotation_z @ (step * towards)
     return HandEye(compose(rotation_x, translation_x), compose(rotation_z, translation_z))
 
 

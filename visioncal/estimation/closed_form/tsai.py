@@ -16,7 +16,7 @@ from visioncal.estimation.closed_form.translation import complete, smallest_solu
 # these frames, is w, x, y or z; one of the four is at least 1/2, a turn of at most 120 degrees.
 _FRAMES = np.array([np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])], float)
 
-# Of a mean square turn [rad^2]: less is arithmetic, not motion.
+# Least mean square rotation [rad^2]: less is rounding, not motion.
 _ROUNDING = 1e-14
 
 
@@ -24,11 +24,11 @@ _ROUNDING = 1e-14
 def tsai(robot: FloatArray, camera: FloatArray) -> HandEye:
     """Solves for X's modified Rodrigues vector, in a frame where it is small.
 
-    A pair says (P_g + P_c) x P' = P_c - P_g (eq. 12), with P = 2 sin(angle / 2) axis of both
+    A pair obeys (P_g + P_c) x P' = P_c - P_g (eq. 12), with P = 2 sin(angle / 2) axis of both
     relative rotations and P' = tan(angle / 2) axis of X, which is infinite for a half turn.
-    Therefore the camera's vectors are first turned by a known rotation R0, which leaves
-    X inv(R0) to solve for: by the best conditioned of four such turns, and then by the X so found,
-    so that the outcome does not hang on the choice of the camera's axes.
+    Therefore the camera's vectors are first rotated by a known R0, which leaves X inv(R0) to solve
+    for: by the best conditioned of four such rotations, and then by the solution of that, so that
+    the result does not depend on the choice of the camera's axes.
     """
     pairs = rotation_pairs(robot, camera)
     g, c, trust = pairs.robot[1:], pairs.camera[1:], np.abs(pairs.weight)
@@ -46,7 +46,7 @@ def tsai(robot: FloatArray, camera: FloatArray) -> HandEye:
 def _normal_equations(
     robot: FloatArray, camera: FloatArray, mixed: FloatArray, frames: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Sums up eq. 12, halved, in turned camera frames.
+    """Normal equations of eq. 12, halved, in rotated camera frames.
 
     Args:
         robot: (3, 3) sum of the outer products g g^T, with P_g = 2 g.

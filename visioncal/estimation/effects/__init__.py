@@ -1,7 +1,7 @@
-"""Effects: vectors of unknowns that move many observations together, one file each.
+"""Effects: vectors of unknowns that act on many observations together, one file each.
 
-Those of time within an image are looked for wherever a camera sees a moving target beside a
-robot's stream: an effect of the kind is a file, and its entry in `EFFECTS`.
+Delays within an image are estimated wherever a camera sees a moving target while the robot streams
+its poses: each is a file, and an entry in `EFFECTS`.
 """
 
 from visioncal.estimation.effects.delays import Delay

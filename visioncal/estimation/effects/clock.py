@@ -1,4 +1,4 @@
-"""Effect of clocks: a camera's is ahead of a robot's, and the robot was elsewhere in between."""
+"""Effect of a clock offset between a camera and a robot."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from visioncal.estimation.variance import Knowledge
 def clock_effect(
     speeds: FloatArray, sigma_s: float = np.inf, name: str = "clock", robot: str = ROBOT
 ) -> Effect:
-    """The change of an offset [s] as an unknown.
+    """The change of a clock offset [s] as an unknown.
 
     Args:
-        speeds: (s, 6) twists a second of the robot's flange at each stop, in its own frame; zero
+        speeds: (s, 6) twists per second of the robot's flange at each stop, in its own frame; zero
             where a pose does not depend on the clock.
-        sigma_s: How well the offset is known beforehand [s].
-        name: What it is of.
+        sigma_s: Prior standard deviation of the offset [s].
+        name: Name of the effect.
         robot: The robot whose flange moves.
     """
-    known = Knowledge(np.array([[sigma_s**-2.0]]), np.zeros(1))
+    prior = Knowledge(np.array([[sigma_s**-2.0]]), np.zeros(1))
     # The farther the camera's clock is ahead, the earlier the robot's own time.
-    return Effect.free(name, known, flange_jacobian={robot: -speeds[:, :, None]})
+    return Effect.free(name, prior, flange_jacobian={robot: -speeds[:, :, None]})

@@ -1,8 +1,8 @@
-"""Effects of time within an image: corners of a moving target that are taken later than others.
+"""Effects of time within an image: corners of a moving target with a delay of their own.
 
-Such an effect takes each corner later than its image's stamp by a share of one time, which is
-unknown. A corner p that is taken by t later lies at `exp(t w) p` in the target's frame, w being the
-twist a second at which the target moves in the camera's view, on its right.
+Each corner's delay from its image's stamp is a known share of one unknown time. A corner p delayed
+by t lies at `exp(t w) p` in the target's frame, w being the target's right twist per second in the
+camera's view.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,15 +19,14 @@ from visioncal.estimation.corners import CornerStack
 
 @dataclass(frozen=True)
 class Delay:
-    """One such effect.
+    """An effect of time within an image.
 
     Attributes:
-        name: What it is called.
-        sigma_s: What the time is known to without any view, about zero [s].
+        sigma_s: Prior standard deviation of the time, about zero [s].
         shares: Of (n, 2) corners [px] in an image of some resolution, the (n,) shares.
-        result: Fields of `results.ClockResult`, from a time, its sigma [s], whether it is beyond
-            chance, and the image's resolution.
-        words: The same in a sentence, of a time and its sigma [s] that are beyond chance.
+        result: Fields of `results.ClockResult`, from a time, its sigma [s], whether it is
+            significant, and the image's resolution.
+        words: A sentence on a significant time, from the time and its sigma [s].
     """
 
     name: str
@@ -40,17 +39,17 @@ class Delay:
 def target_twists(
     mount: Mount, base_from_flange: FloatArray, x: FloatArray, poses: FloatArray, speeds: FloatArray
 ) -> FloatArray:
-    """How views' targets move in front of the camera.
+    """Twists of the views' targets relative to the camera.
 
     Args:
-        mount: Where the camera is.
+        mount: Mounting of the camera.
         base_from_flange: (v, 4, 4).
         x: (4, 4) the camera's edge.
         poses: (v, 4, 4) `cam_from_target`.
-        speeds: (v, 6) twists a second of the flange, in its own frame.
+        speeds: (v, 6) twists per second of the flange, in its own frame.
 
     Returns:
-        (v, 6) twists a second, in the target's frame.
+        (v, 6) twists per second, in the target's frame.
     """
     hand = mount == "eye-in-hand"
     flange_from_target = x @ poses if hand else invert(base_from_flange) @ x @ poses
@@ -61,7 +60,7 @@ def target_twists(
 def delayed_points(
     stack: CornerStack, shares: FloatArray, twists: FloatArray, times_s: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where the corners were when they were taken.
+    """Target positions of the corners at the time of their exposure.
 
     Args:
         stack: The corners of v views.
@@ -70,7 +69,7 @@ def delayed_points(
         times_s: (k,) the times [s].
 
     Returns:
-        (n, 3) places on the target [m], and (n, 3, k) how they move with the times [m/s].
+        (n, 3) positions on the target [m], and (n, 3, k) their derivatives by the times [m/s].
     """
     of_corner = twists[stack.view_of]
     points = apply_each(exp((shares @ times_s)[:, None] * of_corner), stack.points)
@@ -98,8 +97,8 @@ def compress_delayed(
         camera: The intrinsics, held.
         shares: (n, k) of `shares_of`.
         twists: (v, 6) of `target_twists`.
-        times_s: (k,) where to linearise [s].
-        starts: (v, 4, 4) `cam_from_target` to start from.
+        times_s: (k,) linearisation point [s].
+        starts: (v, 4, 4) starts of `cam_from_target`.
     """
     points, jacobian = delayed_points(stack, shares, twists, times_s)
     return compress_points(stack.with_points(points), camera, starts, jacobian, lens=False)

@@ -1,4 +1,4 @@
-"""Effect of a rolling shutter: the rows of an image are taken one after the other."""
+"""Effect of a rolling shutter: the rows of an image are exposed one after the other."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -9,19 +9,19 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 from visioncal.estimation.effects.delays import Delay
 
-# Sensors read an image out within some tens of milliseconds [s].
+# Typical readout time of an image [s].
 _READOUT_SIGMA_S = 0.02
 
 
 @dataclass(frozen=True)
 class Shutter:
-    """When the rows of an image are taken.
+    """Shutter of a camera.
 
     Attributes:
-        kind: One after the other, or all at once.
-        readout_s: By how much the last row is later than the first [s].
-        readout_sigma_s: The standard deviation of that [s].
-        line_s: By how much each row is later than the one before it [s].
+        kind: Rows exposed one after the other, or all at once.
+        readout_s: Delay of the last row behind the first [s].
+        readout_sigma_s: Its standard deviation [s].
+        line_s: Delay of each row behind the one before it [s].
     """
 
     kind: Literal["rolling", "global"]
@@ -31,7 +31,7 @@ class Shutter:
 
 
 def _shares(px: FloatArray, resolution: tuple[int, int]) -> FloatArray:
-    """By which share of the readout corners are taken later: the middle row has the stamp."""
+    """Delays of corners as shares of the readout; the middle row has the stamp."""
     return np.asarray(px[:, 1] / (resolution[1] - 1) - 0.5)
 
 
