@@ -115,7 +115,7 @@ class ArmIdentifiability:
             result: The section.
             robot: The nominal arm.
             views: (m,) view of each stop.
-            lost: Reading of a joint whose zero was found far from its stated value.
+            lost: Reading of a joint with a lost zero.
         """
         ordered = sorted(
             zip(self.influence.tolist(), views, strict=True), key=lambda pair: -pair[0]
@@ -127,8 +127,7 @@ class ArmIdentifiability:
             convention=self.convention,
             parameters=tuple(_arm_parameter(estimate, robot, lost) for estimate in self.estimates),
             workspace_sigma_mm=WorkspaceSigma(
-                1e3 * float(np.median(self.sigmas_m)),
-                1e3 * float(np.quantile(self.sigmas_m, 0.95)),
+                1e3 * float(np.median(self.sigmas_m)), 1e3 * float(np.quantile(self.sigmas_m, 0.95))
             ),
             workspace_map=_map(self.places, self.sigmas_m),
             measured_map=_map(self.near, self.near_sigmas_m),

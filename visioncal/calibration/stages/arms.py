@@ -274,21 +274,12 @@ class RobotArm:
         return replace(self, thermal=find_drift(problem, start, stops, inputs, self.matched.arm))
 
     def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:
-        """Looks for posture-dependent errors.
-
-        Args:
-            likelihood: Likelihood of the robots' noise levels at the fit with the nominal arm.
-            robot: Index of this robot in it.
-        """
+        """Looks for posture-dependent errors, by the likelihood at the fit with the nominal arm."""
         errors = find_arm_errors(likelihood, robot, self.basis, of_links=self.is_modelled)
         return replace(self, errors=errors)
 
     def stated(self, problem: Problem) -> Problem | None:
-        """A problem with a lost joint zero put back to its nominal value; None where none is lost.
-
-        Args:
-            problem: The observations, with the zero that was found.
-        """
+        """A problem with a lost joint zero set to its nominal value; None where none is lost."""
         matched, q = self.matched, self.joints_rad
         if matched is None or matched.zero is None or q is None:
             return None
@@ -297,12 +288,9 @@ class RobotArm:
         return replace(problem, poses={**problem.poses, self.robot: poses})
 
     def reported_alike(self, agrees: Mask) -> Mask:
-        """Mask (s,) of stops whose reported pose matches the joints as well as at inlier stops.
+        """Mask (s,) of stops whose reported pose matches the joints as at the inlier stops (s,).
 
         A wrong report says nothing against joints and cameras, but would mislead the fit.
-
-        Args:
-            agrees: (s,) mask of the inlier stops.
         """
         if self.matched is None or self.joints_rad is None:
             return agrees
@@ -395,12 +383,7 @@ class RobotArm:
         )
 
     def result(self, found: ArmFound, views: Sequence[int]) -> ArmSections:
-        """The arm's sections of a calibration.
-
-        Args:
-            found: The identified properties of the arm.
-            views: View of each stop.
-        """
+        """The arm's sections of a calibration; `views` are those of the stops."""
         sections = ArmSections(
             arm_errors=_size_of(self.errors) if self.errors and self.errors.is_likely else None,
             thermal=found.drift,
@@ -485,14 +468,7 @@ class RobotArm:
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
 
     def with_functions(self, problem: Problem, start: State, asked: str, noise: Noise) -> Self:
-        """Looks for joint error functions beyond the chosen level of the geometry.
-
-        Args:
-            problem: The observations, with this arm as reported.
-            start: Starting values.
-            asked: A key of `stages.kinematics.ASKED`.
-            noise: Noise levels to start from.
-        """
+        """Looks for joint error functions beyond the chosen level; see `with_level`."""
         used = self.at(stops_of(problem, self.robot))
         q, reported = used.joints_rad, used.reported
         if self.matched is None or self.joints_rad is None or q is None or self.kinematics is None:
@@ -506,9 +482,7 @@ class RobotArm:
         if fit.functions is None:
             return self
         model = replace(
-            model,
-            harmonic_directions=fit.functions.directions,
-            harmonic_sizes=fit.functions.sizes,
+            model, harmonic_directions=fit.functions.directions, harmonic_sizes=fit.functions.sizes
         ).erring(fit.errors)
         return replace(self, kinematics=fit)._with_model(model)
 

@@ -42,12 +42,7 @@ class PredictedAccuracy:
 
 
 def carries_over(arm: ArmData, kinematics: Kinematics) -> CarriesOver:
-    """Computes where a calibrated arm is more accurate than the nominal one.
-
-    Args:
-        arm: The observations of the arm.
-        kinematics: The compared levels.
-    """
+    """Computes where a calibrated arm is more accurate than the nominal one."""
     with one_blas_thread():
         predicted = _predicted_accuracy(arm, kinematics)
     stops = arm.model.base_from_flange(arm.q, arm.loads)[:, :3, 3]

@@ -135,13 +135,7 @@ NO_JOINTS = Remedy(
 
 
 def adding(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
-    """Advice to add views, with the command that proposes them where the arm's model is known.
-
-    Args:
-        words: The advice on which views to add.
-        modelled: Whether the arm's model is known.
-        purpose: Options of the command.
-    """
+    """Advice to add views, with the command that proposes them (and its options, `purpose`)."""
     if modelled:
         return Remedy(words, f"{PLAN}{purpose}")
     model = "With [robot] model in session.toml, visioncal plan proposes them."
@@ -149,12 +143,7 @@ def adding(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
 
 
 def with_misread(verdict: Verdict, found: Finding) -> Verdict:
-    """Verdict in which misread poses come first, as they explain the other findings.
-
-    Args:
-        verdict: The verdict on the poses as declared.
-        found: The finding that they are misread.
-    """
+    """Verdict in which the finding of misread poses comes first, as it explains the others."""
     if verdict.causes and verdict.causes[0].kind == EXCHANGED:
         # The views themselves show the exchange; the finding's command undoes it.
         words = "Write a copy of the session with these rows exchanged, and calibrate it."
@@ -178,12 +167,7 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
 
 
 def with_other_board(verdict: Verdict, found: Finding) -> Verdict:
-    """Verdict in which another board than the declared one comes first.
-
-    Args:
-        verdict: The verdict for the declared board.
-        found: The finding on the board that the images show.
-    """
+    """Verdict in which the finding that images show another board comes first."""
     odds = _odds(EVIDENCE[found.kind].chance)
     cause = replace(found, probability=odds / (1.0 + odds))
     rest = (finding for finding in verdict.findings if finding.kind != "lost_views")
@@ -350,12 +334,7 @@ LEAST_RUN = 3
 
 
 def run_evidence(count: int, of: int) -> float:
-    """Evidence of a run of left-out views, as a chi-square with one degree of freedom.
-
-    Args:
-        count: Number of consecutive left-out views.
-        of: Number of all views.
-    """
+    """Chi-square (one degree of freedom) of `count` consecutive left-out views among `of` views."""
     # Views that are wrong independently are equally likely to be any of them.
     chance = EVIDENCE["something_moved"].chance * (of - count + 1) / math.comb(of, count)
     return float(chi2_limit(max(chance, _LEAST_CHANCE), 1))
@@ -379,11 +358,7 @@ def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
 # Error sources of picks: kind of the finding, words, and remedy.
 _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
     "calibration": ("calibration", "the calibration itself", None),
-    "board": (
-        "unmeasured_board",
-        "the board, whose size is not known better",
-        MEASURE_BOARD,
-    ),
+    "board": ("unmeasured_board", "the board, whose size is not known better", MEASURE_BOARD),
     "look": (
         "robot_noise",
         "the robot's own noise where it looks, which more views do not change",
@@ -394,11 +369,7 @@ _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
         "the robot's own noise where it picks, which no calibration changes",
         Remedy("Take a robot that repeats better, or a gripper that forgives."),
     ),
-    "arm": (
-        "arm_errors",
-        "the arm's own errors, which more views do not change",
-        NO_JOINTS,
-    ),
+    "arm": ("arm_errors", "the arm's own errors, which more views do not change", NO_JOINTS),
     "left out": (
         "unexplained",
         "errors of left-out views that the prediction does not explain",

@@ -43,7 +43,6 @@ class Cell:
     Attributes:
         session: The session.
         tree: Tree of frames; the base of one robot, or one other frame, is the cell's frame.
-        reference: That frame.
         poses: (s, 4, 4) `base_from_flange` by robot and station; NaN where unknown.
         rows: The usable observations.
         reasons: Why other views are not usable, by view.
@@ -69,11 +68,9 @@ class Cell:
         return f"from view {self.stops[station]} on"
 
     def or_apart(self, do: str, station: int) -> Remedy:
-        """Advice to fix something and record again, or to calibrate the longer part alone.
+        """Advice to `do` something and record again, or to calibrate the longer part alone.
 
-        Args:
-            do: What to do, in the imperative.
-            station: First station of the later part.
+        The later part begins at a station.
         """
         parts: dict[str, list[int]] = {"before": [], "after": []}
         for row in (*self.rows, *self.held):

@@ -59,7 +59,6 @@ class FoundDelay:
     """Estimated delay within images, such as that of a rolling shutter.
 
     Attributes:
-        of: The effect.
         time_s: The delay [s].
         sigma_s: Its standard deviation [s].
         is_clear: Whether it is significant, and was corrected.
@@ -264,12 +263,7 @@ def turning_doubt(match: Match) -> Finding:
 
 
 def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
-    """Finding about a change of the offset between the clocks.
-
-    Args:
-        change: The change.
-        views: The views with their original stamps.
-    """
+    """Finding about a change of the offset between the clocks, with the views' original stamps."""
     if change.is_drift:
         how = (
             f"drifts against the robot's, by {1e6 * change.step_s:+.0f} ppm (sigma "
@@ -337,14 +331,9 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
 
 
 def shared_stamps_error(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> DataError | None:
-    """Error for views with equal stamps that show the same target in different poses.
+    """Error for views of a camera with equal stamps that show the same target in different poses.
 
-    Args:
-        views: The views of one camera that wait for a pose of the robot.
-        poses: Target poses by view.
-
-    Returns:
-        The error; None where these are no more than half of the views.
+    It is None where these are no more than half of the views.
     """
     groups: dict[tuple[float | None, int], list[View]] = {}
     for view in views:

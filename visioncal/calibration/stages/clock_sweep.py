@@ -147,10 +147,6 @@ class CameraSweep:
 def set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> Clocked:
     """Gives views the robot's poses at their time.
 
-    Args:
-        sweep: Observations of a camera while a robot moved.
-        poses: Target poses by view.
-
     Raises:
         DataError: No view lies within the stream, or the views' times are wrong.
         DegenerateError: The motion does not determine the offset, it is not stated, and too few
@@ -263,13 +259,7 @@ def misread_joints(
 ) -> DataError | None:
     """Error for a stream of joint angles that explains the camera's motion in another unit.
 
-    Args:
-        sweep: Observations that the stream as recorded does not explain.
-        poses: Target poses by view.
-        robot: Model of the robot, which gives the stream's poses.
-
-    Returns:
-        The error; None where no other unit explains the motion.
+    It is None where no other unit explains the motion.
     """
     if sweep.motion.reported or sweep.motion.joints is None:
         return None
@@ -364,9 +354,7 @@ def _by_turning(sweep: CameraSweep, views: Sequence[View], match: Match) -> Cloc
 
 
 def _undetermined(
-    sweep: CameraSweep,
-    views: Sequence[View],
-    tried: tuple[Sequence[ClockFit], Sequence[Match]],
+    sweep: CameraSweep, views: Sequence[View], tried: tuple[Sequence[ClockFit], Sequence[Match]]
 ) -> Clocked:
     """Gives views their poses without an estimate: at the stated offset, or for views at rest."""
     why, stated_s = why_undetermined(*tried), sweep.stated_s

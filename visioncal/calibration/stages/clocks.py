@@ -141,11 +141,8 @@ def clock_effects(
         if clock.speeds and robot in cell.poses:
             sigma_s = clock.known_s(erring=robot in erring)
             effects.append(_offset_effect(cell, pair, clock, sigma_s))
-            effects += [
-                delay.effect(views, pair.delay(delay.of))
-                for delay in clock.delays
-                if delay.is_clear
-            ]
+            clear = (delay for delay in clock.delays if delay.is_clear)
+            effects += [delay.effect(views, pair.delay(delay.of)) for delay in clear]
     return tuple(effects)
 
 

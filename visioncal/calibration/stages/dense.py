@@ -87,7 +87,7 @@ def fit_densely(
         session: The session.
         views: Its views.
         corners: Detected corners by view, in their own board's numbers.
-        dense: Settings and earlier results.
+        dense: Settings, and earlier results.
         progress: Called after each image.
 
     Returns:
@@ -184,14 +184,7 @@ def _weighted(seen: Corners, fit: FittedCorners | None, weights: FloatArray) -> 
 def explained(
     session: Session, evidence: Sequence[ViewEvidence], dense: Dense, camera: Camera
 ) -> tuple[ViewEvidence, ...]:
-    """Adds rendered images and their residuals to the evidence of views.
-
-    Args:
-        session: The session.
-        evidence: Evidence of its views, with predicted corners.
-        dense: Dense fits of the images.
-        camera: The calibrated camera.
-    """
+    """Adds rendered images and their residuals to the evidence of views."""
     rows = {view.number: view for view in session.views}
 
     def explained(seen: ViewEvidence) -> ViewEvidence:
@@ -223,8 +216,8 @@ def _words(fit: FittedCorners, rendered: DenseImage) -> str:
     blur = fit.blur
     causes = {"motion": "Smeared by motion", "focus": "Out of focus", "": "Sharp"}
     return (
-        f"**{causes[blur.cause]}.** Edges are {blur.width_px:.2f} px wide as a sigma: a Gaussian of "
-        f"{blur.sigma_px:.2f} px, a disc of {blur.disc_px:.2f} px radius, and a line of "
+        f"**{causes[blur.cause]}.** Edges are {blur.width_px:.2f} px wide as a sigma: a Gaussian "
+        f"of {blur.sigma_px:.2f} px, a disc of {blur.disc_px:.2f} px radius, and a line of "
         f"{blur.length_px:.2f} px at {blur.direction_deg:.0f} deg from the image's rows.\n\n"
         f"What is not explained has an rms of {rendered.rest_rms:.1f} grey levels on the board, "
         f"about its corners alone {fit.noise:.1f}; it is drawn {MAGNIFIED} times as strong. Edges "

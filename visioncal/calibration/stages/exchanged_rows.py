@@ -111,12 +111,7 @@ def _has_robot_poses(problem: Problem) -> Mask:
 
 
 def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[int, int]:
-    """Pairs of observations of the same two frames, each of which fits the other's stop.
-
-    Args:
-        problem: All observations.
-        fitting: Other stops that outliers fit; see `other_stops`.
-    """
+    """Pairs of observations that each fit the other's stop, by the result of `other_stops`."""
     seen, pairs = problem.observations, {}
     first = [observer.partition("@")[0] for observer in seen.observers]
     second = [name.partition("@")[0] for name in seen.observed]
