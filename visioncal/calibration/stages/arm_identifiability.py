@@ -106,7 +106,7 @@ class ArmIdentifiability:
     near: FloatArray
     near_sigmas_m: FloatArray
 
-    def in_result(
+    def add_to(
         self, result: ArmResult, robot: Robot, views: Sequence[int], lost: JointReading | None
     ) -> ArmResult:
         """Adds the identifiability to the arm's section of a calibration.

@@ -400,7 +400,7 @@ class RobotArm:
         )
         if found.numbers is not None:
             zero = None if self.matched is None else self.matched.zero
-            arm = found.numbers.in_result(arm, self.model.nominal, views, zero)
+            arm = found.numbers.add_to(arm, self.model.nominal, views, zero)
             arm = replace(arm, left_out=self.kinematics.left_out(), carries_over=found.carries)
         springs = None if found.springs is None else found.springs.result(views)
         return replace(sections, arm=arm, elastic=springs)

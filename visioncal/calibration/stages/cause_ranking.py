@@ -112,7 +112,7 @@ _BY_THE_CHAIN = (
     "prior",
     *MOVED_AT_ONCE,
 )
-LOOK = Remedy(
+_INSPECT_VIEWS = Remedy(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )
 
@@ -134,7 +134,7 @@ NO_JOINTS = Remedy(
 )
 
 
-def adding(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
+def add_views_remedy(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
     """Advice to add views, with the command that proposes them (and its options, `purpose`)."""
     if modelled:
         return Remedy(words, f"{PLAN}{purpose}")
@@ -373,7 +373,7 @@ _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
     "left out": (
         "unexplained",
         "errors of left-out views that the prediction does not explain",
-        LOOK,
+        _INSPECT_VIEWS,
     ),
 }
 

@@ -10,7 +10,7 @@ from visioncal.calibration.stages.cause_ranking import (
     MEASURE_BOARD,
     MOVED_AT_ONCE,
     NO_JOINTS,
-    adding,
+    add_views_remedy,
     run_evidence,
 )
 from visioncal.calibration.stages.findings import Findings, JudgedArm, JudgedPair, Sensor
@@ -151,14 +151,14 @@ def helping(findings: Findings) -> Remedy | None:
     if any(warning.do is NO_JOINTS for warning in findings.warnings):
         return None
     words = "Add views from other poses of the robot."
-    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
+    return add_views_remedy(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
 def _tilted(findings: Findings) -> Remedy:
     words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
     if not all(arm.can_tilt for arm in findings.arms):
         words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
-    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
+    return add_views_remedy(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
 def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
@@ -329,7 +329,7 @@ def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[
                 f"{figure(arm.workspace_mm)} mm (sigma, in the median; doubt begins at "
                 f"{limits.sigma_mm[0]:g}).{board if seen else ''}"
             )
-            step = adding(
+            step = add_views_remedy(
                 "Add views with other postures of the arm, all over the workspace.",
                 modelled=findings.plannable,
                 purpose=f" --for kinematics{findings.of_camera}",
