@@ -1,4 +1,4 @@
-"""The robots' arms: where each stood, which of its errors show, and how they are unknowns."""
+"""Robot arms: reported and calibrated poses, identified errors, and their effects in the fit."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -52,22 +52,22 @@ from visioncal.robot import Loads
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
 
-# Poses and joints are written with so many digits [m, rad].
-_ROUNDED = 1e-5
+# Rounding of written poses and joints [m, rad].
+_ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class ArmFound:
-    """What the stops determine of an arm.
+    """Identified properties of an arm.
 
     Attributes:
-        numbers: Identifiability of its parameters; None where it stands as stated.
-        springs: Of its joints as springs; None for a rigid one.
-        plays: Of the play in its joints; empty where stops did not come from both sides.
-        drift: Its drift with temperature; None for none.
-        carries: Where it is better than as stated; None where it stands as stated.
-        functions: Of its joints; None without any.
-        measured: Over which ranges of its joints that is.
+        numbers: Identifiability of its parameters; None for a nominal arm.
+        springs: Joint compliances; None for a rigid arm.
+        plays: Backlash of the joints; empty where stops were not approached from both sides.
+        drift: Drift with temperature; None without one.
+        carries: Where the calibrated arm beats the nominal one; None for a nominal arm.
+        functions: Joint error functions; None without any.
+        measured: Joint ranges of the stops.
     """
 
     numbers: ArmIdentifiability | None = None
@@ -79,7 +79,7 @@ class ArmFound:
     measured: tuple[JointRange, ...] = ()
 
     def notes(self) -> Iterator[str]:
-        """Words what is no reason for doubt."""
+        """Remarks that are no reason for doubt."""
         if self.carries is not None:
             yield self.carries.words
         if self.numbers is not None and self.numbers.advice:
@@ -89,7 +89,7 @@ class ArmFound:
             yield from elastic.remarks(self.springs)
 
     def doubts(self) -> Iterator[Finding]:
-        """Words what speaks against it."""
+        """Findings against the arm."""
         if self.springs is not None:
             yield from elastic.doubts(self.springs)
 
@@ -99,17 +99,17 @@ class RobotArm:
     """A robot's arm at the s stops of a cell.
 
     Attributes:
-        robot: The robot, as the problem has it.
-        reported: (s, 4, 4) `base_from_flange` as it was reported; not a number where unknown.
-        stood: (s,) the m stops at which it was.
-        joints_rad: (m, n) its joints there; None where they are missing or belong to no model.
-        loads: What it carried there.
-        matched: Its model, beside poses and joints; None where none is known.
-        heat: What heats it; None where its joints are not known.
-        thermal: How it drifts with that; None where that was not asked or cannot be.
-        errors: Errors that follow its posture, where they are likely.
-        kinematics: Which levels were compared; None where that was not asked or cannot be.
-        model: The arm with the errors of the level that was taken; None where it stays as stated.
+        robot: Name of the robot in the problem.
+        reported: (s, 4, 4) reported `base_from_flange`; NaN where unknown.
+        stood: (s,) mask of the m stops with a pose of this robot.
+        joints_rad: (m, n) joints at these; None where they are missing or belong to no model.
+        loads: Loads at these.
+        matched: Model, matched with poses and joints; None where none is known.
+        heat: Heat inputs; None where joints are not known.
+        thermal: Thermal drift fit; None where it was not requested or is impossible.
+        errors: Posture-dependent errors, where they are likely.
+        kinematics: Compared levels; None where none were requested or possible.
+        model: Arm with the errors of the chosen level; None for a nominal arm.
     """
 
     robot: str
@@ -133,19 +133,19 @@ class RobotArm:
         matched: Matched | None,
         recorded: tuple[Session, str],
     ) -> Self:
-        """Reads an arm, as it is stated.
+        """Builds a nominal arm.
 
         Args:
-            robot: The robot, as the problem has it.
-            reported: (s, 4, 4) `base_from_flange`; not a number at stops at which it was not.
-            views: The rows that have its pose at the m stops at which it was.
-            matched: Its model, beside poses and joints; None where none is known.
+            robot: Name of the robot in the problem.
+            reported: (s, 4, 4) reported `base_from_flange`; NaN where unknown.
+            views: The rows with its pose at the m stops where it is known.
+            matched: Model, matched with poses and joints; None where none is known.
             recorded: The session, and the robot's name there.
         """
         joints = [] if matched is None else [matched.joints_rad.get(view.number) for view in views]
         q = [joint for joint in joints if joint is not None]
-        known, heat = 0 < len(q) == len(views), None
-        if known:
+        has_joints, heat = 0 < len(q) == len(views), None
+        if has_joints:
             stamps_s = np.array([view.stamp_s for view in views], dtype=float)
             numbers = np.array([view.number for view in views])
             heat = Heat(*recorded, len(q[0]), numbers, stamps_s)
@@ -153,7 +153,7 @@ class RobotArm:
             robot,
             reported,
             np.isfinite(reported[:, 0, 0]),
-            np.array(q) if known else None,
+            np.array(q) if has_joints else None,
             loads_of(
                 [view.numbers for view in views], [view.text.get("approach", "") for view in views]
             ),
@@ -168,24 +168,24 @@ class RobotArm:
 
     @property
     def can_tilt(self) -> bool:
-        """Whether its flange turns about more than one direction, as far as is known."""
+        """Whether the flange turns about more than one direction; True without a model."""
         return self.matched is None or self.matched.robot.can_tilt
 
     @property
     def has_functions(self) -> bool:
-        """Whether functions of its joints were found."""
+        """Whether joint error functions were found."""
         return self.kinematics is not None and self.kinematics.functions is not None
 
     @property
     def gain_of_functions(self) -> float:
-        """Twice what functions of its joints gain of the log-likelihood; zero without any."""
+        """Twice the gain in log-likelihood by joint error functions; zero without any."""
         if self.kinematics is None or self.kinematics.functions is None:
             return 0.0
         *others, functions = (fit.gain for fit in self.kinematics.fits.values())
         return functions - max(others)
 
     def at(self, stops: IntArray) -> Self:
-        """The arm at (k,) of its stops."""
+        """The arm at a subset (k,) of its stops."""
         stood = self.stood[stops]
         kept = (np.cumsum(self.stood) - 1)[stops][stood]
         joints, errors = self.joints_rad, self.errors
@@ -201,12 +201,12 @@ class RobotArm:
 
     @property
     def drift(self) -> ThermalFit | None:
-        """How it drifts with its temperature; None where it does not beyond chance."""
+        """Significant drift with temperature; None without one."""
         return None if self.thermal is None or not thermal.is_found(self.thermal) else self.thermal
 
     @property
     def warming(self) -> ThermalStops:
-        """Where it stood, and when; a stop without a time counts as at the start."""
+        """Joints and times of the stops; a stop without a time counts as at the start."""
         if self.joints_rad is None or self.heat is None or self.thermal is None:
             raise RuntimeError("an arm drifts by its joints and what heats them")
         start_s = self.thermal.inputs.stamps_s[0]
@@ -214,13 +214,13 @@ class RobotArm:
         return ThermalStops(self.robot, np.flatnonzero(self.stood), self.joints_rad, stamps_s)
 
     def erring(self, errors: ArmErrors | None) -> Self:
-        """The arm with errors that were found at some of its stops, none of them estimated yet."""
+        """The arm with errors found at some of its stops, none of them estimated yet."""
         arm = replace(self, errors=errors, kinematics=None, model=None)
         return arm if errors is None else replace(arm, errors=replace(errors, basis=arm.basis))
 
     @property
     def poses(self) -> FloatArray:
-        """(s, 4, 4) where the flange stood, by the calibrated arm where there is one."""
+        """(s, 4, 4) poses of the flange, by the calibrated arm where there is one."""
         poses = self.reported.copy()
         if self.model is not None and self.joints_rad is not None:
             poses[self.stood] = self.model.base_from_flange(self.joints_rad, self.loads)
@@ -229,11 +229,11 @@ class RobotArm:
         return poses
 
     def frees_errors(self, *, freely: bool = False) -> bool:
-        """Whether its errors are unknowns: those that are estimated, or freely all found."""
+        """Whether its errors are unknowns: estimated ones, or with `freely` any that were found."""
         return self.errors is not None and (freely or self.errors.is_estimated)
 
     def effects(self, *, freely: bool = False) -> tuple[Effect, ...]:
-        """What moves its flange at all stops: the uncertainty of its drift, and its errors."""
+        """Effects that move its flange at the stops: drift uncertainty and errors."""
         drift, found = self.drift, []
         if drift is not None:
             found.append(drift.effect(self.warming, len(self.stood)))
@@ -243,53 +243,43 @@ class RobotArm:
         return tuple(found)
 
     def put_into(self, problem: Problem) -> Problem:
-        """A problem with this arm in the place of what it has of it."""
+        """A problem with this arm's poses and effects in place of its former ones."""
         mine = {f"{name} of {self.robot}" for name in ("arm", "temperature")}
         rest = [effect for effect in problem.effects if effect.name not in mine]
         moved = replace(problem, poses={**problem.poses, self.robot: self.poses})
         return moved.with_effects([*rest, *self.effects()])
 
     def without_errors(self, problem: Problem) -> Problem:
-        """A problem with this arm as reported, but for its drift."""
+        """A problem with this arm as reported, apart from its drift."""
         return self.erring(None).put_into(problem)
 
     def with_drift(self, problem: Problem, start: State, asked: str) -> Self:
-        """Looks for how it drifts with its temperature, where the session determines it.
+        """Estimates the drift with temperature, where the session determines it.
 
         Args:
             problem: The observations, with this arm as reported.
-            start: Where to start.
+            start: Starting values.
             asked: A key of `stages.kinematics.ASKED`.
 
         Raises:
-            DataError: The level asks for it, and the session lacks what it takes.
-            DegenerateError: The level asks for it, and all views were taken about equally warm.
+            DataError: The level requires the drift, and the session lacks its inputs.
+            DegenerateError: The level requires the drift, and the temperature hardly changed.
         """
-        seen = self.at(stops_of(problem, self.robot))
-        inputs = heating(seen.heat if self.is_modelled else None, asked)
-        if inputs is None or seen.heat is None or seen.joints_rad is None or self.matched is None:
-            return self
         places = stops_of(problem, self.robot)
-        stops = ThermalStops(self.robot, places, seen.joints_rad, seen.heat.stamps_s)
-        found = find_drift(problem, start, stops, inputs, self.matched.arm)
-        return replace(self, thermal=found)
+        arm = self.at(places)
+        inputs = heating(arm.heat if self.is_modelled else None, asked)
+        if inputs is None or arm.heat is None or arm.joints_rad is None or self.matched is None:
+            return self
+        stops = ThermalStops(self.robot, places, arm.joints_rad, arm.heat.stamps_s)
+        return replace(self, thermal=find_drift(problem, start, stops, inputs, self.matched.arm))
 
     def with_errors(self, likelihood: RobotLikelihood, robot: int) -> Self:
-        """Looks for errors that follow its posture.
-
-        Args:
-            likelihood: That of the robots' levels with this arm as stated, at the fit.
-            robot: Its place among the robots.
-        """
-        found = find_arm_errors(likelihood, robot, self.basis, of_links=self.is_modelled)
-        return replace(self, errors=found)
+        """Looks for posture-dependent errors, by the likelihood at the fit with the nominal arm."""
+        errors = find_arm_errors(likelihood, robot, self.basis, of_links=self.is_modelled)
+        return replace(self, errors=errors)
 
     def stated(self, problem: Problem) -> Problem | None:
-        """A problem with a lost zero where the model has it; None where none is lost.
-
-        Args:
-            problem: The observations, with the zero where it was found.
-        """
+        """A problem with a lost joint zero set to its nominal value; None where none is lost."""
         matched, q = self.matched, self.joints_rad
         if matched is None or matched.zero is None or q is None:
             return None
@@ -298,23 +288,20 @@ class RobotArm:
         return replace(problem, poses={**problem.poses, self.robot: poses})
 
     def reported_alike(self, agrees: Mask) -> Mask:
-        """(s,) where the reported poses are those of the joints, as much as where views agree.
+        """Mask (s,) of stops whose reported pose matches the joints as at the inlier stops (s,).
 
         A wrong report says nothing against joints and cameras, but would mislead the fit.
-
-        Args:
-            agrees: (s,) where they do.
         """
         if self.matched is None or self.joints_rad is None:
             return agrees
         nominal = self.matched.arm.base_from_flange(self.joints_rad)
-        tools, sound = invert(nominal) @ self.reported[self.stood], agrees[self.stood]
-        away = distances(tools, mean_transform(tools[sound]))
-        found = agrees.copy()
-        found[self.stood] = np.all(
-            [array <= 2.0 * array[sound].max() + _ROUNDED for array in away], axis=0
+        tools, inliers = invert(nominal) @ self.reported[self.stood], agrees[self.stood]
+        residuals = distances(tools, mean_transform(tools[inliers]))
+        matches = agrees.copy()
+        matches[self.stood] = np.all(
+            [array <= 2.0 * array[inliers].max() + _ROUNDING for array in residuals], axis=0
         )
-        return found
+        return matches
 
     def data(
         self,
@@ -323,16 +310,16 @@ class RobotArm:
         covariance: FloatArray,
         middles: Mapping[str, FloatArray],
     ) -> ArmData | None:
-        """What was seen of its errors; None where it stands as stated."""
+        """The observations of its errors; None for a nominal arm."""
         columns = problem.effect_columns.get(f"arm of {self.robot}")
         if self.model is None or self.errors is None or self.joints_rad is None or columns is None:
             return None
         stops, every = stops_of(problem, self.robot), np.arange(problem.size)
         rows = np.searchsorted(np.flatnonzero(self.stood), stops)
         pair = ArmPair.of(problem, fit.state, self.robot)
-        # Readings of one point show its place and no rotation; several points make a frame.
+        # A single point shows no rotation; several points make a frame.
         shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
-        # The rotation of what is only a point beside it is no value of its frame.
+        # A point has no rotation to be determined.
         edges = problem.counted.copy()
         edges[problem.edge_columns(pair.observed)] = True
         edges[6 * len(problem.unknown) :] = False
@@ -361,32 +348,33 @@ class RobotArm:
         middles: Mapping[str, FloatArray],
         convention: Convention | None = None,
     ) -> ArmFound:
-        """What the stops determine of it.
+        """Identified properties of the arm.
 
         Args:
-            problem: The observations that agree, with its errors among the unknowns.
+            problem: The inlier observations, with the arm's errors among the unknowns.
             fit: Their fit.
             covariance: (p, p) its covariance.
-            middles: (3,) the middle of each printed target by its frame, in that [m].
-            convention: Of the table that is wanted; see `stages.arm_identifiability`.
+            middles: (3,) centre of each printed target by its frame, in that frame [m].
+            convention: Convention of the arm's table; see `stages.arm_identifiability`.
         """
         drift = None
         if self.drift is not None and self.heat is not None:
-            seen = self.at(stops_of(problem, self.robot))
-            stops = replace(seen.warming, places=stops_of(problem, self.robot))
-            views = [] if seen.heat is None else seen.heat.views.tolist()
+            places = stops_of(problem, self.robot)
+            arm = self.at(places)
+            views = [] if arm.heat is None else arm.heat.views.tolist()
+            stops = replace(arm.warming, places=places)
             drift = drift_result(self.drift, stops, views, problem, fit)
         data = self.data(problem, fit, covariance, middles)
         if data is None or self.kinematics is None:
             return ArmFound(drift=drift)
-        # With nothing but play and springs its numbers are as stated.
-        erring = data.model.weights.keys() & set(RIGID)
+        # With backlash and compliance alone the table stays nominal.
+        has_rigid_errors = data.model.weights.keys() & set(RIGID)
         return ArmFound(
-            identify_arm(data, convention) if erring else None,
+            identify_arm(data, convention) if has_rigid_errors else None,
             springs_of(data, self.kinematics.errors),
             plays_of(data.model, data.arm_covariance),
             drift,
-            carries_over(data, self.kinematics) if erring else None,
+            carries_over(data, self.kinematics) if has_rigid_errors else None,
             functions_of(data, self.kinematics),
             tuple(
                 JointRange(name, float(column.min()), float(column.max()))
@@ -395,12 +383,7 @@ class RobotArm:
         )
 
     def result(self, found: ArmFound, views: Sequence[int]) -> ArmSections:
-        """What was found of it, as sections of a calibration.
-
-        Args:
-            found: What the stops determine of it.
-            views: By which views these stops go.
-        """
+        """The arm's sections of a calibration; `views` are those of the stops."""
         sections = ArmSections(
             arm_errors=_size_of(self.errors) if self.errors and self.errors.is_likely else None,
             thermal=found.drift,
@@ -417,17 +400,16 @@ class RobotArm:
         )
         if found.numbers is not None:
             zero = None if self.matched is None else self.matched.zero
-            arm = found.numbers.in_result(arm, self.model.nominal, views, zero)
+            arm = found.numbers.add_to(arm, self.model.nominal, views, zero)
             arm = replace(arm, left_out=self.kinematics.left_out(), carries_over=found.carries)
         springs = None if found.springs is None else found.springs.result(views)
         return replace(sections, arm=arm, elastic=springs)
 
     @property
     def basis(self) -> FloatArray:
-        """(s, 6, p) how small errors move its flange.
+        """Jacobian (s, 6, p) of the flange by arm errors.
 
-        They are those of its model where it is calibrated, or else of any of its links, where these
-        are known.
+        The errors are those of the calibrated model, else of any link, else of the pose.
         """
         if self.matched is None or self.joints_rad is None:
             return self._by_stop(pose_basis(self.reported[self.stood]))
@@ -437,11 +419,11 @@ class RobotArm:
 
     @property
     def joint_offsets(self) -> FloatArray | None:
-        """(s, 6, n) how its flange moves with the offsets of its joints; None without a model."""
+        """Jacobian (s, 6, n) of the flange by joint offsets; None without a model."""
         if self.matched is None or self.joints_rad is None:
             return None
-        stated = ArmModel.of(self.matched.arm, self.joints_rad, self.reported[self.stood])
-        return self._columns(self.model or stated, "offsets")
+        nominal = ArmModel.of(self.matched.arm, self.joints_rad, self.reported[self.stood])
+        return self._block_jacobian(self.model or nominal, "offsets")
 
     def with_level(
         self,
@@ -451,78 +433,70 @@ class RobotArm:
         views: Sequence[int],
         noise: Noise | None = None,
     ) -> Self:
-        """Chooses how far it is calibrated.
+        """Chooses the level of the arm's model by the data.
 
         Args:
             problem: The observations, with this arm as reported.
-            start: Where to start.
+            start: Starting values.
             asked: A key of `stages.kinematics.ASKED`.
-            views: (n,) by which view each observation goes.
-            noise: The noise's levels to start from; those from above where None.
+            views: (n,) view of each observation.
+            noise: Noise levels to start from; None to start from large ones.
         """
         stops = stops_of(problem, self.robot)
         if self.matched is None or self.joints_rad is None or not len(stops):
             return self
-        seen = self.at(stops)
-        q, loads = seen.joints_rad, seen.loads
+        used = self.at(stops)
+        q, loads = used.joints_rad, used.loads
         if q is None:
             return self
-        model = ArmModel.of(self.matched.arm, q, seen.reported).loaded(q, loads)
+        model = ArmModel.of(self.matched.arm, q, used.reported).loaded(q, loads)
         blocks = blocks_of(model.nominal, self.loads)
-        bases = {name: self._columns(model, name) for name in blocks}
-        found = choose_level(
+        bases = {name: self._block_jacobian(model, name) for name in blocks}
+        kinematics = choose_level(
             problem, start, self.robot, bases, asked, self.stated(problem), noise=noise
         )
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
-        arm = replace(self, kinematics=replace(found, views=tuple(views[index] for index in mine)))
-        if found.errors:
-            return arm._bending(model.erring(found.errors))
+        arm_views = tuple(views[index] for index in mine)
+        arm = replace(self, kinematics=replace(kinematics, views=arm_views))
+        if kinematics.errors:
+            return arm._with_model(model.erring(kinematics.errors))
         if self.model is None:
             return arm
-        # Fewer views agree than when it was calibrated: its errors are sought as of a stated one.
-        fit = found.nominal.fit
+        # There are fewer inliers than when it was calibrated: errors are sought at the nominal arm.
+        fit = kinematics.nominal.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         return replace(arm, model=None).with_errors(likelihood, problem.robots.index(self.robot))
 
     def with_functions(self, problem: Problem, start: State, asked: str, noise: Noise) -> Self:
-        """Looks for functions of its joints beside all that a level of its geometry has.
-
-        Args:
-            problem: The observations, with this arm as reported.
-            start: Where to start.
-            asked: A key of `stages.kinematics.ASKED`.
-            noise: The noise's levels to start from.
-        """
-        seen = self.at(stops_of(problem, self.robot))
-        q, reported = seen.joints_rad, seen.reported
+        """Looks for joint error functions beyond the chosen level; see `with_level`."""
+        used = self.at(stops_of(problem, self.robot))
+        q, reported = used.joints_rad, used.reported
         if self.matched is None or self.joints_rad is None or q is None or self.kinematics is None:
             return self
         if not allows_functions(asked, len(q)):
             return self
-        model = ArmModel.of(self.matched.arm, q, reported).loaded(q, seen.loads)
-        placed = np.eye(len(self.stood))[:, self.stood]
-        stops = (placed, self.joints_rad, self.loads)
-        found = with_functions(self.kinematics, problem, start, self.robot, model, stops, noise)
-        if found.functions is None:
+        model = ArmModel.of(self.matched.arm, q, reported).loaded(q, used.loads)
+        selection = np.eye(len(self.stood))[:, self.stood]
+        stops = (selection, self.joints_rad, self.loads)
+        fit = with_functions(self.kinematics, problem, start, self.robot, model, stops, noise)
+        if fit.functions is None:
             return self
         model = replace(
-            model,
-            harmonic_directions=found.functions.directions,
-            harmonic_sizes=found.functions.sizes,
-        ).erring(found.errors)
-        return replace(self, kinematics=found)._bending(model)
+            model, harmonic_directions=fit.functions.directions, harmonic_sizes=fit.functions.sizes
+        ).erring(fit.errors)
+        return replace(self, kinematics=fit)._with_model(model)
 
-    def _columns(self, model: ArmModel, name: str) -> FloatArray:
-        """(s, 6, p) how the flange moves with the errors of a block."""
+    def _block_jacobian(self, model: ArmModel, name: str) -> FloatArray:
+        """Jacobian (s, 6, p) of the flange by the errors of a block."""
         if self.joints_rad is None:
             raise RuntimeError("an arm is calibrated by its joints")
         return self._by_stop(model.columns(name, self.joints_rad, self.loads))
 
     def moved(self, problem: Problem, state: State) -> tuple[Self, float]:
-        """Linearises the calibrated arm anew where a fit has it.
+        """Relinearises the calibrated arm at a fit.
 
         Returns:
-            The arm, and how far its farthest error has moved [rad].
+            The arm, and the largest step of its errors [rad].
         """
         if self.model is None:
             return self, 0.0
@@ -531,39 +505,39 @@ class RobotArm:
         if not start:
             return self, 0.0
         step = problem.values_of(name, state) - start[0]
-        return self._bending(self.model.moved(step)), float(np.abs(step).max())
+        return self._with_model(self.model.moved(step)), float(np.abs(step).max())
 
-    def _bending(self, model: ArmModel) -> Self:
-        """The arm with the errors of its model as they move the flange."""
+    def _with_model(self, model: ArmModel) -> Self:
+        """The arm with a calibrated model, and its errors linearised there."""
         if self.kinematics is None:
             return self
-        found = self.kinematics.errors.values()
-        arm, gain = replace(self, model=model), sum(arm_errors.gain for arm_errors in found)
-        return replace(arm, errors=ArmErrors(arm.basis, next(iter(found)).sigma, gain, True))
+        blocks = self.kinematics.errors.values()
+        arm, gain = replace(self, model=model), sum(block.gain for block in blocks)
+        return replace(arm, errors=ArmErrors(arm.basis, next(iter(blocks)).sigma, gain, True))
 
     def _by_stop(self, columns: FloatArray) -> FloatArray:
-        """(s, 6, p) of (m, 6, p): zero where the robot did not stand."""
-        found = np.zeros((len(self.stood), *columns.shape[1:]))
-        found[self.stood] = columns
-        return found
+        """(m, 6, p) spread over all stops, (s, 6, p): zero where the robot has no pose."""
+        scattered = np.zeros((len(self.stood), *columns.shape[1:]))
+        scattered[self.stood] = columns
+        return scattered
 
 
 def _size_of(errors: ArmErrors) -> ArmErrorsResult:
-    """The size of errors, as a section of a calibration."""
+    """Size of the errors, as a section of a calibration."""
     if errors.look is not None and errors.white is not None:
-        turned, shifted = np.sqrt(np.maximum(errors.look**2 - errors.white**2, 0.0))
-        found = ArmErrorsResult(
-            sigma_mm=1e3 * float(shifted),
-            sigma_deg=float(np.rad2deg(turned)),
+        sigma_rad, sigma_m = np.sqrt(np.maximum(errors.look**2 - errors.white**2, 0.0))
+        result = ArmErrorsResult(
+            sigma_mm=1e3 * float(sigma_m),
+            sigma_deg=float(np.rad2deg(sigma_rad)),
             likelihood_ratio=errors.gain,
             estimated=False,
             of="flange",
         )
         if errors.away is None:
-            return found
+            return result
         (deg, mm), (predicted_deg, predicted_mm) = (errors.away * [np.rad2deg(1.0), 1e3]).tolist()
         return replace(
-            found,
+            result,
             away_mm=mm,
             away_deg=deg,
             away_predicted_mm=predicted_mm,
@@ -578,16 +552,16 @@ def _size_of(errors: ArmErrors) -> ArmErrorsResult:
 
 
 def effects_of(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:
-    """The errors of all arms that are unknowns; see `RobotArm.effects`."""
+    """The effects of all arms; see `RobotArm.effects`."""
     for arm in arms.values():
         yield from arm.effects(freely=freely)
 
 
 def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
-    """Refuses loads that determine nothing.
+    """Refuses loads that determine no compliance.
 
     Raises:
-        DataError: Springs are asked for that nothing bends.
+        DataError: Compliance is requested, and no load bends the joints.
         DegenerateError: Loads change while an arm stands still.
     """
     for arm in arms.values():

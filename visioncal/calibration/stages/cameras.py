@@ -1,4 +1,4 @@
-"""What every camera saw: its corners, its lens, and the poses that each image allows."""
+"""Corners, intrinsics and target poses of each camera."""
 
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -27,15 +27,16 @@ from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)
 
-# Corners are found to a few tenths of a pixel, and a lens that once was this camera's still fits to
-# a pixel or two: beyond these, where another fits this much better, it never was.
+# Corners are found to a few tenths of a pixel, and an outdated calibration of the same lens fits to
+# a pixel or two. Stated intrinsics belong to another camera where their residual is above this
+# [px], and that of estimated ones is below this share of it.
 _WRONG_LENS_PX, _MUCH_BETTER = 2.0, 0.1
-# Small boards before a long lens look nearly as well by another: from so many pixels on, one is
-# looked for whose focal lengths are off by more than any focusing [share], by more sigmas than a
-# bent board makes, and that leaves the corners much less.
+# Small boards before a long lens hardly show wrong intrinsics: from this residual [px] on, others
+# are estimated. They replace the stated ones where focal lengths differ by more than any focusing
+# [share], by more sigmas than a bent board causes, and the residual falls below this share.
 _DOUBTFUL_PX, _CLEARLY_BETTER = 0.5, 0.5
 _OTHER_FOCAL, _OTHER_SIGMAS = 0.1, 20.0
-# Of corners without images.
+# Advice for corners without images.
 COUNTED_BACKWARDS = (
     "In corners.csv, u_px counts to the right and v_px down: exchange the two columns where they "
     "are exchanged, or count from the other side where one runs backwards."
@@ -46,44 +47,44 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
     """Finds the targets in the images of all cameras.
 
     Args:
-        seen: What is known.
-        given: What was found before, by view, each by its own board's numbers; None to look.
+        seen: The run's observations.
+        given: Corners found before, by view, in their own board's numbers; None to search images.
 
     Raises:
         DataError: See `detect`.
     """
     session, images = seen.session, _images(seen.session)
-    # Nothing need be declared of an only camera.
+    # A single camera need not be declared.
     for name, table in (session.cameras or {"": CameraTable()}).items():
         frame = frame_name("camera", name)
         views, corners, resolution = images.get(frame, []), given or {}, table.size
         if not views:
             continue
         if given is None:
-            with _naming(session, frame):
-                found = detect(
+            with _naming_camera(session, frame):
+                detections = detect(
                     session,
                     seen.progress,
                     among=views,
                     threads=seen.threads,
                     keeps=seen.keeps_corners,
                 )
-            corners, resolution = found.corners, found.resolution
-            seen = seen.noting(found.rejections, _of_other_size(session, found))
+            corners, resolution = detections.corners, detections.resolution
+            seen = seen.noting(detections.rejections, _other_size_findings(session, detections))
             if seen.dense is not None:
-                looked = fit_densely(session, views, corners, seen.dense, seen.progress)
-                corners, seen = looked[0], replace(seen, dense=looked[1])
-        mine = _numbered_through(session, views, corners)
-        again = _repeated(views, mine)
-        mine = {view: corners for view, corners in mine.items() if view not in again}
-        repeats = {view: f"repeats view {earlier}" for view, earlier in again.items()}
-        look = CameraLook(table, mine, resolution, repeats=repeats)
-        seen = seen.noting((), _said_of(again)).with_camera(frame, look)
+                corners, dense = fit_densely(session, views, corners, seen.dense, seen.progress)
+                seen = replace(seen, dense=dense)
+        numbered = _numbered_through(session, views, corners)
+        repeated = _repeated(views, numbered)
+        unique = {view: corners for view, corners in numbered.items() if view not in repeated}
+        repeats = {view: f"repeats view {earlier}" for view, earlier in repeated.items()}
+        look = CameraLook(table, unique, resolution, repeats=repeats)
+        seen = seen.noting((), _repeat_findings(repeated)).with_camera(frame, look)
     return seen
 
 
 def estimate_lenses(seen: T) -> T:
-    """Takes the intrinsics of each camera as stated, or estimates them of its images.
+    """Takes the stated intrinsics of each camera, or estimates them from its images.
 
     Raises:
         DataError: There are too few views.
@@ -92,43 +93,40 @@ def estimate_lenses(seen: T) -> T:
     """
     session, targets = seen.session, tuple(seen.session.boards.values())
     for frame, look in seen.cameras.items():
-        fitted = {
-            view: view_corners
-            for view, view_corners in look.corners.items()
-            if view not in seen.held_back
-        }
+        fitted = {view: px for view, px in look.corners.items() if view not in seen.held_back}
         if not fitted or look.resolution is None:
             continue
         stated = look.table.stated
         if stated is not None:
             lens = CameraResult(stated, estimated=False)
         else:
-            with _naming(session, frame):
+            with _naming_camera(session, frame):
                 try:
-                    found = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
+                    fit = estimate_intrinsics(fitted, targets, look.resolution, look.table.model)
                 except VisioncalError:
                     _refuse_mirrored(seen, frame, fitted, np.inf)
                     raise
-            lens = CameraResult(found.camera, estimated=True, covariance=found.covariance)
+            lens = CameraResult(fit.camera, estimated=True, covariance=fit.covariance)
             of = frame if len(session.cameras) > 1 else ""
-            seen = seen.noting(found.rejections, (_of(warning, of) for warning in found.warnings))
+            seen = seen.noting(fit.rejections, (_about(warning, of) for warning in fit.warnings))
         seen = seen.with_camera(frame, replace(look, lens=lens))
     return seen
 
 
-def _of(warning: Finding, frame: str) -> Finding:
-    """A finding about a lens with the camera's frame, where there are several; empty for one."""
-    found = warning.of(frame)
-    if not frame or found.do is None or found.kind != EMPTY_IMAGE:
-        return found
-    # Several cameras lack different parts of their images.
-    return replace(found, do=Remedy(f"{frame}: {found.do.words[0].lower()}{found.do.words[1:]}"))
+def _about(warning: Finding, frame: str) -> Finding:
+    """A finding about a lens, naming the camera's frame where it is not empty."""
+    finding = warning.of(frame)
+    if not frame or finding.do is None or finding.kind != EMPTY_IMAGE:
+        return finding
+    # Each of several cameras has its own empty parts of the image.
+    words = finding.do.words
+    return replace(finding, do=Remedy(f"{frame}: {words[0].lower()}{words[1:]}"))
 
 
 def locate_targets(seen: T) -> T:
-    """Estimates the target's pose in each view; those that the session gives are taken.
+    """Estimates the target's pose in each view, or takes it from the session where given.
 
-    What is held back neither sets the noise of the others nor is it left out for its own.
+    Views that are held back do not affect the noise level, nor are they rejected for their own.
 
     Raises:
         DataError: No view shows a target, or a lens's distortion cannot be inverted at any view's
@@ -139,37 +137,27 @@ def locate_targets(seen: T) -> T:
     poses = {**seen.poses, **given_poses(session)}
     for frame in seen.cameras:
         look = seen.cameras[frame]
-        corners = {
-            view: view_corners
-            for view, view_corners in look.corners.items()
-            if view not in seen.reasons
-        }
-        fitted = {
-            view: view_corners
-            for view, view_corners in corners.items()
-            if view not in seen.held_back
-        }
+        corners = {view: px for view, px in look.corners.items() if view not in seen.reasons}
+        fitted = {view: px for view, px in corners.items() if view not in seen.held_back}
         lens = look.lens
         if lens is None or not fitted:
             continue
-        with _naming(session, frame):
-            found = estimate_poses(
+        with _naming_camera(session, frame):
+            fit = estimate_poses(
                 fitted, targets, lens.camera, 0 if lens.covariance is None else len(lens.covariance)
             )
-        if found.sigma_px > _DOUBTFUL_PX:
-            other = None if lens.estimated else _other_lens(seen, frame, fitted, found.sigma_px)
+        if fit.sigma_px > _DOUBTFUL_PX:
+            other = None if lens.estimated else _other_lens(seen, frame, fitted, fit.sigma_px)
             if other is not None:
-                lens, found, said = other
-                seen = seen.noting((), (said,))
-            elif found.sigma_px > _WRONG_LENS_PX:
-                _refuse_mirrored(seen, frame, fitted, found.sigma_px)
-        rest = {
-            view: view_corners for view, view_corners in corners.items() if view in seen.held_back
-        }
-        held = measure_poses(rest, targets, lens.camera, found.sigma_px)
-        poses |= {view.view: view for view in (*found.views, *held)}
-        seen = seen.with_camera(frame, replace(look, lens=lens, pixel_px=found.sigma_px))
-        seen = seen.noting(found.rejections)
+                lens, fit, finding = other
+                seen = seen.noting((), (finding,))
+            elif fit.sigma_px > _WRONG_LENS_PX:
+                _refuse_mirrored(seen, frame, fitted, fit.sigma_px)
+        holdout = {view: px for view, px in corners.items() if view in seen.held_back}
+        held = measure_poses(holdout, targets, lens.camera, fit.sigma_px)
+        poses |= {view.view: view for view in (*fit.views, *held)}
+        seen = seen.with_camera(frame, replace(look, lens=lens, pixel_px=fit.sigma_px))
+        seen = seen.noting(fit.rejections)
     if not poses:
         raise nothing_seen(seen)
     return replace(seen, poses=poses)
@@ -178,14 +166,14 @@ def locate_targets(seen: T) -> T:
 def _other_lens(
     seen: Observed, frame: str, corners: Mapping[int, Corners], stated_px: float
 ) -> tuple[CameraResult, Poses, Finding] | None:
-    """The lens by the images, where the stated one cannot be this camera's."""
+    """The lens estimated from the images, where the stated one cannot be this camera's."""
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
     if look.resolution is None:
         return None
     try:
         lens = estimate_intrinsics(corners, targets, look.resolution, look.table.model)
     except VisioncalError:
-        # The images do not determine one, or the board is not the stated one.
+        # The images do not determine a lens, or show another board than the stated one.
         return None
     stated = seen.lenses[frame].camera
     if not _is_another(lens, stated, stated_px):
@@ -204,33 +192,32 @@ def _other_lens(
     resized, do = other_images(stated, lens.camera.matrix)
     if resized:
         words, step = f"{resized} The lens was estimated of these images.", Remedy(do)
-    found = Finding("other_lens", words, step)
+    finding = Finding("other_lens", words, step)
     result = CameraResult(lens.camera, estimated=True, covariance=lens.covariance)
     several = len(seen.session.cameras) > 1
-    return result, poses, found.of(frame if several else "")
+    return result, poses, finding.of(frame if several else "")
 
 
 def _is_another(lens: Intrinsics, stated: Camera, stated_px: float) -> bool:
-    """Whether the lens that the images determine is none that the stated one may have become."""
+    """Whether the estimated lens differs by more than the stated one can have changed."""
     if stated_px > _WRONG_LENS_PX and lens.sigma_px <= _MUCH_BETTER * stated_px:
         return True
-    off = np.abs(lens.camera.matrix[:2] - stated.matrix[:2])
+    change = np.abs(lens.camera.matrix[:2] - stated.matrix[:2])
     sigma = np.sqrt(np.diag(lens.covariance)[:2])
-    is_far = np.all((off > _OTHER_FOCAL * stated.matrix[:2]) & (off > _OTHER_SIGMAS * sigma))
+    is_far = np.all((change > _OTHER_FOCAL * stated.matrix[:2]) & (change > _OTHER_SIGMAS * sigma))
     return bool(is_far) and lens.sigma_px <= _CLEARLY_BETTER * stated_px
 
 
 def _refuse_mirrored(
     seen: Observed, frame: str, corners: Mapping[int, Corners], sigma_px: float
 ) -> None:
-    """Refuses corners that fit no pose as they are, and do with left and right exchanged."""
-    # Those of a flat target fit mirrored as well, by a pose behind it, which the robot's motion
-    # tells.
+    """Refuses corners that fit a pose only with left and right exchanged."""
+    # Mirrored corners of a flat target fit a pose behind it, which the robot's motion reveals.
     look, targets = seen.cameras[frame], tuple(seen.session.boards.values())
     if look.resolution is None:
         return
     width = look.resolution[0]
-    turned = {
+    mirrored = {
         view: replace(
             view_corners,
             px=np.stack([width - 1.0 - view_corners.px[:, 0], view_corners.px[:, 1]], axis=1),
@@ -238,18 +225,18 @@ def _refuse_mirrored(
         for view, view_corners in corners.items()
     }
     try:
-        found = estimate_intrinsics(turned, targets, look.resolution, look.table.model)
+        fit = estimate_intrinsics(mirrored, targets, look.resolution, look.table.model)
     except VisioncalError:
         return
-    if found.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
+    if fit.sigma_px > min(_MUCH_BETTER * sigma_px, _WRONG_LENS_PX):
         return
     has_images = any(view.image for view in seen.session.views if view.number in corners)
-    # No rig that was written down in a left-handed frame looks like itself.
+    # A rig whose table is left-handed appears mirrored, too.
     rig = any(target.kind == "points" for target in targets)
     left_handed = " Or one axis of the rig's table has the wrong sign." if rig else ""
     raise DataError(
         "The target is seen mirrored: its corners fit no pose as they are, and to "
-        f"{figure(found.sigma_px)} px with left and right exchanged.",
+        f"{figure(fit.sigma_px)} px with left and right exchanged.",
         next_step=(
             "Turn the images back (a flip in the camera's driver, or a mirror before the "
             "lens), and calibrate anew."
@@ -262,52 +249,53 @@ def _refuse_mirrored(
 
 def _images(session: Session) -> dict[str, list[View]]:
     """The views with images or corners, by the frame of the camera that took them."""
-    found = defaultdict(list)
+    views = defaultdict(list)
     for view in session.views:
         if view.image or view.has_corners:
             camera = name_of(session.declaration, "camera", view)
-            found[frame_name("camera", camera)].append(view)
-    return found
+            views[frame_name("camera", camera)].append(view)
+    return views
 
 
 def _numbered_through(
     session: Session, views: Sequence[View], corners: Mapping[int, Corners]
 ) -> dict[int, Corners]:
-    """The corners of some views, those of several boards numbered through."""
+    """The corners of some views, numbered consecutively over all boards."""
     starts = dict(
         zip(session.boards, first_corners(tuple(session.boards.values())).tolist(), strict=True)
     )
-    mine = [view for view in views if view.number in corners]
-    first = {view.number: starts[session.board_of(view)] for view in mine}
+    first = {
+        view.number: starts[session.board_of(view)] for view in views if view.number in corners
+    }
     return {
-        index: replace(corners[index], ids=corners[index].ids + first[index]) for index in first
+        view: replace(corners[view], ids=corners[view].ids + start) for view, start in first.items()
     }
 
 
 def _repeated(views: Sequence[View], corners: Mapping[int, Corners]) -> dict[int, int]:
-    """The views that repeat an earlier one, by number: no camera gives the same corners twice."""
+    """The earlier view that each repeated one equals: no camera gives the same corners twice."""
     first: dict[Hashable, int] = {}
-    again: dict[int, int] = {}
+    repeated: dict[int, int] = {}
     for view in views:
         numbers = tuple(number for number in view.numbers.items() if number[0] != "stamp_s")
         if numbers and view.number in corners:
-            seen = corners[view.number]
-            key = (numbers, seen.ids.tobytes(), seen.px.tobytes())
+            found = corners[view.number]
+            key = (numbers, found.ids.tobytes(), found.px.tobytes())
             earlier = first.setdefault(key, view.number)
             if earlier != view.number:
-                again[view.number] = earlier
-    return again
+                repeated[view.number] = earlier
+    return repeated
 
 
-def _of_other_size(session: Session, found: Detections) -> Iterator[Finding]:
-    """Says which images are not of the camera's size."""
-    if not found.other_sizes:
+def _other_size_findings(session: Session, detections: Detections) -> Iterator[Finding]:
+    """Finding about images of another size than the camera's."""
+    if not detections.other_sizes:
         return
-    views, (wide, high) = tuple(found.other_sizes), found.resolution
+    views, (wide, high) = tuple(detections.other_sizes), detections.resolution
     names = {view.number: view.image for view in session.views}
-    shown = [f"{names[at]} ({w} x {h} px)" for at, (w, h) in found.other_sizes.items()]
+    shown = [f"{names[view]} ({w} x {h} px)" for view, (w, h) in detections.other_sizes.items()]
     one = len(views) == 1
-    is_turned = {*found.other_sizes.values()} == {(high, wide)}
+    is_turned = {*detections.other_sizes.values()} == {(high, wide)}
     words = (
         f"{len(views)} image{' is' if one else 's are'} "
         f"{'turned by 90 degrees' if is_turned else 'of another size'}, and not used: "
@@ -320,13 +308,13 @@ def _of_other_size(session: Session, found: Detections) -> Iterator[Finding]:
     yield Finding(OTHER_SIZE, words, step, views, until_mm=0.0)
 
 
-def _said_of(again: Mapping[int, int]) -> Iterator[Finding]:
-    """Says which views repeat earlier ones; they count once."""
-    if not again:
+def _repeat_findings(repeated: Mapping[int, int]) -> Iterator[Finding]:
+    """Finding about views that repeat earlier ones."""
+    if not repeated:
         return
-    copies, originals = list(again), list(dict.fromkeys(again.values()))
-    rows, repeat = ("row", "repeats") if len(again) == 1 else ("rows", "repeat")
-    views = "View" if len(again) == 1 else "Views"
+    copies, originals = list(repeated), list(dict.fromkeys(repeated.values()))
+    rows, repeat = ("row", "repeats") if len(repeated) == 1 else ("rows", "repeat")
+    views = "View" if len(repeated) == 1 else "Views"
     yield Finding(
         "repeated_views",
         f"{views} {_listed(copies)} {repeat} {_listed(originals)}: poses and corners are the same "
@@ -338,15 +326,15 @@ def _said_of(again: Mapping[int, int]) -> Iterator[Finding]:
 
 
 def _listed(views: Sequence[int]) -> str:
-    """Views by their numbers, those in a row by the first and the last."""
+    """View numbers in words; consecutive ones as a range."""
     if len(views) > 2 and list(views) == list(range(views[0], views[-1] + 1)):
         return f"{views[0]} to {views[-1]}"
     return some_of([str(view) for view in views])
 
 
 @contextmanager
-def _naming(session: Session, frame: str) -> Iterator[None]:
-    """Names, of several cameras, the one that an error is of."""
+def _naming_camera(session: Session, frame: str) -> Iterator[None]:
+    """Adds the camera's frame to errors where there are several cameras."""
     try:
         yield
     except VisioncalError as error:

@@ -1,16 +1,15 @@
-"""What may be why a result is not good, ranked: how likely each finding is the cause.
+"""Ranking of findings by the probability that each is the cause of a bad result.
 
-How likely a cause is rests on what is computed today:
+The probability depends on the kind of finding:
 
-- Of what a test found, by the chance p with which sound data pass its limit: against "nothing is
-  wrong" its odds are at least 1 to -e p ln p (Sellke, Bayarri and Berger 2001), both alike
-  beforehand. What explains the same misfit competes: odds are put in proportion, "none of these"
-  among them, which is the cause `unexplained`. What is known to move picks by less than left-out
-  views disagree explains no more of that than its square.
-- Of errors that are too large with nothing wrong, by the share of a pick's mean squared error that
-  comes from them.
-- Of what is a fact, as a frame that nothing ties, it is one; remarks that no test is behind are no
-  causes.
+- Test results: by the false-alarm probability p of the test. With even prior odds, the odds of a
+  fault against "nothing is wrong" are at least 1 to -e p ln p (Sellke, Bayarri and Berger 2001).
+  Findings that explain the same misfit compete: their odds are normalised, together with "none of
+  these", which is the cause `unexplained`. A finding that moves picks by less than left-out views
+  disagree explains at most the squared ratio of both.
+- Error sources that are too large with nothing wrong: by their share of a pick's mean squared
+  error.
+- Facts, such as an unconnected frame: probability one. Remarks without a test are no causes.
 """
 
 import math
@@ -36,24 +35,24 @@ from visioncal.core.verdict import (
 )
 from visioncal.results import NeedMet
 
-# The limits of tests that are passed by chance: none is behind the first, the last is a fact.
+# False-alarm probabilities of remarks, which no test is behind, and of facts.
 _REMARK, _FACT = float(np.exp(-1.0)), 1e-12
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is behind a kind of finding.
+    """Evidence behind a kind of finding.
 
     Attributes:
-        chance: With which a sound session shows as much: the limit of the test that found it.
-        misfit: What it explains; causes of one misfit compete.
+        chance: False-alarm probability of its test in a sound session.
+        misfit: The misfit that it explains; causes of one misfit compete.
     """
 
     chance: float
     misfit: str = ""
 
 
-# The misfit that errors of the chain as a whole explain: views disagree, the flange errs.
+# Misfit of the kinematic chain: views disagree, or the flange is off.
 _CHAIN = "chain"
 EVIDENCE: Mapping[str, Evidence] = {
     EXCHANGED: Evidence(1e-6),
@@ -101,7 +100,7 @@ OF_CHAIN = frozenset(kind for kind, evidence in EVIDENCE.items() if evidence.mis
 _MOVED = ("moved_slowly", *MOVED_AT_ONCE)
 _OF_ROBOT = ("arm_errors", "robot_noise", "robot_noise_of_pick")
 _UNUSED_JOINTS = ("misread_joints", "other_arm")
-# What is measured by way of the robot says nothing where its poses are misread.
+# Findings measured through the robot, which mean nothing where its poses are misread.
 _BY_THE_CHAIN = (
     "board_size",
     "board_shape",
@@ -113,36 +112,30 @@ _BY_THE_CHAIN = (
     "prior",
     *MOVED_AT_ONCE,
 )
-LOOK = Remedy(
+_INSPECT_VIEWS = Remedy(
     "Look at the worst views: does each pose belong to its image, did anything move?", REVIEW
 )
 
-# Sigmas that have a limit of their own, what others come from first, and how likely mistakes are
-# that come before them.
+# Findings on sigmas that have limits of their own, in order of precedence, and the probability from
+# which on a mistake precedes them.
 _SIGMAS, _LIKELIER = ("weak_motion", "place", "workspace"), 0.5
 
-# What helps where the size of a board limits a result.
+# Remedies where the size of a board limits a result.
 TILTED = Remedy("Add views tilted by 30 to 45 degrees.")
 MEASURE_BOARD = Remedy(
     "Measure the board with a caliper over its whole width, and state square_m, the side of one "
     "square, and square_sigma_m, how well it is known, of the target: more views tell neither."
 )
 
-# What helps where an arm errs whose joints are not known.
+# Remedy for errors of an arm whose joints are not known.
 NO_JOINTS = Remedy(
     "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
     "calibrate then estimates the arm, too."
 )
 
 
-def adding(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
-    """Advice to add views, with the command that proposes them where the arm's model is known.
-
-    Args:
-        words: Which views.
-        modelled: Whether it is.
-        purpose: Options of the command.
-    """
+def add_views_remedy(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
+    """Advice to add views, with the command that proposes them (and its options, `purpose`)."""
     if modelled:
         return Remedy(words, f"{PLAN}{purpose}")
     model = "With [robot] model in session.toml, visioncal plan proposes them."
@@ -150,24 +143,19 @@ def adding(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
 
 
 def with_misread(verdict: Verdict, found: Finding) -> Verdict:
-    """A verdict on poses that are better read otherwise, which explains all else that is wrong.
-
-    Args:
-        verdict: On the poses as they are declared.
-        found: That they are misread.
-    """
+    """Verdict in which the finding of misread poses comes first, as it explains the others."""
     if verdict.causes and verdict.causes[0].kind == EXCHANGED:
-        # The same, found by the views themselves; the command exchanges the rows.
+        # The views themselves show the exchange; the finding's command undoes it.
         words = "Write a copy of the session with these rows exchanged, and calibrate it."
         step = found.do and replace(found.do, words=words)
-        # What is likely by itself keeps its own step.
-        said = (
+        # Findings with a probability of their own keep their remedy.
+        findings = (
             replace(finding, do=step)
             if finding.do and (finding.kind == EXCHANGED or not finding.probability)
             else finding
             for finding in verdict.findings
         )
-        return replace(verdict, findings=tuple(said))
+        return replace(verdict, findings=tuple(findings))
     odds = _odds(EVIDENCE[found.kind].chance)
     rest = (
         replace(finding, probability=finding.probability / (1.0 + odds), do=None)
@@ -179,16 +167,11 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
 
 
 def with_other_board(verdict: Verdict, found: Finding) -> Verdict:
-    """A verdict on images that show another board than the declared one, which is said first.
-
-    Args:
-        verdict: As the board is declared.
-        found: What the images show.
-    """
+    """Verdict in which the finding that images show another board comes first."""
     odds = _odds(EVIDENCE[found.kind].chance)
-    named = replace(found, probability=odds / (1.0 + odds))
+    cause = replace(found, probability=odds / (1.0 + odds))
     rest = (finding for finding in verdict.findings if finding.kind != "lost_views")
-    return replace(verdict, findings=(named, *rest))
+    return replace(verdict, findings=(cause, *rest))
 
 
 def ranked(
@@ -200,19 +183,19 @@ def ranked(
     left_out_mm: float = 0.0,
     is_scattered: bool = False,
 ) -> tuple[Finding, ...]:
-    """Doubts with how likely each is the cause, and the sources of errors that are too large.
+    """Ranks findings by their probability of being the cause, and adds too large error sources.
 
     Args:
-        doubts: All there are.
-        picks: What picks err by.
-        met: What is needed, and how likely it is met; None where nothing is.
-        more: What makes the calibration less uncertain.
-        left_out_mm: By how much left-out views disagree [mm].
-        is_scattered: Whether that is more than a sound cell's do.
+        doubts: All findings.
+        picks: Error budgets of picks.
+        met: The required accuracy and the probability of meeting it; None where none is stated.
+        more: Remedy that makes the calibration less uncertain.
+        left_out_mm: Disagreement of left-out views [mm].
+        is_scattered: Whether that is more than in a sound cell.
     """
-    found = _tested(doubts, left_out_mm)
-    if met is None and (deciding := _deciding(found)) is not None:
-        rest = (finding for finding in found if finding is not deciding)
+    findings = _with_probabilities(doubts, left_out_mm)
+    if met is None and (deciding := _deciding(findings)) is not None:
+        rest = (finding for finding in findings if finding is not deciding)
         return (replace(deciding, probability=1.0 - _FACT), *rest)
     unmet = met is not None and met.probability < NeedLimits.probability[0]
     too_large = met is None and any(
@@ -220,19 +203,19 @@ def ranked(
     )
     sized = is_scattered or any(doubt.until_mm == 0.0 for doubt in doubts)
     if picks and (unmet or (too_large and sized)):
-        known = {finding.kind for finding in found if finding.probability}
-        # What moved is in the arm's errors by posture and time, too, which are no cause then.
+        known = {finding.kind for finding in findings if finding.probability}
+        # A motion inflates the arm's errors by posture and time, too, which are no cause then, ...
         known |= {"arm_errors"} if known & {*_MOVED, LENS_CHANGED} else set()
-        # ... and in the calibration's uncertainty.
+        # ... and the calibration's uncertainty.
         known |= {"calibration"} if known & {*MOVED_AT_ONCE, LENS_CHANGED} else set()
-        # What was measured badly is in all that the robot seems to err by.
+        # Badly measured rotations inflate all apparent errors of the robot.
         known |= {*_OF_ROBOT} if "measured_turns" in known else set()
-        found += [source for source in _sources(picks, met, more) if source.kind not in known]
-    return tuple(_with_weak_motion(_with_joints_at_hand(found), more))
+        findings += [source for source in _sources(picks, met, more) if source.kind not in known]
+    return tuple(_with_weak_motion(_with_misread_joints(findings), more))
 
 
 def _deciding(found: Sequence[Finding]) -> Finding | None:
-    """What alone makes a result bad: a sigma far beyond its limit, where no mistake is likelier."""
+    """The sigma that alone makes a result bad: far beyond its limit, with no likely mistake."""
     sigmas = [finding for finding in found if finding.kind in _SIGMAS]
     likelier = any(finding.probability >= _LIKELIER for finding in found)
     if likelier or not any(finding.is_fatal for finding in sigmas):
@@ -241,24 +224,23 @@ def _deciding(found: Sequence[Finding]) -> Finding | None:
 
 
 def _with_weak_motion(found: Sequence[Finding], more: Remedy | None) -> Sequence[Finding]:
-    """The same where the motion is why the calibration is uncertain: one cause, and one advice."""
+    """Findings with weak motion as the cause, and its remedy, of an uncertain calibration."""
     weak = next((finding for finding in found if finding.kind == "weak_motion"), None)
     source = next((finding for finding in found if finding.kind == "calibration"), None)
     if weak is None or source is None or source.probability < 0.5 or more in (None, MEASURE_BOARD):
         return found
-    first = replace(weak, probability=source.probability)
-    rest = (finding for finding in found if finding is not weak)
     return [
-        first,
+        replace(weak, probability=source.probability),
         *(
             replace(finding, do=weak.do) if finding.do in (more, TILTED) else finding
-            for finding in rest
+            for finding in found
+            if finding is not weak
         ),
     ]
 
 
-def _with_joints_at_hand(found: Sequence[Finding]) -> Sequence[Finding]:
-    """The same where joint angles that would explain an arm's errors are there, but misread."""
+def _with_misread_joints(found: Sequence[Finding]) -> Sequence[Finding]:
+    """Findings with misread joint angles as the cause of the arm errors that they explain."""
     unused = next(
         (finding for finding in found if finding.kind in _UNUSED_JOINTS and finding.do is not None),
         None,
@@ -266,54 +248,52 @@ def _with_joints_at_hand(found: Sequence[Finding]) -> Sequence[Finding]:
     errors = [finding for finding in found if finding.do is NO_JOINTS]
     if unused is None or not errors:
         return found
-    first = replace(unused, probability=max(error.probability for error in errors))
-    rest = [finding for finding in found if finding is not unused]
     return [
-        first,
+        replace(unused, probability=max(error.probability for error in errors)),
         *(
-            replace(finding, do=first.do) if finding.do is NO_JOINTS else finding
-            for finding in rest
+            replace(finding, do=unused.do) if finding.do is NO_JOINTS else finding
+            for finding in found
+            if finding is not unused
         ),
     ]
 
 
-def _tested(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
-    """Doubts, each weighed against what explains the same; of one kind, the first is the cause."""
+def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[Finding]:
+    """Findings with their probabilities among rivals; only the first of a kind is a cause."""
     first: dict[str, Finding] = {}
     for finding in doubts:
         if finding.kind in EVIDENCE:
             first.setdefault(finding.kind, finding)
     misfit_mm = left_out_mm if "unexplained" in first else 0.0
-    odds = {name: _explaining(finding, misfit_mm) for name, finding in first.items()}
+    odds = {name: _explaining_odds(finding, misfit_mm) for name, finding in first.items()}
     odds |= dict.fromkeys(_feigned(first) & odds.keys(), 1.0)
-    weighed = []
+    weighted = []
     for doubt in doubts:
         name = doubt.kind
         if first.get(name) is not doubt:
-            weighed.append(doubt)
+            weighted.append(doubt)
             continue
         rivals = sum(
-            odds[word]
-            for word in first
-            if word != name
-            and EVIDENCE[word].misfit
-            and EVIDENCE[word].misfit == EVIDENCE[name].misfit
+            odds[rival]
+            for rival in first
+            if rival != name
+            and EVIDENCE[rival].misfit
+            and EVIDENCE[rival].misfit == EVIDENCE[name].misfit
         )
-        # None of these is what is unexplained: a cause of its own where it shows, of odds one.
+        # "None of these" has odds one, unless `unexplained` stands for it as a finding of its own.
         none = float(name != "unexplained" and not (rivals and "unexplained" in first))
-        weighed.append(replace(doubt, probability=odds[name] / (none + odds[name] + rivals)))
-    return weighed
+        weighted.append(replace(doubt, probability=odds[name] / (none + odds[name] + rivals)))
+    return weighted
 
 
 def _feigned(first: Mapping[str, Finding]) -> set[str]:
-    """Kinds of findings that another one of these passes for."""
-    # What moves along a camera's axis passes for changes of its focus, which are random in the fit;
-    # a focus that changes does not go by the time, and is found moving in one session of ten
-    # thousand. Before and after a step, errors by posture and time are alike because of it, and it
-    # is found beside these. What a held lens that the corners contradict does to views passes for a
-    # board of another size or shape, and, with the views' postures, for an arm that errs; the
-    # corners alone do not show the size, and the lens is tested beside all three. What is left of a
-    # clock's jump passes for motion.
+    """Kinds of findings that are mere effects of another finding."""
+    # Motion along a camera's axis looks like changes of its focus, which are random in the fit; a
+    # changing focus does not follow time, and looks like motion in one session of ten thousand.
+    # A step makes errors by posture and time correlate before and after it, and is tested beside
+    # them. A held lens that the corners contradict looks like a board of another size or shape,
+    # and, by the views' postures, like arm errors; the corners alone do not show the size, and the
+    # lens is tested beside all three. The remainder of a clock's jump looks like motion.
     feigned: set[str] = set()
     if moved := [first[name].mahalanobis_sq for name in _MOVED if name in first]:
         feigned.add("focus")
@@ -331,8 +311,8 @@ def _feigned(first: Mapping[str, Finding]) -> set[str]:
     return feigned
 
 
-def _explaining(doubt: Finding, misfit_mm: float) -> float:
-    """The odds of a finding, which explains no more of a misfit than it moves picks by."""
+def _explaining_odds(doubt: Finding, misfit_mm: float) -> float:
+    """Odds of a finding, bounded by the share of the misfit that it can explain."""
     odds = _odds(_chance(doubt))
     if doubt.up_to_mm >= misfit_mm:
         return odds
@@ -344,54 +324,41 @@ _LEAST_CHANCE = 1e-12
 
 
 def _chance(doubt: Finding) -> float:
-    """With which chance a sound session shows it: by its figures, or the limit of its test."""
+    """False-alarm probability of a finding: by its chi-square, or the limit of its test."""
     limit, square = EVIDENCE[doubt.kind].chance, doubt.mahalanobis_sq
     return min(max(float(chdtrc(1.0, square)), _LEAST_CHANCE), limit) if square else limit
 
 
-# So many views in a row are not left out by chance.
+# Fewest consecutive left-out views that count as a run, and not as chance.
 LEAST_RUN = 3
 
 
 def run_evidence(count: int, of: int) -> float:
-    """What it says that views which were left out follow each other, as a chi-square of one.
-
-    Args:
-        count: How many were left out.
-        of: Of how many views.
-    """
-    # Views that are wrong one by one are any of them.
+    """Chi-square (one degree of freedom) of `count` consecutive left-out views among `of` views."""
+    # Views that are wrong independently are equally likely to be any of them.
     chance = EVIDENCE["something_moved"].chance * (of - count + 1) / math.comb(of, count)
     return float(chi2_limit(max(chance, _LEAST_CHANCE), 1))
 
 
 def _odds(chance: float) -> float:
-    """The least odds of a finding against nothing, by its chance (under 1 / e)."""
+    """Lower bound of the odds of a fault by a false-alarm probability (under 1 / e)."""
     return float(-1.0 / (np.e * chance * np.log(chance)))
 
 
-# Without a source of a smaller share of the variance picks err by hardly less: by 5 %.
+# Removing a source with a smaller share of the variance would reduce a pick's error by under 5 %.
 _LEAST_SHARE = 0.1
 
 
 def is_negligible(found: Finding, picks: Sequence[Picks]) -> bool:
-    """Whether picks would err by hardly less without what was found, however sure it is."""
+    """Whether removing the cause of a finding would hardly reduce the error of picks."""
     least_mm = min((pick.budget_mm["total"] for pick in picks), default=0.0)
     return found.up_to_mm**2 < _LEAST_SHARE * least_mm**2
 
 
-# What picks are limited by: as a kind, in words, and what helps.
+# Error sources of picks: kind of the finding, words, and remedy.
 _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
-    "calibration": (
-        "calibration",
-        "the calibration itself",
-        None,
-    ),
-    "board": (
-        "unmeasured_board",
-        "the board, whose size is not known better",
-        MEASURE_BOARD,
-    ),
+    "calibration": ("calibration", "the calibration itself", None),
+    "board": ("unmeasured_board", "the board, whose size is not known better", MEASURE_BOARD),
     "look": (
         "robot_noise",
         "the robot's own noise where it looks, which more views do not change",
@@ -402,21 +369,17 @@ _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
         "the robot's own noise where it picks, which no calibration changes",
         Remedy("Take a robot that repeats better, or a gripper that forgives."),
     ),
-    "arm": (
-        "arm_errors",
-        "the arm's own errors, which more views do not change",
-        NO_JOINTS,
-    ),
+    "arm": ("arm_errors", "the arm's own errors, which more views do not change", NO_JOINTS),
     "left out": (
         "unexplained",
         "errors of left-out views that the prediction does not explain",
-        LOOK,
+        _INSPECT_VIEWS,
     ),
 }
 
 
 def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -> list[Finding]:
-    """What makes errors as large as they are, by the worst camera and robot."""
+    """Dominant error sources of the worst pair of camera and robot."""
     if met is None:
         worst = max(picks, key=lambda pick: pick.good_for_mm)
     else:
@@ -433,14 +396,15 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -
         without = f"Without this part 95 % of picks land within {rest.stays_within(need)}"
         if met is not None:
             without += f", and {percent(rest.probability(met.need))} within what is needed"
-        found = Finding(
-            kind,
-            f"Picks err by {figure(total)} {unit} (sigma); {figure(size)} {unit} of this come from "
-            f"{words}.",
-            do or more,
-            probability=size**2 / total**2,
-            without_it=f"{without}.",
-            until_mm=0.0,
+        causes.append(
+            Finding(
+                kind,
+                f"Picks err by {figure(total)} {unit} (sigma); {figure(size)} {unit} of this come "
+                f"from {words}.",
+                do or more,
+                probability=size**2 / total**2,
+                without_it=f"{without}.",
+                until_mm=0.0,
+            )
         )
-        causes.append(found)
     return causes

@@ -1,4 +1,4 @@
-"""A whole cell as its session has it: its frames, where its robots stood, who saw what."""
+"""Model of a whole cell read from a session: frames, robot poses, observations and priors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +27,7 @@ _CELL = "cell"
 
 @dataclass(frozen=True, eq=False)
 class ObservationRow:
-    """An observation that can be used, of a place alone or of a pose."""
+    """A usable observation of a position alone or of a pose."""
 
     view: int
     station: int
@@ -42,14 +42,13 @@ class Cell:
 
     Attributes:
         session: The session.
-        tree: Its frames; the base of one robot, or one other frame, stands for the cell.
-        reference: That frame.
-        poses: (s, 4, 4) `base_from_flange` by robot and station; not a number where unknown.
-        rows: The observations that can be used.
-        reasons: Why others cannot, by view.
-        stops: What the session calls each station: its stop's number, or its first view's.
-        priors: Where frames were measured to be, beside the observations.
-        held: The observations that could be used, and that the session keeps from every fit.
+        tree: Tree of frames; the base of one robot, or one other frame, is the cell's frame.
+        poses: (s, 4, 4) `base_from_flange` by robot and station; NaN where unknown.
+        rows: The usable observations.
+        reasons: Why other views are not usable, by view.
+        stops: Number of each station in the session: its stop, or its first view.
+        priors: Priors of frames.
+        held: Usable observations that the session holds back from every fit.
     """
 
     session: Session
@@ -63,17 +62,15 @@ class Cell:
     held: tuple[ObservationRow, ...] = ()
 
     def from_when(self, station: int) -> str:
-        """From when on, in the session's own numbers."""
+        """Start at a station in words, by the session's own numbers."""
         if "stop" in self.session.columns:
             return f"from stop {self.stops[station]} on"
         return f"from view {self.stops[station]} on"
 
     def or_apart(self, do: str, station: int) -> Remedy:
-        """To do something and record again, or to calibrate the longer part of the session alone.
+        """Advice to `do` something and record again, or to calibrate the longer part alone.
 
-        Args:
-            do: What to do, in the imperative.
-            station: Where the later part begins.
+        The later part begins at a station.
         """
         parts: dict[str, list[int]] = {"before": [], "after": []}
         for row in (*self.rows, *self.held):
@@ -85,7 +82,7 @@ class Cell:
 
     @property
     def mount(self) -> Mount | None:
-        """Where the camera of one camera and one robot is; None of a whole cell."""
+        """Mount of the camera of a single camera and robot; None of a whole cell."""
         return None if is_whole_cell(self.session) else self.session.mount
 
     def without(self, reasons: Mapping[int, str]) -> "Cell":
@@ -94,16 +91,16 @@ class Cell:
         return replace(self, rows=rows, reasons={**self.reasons, **reasons})
 
     def tied(self) -> tuple[str, ...]:
-        """The frames that observations tie to the reference, in the tree's order."""
+        """The frames that observations connect to the reference, in the tree's order."""
         names = [_CELL, *self.tree.branches]
-        place = {name: at for at, name in enumerate(names)}
+        index = {name: at for at, name in enumerate(names)}
         pairs = [
-            (place[name], place[branch.parent])
+            (index[name], index[branch.parent])
             for name, branch in self.tree.branches.items()
             if branch.known is not None
         ]
         pairs += [
-            (place[prior.first], place[prior.second])
+            (index[prior.first], index[prior.second])
             for prior in self.priors
             if prior.matrix is not None
         ]
@@ -112,30 +109,31 @@ class Cell:
             for step in self.tree.path(seer, seen):
                 if step.robot:
                     ends += [step.frame, self.tree.branches[step.frame].parent]
-            pairs += [(place[seer], place[end]) for end in ends]
+            pairs += [(index[seer], index[end]) for end in ends]
         links = coo_array(
             (np.ones(len(pairs)), np.array(pairs, dtype=np.int64).reshape(-1, 2).T),
             shape=(len(names), len(names)),
         )
         part = connected_components(links, directed=False)[1]
-        return tuple(branch for branch in self.tree.branches if part[place[branch]] == part[0])
+        return tuple(branch for branch in self.tree.branches if part[index[branch]] == part[0])
 
-    def held_to(self, reference: str) -> "Cell":
-        """Returns the cell in which one frame stands for it."""
+    def with_reference(self, reference: str) -> "Cell":
+        """Returns the cell with a frame as its reference."""
         tree = self.tree.with_known(reference, np.eye(4))
         return replace(self, tree=tree, reference=reference)
 
 
 def read_cell(seen: Observed) -> Cell:
-    """Takes what was observed as a whole cell.
+    """Builds the cell from the observations of a session.
 
     Raises:
-        DataError: It observes nothing, or what it says of its frames is not clear.
+        DataError: The session has no observations, or its frames are ambiguous.
     """
     session = seen.timed
-    frames = session.frames
+    # Robots by the frames of their flanges.
+    flanges = {frame_name("flange", name): robot_key(name) for name in session.robots}
     branches = {
-        name: Branch(parent, robot=_robot_of(session, name)) for name, parent in frames.items()
+        name: Branch(parent, robot=flanges.get(name, "")) for name, parent in session.frames.items()
     }
     observations = [
         observation for observation in session.observations if not observation.view.is_of_lens
@@ -154,7 +152,7 @@ def read_cell(seen: Observed) -> Cell:
             not is_seen(observation.view) and observation.view.instrument_from_probe() is None,
         )
         for observation in observations
-        if _is_known(observation, seen.robots)
+        if _has_robot_poses(observation, seen.robots)
     ]
     held = tuple(row for row in rows if row.view in seen.held_back)
     rows = [row for row in rows if row.view not in seen.held_back]
@@ -164,17 +162,17 @@ def read_cell(seen: Observed) -> Cell:
         number = observation.view.number if observation.view.stop is None else observation.view.stop
         stations.setdefault(observation.station, number)
     tree = Tree(_CELL, branches)
-    priors = priors_of(_tables_of_priors(session, tree), tree)
+    priors = priors_of(_prior_tables(session, tree), tree)
     poses = _poses(seen, observations)
     cell = Cell(session, tree, "", poses, tuple(rows), reasons, priors=priors, held=held)
     cell = replace(cell, stops=tuple(stations[station] for station in sorted(stations)))
-    return cell.held_to(_reference(cell))
+    return cell.with_reference(_reference(cell))
 
 
-def _tables_of_priors(session: Session, tree: Tree) -> dict[str, PriorTable]:
-    """What is stated beforehand, by the full names of its frames."""
-    # Of one camera and one robot that have no names, it is of an unknown edge, or not used. Where
-    # they have names, flange and cam mean the only ones.
+def _prior_tables(session: Session, tree: Tree) -> dict[str, PriorTable]:
+    """The stated priors, by the full names of their frames."""
+    # Of one camera and one robot without names, priors of the unknown edges are used. Where they
+    # have names, flange and cam mean the only ones.
     tables = session.declaration.prior
     if not session.declaration.has_names:
         kept = {name: table for name, table in tables.items() if name in pair_edges(session)}
@@ -184,11 +182,13 @@ def _tables_of_priors(session: Session, tree: Tree) -> dict[str, PriorTable]:
             kept[f"flange_from_{probe}"] = kept.pop(of_probe)
         return kept
 
-    def full(frame: str) -> str:
-        alike = [branch for branch in tree.branches if branch.startswith(f"{frame}_")]
-        return alike[0] if frame not in tree.branches and len(alike) == 1 else frame
+    def full_name(frame: str) -> str:
+        matches = [branch for branch in tree.branches if branch.startswith(f"{frame}_")]
+        return matches[0] if frame not in tree.branches and len(matches) == 1 else frame
 
-    return {"_from_".join(map(full, name.split("_from_"))): table for name, table in tables.items()}
+    return {
+        "_from_".join(map(full_name, name.split("_from_"))): table for name, table in tables.items()
+    }
 
 
 def pair_edges(session: Session) -> tuple[str, ...]:
@@ -201,21 +201,13 @@ def pair_edges(session: Session) -> tuple[str, ...]:
     return (camera, *(f"{parent}_from_{frame_name('target', board)}" for board in boards))
 
 
-def _robot_of(session: Session, frame: str) -> str:
-    """The name that a flange's robot goes by, by its frame: two may not share an empty one."""
-    for name in session.robots:
-        if frame == frame_name("flange", name):
-            return robot_key(name)
-    return ""
-
-
 def robot_key(name: str) -> str:
-    """What a robot is called where every robot must have a name."""
+    """Name of a robot where none may be empty."""
     return name or "robot"
 
 
-def _is_known(observation: Observation, robots: Mapping[str, Reported]) -> bool:
-    """Whether it is known where all robots stood by way of which something was observed."""
+def _has_robot_poses(observation: Observation, robots: Mapping[str, Reported]) -> bool:
+    """Whether the poses of all robots in an observation's chain are known."""
     view = observation.view.number
     return not observation.lacks and all(
         view in robots[name].base_from_flange for name in observation.robots
@@ -223,21 +215,21 @@ def _is_known(observation: Observation, robots: Mapping[str, Reported]) -> bool:
 
 
 def _poses(seen: Observed, observations: Sequence[Observation]) -> dict[str, FloatArray]:
-    """(s, 4, 4) where every robot stood at every station."""
+    """Pose (s, 4, 4) of every robot at every station; NaN where unknown."""
     count = 1 + max(observation.station for observation in observations)
     poses = {robot_key(name): np.full((count, 4, 4), np.nan) for name in seen.robots}
     for observation in observations:
         for name, row in observation.robots.items():
-            known = seen.robots[name].base_from_flange
-            # What most rows of a stop say comes before what each says itself.
-            at = row.number if row.number in known else observation.view.number
-            if at in known:
-                poses[robot_key(name)][observation.station] = known[at]
+            reported = seen.robots[name].base_from_flange
+            # The stop's row, which most of its rows agree with, precedes the view's own.
+            view = row.number if row.number in reported else observation.view.number
+            if view in reported:
+                poses[robot_key(name)][observation.station] = reported[view]
     return poses
 
 
 def _reference(cell: Cell) -> str:
-    """The frame that stands for the cell: the first base of most observations, or the like."""
+    """Reference frame: the base, or other static frame, that connects most observations."""
     tree = cell.tree
     bases = [
         tree.branches[branch].parent for branch in tree.branches if tree.branches[branch].robot
@@ -245,8 +237,8 @@ def _reference(cell: Cell) -> str:
     still = [name for name, branch in tree.branches.items() if branch.parent == _CELL]
     choices = [base for base in bases if base in still] or still
 
-    def rows(name: str) -> int:
-        tied = cell.held_to(name).tied()
-        return sum(row.seer in tied for row in cell.rows)
+    def connected_rows(name: str) -> int:
+        connected = cell.with_reference(name).tied()
+        return sum(row.seer in connected for row in cell.rows)
 
-    return max(choices, key=rows)
+    return max(choices, key=connected_rows)

@@ -1,7 +1,7 @@
-"""The offset between the clocks of camera and robot: what is known of it, and in words.
+"""Offset between the clocks of camera and robot: result, messages, and correction of corners.
 
-An image says its stamp, and its corners may have been taken before or after. Once it is known by
-how much, they are set straight: to where they would have been at the stamp.
+Corners may have been exposed before or after their image's stamp. Once these delays are estimated,
+the corners are moved to where they would have been at the stamp.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,18 +35,20 @@ from visioncal.estimation.variance import Knowledge
 from visioncal.results.sections import ClockResult
 from visioncal.session import View, too_far_apart
 
-# Angles that go along by less are of other motions; a larger sigma [s] is no answer.
+# Least correlation of turning angles of the same motion; largest sigma of a usable offset, and of
+# any information at all [s].
 LEAST_CORRELATION, LARGEST_SIGMA_S, _ANY_SIGMA_S = 0.5, 0.01, 1.0
-# Fewer views at rest make no calibration.
+# Fewest views at rest that make a calibration.
 FEWEST_VIEWS = 3
-# A stated offset that is off by so many sigmas, and by this share of a frame, is reported.
+# A stated offset is reported as wrong beyond this many sigmas and this share of a frame period.
 _STATED_SIGMAS, _STATED_SHARE = 3.0, 0.1
-# Images of one time whose targets are farther apart, as a share of their distance, are of several.
-_ELSEWHERE = 0.05
-# Views that follow each other faster than cameras take images have no times in milliseconds [ms].
+# Images with equal stamps show different poses where targets are farther apart than this share of
+# their distance.
+_DIFFERENT_SHARE = 0.05
+# Shortest interval of images by which stamps can be milliseconds [ms].
 _LEAST_STEP_MS = 5.0
-# Rows by the names of their images ("10" before "2") fall in a tenth of the steps, shuffled ones in
-# half.
+# Stamps fall in a tenth of the steps for rows sorted by image name ("10" before "2"), and in half
+# for shuffled ones.
 _SHUFFLED = 0.25
 
 ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
@@ -54,15 +56,14 @@ ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
 @dataclass(frozen=True, eq=False)
 class FoundDelay:
-    """A time within images.
+    """Estimated delay within images, such as that of a rolling shutter.
 
     Attributes:
-        of: The effect.
-        time_s: How much it is [s].
+        time_s: The delay [s].
         sigma_s: Its standard deviation [s].
-        is_clear: Whether it is beyond chance, and was taken into account.
-        resolution: Of the images [px].
-        jacobian: (6,) how each view's `cam_from_target` moves with it, by view.
+        is_clear: Whether it is significant, and was corrected.
+        resolution: Resolution of the images [px].
+        jacobian: (6,) Jacobian of each view's `cam_from_target` by the delay, by view.
     """
 
     of: Delay
@@ -73,11 +74,11 @@ class FoundDelay:
     jacobian: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def effect(self, views: Sequence[int], name: str = "") -> Effect:
-        """Its error as an unknown of some views; see `Clock.effects`."""
-        still = np.zeros(6)
-        jacobian = np.array([self.jacobian.get(view, still) for view in views]).reshape(-1, 6, 1)
-        known = Knowledge(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
-        return Effect.free(name or self.of.name, known, jacobian)
+        """Error of the delay as an unknown of some views; see `stages.clocks.clock_effects`."""
+        unaffected = np.zeros(6)
+        jacobian = np.array([self.jacobian.get(view, unaffected) for view in views])
+        prior = Knowledge(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
+        return Effect.free(name or self.of.name, prior, jacobian.reshape(-1, 6, 1))
 
     def result(self) -> dict[str, Any]:
         """Fields of `results.ClockResult`."""
@@ -85,98 +86,93 @@ class FoundDelay:
 
     @property
     def words(self) -> str:
-        """Says what was found."""
+        """The delay in words."""
         return self.of.words(self.time_s, self.sigma_s)
 
 
 def find_delays(
     flange: Trajectory, frames: ImageTimes, camera: Camera | None, start: ClockFit
 ) -> tuple[DelayedFit | None, tuple[FoundDelay, ...]]:
-    """Looks for times within images.
+    """Estimates delays within images.
 
     Args:
         flange: `base_from_flange` over the robot's time.
-        frames: What the camera saw.
+        frames: The camera's observations.
         camera: Its intrinsics; None where its corners are not known.
-        start: The fit without them.
+        start: The fit without delays.
 
     Returns:
-        The fit with those that are beyond chance, None without any; and what was found of all.
+        The fit with the significant delays, None without any; and all delays.
     """
-    whole = None if camera is None else fit_delays(flange, frames, camera, start, EFFECTS)
-    if whole is None or camera is None:
+    full = None if camera is None else fit_delays(flange, frames, camera, start, EFFECTS)
+    if full is None or camera is None:
         return None, ()
-    found = tuple(
+    columns = (full.times_s.tolist(), full.sigmas_s.tolist(), full.is_clear.tolist())
+    delays = tuple(
         FoundDelay(of, time_s, sigma_s, is_clear, camera.resolution)
-        for of, time_s, sigma_s, is_clear in zip(
-            EFFECTS,
-            whole.times_s.tolist(),
-            whole.sigmas_s.tolist(),
-            whole.is_clear.tolist(),
-            strict=True,
-        )
+        for of, time_s, sigma_s, is_clear in zip(EFFECTS, *columns, strict=True)
     )
-    clear = [delay.of for delay in found if delay.is_clear]
-    if len(clear) in (0, len(found)):
-        return (whole if clear else None), found
-    return fit_delays(flange, frames, camera, whole.clock, clear), found
+    clear = [delay.of for delay in delays if delay.is_clear]
+    if len(clear) in (0, len(delays)):
+        return (full if clear else None), delays
+    return fit_delays(flange, frames, camera, full.clock, clear), delays
 
 
 @dataclass(frozen=True, eq=False)
-class Straight:
-    """Views whose corners are where they would have been at the image's stamp.
+class CorrectedViews:
+    """Views with corners corrected to the image's stamp.
 
     Attributes:
-        poses: The views' poses, made anew where each has just one.
-        jacobian: (6, k) how they move with the k times, by view.
+        poses: The views' poses by the corrected corners; ambiguous ones stay as they are.
+        jacobian: (6, k) Jacobian of each by the k delays, by view.
     """
 
     poses: Mapping[int, ViewPoses]
     jacobian: Mapping[int, FloatArray]
 
 
-def straighten(
+def correct_corners(
     frames: ImageTimes,
     flange: tuple[FloatArray, FloatArray],
     seen: Sequence[ViewPoses],
     camera: Camera,
     fit: DelayedFit,
-) -> Straight:
-    """Sets corners straight.
+) -> CorrectedViews:
+    """Corrects corners for the delays within images.
 
     Args:
-        frames: What the camera saw in v views, with corners.
-        flange: (v, 4, 4) `base_from_flange` and (v, 6) its twists a second, in its own frame.
-        seen: The same views.
+        frames: The camera's observations in v views, with corners.
+        flange: (v, 4, 4) `base_from_flange` and (v, 6) its twists a second, in the flange frame.
+        seen: The poses of the same views.
         camera: The intrinsics.
-        fit: The times, and the camera's edge.
+        fit: The delays, and the camera's extrinsics.
     """
     stack, starts = frames.stack, frames.cam_from_target
     if stack is None or not len(seen):
-        return Straight({}, {})
+        return CorrectedViews({}, {})
     with one_blas_thread():
         x = fit.clock.fit.state.edges[0]
         twists = target_twists(frames.mount, flange[0], x, starts, flange[1])
         shares = shares_of(fit.delays, stack, camera)
-        found = compress_delayed(stack, camera, shares, twists, fit.times_s, starts)
+        delayed = compress_delayed(stack, camera, shares, twists, fit.times_s, starts)
         unknowns = 6 * len(seen) + len(fit.times_s)
-        sigma_px = floored_sigma_px(stack.sigma_px(found.residuals, unknowns))
-        there, _ = delayed_points(stack, shares, twists, fit.times_s)
+        sigma_px = floored_sigma_px(stack.sigma_px(delayed.residuals, unknowns))
+        points, _ = delayed_points(stack, shares, twists, fit.times_s)
         plain = replace(stack, weights=None)
-        late_px = _projected(plain.with_points(there), camera, found.cam_from_target)
-        px = stack.px + _projected(plain, camera, found.cam_from_target) - late_px
-    covariance = sigma_px**2 * covariance_from(found.information)
+        delayed_px = _projected(plain.with_points(points), camera, delayed.cam_from_target)
+        px = stack.px + _projected(plain, camera, delayed.cam_from_target) - delayed_px
+    covariance = sigma_px**2 * covariance_from(delayed.information)
     poses = {
         view.view: _with_corners(
-            view, px[stack.view_of == at], found.cam_from_target[at], covariance[at]
+            view, px[stack.view_of == at], delayed.cam_from_target[at], covariance[at]
         )
         for at, view in enumerate(seen)
     }
-    return Straight(poses, dict(zip(poses, found.by_shared, strict=True)))
+    return CorrectedViews(poses, dict(zip(poses, delayed.by_shared, strict=True)))
 
 
 def _projected(stack: CornerStack, camera: Camera, poses: FloatArray) -> FloatArray:
-    """(n, 2) where the corners are predicted [px]."""
+    """Predicted positions (n, 2) of the corners [px]."""
     return reproject(stack, camera, poses, lens=False).residuals + stack.px
 
 
@@ -193,18 +189,18 @@ def _with_corners(
 
 @dataclass(frozen=True, eq=False)
 class ClockOffset:
-    """How far the camera's clock is ahead of the robot's, and what that rests on.
+    """Offset of the camera's clock ahead of the robot's, and its source.
 
     Attributes:
         camera_minus_robot_s: The offset [s].
         sigma_s: Its standard deviation [s]; 0 where views at rest make it immaterial.
-        method: Told by the motion, or by its turning alone; stated by the session; of no
-            consequence, for views at rest.
-        stated_s: What the session states [s]; None where it states nothing.
-        frames: How many frames in motion determined it.
-        correlation: Of the angles by which camera and robot turned; None where none was found.
-        speeds: (6,) how fast the flange moved, by view, in its own frame [rad/s, m/s].
-        delays: Times within the images that were looked for.
+        method: Estimated from the motion, or from its rotation alone; stated by the session; or
+            immaterial for views at rest.
+        stated_s: Offset stated by the session [s]; None without one.
+        frames: Number of frames in motion that determined it.
+        correlation: Correlation of the rotation angles of camera and robot; None without any.
+        speeds: (6,) twist of the flange by view, in its own frame [rad/s, m/s].
+        delays: Delays within the images.
     """
 
     camera_minus_robot_s: float
@@ -217,14 +213,14 @@ class ClockOffset:
     delays: tuple[FoundDelay, ...] = ()
 
     def known_s(self, *, erring: bool = False) -> float:
-        """How well the offset is known beside the views that are used [s].
+        """Prior sigma of the offset in the fit of the used views [s].
 
-        These are in the fit themselves: of the motion, the share of frames that are no such views
-        determines besides.
+        The used views determine it in the fit themselves; of the motion, only the share of the
+        other frames is prior information.
 
         Args:
             erring: Whether errors of the arm are unknowns of that fit. The motion determined the
-                offset of an arm as stated, whose errors are the same ones in all frames.
+                offset with the nominal arm, whose errors are common to all frames.
         """
         if self.method != "motion":
             return self.sigma_s
@@ -245,7 +241,7 @@ class ClockOffset:
 
 
 def clock_words(fit: ClockFit, match: Match, stream: str) -> str:
-    """Says what the motion determines."""
+    """Offset by the motion, in words."""
     return (
         f"The camera's clock is {1e3 * fit.offset_s:+.2f} ms ahead of the robot's (sigma "
         f"{figure(1e3 * fit.sigma_s)} ms), by the motion in {fit.frames} frames and "
@@ -255,7 +251,7 @@ def clock_words(fit: ClockFit, match: Match, stream: str) -> str:
 
 
 def turning_doubt(match: Match) -> Finding:
-    """Says what the turning alone determines."""
+    """Finding about an offset by the rotation alone."""
     return Finding(
         "clock",
         f"The camera's clock is {1e3 * match.offset_s:+.1f} ms ahead of the robot's (sigma "
@@ -267,12 +263,7 @@ def turning_doubt(match: Match) -> Finding:
 
 
 def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
-    """Says how the offset between the clocks changed.
-
-    Args:
-        change: How.
-        views: The views, as they were stamped.
-    """
+    """Finding about a change of the offset between the clocks, with the views' original stamps."""
     if change.is_drift:
         how = (
             f"drifts against the robot's, by {1e6 * change.step_s:+.0f} ppm (sigma "
@@ -297,12 +288,12 @@ def change_doubt(change: ClockChange, views: Sequence[View]) -> Finding:
 
 
 def stated_doubts(clock: ClockOffset, views: Sequence[View]) -> Iterator[Finding]:
-    """Says so where what the session states is not what the motion gives."""
+    """Finding where the motion contradicts the stated offset."""
     if clock.stated_s is None:
         return
-    away_s = abs(clock.stated_s - clock.camera_minus_robot_s)
+    difference_s = abs(clock.stated_s - clock.camera_minus_robot_s)
     frame_s = float(np.median(np.diff([view.stamp_s or 0.0 for view in views])))
-    if away_s > max(_STATED_SIGMAS * clock.sigma_s, _STATED_SHARE * frame_s):
+    if difference_s > max(_STATED_SIGMAS * clock.sigma_s, _STATED_SHARE * frame_s):
         yield Finding(
             "clock",
             f"[clock] camera_minus_robot_s is stated as {1e3 * clock.stated_s:+.2f} ms, but the "
@@ -313,7 +304,7 @@ def stated_doubts(clock: ClockOffset, views: Sequence[View]) -> Iterator[Finding
 
 
 def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
-    """Says why the motion does not determine the offset."""
+    """Why the motion does not determine the offset, in words."""
     best = max(matches, key=lambda match: match.correlation, default=None)
     if best is None:
         return "camera and robot are not seen to turn together for long enough"
@@ -339,20 +330,15 @@ def why_undetermined(fits: Sequence[ClockFit], matches: Sequence[Match]) -> str:
     return f"the motion repeats itself: offsets of {several} ms explain it alike"
 
 
-def shared_times(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> DataError | None:
-    """The error of views of one time that show the same target in several places.
+def shared_stamps_error(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> DataError | None:
+    """Error for views of a camera with equal stamps that show the same target in different poses.
 
-    Args:
-        views: The views of one camera that wait for a pose of the robot.
-        poses: What it saw, by view.
-
-    Returns:
-        The error; None where these are no more than half of the views.
+    It is None where these are no more than half of the views.
     """
-    same: dict[tuple[float | None, int], list[View]] = {}
+    groups: dict[tuple[float | None, int], list[View]] = {}
     for view in views:
-        same.setdefault((view.stamp_s, poses[view.number].board), []).append(view)
-    shared = [group for group in same.values() if _elsewhere(group, poses)]
+        groups.setdefault((view.stamp_s, poses[view.number].board), []).append(view)
+    shared = [group for group in groups.values() if _differ(group, poses)]
     if 2 * sum(map(len, shared)) <= len(views):
         return None
     largest = max(shared, key=len)
@@ -366,17 +352,17 @@ def shared_times(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> DataE
     )
 
 
-def _elsewhere(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> bool:
-    """Whether views show the target in several places."""
+def _differ(views: Sequence[View], poses: Mapping[int, ViewPoses]) -> bool:
+    """Whether views show the target in different places."""
     first_m, *others = (poses[view.number].cam_from_target[:, :3, 3] for view in views)
     at_m = first_m[0]
-    # A board that looks the same upside down may be taken for either.
-    away_m = [np.linalg.norm(other - at_m, axis=1).min() for other in others]
-    return max(away_m, default=0.0) > _ELSEWHERE * float(np.linalg.norm(at_m))
+    # A board that looks the same upside down has several candidate poses.
+    distances_m = [np.linalg.norm(other - at_m, axis=1).min() for other in others]
+    return max(distances_m, default=0.0) > _DIFFERENT_SHARE * float(np.linalg.norm(at_m))
 
 
 def not_ascending(views: Sequence[View]) -> str:
-    """Says so where the times do not go along with the views' numbers; empty where they do."""
+    """Says where stamps do not ascend with the views' numbers; empty where they do."""
     ordered = sorted(views, key=lambda view: view.number)
     stamps_s = np.array([view.stamp_s for view in ordered], dtype=float)
     falls = np.flatnonzero(np.diff(stamps_s) < 0.0)
@@ -390,10 +376,10 @@ def not_ascending(views: Sequence[View]) -> str:
     )
 
 
-def no_offset(
+def undetermined_error(
     motion: RobotMotion, views: Sequence[View], resting: Mask, why: str
 ) -> DegenerateError | DataError:
-    """What to raise where there is no way to the robot's poses."""
+    """Error where the robot's poses cannot be determined."""
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
     begin_s, end_s = motion.flange.stamps_s[[0, -1]]
     if not len(views):
@@ -444,7 +430,7 @@ def no_offset(
 
 
 def speed_words(clock: ClockOffset, speeds: FloatArray, inside: int) -> str:
-    """How fast the flange moved at most in the views that are used, and what that costs."""
+    """Largest flange speed in the used views and the resulting uncertainty, in words."""
     if not len(speeds):
         return "No view lies within the stream."
     fastest_mm, fastest_deg = (

@@ -1,7 +1,7 @@
-"""Where the flange was when a view was taken, out of a stream with a clock of its own.
+"""Flange poses at the times of views, from a robot stream with its own clock.
 
-A view that has a time and no pose of the robot gets it from the robot's stream. How far the
-camera's clock is ahead of the robot's is estimated from the motion that both have seen.
+A view that has a time and no pose of the robot gets it from the robot's stream. The offset between
+the clocks of camera and robot is estimated from the motion that both observed.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,14 +17,14 @@ from visioncal.calibration.stages.clock_offset import (
     ClockOffset,
     change_doubt,
     clock_words,
+    correct_corners,
     find_delays,
-    no_offset,
     not_ascending,
-    shared_times,
+    shared_stamps_error,
     speed_words,
     stated_doubts,
-    straighten,
     turning_doubt,
+    undetermined_error,
     why_undetermined,
 )
 from visioncal.calibration.stages.motion import RobotMotion, at_rest, is_open, slow_and_new
@@ -49,41 +49,41 @@ from visioncal.estimation.trajectory import Trajectory
 from visioncal.robot import Robot
 from visioncal.session import View
 
-# A stated offset is taken to be known so well [s].
+# Assumed sigma of a stated offset [s].
 _STATED_SIGMA_S = 1e-3
 _SPARED = "not needed: slower views stand for it, at the same places"
 _NO_TIME = "no pose of the robot: neither a pose nor a time is there"
 _BEYOND = "no pose of the robot: it was taken before or after the robot's stream"
 _IN_A_GAP = "no pose of the robot: samples of its stream are missing around that time"
 _IN_MOTION = "no pose of the robot: taken in motion, and how far the clocks differ is not known"
-# So many views are all used; of more, slow ones.
+# Up to this number all views are used; of more, slow ones.
 _MANY_VIEWS = 60
-# A change of the offset must leave so much less of rotations times positions; it is refined in so
-# many rounds at most, or until it moves by less than this share of its sigma.
-_CLEARLY_LESS, _ROUNDS, _AT_REST = 0.9, 6, 0.3
-# What turns together goes along by so much.
+# A change of the offset must reduce the misfit (rotations times positions) to this share. It is
+# refined for this number of rounds at most, or until its step is below this share of its sigma.
+_CLEARLY_LESS, _ROUNDS, _CONVERGED = 0.9, 6, 0.3
+# Correlation that shows that camera and robot turn together.
 _SURELY_ALIKE = 0.9
 
 
 @dataclass(frozen=True)
 class ClockPair:
-    """A camera's frame and the name of a robot that parts it from what it sees."""
+    """A camera's frame and the name of the robot between it and what it observes."""
 
     camera: str
     robot: str
 
     @property
     def words(self) -> str:
-        """Both, as messages and results name them."""
+        """Both in words, as in messages and results."""
         return f"{self.camera} and robot {self.robot or 'robot'}"
 
     @property
     def effect(self) -> str:
-        """The effect of their clocks' offset, by its name."""
+        """Name of the effect of the offset of their clocks."""
         return f"clock of {self.words}"
 
     def delay(self, of: Delay) -> str:
-        """The effect of a time within the camera's images, by its name."""
+        """Name of the effect of a delay within the camera's images."""
         return f"{of.name} of {self.words}"
 
 
@@ -94,11 +94,11 @@ class Clocked:
     Attributes:
         clock: The offset.
         views: Those that have a pose now, or had one before, in the session's order.
-        rejections: Those that have none, and why.
-        spared: Why the others of very many are not needed, by view.
-        poses: Poses that were made anew of corners taken before or after their stamp.
-        warnings: What gives reason for doubt.
-        notes: What is good to know.
+        rejections: Those without a pose, and why.
+        spared: Why redundant views are not needed, by view.
+        poses: Target poses by corners that were corrected for delays.
+        warnings: Findings against the clock.
+        notes: Remarks for the user.
     """
 
     clock: ClockOffset
@@ -112,15 +112,15 @@ class Clocked:
 
 @dataclass(frozen=True, eq=False)
 class CameraSweep:
-    """What one camera saw while one robot moved.
+    """Observations of one camera while one robot moved.
 
     Attributes:
         motion: The robot's stream.
-        mount: Where the camera is.
+        mount: Mount of the camera.
         views: The rows; those that have a time and no pose of the robot wait for the clock.
-        stated_s: The stated offset; None where none is stated.
-        camera: The camera's intrinsics; None where it is not known how it took its images.
-        positions: (c, 3) corners of all boards, numbered through [m].
+        stated_s: The stated offset [s]; None without one.
+        camera: The camera's intrinsics; None where unknown.
+        positions: (c, 3) corners of all boards, numbered consecutively [m].
     """
 
     motion: RobotMotion
@@ -131,11 +131,8 @@ class CameraSweep:
     positions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def frames(self, seen: Sequence[tuple[View, ViewPoses]]) -> ImageTimes:
-        """What the camera saw over time, each view by its best pose."""
-        known = [view.corners for _, view in seen]
-        corners = {
-            view.number: corners for (view, _), corners in zip(seen, known, strict=True) if corners
-        }
+        """The camera's observations over time, by the best pose of each view."""
+        corners = {view.number: pose.corners for view, pose in seen if pose.corners}
         measured = bool(seen) and len(corners) == len(seen)
         stacked = measured and self.camera is not None
         return ImageTimes(
@@ -150,36 +147,32 @@ class CameraSweep:
 def set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> Clocked:
     """Gives views the robot's poses at their time.
 
-    Args:
-        sweep: What a camera saw while a robot moved.
-        poses: What the camera saw, by view.
-
     Raises:
         DataError: No view lies within the stream, or the views' times are wrong.
         DegenerateError: The motion does not determine the offset, it is not stated, and too few
             views were taken at rest.
     """
-    found = _match(sweep, poses)
-    change = None if found.fit is None else _change(sweep, found.frames, found.fit)
+    matched = _match(sweep, poses)
+    change = None if matched.fit is None else _change(sweep, matched.frames, matched.fit)
     if change is None:
-        return _placed_by(sweep, found, poses)
-    doubt = change_doubt(change, found.views)
+        return _clocked(sweep, matched, poses)
+    doubt = change_doubt(change, matched.views)
     sweep = replace(sweep, views=tuple(_corrected(view, change) for view in sweep.views))
-    placed = _placed_by(sweep, _match(sweep, poses), poses)
-    return replace(placed, warnings=(*placed.warnings, doubt))
+    clocked = _clocked(sweep, _match(sweep, poses), poses)
+    return replace(clocked, warnings=(*clocked.warnings, doubt))
 
 
 @dataclass(frozen=True, eq=False)
 class _Matched:
-    """What the motion says of the clocks.
+    """Evidence of the motion on the offset of the clocks.
 
     Attributes:
-        views: The views that wait for a pose, by their times.
-        frames: What those in the fit saw.
-        matches: The offsets at which camera and robot turn alike.
-        sound: Those that are no chance.
-        fits: The fits from them.
-        fit: The one that stands out; None where none does.
+        views: The views that wait for a pose, sorted by time.
+        frames: Observations of those that are not held back.
+        matches: Offsets at which camera and robot turn alike.
+        sound: The significant ones.
+        fits: Fits started from these.
+        fit: The clear one; None without one.
     """
 
     views: Sequence[View]
@@ -206,43 +199,43 @@ def _match(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> _Matched:
     return _Matched(views, frames, matches, sound, fits, clear_fit(fits, stated_s))
 
 
-def _placed_by(sweep: CameraSweep, found: _Matched, poses: Mapping[int, ViewPoses]) -> Clocked:
-    """Gives views their poses by the best that the motion says."""
-    fit, sound = found.fit, found.sound
+def _clocked(sweep: CameraSweep, matched: _Matched, poses: Mapping[int, ViewPoses]) -> Clocked:
+    """Gives views their poses by the best available offset."""
+    fit, sound = matched.fit, matched.sound
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
-        nearest_s = fit.offset_s
-        match = min(sound, key=lambda value: abs(value.offset_s - nearest_s))
-        return _by_motion(sweep, found.views, (fit, match), found.frames, poses)
-    if len(sound) == 1 and found.frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
-        return _by_turning(sweep, found.views, sound[0])
-    wrong = shared_times(found.views, poses)
-    if wrong is not None:
-        raise wrong
-    return _undetermined(sweep, found.views, (found.fits, found.matches))
+        offset_s = fit.offset_s
+        match = min(sound, key=lambda value: abs(value.offset_s - offset_s))
+        return _by_motion(sweep, matched.views, (fit, match), matched.frames, poses)
+    if len(sound) == 1 and matched.frames.are_dense and sound[0].sigma_s <= LARGEST_SIGMA_S:
+        return _by_turning(sweep, matched.views, sound[0])
+    error = shared_stamps_error(matched.views, poses)
+    if error is not None:
+        raise error
+    return _undetermined(sweep, matched.views, (matched.fits, matched.matches))
 
 
 def _change(sweep: CameraSweep, frames: ImageTimes, fit: ClockFit) -> ClockChange | None:
-    """How the offset changes over the frames; None where it does not, or that explains little."""
-    # A fit to both sides of a jump misleads about its size, which is found in a few rounds.
+    """Change of the offset over the frames; None without one, or where it explains little."""
+    # A fit to both sides of a jump is biased, so that the jump is refined in a few rounds.
     flange, change = sweep.motion.flange, clock_change(sweep.motion.flange, frames, fit)
     for _ in range(_ROUNDS if change else 0):
         if change is None:
             return None
-        there = replace(frames, stamps_s=change.corrected(frames.stamps_s))
-        fits = fit_offset(flange, there, [fit.offset_s])
+        corrected = replace(frames, stamps_s=change.corrected(frames.stamps_s))
+        fits = fit_offset(flange, corrected, [fit.offset_s])
         if not fits or left_by(fits[0]) > _CLEARLY_LESS * left_by(fit):
             return None
         if frames.stack is not None:
-            # What a rolling shutter does goes with the motion, and would be taken for the clock's.
+            # A rolling shutter follows the motion, and would be taken for the clock's change.
             break
-        before_s, change = change.step_s, refined_change(flange, there, fits[0], frames, change)
-        if abs(change.step_s - before_s) < _AT_REST * change.sigma_s:
+        before_s, change = change.step_s, refined_change(flange, corrected, fits[0], frames, change)
+        if abs(change.step_s - before_s) < _CONVERGED * change.sigma_s:
             break
     return change
 
 
 def _corrected(view: View, change: ClockChange) -> View:
-    """A view with the time that a clock without the change would have given it."""
+    """A view with the stamp of a clock without the change."""
     if view.stamp_s is None:
         return view
     (stamp_s,) = change.corrected(np.array([view.stamp_s])).tolist()
@@ -252,46 +245,40 @@ def _corrected(view: View, change: ClockChange) -> View:
 def _frames(
     sweep: CameraSweep, views: Sequence[View], poses: Mapping[int, ViewPoses]
 ) -> ImageTimes:
-    """What the camera saw over time: of several boards one, and where it can be of clear poses."""
+    """Observations of the board seen most often, without ambiguous poses where enough are clear."""
     seen = [(view, poses[view.number]) for view in views]
-    boards = [view.board for _, view in seen]
+    boards = [pose.board for _, pose in seen]
     most = max(sorted(set(boards)), key=boards.count, default=0)
-    seen = [pair for pair in seen if pair[1].board == most]
-    clear = [pair for pair in seen if len(pair[1].cam_from_target) == 1]
+    seen = [(view, pose) for view, pose in seen if pose.board == most]
+    clear = [(view, pose) for view, pose in seen if len(pose.cam_from_target) == 1]
     return sweep.frames(clear if 2 * len(clear) > len(seen) else seen)
 
 
 def misread_joints(
     sweep: CameraSweep, poses: Mapping[int, ViewPoses], robot: Robot
 ) -> DataError | None:
-    """The error of a stream of joint angles alone that turn as the camera sees in another unit.
+    """Error for a stream of joint angles that explains the camera's motion in another unit.
 
-    Args:
-        sweep: What a camera saw while a robot moved, which its stream does not explain.
-        poses: What the camera saw, by view.
-        robot: The model by which the stream's poses are.
-
-    Returns:
-        The error; None where no other unit explains it.
+    It is None where no other unit explains the motion.
     """
     if sweep.motion.reported or sweep.motion.joints is None:
         return None
     samples, q = sweep.motion.joints
     frames = _match(sweep, poses).frames
 
-    def alike(reading: JointReading) -> float:
+    def correlation(reading: JointReading) -> float:
         flange = Trajectory(samples.stamps_s, reading.poses(q))
         matches = turning_matches(flange, frames, sweep.stated_s or 0.0)
         return max((match.correlation for match in matches), default=0.0)
 
     declared, file = declared_reading(robot), f"streams/{sweep.motion.name}.csv"
-    recorded = alike(declared)
+    recorded = correlation(declared)
     for reading in unit_readings(declared):
-        read = alike(reading)
-        if recorded < LEAST_CORRELATION and read > _SURELY_ALIKE:
+        reread = correlation(reading)
+        if recorded < LEAST_CORRELATION and reread > _SURELY_ALIKE:
             return DataError(
                 f"{file}: the joint angles are misread. With {reading.words}, robot and camera "
-                f"turn alike with a correlation of {read:.2f}; as recorded, of {recorded:.2f}.",
+                f"turn alike with a correlation of {reread:.2f}; as recorded, of {recorded:.2f}.",
                 culprits=[f"{file}: q{at + 1}_rad" for at in range(robot.joint_count)],
                 next_step=reading.fix,
             )
@@ -306,8 +293,8 @@ def _by_motion(
     poses: Mapping[int, ViewPoses],
 ) -> Clocked:
     fit, match = found
-    late, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
-    fit = fit if late is None else late.clock
+    delayed, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
+    fit = fit if delayed is None else delayed.clock
     clock = ClockOffset(
         fit.offset_s,
         fit.sigma_s,
@@ -320,60 +307,58 @@ def _by_motion(
     )
     words, warnings = clock_words(fit, match, sweep.motion.name), list(stated_doubts(clock, views))
     notes = [words, *(delay.words for delay in delays if delay.is_clear)]
-    placed = _placed(sweep, views, clock, warnings, notes)
-    return placed if late is None else _straightened(sweep, placed, views, poses, late)
+    clocked = _at_offset(sweep, views, clock, warnings, notes)
+    return clocked if delayed is None else _with_corrected(sweep, clocked, views, poses, delayed)
 
 
-def _straightened(
+def _with_corrected(
     sweep: CameraSweep,
-    placed: Clocked,
+    clocked: Clocked,
     views: Sequence[View],
     poses: Mapping[int, ViewPoses],
-    late: DelayedFit,
+    fit: DelayedFit,
 ) -> Clocked:
-    """Sets the corners straight of all views that the stream covers."""
-    flange, clock = sweep.motion.flange, placed.clock
+    """Corrects the corners of all views that the stream covers for delays."""
+    flange, clock = sweep.motion.flange, clocked.clock
     seen = [(view, poses[view.number]) for view in views if poses[view.number].corners is not None]
     at_s = np.array([view.stamp_s for view, _ in seen], dtype=float) - clock.camera_minus_robot_s
     covered = flange.covers(at_s)
     seen, at_s = [pair for pair, ok in zip(seen, covered, strict=True) if ok], at_s[covered]
     if sweep.camera is None:
-        return placed
-    found = straighten(
+        return clocked
+    corrected = correct_corners(
         sweep.frames(seen),
         (flange.at(at_s), flange.speeds(at_s)),
         [view for _, view in seen],
         sweep.camera,
-        late,
+        fit,
     )
-    jacobian = {view: array for view, array in found.jacobian.items() if view in clock.speeds}
-    places = {delay: at for at, delay in enumerate(late.delays)}
+    jacobian = {view: array for view, array in corrected.jacobian.items() if view in clock.speeds}
+    places = {delay: at for at, delay in enumerate(fit.delays)}
     delays = tuple(
         replace(delay, jacobian={view: by[:, places[delay.of]] for view, by in jacobian.items()})
         if delay.of in places
         else delay
         for delay in clock.delays
     )
-    return replace(placed, clock=replace(clock, delays=delays), poses=found.poses)
+    return replace(clocked, clock=replace(clock, delays=delays), poses=corrected.poses)
 
 
 def _by_turning(sweep: CameraSweep, views: Sequence[View], match: Match) -> Clocked:
-    """Takes the offset at which both turn alike, where the chain as it is read does not close."""
+    """Takes the offset by rotation alone, where the chain of frames does not close."""
     clock = ClockOffset(
         match.offset_s, match.sigma_s, "turning", sweep.stated_s, 0, match.correlation, speeds={}
     )
     warnings = [turning_doubt(match), *stated_doubts(clock, views)]
-    return _placed(sweep, views, clock, warnings, [])
+    return _at_offset(sweep, views, clock, warnings, [])
 
 
 def _undetermined(
-    sweep: CameraSweep,
-    views: Sequence[View],
-    tried: tuple[Sequence[ClockFit], Sequence[Match]],
+    sweep: CameraSweep, views: Sequence[View], tried: tuple[Sequence[ClockFit], Sequence[Match]]
 ) -> Clocked:
-    """Does without an estimate: by what is stated, or with views at rest."""
+    """Gives views their poses without an estimate: at the stated offset, or for views at rest."""
     why, stated_s = why_undetermined(*tried), sweep.stated_s
-    likeliest = not_ascending(views) or why
+    reason = not_ascending(views) or why
     offset_s = stated_s or 0.0
     correlation = max((match.correlation for match in tried[1]), default=None)
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
@@ -385,61 +370,61 @@ def _undetermined(
             f"{'as stated' if stated_s is not None else 'as nothing is stated'}: the views were "
             "taken at rest, where this does not count."
         )
-        return _placed(sweep, views, clock, [], [note])
+        return _at_offset(sweep, views, clock, [], [note])
     if stated_s is not None:
         warning = Finding(
             "clock",
             f"[clock] camera_minus_robot_s is taken as stated, {1e3 * stated_s:+.4g} ms, to "
-            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {likeliest}.",
+            f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {reason}.",
         )
         clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
-        return _placed(sweep, views, clock, [warning], [])
+        return _at_offset(sweep, views, clock, [warning], [])
     if resting.sum() < FEWEST_VIEWS:
-        raise no_offset(sweep.motion, views, resting, why)
+        raise undetermined_error(sweep.motion, views, resting, why)
     warning = Finding(
         "clock",
         f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
-        f"between the clocks is not known: {likeliest}.",
+        f"between the clocks is not known: {reason}.",
     )
-    kept = [view for view, value in zip(views, resting, strict=True) if value]
-    placed = _placed(sweep, kept, clock, [warning], [])
-    rejected = {rejection.view: rejection for rejection in placed.rejections} | {
+    kept = [view for view, is_still in zip(views, resting, strict=True) if is_still]
+    clocked = _at_offset(sweep, kept, clock, [warning], [])
+    rejected = {rejection.view: rejection for rejection in clocked.rejections} | {
         view.number: Rejection(view.number, _IN_MOTION)
-        for view, value in zip(views, resting, strict=True)
-        if not value
+        for view, is_still in zip(views, resting, strict=True)
+        if not is_still
     }
-    return replace(placed, rejections=tuple(rejected.values()))
+    return replace(clocked, rejections=tuple(rejected.values()))
 
 
-def _placed(
+def _at_offset(
     sweep: CameraSweep,
     views: Sequence[View],
     clock: ClockOffset,
     warnings: Sequence[Finding],
     notes: Sequence[str],
 ) -> Clocked:
-    """Gives views their poses at an offset, and chooses among very many."""
+    """Gives views their poses at an offset, and selects among very many."""
     at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
     covered = sweep.motion.flange.covers(at_s)
-    inside = [view for view, value in zip(views, covered, strict=True) if value]
+    inside = [view for view, is_covered in zip(views, covered, strict=True) if is_covered]
     poses, speeds = sweep.motion.flange.at(at_s[covered]), sweep.motion.flange.speeds(at_s[covered])
-    chosen = _chosen(inside, poses, speeds)
-    taken = [inside[at].number for at in chosen]
-    rows = dict(zip(taken, sweep.motion.numbers(at_s[covered][chosen]), strict=True))
+    selected = _selected(inside, poses, speeds)
+    taken = [inside[at].number for at in selected]
+    rows = dict(zip(taken, sweep.motion.numbers(at_s[covered][selected]), strict=True))
     if clock.method != "rest":
-        clock = replace(clock, speeds=dict(zip(taken, speeds[chosen], strict=True)))
-        notes = [*notes, speed_words(clock, speeds[chosen], len(inside))]
+        clock = replace(clock, speeds=dict(zip(taken, speeds[selected], strict=True)))
+        notes = [*notes, speed_words(clock, speeds[selected], len(inside))]
     lost = dict(_uncovered(sweep.motion, views, at_s, covered))
-    # A sweep may be longer than the stream beside it.
+    # Of a sweep that is longer than the stream, the rest is no loss.
     beyond = {key for key, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
     spared = {view.number: _SPARED for view in inside if view.number not in rows}
-    lost |= {view.number: _NO_TIME for view in sweep.views if _knows_nothing(view)}
+    lost |= {view.number: _NO_TIME for view in sweep.views if _has_no_pose_or_time(view)}
     return Clocked(
         clock,
         tuple(
             replace(view, numbers={**view.numbers, **rows.get(view.number, {})})
             for view in sweep.views
-            if view.number in rows or not (is_open(view) or _knows_nothing(view))
+            if view.number in rows or not (is_open(view) or _has_no_pose_or_time(view))
         ),
         tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),
         spared | dict.fromkeys(beyond, _BEYOND),
@@ -448,8 +433,8 @@ def _placed(
     )
 
 
-def _chosen(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> IntArray:
-    """Which views to use: all of few, of many the slow ones, and those that are held back."""
+def _selected(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> IntArray:
+    """Indices of the views to use: all of few; of many, slow ones and those held back."""
     everything = np.arange(len(views))
     if len(views) <= _MANY_VIEWS:
         return everything
@@ -461,14 +446,12 @@ def _chosen(views: Sequence[View], poses: FloatArray, speeds: FloatArray) -> Int
 def _uncovered(
     motion: RobotMotion, views: Sequence[View], at_s: FloatArray, covered: Mask
 ) -> Iterator[tuple[int, str]]:
-    """The views about which the stream says nothing, and why."""
+    """The views that the stream does not cover, and why."""
     first_s, last_s = motion.flange.stamps_s[[0, -1]]
-    for view, it_s, there in zip(views, at_s, covered, strict=True):
-        if not there:
-            within = first_s <= it_s <= last_s
-            yield view.number, _IN_A_GAP if within else _BEYOND
+    for view, view_s, is_covered in zip(views, at_s, covered, strict=True):
+        if not is_covered:
+            yield view.number, _IN_A_GAP if first_s <= view_s <= last_s else _BEYOND
 
 
-def _knows_nothing(view: View) -> bool:
-    """Whether neither a pose of the robot nor a time is there."""
+def _has_no_pose_or_time(view: View) -> bool:
     return view.stamp_s is None and view.base_from_flange() is None and view.joints_rad is None

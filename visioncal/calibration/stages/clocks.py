@@ -1,7 +1,7 @@
-"""Rows that have a time and no pose of a robot: its stream gives them the pose.
+"""Robot poses, from streams, for rows with a time and no pose.
 
-Every pair of a camera and a robot has clocks of its own, whose offset is estimated from the motion
-that both have seen.
+Every pair of a camera and a robot has its own clock offset, estimated from the motion that both
+observed.
 """
 
 from collections.abc import Collection, Mapping
@@ -37,7 +37,7 @@ T = TypeVar("T", bound=Observed)
 
 
 def waits_for_clock(session: Session) -> bool:
-    """Tells whether rows have a time, and the pose of the robot that they need in a stream."""
+    """Tells whether rows have a time, and need a robot's pose that its stream may give."""
     return bool(_waiting(session))
 
 
@@ -45,37 +45,33 @@ def set_clocks(seen: T) -> T:
     """Gives rows the poses of robots at their times.
 
     Raises:
-        DataError: The stream of an only robot has no poses, and no joints that its model knows, or
-            no view of its only camera lies within it.
-        DegenerateError: The motion of an only pair does not determine the offset, it is not stated,
-            and too few views were taken at rest.
+        DataError: The stream of a single robot has no poses and no usable joints, or no view of the
+            single camera lies within it.
+        DegenerateError: The motion of a single pair does not determine the offset, it is not
+            stated, and too few views were taken at rest.
     """
     for pair, rows in _waiting(seen.session).items():
-        seen = _with_pair(seen, pair, rows)
+        seen = _with_clock(seen, pair, rows)
     return seen
 
 
 def _waiting(session: Session) -> dict[ClockPair, list[View]]:
-    """The rows that lack the pose of one robot that has a stream, where any of them has a time."""
+    """Rows that lack the pose of one robot with a stream, by pair; at least one has a time."""
     if not session.streams or not any(is_open(view) for view in session.views):
         return {}
-    found: dict[ClockPair, list[View]] = {}
+    waiting: dict[ClockPair, list[View]] = {}
     for observation in session.observations:
-        if (
-            len(observation.lacks) == 1
-            and is_seen(observation.view)
-            and stream_of(session, observation.lacks[0])
-        ):
-            found.setdefault(ClockPair(observation.seer, observation.lacks[0]), []).append(
-                observation.view
-            )
-    return {pair: rows for pair, rows in found.items() if any(map(is_open, rows))}
+        view, lacks = observation.view, observation.lacks
+        if len(lacks) == 1 and is_seen(view) and stream_of(session, lacks[0]):
+            waiting.setdefault(ClockPair(observation.seer, lacks[0]), []).append(view)
+    return {pair: rows for pair, rows in waiting.items() if any(map(is_open, rows))}
 
 
-def _with_pair(seen: T, pair: ClockPair, rows: list[View]) -> T:
+def _with_clock(seen: T, pair: ClockPair, rows: list[View]) -> T:
+    """Adds the clock of a pair; one of several without a clock is only reported."""
     session, lens = seen.session, seen.lenses.get(pair.camera)
     document = session.robot_documents.get(pair.robot)
-    # An only pair needs no name, and there is nothing to go on with where it has no clock.
+    # A single pair needs no name, and cannot do without its clock.
     is_only = max(len(session.cameras), len(session.robots)) < 2
     of = "" if is_only else pair.words
     on_flange = session.frames[pair.camera] == frame_name("flange", pair.robot)
@@ -90,17 +86,15 @@ def _with_pair(seen: T, pair: ClockPair, rows: list[View]) -> T:
             None if lens is None else lens.camera,
             numbered_positions(tuple(session.boards.values())),
         )
-        clocked = _set(sweep, seen.poses, model)
+        clocked = _set_clock(sweep, seen.poses, model)
     except VisioncalError as error:
         if is_only:
             raise
         lost = [Rejection(row.number, f"no pose: {error.message}") for row in rows]
-        found = Finding(
-            "clock", error.message, Remedy(error.next_step) if error.next_step else None
-        )
-        return seen.noting(lost, (found.of(of),))
-    named = {"robot": pair.robot} if pair.robot else {}
-    views = tuple(replace(view, text={**view.text, **named}) for view in clocked.views)
+        step = Remedy(error.next_step) if error.next_step else None
+        return seen.noting(lost, (Finding("clock", error.message, step).of(of),))
+    robot_text = {"robot": pair.robot} if pair.robot else {}
+    views = tuple(replace(view, text={**view.text, **robot_text}) for view in clocked.views)
     seen = replace(
         seen,
         clocks={**seen.clocks, pair: replace(clocked, views=views)},
@@ -110,7 +104,7 @@ def _with_pair(seen: T, pair: ClockPair, rows: list[View]) -> T:
     return seen.noting(clocked.rejections, (warning.of(of) for warning in clocked.warnings))
 
 
-def _set(sweep: CameraSweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
+def _set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
     try:
         return set_clock(sweep, poses)
     except (DataError, DegenerateError) as error:
@@ -121,7 +115,7 @@ def _set(sweep: CameraSweep, poses: Mapping[int, ViewPoses], model: Robot | None
 
 
 def _stated_s(session: Session, camera: str) -> float | None:
-    """What the session states of a camera's clock, or of all of them."""
+    """Stated clock offset of a camera [s], its own or that of all; None without one."""
     declared = session.declaration
     tables: dict[str, ClockTable] = {
         frame_name("camera", name): clock for name, clock in declared.clocks.items()
@@ -133,34 +127,30 @@ def _stated_s(session: Session, camera: str) -> float | None:
 def clock_effects(
     cell: Cell, clocks: Mapping[ClockPair, Clocked], erring: Collection[str] = ()
 ) -> tuple[Effect, ...]:
-    """The errors of offsets and times within images [s], as effects on the cell's rows.
+    """Errors of clock offsets and delays [s], as effects on the cell's rows.
 
     Args:
         cell: The cell.
-        clocks: What was found of clocks.
-        erring: The robots, as the problem has them, whose arms' errors are unknowns of the fit.
+        clocks: The clocks of pairs.
+        erring: Names in the problem of robots whose arm errors are unknowns of the fit.
     """
     views = [row.view for row in cell.rows]
-    found: list[Effect] = []
+    effects: list[Effect] = []
     for pair, clocked in clocks.items():
-        if clocked.clock.speeds and robot_key(pair.robot) in cell.poses:
-            errs = robot_key(pair.robot) in erring
-            found.append(_effect(cell, pair, clocked.clock, clocked.clock.known_s(erring=errs)))
-            found += [
-                delay.effect(views, pair.delay(delay.of))
-                for delay in clocked.clock.delays
-                if delay.is_clear
-            ]
-    return tuple(found)
+        clock, robot = clocked.clock, robot_key(pair.robot)
+        if clock.speeds and robot in cell.poses:
+            sigma_s = clock.known_s(erring=robot in erring)
+            effects.append(_offset_effect(cell, pair, clock, sigma_s))
+            clear = (delay for delay in clock.delays if delay.is_clear)
+            effects += [delay.effect(views, pair.delay(delay.of)) for delay in clear]
+    return tuple(effects)
 
 
-def _effect(cell: Cell, pair: ClockPair, clock: ClockOffset, sigma_s: float) -> Effect:
-    speeds = clock.speeds
+def _offset_effect(cell: Cell, pair: ClockPair, clock: ClockOffset, sigma_s: float) -> Effect:
+    speeds, robot = clock.speeds, robot_key(pair.robot)
     concerned = np.array([row.view in speeds for row in cell.rows], dtype=bool)
-    robot = robot_key(pair.robot)
-    moving = np.zeros((len(cell.poses[robot]), 6))
+    twists = np.zeros((len(cell.poses[robot]), 6))
     for row in cell.rows:
         if row.view in speeds:
-            moving[row.station] = speeds[row.view]
-    found = clock_effect(moving, sigma_s, pair.effect, robot)
-    return replace(found, concerned=concerned)
+            twists[row.station] = speeds[row.view]
+    return replace(clock_effect(twists, sigma_s, pair.effect, robot), concerned=concerned)

@@ -1,6 +1,6 @@
-"""Whether corners that another detector has found lie as the drawing numbers them, in the image.
+"""Checks of corners from another detector against the target's numbering and the image size.
 
-A view of a flat board is a homography, but for noise, the lens and single wild corners: these stay
+A view of a flat board is a homography, apart from noise, the lens and single outliers, which stay
 under a tenth of the corners' spread. Numbers of another board leave nearly all of it.
 """
 
@@ -13,23 +13,20 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.vision.targets import corner_positions
 
-# Share of the corners' spread that is left of a view whose numbers are another board's: 0.7 to 1.1
-# were seen, and 0.1 at most of fisheyes and of views with wild corners.
+# Largest homography residual as a share of the corners' spread. Wrong numbers leave 0.7 to 1.1;
+# fisheyes and views with single outliers 0.1 at most.
 _MOST_LEFT = 0.3
-# A homography takes four points; with two more there is something left.
+# Fewest corners to be checked: a homography takes four.
 _FEWEST = 6
-# Detectors place corners at the image's edge, or this far outside of it [px].
+# Largest distance outside the image at which detectors place corners of its edge [px].
 _BORDER_PX = 2.0
-# Share of the views from which on targets are taken to be seen from behind.
+# Share of the views from which on targets count as seen from behind.
 _MOST_FROM_BEHIND = 0.5
-# Corners of one row of a grid that are tried; a sheet of paper holds fewer.
+# Largest number of corners in a row that is tried; a sheet of paper holds fewer.
 _MOST_A_ROW = 100
-# What a drawing's columns have beyond the corners of a row, by its kind: those whose numbers go row
-# by row.
-_BEYOND = {"charuco": 1, "checkerboard": 0}
-
-
-# Why a single view of that kind is left out.
+# Columns of a drawing minus corners in a row, by the kinds whose numbers go row by row.
+_EXTRA_COLUMNS = {"charuco": 1, "checkerboard": 0}
+# Why a single misnumbered view is left out.
 OTHER_NUMBERS = "its corners in corners.csv do not lie as the target's drawing numbers them"
 
 
@@ -37,22 +34,22 @@ def _is_misnumbered(corners: Corners, target: Target) -> bool:
     points = corner_positions(target)[corners.ids]
     if np.ptp(points[:, 2]) > 0.0 or len(points) < _FEWEST:
         return False
-    return _left(points[:, :2], corners.px) > _MOST_LEFT
+    return _homography_residual(points[:, :2], corners.px) > _MOST_LEFT
 
 
 def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> list[int]:
-    """Finds corners that lie otherwise than the target's drawing numbers them; refuses most.
+    """Finds views whose corners contradict the numbering of the target's drawing.
 
     Args:
         views: The corners of each view of the target.
         target: The target.
-        name: What the session calls it, where it has several.
+        name: Name of the target in the session, where it has several.
 
     Returns:
-        The views whose corners do.
+        The numbers of these views.
 
     Raises:
-        DataError: So do those of most views; another number of columns is named where it fits.
+        DataError: Most views do; another number of columns is named where it fits.
     """
     wrong = [view for view in views if _is_misnumbered(view, target)]
     if 2 * len(wrong) <= len(views):
@@ -63,7 +60,7 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
         f"corners.csv do not lie as its drawing{size} numbers them"
     )
     culprits = [f"view {corners.view}" for corners in wrong]
-    width = _fitting_width(wrong) if target.kind in _BEYOND else None
+    width = _fitting_width(wrong) if target.kind in _EXTRA_COLUMNS else None
     if width is None:
         raise DataError(
             f"{seen}: the drawing is of another board, or the numbers are of another order.",
@@ -71,7 +68,7 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
             next_step="Compare columns, rows and the order of the points with the detector's.",
         )
     most = max(int(corners.ids.max()) for corners in wrong)
-    columns, rows = (index + _BEYOND[target.kind] for index in (width, most // width + 1))
+    columns, rows = (count + _EXTRA_COLUMNS[target.kind] for count in (width, most // width + 1))
     raise DataError(
         f"{seen}; they do with columns = {columns}.",
         culprits=culprits,
@@ -80,14 +77,14 @@ def check_numbers(views: Sequence[Corners], target: Target, name: str = "") -> l
 
 
 def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, int]) -> None:
-    """Refuses corners whose columns, or those of the image's size, are exchanged.
+    """Refuses corners whose columns u and v, or the image's width and height, are exchanged.
 
     Args:
         views: The corners of each view, with its target.
-        resolution: Width and height of the image, as stated [px].
+        resolution: Stated width and height of the image [px].
 
     Raises:
-        DataError: Corners lie beyond the image, and none of all would with the other order.
+        DataError: Corners lie outside the image, and none would with the other order.
     """
     size = np.array(resolution, dtype=float)
     outside = [corners for corners, _ in views if _is_beyond(corners.px, size)]
@@ -99,7 +96,7 @@ def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, i
         f"{height} px"
     )
     columns, sides = "the columns u_px and v_px", "width and height in resolution"
-    # A rig's z may point either way.
+    # The z axis of a rig may point either way.
     boards = [(corners, target) for corners, target in views if target.kind != "points"]
     if not boards:
         raise DataError(
@@ -129,40 +126,40 @@ def _is_beyond(px: FloatArray, size: FloatArray) -> bool:
 
 
 def _is_from_behind(corners: Corners, target: Target) -> bool:
-    """Whether the corners of a board turn the other way round than as seen from before it."""
+    """Whether the corners of a board have the orientation of a view from behind."""
     points = corner_positions(target)[corners.ids, :2]
-    away = points - points.mean(axis=0)
-    px_from_plane = np.linalg.lstsq(away, corners.px - corners.px.mean(axis=0))[0]
+    centred = points - points.mean(axis=0)
+    px_from_plane = np.linalg.lstsq(centred, corners.px - corners.px.mean(axis=0))[0]
     return bool(np.linalg.det(px_from_plane) < 0.0)
 
 
 def _fitting_width(views: Iterable[Corners]) -> int | None:
-    """The number of corners a row with which all views are of a grid; None where there is none."""
+    """Number of corners in a row by which all views fit a grid; None without one."""
     views = list(views)
     for width in range(2, min(max(int(view.ids.max()) for view in views), _MOST_A_ROW) + 1):
         grids = [np.stack([view.ids % width, view.ids // width], axis=1) for view in views]
         if all(
-            _left(grid.astype(float), view.px) < _MOST_LEFT
+            _homography_residual(grid.astype(float), view.px) < _MOST_LEFT
             for grid, view in zip(grids, views, strict=True)
         ):
             return width
     return None
 
 
-def _left(points: FloatArray, px: FloatArray) -> float:
-    """What a homography leaves of (n, 2) places, as a share of their spread."""
+def _homography_residual(points: FloatArray, px: FloatArray) -> float:
+    """Rms residual of a homography of (n, 2) points, as a share of their spread."""
     plane, image = _normalised(points), _normalised(px)
     if not (np.isfinite(plane).all() and np.isfinite(image).all()):
         return 0.0
-    # Of corners that no homography maps there is none, whatever OpenCV's types say.
+    # Without any homography OpenCV returns None, whatever its types say.
     homography = np.asarray(cv2.findHomography(plane, image)[0], dtype=float)
     if homography.shape != (3, 3):
         return 1.0
-    there = cv2.perspectiveTransform(plane[None], homography)[0]
-    return float(np.sqrt(np.mean(np.sum((there - image) ** 2, axis=1))))
+    mapped = cv2.perspectiveTransform(plane[None], homography)[0]
+    return float(np.sqrt(np.mean(np.sum((mapped - image) ** 2, axis=1))))
 
 
-def _normalised(places: FloatArray) -> FloatArray:
-    away = places - places.mean(axis=0)
-    spread = np.sqrt(np.mean(np.sum(away**2, axis=1)))
-    return np.asarray(away / spread if spread > 0.0 else away * np.nan)
+def _normalised(points: FloatArray) -> FloatArray:
+    centred = points - points.mean(axis=0)
+    spread = np.sqrt(np.mean(np.sum(centred**2, axis=1)))
+    return np.asarray(centred / spread if spread > 0.0 else centred * np.nan)

@@ -1,4 +1,4 @@
-"""Corners by all pixels around them, in the images where the template has found them before."""
+"""Dense corner refinement: fits a model of the image to all pixels around each corner."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -20,25 +20,25 @@ from visioncal.vision.dense.library import ONE_TORCH_THREAD
 from visioncal.vision.dense.shown import MAGNIFIED, DenseImage, explain
 from visioncal.vision.finders.template import Refined, refine
 
-# Views that show whether smoothing helps, its sigma [px], and by how much it has to.
+# Number of views that show whether smoothing helps, its sigma [px], and the share to which it has
+# to reduce the scatter.
 _SAMPLE, _SMOOTH_PX, _HELPS = 4, 0.7, 0.95
-# Of a view where less than this share of the corners could be fitted, those of the template serve.
+# Least share of fitted corners of a view; below it the template's are used.
 _LEAST_FITTED = 0.5
 _KINDS = ("charuco", "checkerboard")
-# Of pictures for people.
-_QUALITY = 90
-# What the template has of an image, and what all pixels have.
-_Look: TypeAlias = tuple[Refined, FittedCorners | None]
+_JPEG_QUALITY = 90
+# Corners of an image by the template, and by the dense fit.
+_Fit: TypeAlias = tuple[Refined, FittedCorners | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Dense:
-    """How corners are fitted by all pixels, and what was found of the images.
+    """Settings and results of dense corner fits.
 
     Attributes:
-        device: What torch works on: `cpu` or `cuda`.
-        fits: What was fitted, by view.
-        threads: How many images are worked on at a time on the CPU; 0 for one a core.
+        device: Torch device: `cpu` or `cuda`.
+        fits: Fitted corners by view.
+        threads: Number of parallel images on the CPU; 0 for one a core.
     """
 
     device: str
@@ -51,7 +51,7 @@ class Dense:
         return {view: fit.blur for view, fit in self.fits.items()}
 
     def notes(self) -> tuple[str, ...]:
-        """What blurs the images, in sentences."""
+        """Sentences on what blurs the images."""
         words = []
         moved, focus = (
             {view: blur for view, blur in self.blurs.items() if blur.cause == cause}
@@ -84,15 +84,15 @@ def fit_densely(
     """Fits the corners of views by all pixels around them.
 
     Args:
-        session: What was recorded.
+        session: The session.
         views: Its views.
-        corners: What was found in them, each by its own board's numbers.
-        dense: How.
-        progress: Told after each image.
+        corners: Detected corners by view, in their own board's numbers.
+        dense: Settings, and earlier results.
+        progress: Called after each image.
 
     Returns:
-        The corners, each with its weight, and what was found of the images. What other detectors
-        have found stays as it is.
+        The corners with their weights, and the results. Corners by other detectors stay as they
+        are.
     """
     boards, board_of = session.boards, session.board_of
     mine = [
@@ -104,13 +104,13 @@ def fit_densely(
         and boards[board_of(view)].kind in _KINDS
     ]
 
-    def fit(view: View, smooth_px: float) -> _Look | None:
+    def fit(view: View, smooth_px: float) -> _Fit | None:
         image = image_of(session, view)
         if isinstance(image, Rejection):
             return None
         target, seen = boards[board_of(view)], corners[view.number]
         start = refine(image, target, seen.ids, seen.px)
-        found = fit_corners(
+        fitted = fit_corners(
             image,
             target,
             seen.ids,
@@ -119,7 +119,7 @@ def fit_densely(
             device=dense.device,
             smooth_px=smooth_px,
         )
-        return start, found
+        return start, fitted
 
     # One thread keeps a GPU busy.
     threads = (dense.threads or os.cpu_count() or 1) if dense.device == "cpu" else 1
@@ -132,9 +132,9 @@ def fit_densely(
         smooths = _smoothing_helps(*both)
         ready = dict(zip((view.number for view in sample), both[smooths], strict=True))
         rest = [view for view in mine if view.number not in ready]
-        looks = pool.map(lambda view: fit(view, smooths * _SMOOTH_PX), rest)
-        looked = chain(ready.items(), zip((view.number for view in rest), looks, strict=True))
-        for view, pair in looked:
+        others = pool.map(lambda view: fit(view, smooths * _SMOOTH_PX), rest)
+        pairs = chain(ready.items(), zip((view.number for view in rest), others, strict=True))
+        for view, pair in pairs:
             if pair is not None:
                 found[view] = pair
             if progress is not None:
@@ -146,16 +146,16 @@ def fit_densely(
     }
     sigmas = {view: fits[view].sigma_px if view in fits else start.sigma_px
               for view, (start, _) in found.items()}  # fmt: skip
-    every = np.concatenate([np.zeros(0), *sigmas.values()])
-    typical_px = float(np.nanmedian(every)) if np.isfinite(every).any() else 1.0
-    weighed = {
-        view: _weighed(corners[view], fits.get(view), typical_px / sigmas[view]) for view in found
+    all_sigmas = np.concatenate([np.zeros(0), *sigmas.values()])
+    typical_px = float(np.nanmedian(all_sigmas)) if np.isfinite(all_sigmas).any() else 1.0
+    weighted = {
+        view: _weighted(corners[view], fits.get(view), typical_px / sigmas[view]) for view in found
     }
-    return {**corners, **weighed}, replace(dense, fits={**dense.fits, **fits})
+    return {**corners, **weighted}, replace(dense, fits={**dense.fits, **fits})
 
 
-def _smoothing_helps(plain: Sequence[_Look | None], smooth: Sequence[_Look | None]) -> bool:
-    """Whether corners scatter less when image and model are smoothed alike."""
+def _smoothing_helps(plain: Sequence[_Fit | None], smooth: Sequence[_Fit | None]) -> bool:
+    """Whether corners scatter less with image and model smoothed alike."""
     shares = [
         after[1].scatter_px / before[1].scatter_px
         for before, after in zip(plain, smooth, strict=True)
@@ -165,8 +165,8 @@ def _smoothing_helps(plain: Sequence[_Look | None], smooth: Sequence[_Look | Non
     return bool(shares) and float(np.median(shares)) < _HELPS
 
 
-def _weighed(seen: Corners, fit: FittedCorners | None, weights: FloatArray) -> Corners:
-    """The corners that a fit has, or those of the template, with weights where they are known."""
+def _weighted(seen: Corners, fit: FittedCorners | None, weights: FloatArray) -> Corners:
+    """Fitted corners, or else the template's, with weights where they are known."""
     known = np.isfinite(weights)
     if fit is None and known.any():
         return replace(seen, weights=np.where(known, weights, np.nanmin(weights)))
@@ -184,14 +184,7 @@ def _weighed(seen: Corners, fit: FittedCorners | None, weights: FloatArray) -> C
 def explained(
     session: Session, evidence: Sequence[ViewEvidence], dense: Dense, camera: Camera
 ) -> tuple[ViewEvidence, ...]:
-    """Adds to the evidence of views how far a calibration explains their images.
-
-    Args:
-        session: What was recorded.
-        evidence: Of its views, with the corners where the calibration puts them.
-        dense: What blurs the images.
-        camera: The camera as calibrated.
-    """
+    """Adds rendered images and their residuals to the evidence of views."""
     rows = {view.number: view for view in session.views}
 
     def explained(seen: ViewEvidence) -> ViewEvidence:
@@ -203,34 +196,31 @@ def explained(
         if isinstance(image, Rejection):
             return seen
         target = session.boards[session.board_of(view)]
-        found = explain(image, target, seen.corners.ids, px, camera, fit.blur, fit.tone)
-        if found is None:
+        rendered = explain(image, target, seen.corners.ids, px, camera, fit.blur, fit.tone)
+        if rendered is None:
             return seen
-        drawn, rest = (_as_jpeg(array) for array in (found.drawn, found.rest))
-        return replace(seen, explained=ExplainedImage(drawn, rest, _words(fit, found)))
+        drawn, rest = (_as_jpeg(array) for array in (rendered.drawn, rendered.rest))
+        return replace(seen, explained=ExplainedImage(drawn, rest, _words(fit, rendered)))
 
     with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(dense.threads or os.cpu_count() or 1) as pool:
         return tuple(pool.map(explained, evidence))
 
 
 def _as_jpeg(image: Image) -> bytes:
-    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    return bytes(cv2.imencode(".jpg", image, quality)[1].tobytes())
 
 
-def _words(fit: FittedCorners, found: DenseImage) -> str:
-    """What blurs an image, and how much of it is not explained."""
+def _words(fit: FittedCorners, rendered: DenseImage) -> str:
+    """Blur and unexplained residual of an image, in words."""
     blur = fit.blur
-    cause = {
-        "motion": "**Smeared by motion.** ",
-        "focus": "**Out of focus.** ",
-        "": "**Sharp.** ",
-    }[blur.cause]
+    causes = {"motion": "Smeared by motion", "focus": "Out of focus", "": "Sharp"}
     return (
-        f"{cause}Edges are {blur.width_px:.2f} px wide as a sigma: a Gaussian of "
-        f"{blur.sigma_px:.2f} px, a disc of {blur.disc_px:.2f} px radius, and a line of "
+        f"**{causes[blur.cause]}.** Edges are {blur.width_px:.2f} px wide as a sigma: a Gaussian "
+        f"of {blur.sigma_px:.2f} px, a disc of {blur.disc_px:.2f} px radius, and a line of "
         f"{blur.length_px:.2f} px at {blur.direction_deg:.0f} deg from the image's rows.\n\n"
-        f"What is not explained has an rms of {found.rest_rms:.1f} grey levels on the board, about "
-        f"its corners alone {fit.noise:.1f}; it is drawn {MAGNIFIED} times as strong. Edges that "
-        "show on one side light and on the other dark are where the board is not where the "
+        f"What is not explained has an rms of {rendered.rest_rms:.1f} grey levels on the board, "
+        f"about its corners alone {fit.noise:.1f}; it is drawn {MAGNIFIED} times as strong. Edges "
+        "that show on one side light and on the other dark are where the board is not where the "
         "calibration has it."
     )

@@ -1,6 +1,6 @@
-"""Finds the target in every image, on threads, with a reason where it cannot be used.
+"""Multi-threaded target detection in images, with a reason for each view that is rejected.
 
-Where another detector has found the corners of a view (corners.csv), these are taken.
+Corners that another detector found (corners.csv) are used as they are.
 """
 
 import os
@@ -31,26 +31,24 @@ from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
 from visioncal.vision.targets import corner_positions, point_numbers
 
-# A homography takes four points.
+# Fewest corners of corners.csv: a homography takes four points.
 _FEWEST_GIVEN = 4
-# Fewest corners of a board that is found in an image, or all that it has: a homography needs four,
-# the rest are its check.
+# Fewest detected corners, or all that a board has: four for a homography, the rest for its check.
 _FEWEST_FOUND = 6
-# Corners that others have found may lie outside the image by this share of it.
+# Share of the image's size by which corners of corners.csv may lie outside of it.
 _OUTSIDE = 0.1
-# Images with corners that show which layout was printed, or how they were turned; of so many.
-_LAYOUT_SAMPLE, _MOST_LOOKED_AT = 3, 12
+# Number of images with corners that show the printed layout, or how they were turned; and the
+# number of images searched for them.
+_LAYOUT_SAMPLE, _MOST_SEARCHED = 3, 12
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """The corners by view, in the session's order, and the views without.
+    """Detected corners by view, in the session's order, and rejected views.
 
     Attributes:
-        corners: The corners.
-        rejections: Why views have none.
         resolution: The camera's (width, height) [px].
-        other_sizes: The (width, height) of images that have another one, by view [px].
+        other_sizes: The (width, height) of images of another size, by view [px].
     """
 
     corners: Mapping[int, Corners]
@@ -59,8 +57,8 @@ class Detections:
     other_sizes: Mapping[int, tuple[int, int]]
 
 
-class _Room:
-    """Bounds what threads work on at once, in shares of the largest image that is looked at."""
+class _MemoryBudget:
+    """Limit on the image data that threads hold at once, in shares of the largest image."""
 
     def __init__(self) -> None:
         self._left = 1.0
@@ -68,7 +66,7 @@ class _Room:
 
     @contextmanager
     def taken(self, share: float) -> Iterator[None]:
-        """Waits until there is room for a share; one beyond all of it waits to be alone."""
+        """Takes a share once it is free; one above all of the budget waits to be alone."""
         share = min(max(share, 0.0), 1.0)
         with self._changed:
             # Shares add up to one but for rounding.
@@ -90,69 +88,67 @@ def detect(
     threads: int = 0,
     keeps: bool = False,
 ) -> Detections:
-    """Finds in each image of a session the target that its row is said to show.
+    """Finds the declared target in each image of a session.
 
     Args:
-        session: A session with a target; its views without images or corners are passed over.
-        progress: Told after each image.
-        among: Those of its views to look at; all where None.
-        threads: How many images are worked on at a time; 0 for one a core.
-        keeps: Whether what is found is kept beside the session, for the next search.
+        session: A session with a target; views without images or corners are skipped.
+        progress: Called after each image.
+        among: The views to search; None for all.
+        threads: Number of parallel images; 0 for one a core.
+        keeps: Whether to cache detections beside the session.
 
     Returns:
         The corners and the rejected views.
 
     Raises:
         DataError: No view shows the target, half of the images or more have another size than the
-            camera, the size of the images is not known, or the board that was printed has another
-            layout than the one declared.
+            camera, the size of the images is unknown, or the printed board has another layout than
+            the declared one.
     """
     if not session.boards:
         raise DataError("session: images need a target.", next_step="Name one in session.toml.")
     among = session.views if among is None else among
     views = [view for view in among if view.image and not view.has_corners]
     stated = _stated_resolution(session, among)
-    looks: list[Searched] = []
+    searches: list[Searched] = []
     others = {board for board in session.boards if _shows_another(session, board, views)}
-    room, kept = _Room(), KeptCorners.beside(session, grows=keeps)
-    with (
-        _ONE_OPENCV_THREAD.held(),
-        ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool,
-    ):
+    budget, cache = _MemoryBudget(), KeptCorners.beside(session, grows=keeps)
+    with _ONE_OPENCV_THREAD.held(), ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
 
-        def look_at(view: View) -> Searched:
+        def search_view(view: View) -> Searched:
             quick = session.board_of(view) in others
-            return _look(session, view, stated, room, kept, quick=quick)
+            return _search(session, view, stated, budget, cache, quick=quick)
 
-        for look in pool.map(look_at, views):
-            looks.append(look)
+        for search in pool.map(search_view, views):
+            searches.append(search)
             if progress is not None:
-                progress("detect", len(looks), len(views))
-    kept.save()
+                progress("detect", len(searches), len(views))
+    cache.save()
     given = [view for view in among if view.has_corners]
-    resolution = _common_resolution(session, views, looks, given, stated)
-    sizes = {view.number: look.size for view, look in zip(views, looks, strict=True)}
-    looks = [_of_size(look, view, resolution) for look, view in zip(looks, views, strict=True)]
+    resolution = _common_resolution(session, views, searches, given, stated)
+    sizes = {view.number: search.size for view, search in zip(views, searches, strict=True)}
+    pairs = zip(searches, views, strict=True)
+    searches = [_checked_size(search, view, resolution) for search, view in pairs]
     for name in session.boards:
-        _check_layout(session, name, views, looks)
-    own = {view.number: look.found for view, look in zip(views, looks, strict=True)}
+        _check_layout(session, name, views, searches)
+    detected = {view.number: search.found for view, search in zip(views, searches, strict=True)}
     check_axes(
         [(session.corners[view.number], session.boards[session.board_of(view)]) for view in given],
         resolution,
     )
-    elsewhere = {view.number: _given(session, view, resolution) for view in given}
+    imported = {view.number: _imported(session, view, resolution) for view in given}
     for name, target in session.boards.items():
-        mine = [elsewhere[view.number] for view in given if session.board_of(view) == name]
+        mine = [imported[view.number] for view in given if session.board_of(view) == name]
         several = name if len(session.boards) > 1 else ""
         wrong = check_numbers(
             [corners for corners in mine if isinstance(corners, Corners)], target, several
         )
-        elsewhere |= {index: Rejection(index, OTHER_NUMBERS) for index in wrong}
-    own |= elsewhere
-    found = [own[view.number] for view in among if view.number in own]
+        imported |= {view: Rejection(view, OTHER_NUMBERS) for view in wrong}
+    detected |= imported
+    results = [detected[view.number] for view in among if view.number in detected]
     return Detections(
-        {corners.view: corners for corners in found if isinstance(corners, Corners)},
-        tuple(corners for corners in found if isinstance(corners, Rejection)),
+        {corners.view: corners for corners in results if isinstance(corners, Corners)},
+        tuple(corners for corners in results if isinstance(corners, Rejection)),
         resolution,
         {view: size for view, size in sizes.items() if size not in (None, resolution)},
     )
@@ -160,8 +156,8 @@ def detect(
 
 def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
     """Whether images clearly show a checkerboard of another size than the declared one."""
-    # A thorough search for what is not there takes seconds an image, and is spared where all of a
-    # few images show another board.
+    # A thorough search for an absent board takes seconds an image, and is skipped where all images
+    # of a sample show another board.
     target = session.boards[name]
     if target.kind != "checkerboard":
         return False
@@ -191,12 +187,12 @@ def _one_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-# OpenCV's threads inside ours slow both down.
+# OpenCV's own threads inside these would slow both down.
 _ONE_OPENCV_THREAD = SharedSetting(_one_opencv_thread)
 
 
 def image_of(session: Session, view: View) -> Image | Rejection:
-    """Reads a view's (h, w) grey image; or says why there is none."""
+    """Reads a view's (h, w) grey image; a rejection where there is none."""
     if not session.images.exists(view.image):
         return Rejection(view.number, f"{view.image} {session.images.absence(view.image)}")
     return _decoded(view, session.images.read(view.image))
@@ -207,15 +203,16 @@ def _decoded(view: View, data: bytes) -> Image | Rejection:
     return Rejection(view.number, f"{view.image} is {image}") if isinstance(image, str) else image
 
 
-def _look(
+def _search(
     session: Session,
     view: View,
     stated: tuple[int, int] | None,
-    room: _Room,
-    kept: KeptCorners,
+    budget: _MemoryBudget,
+    cache: KeptCorners,
     *,
     quick: bool,
 ) -> Searched:
+    """Searches the image of one view."""
     absence = session.images.absence(view.image)
     if absence:
         return Searched(Rejection(view.number, f"{view.image} {absence}"), None)
@@ -225,40 +222,40 @@ def _look(
     size = claimed_size(data) or (0, 0)
     pixels = size[0] * size[1]
     if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
-        # Refused in any case: what another size shows need not be looked at.
+        # It is refused in any case, and need not be searched.
         return Searched(Rejection(view.number, f"{view.image} is of another size"), size)
-    # Digests of images take time, too.
-    key = kept.key(data, target, name) if kept.entries or kept.grows else ""
-    before = kept.get(key, view.number)
-    if before is not None:
-        return before
+    # Hashing images takes time, too.
+    key = cache.key(data, target, name) if cache.entries or cache.grows else ""
+    cached = cache.get(key, view.number)
+    if cached is not None:
+        return cached
     most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
-    with room.taken(pixels / most):
+    with budget.taken(pixels / most):
         image = _decoded(view, data)
         if isinstance(image, Rejection):
             return Searched(image, None)
         found, misfit = look_for(image, target, view.number, quick=quick, name=name)
     searched = Searched(found, (image.shape[1], image.shape[0]), misfit)
     if not quick:
-        kept.put(key, searched)
+        cache.put(key, searched)
     return searched
 
 
 def look_for(
     image: Image, target: Target, view: int, *, quick: bool = False, name: str = ""
 ) -> tuple[Corners | Rejection, bool]:
-    """Looks for a target in one image, as `detect` does in those of a session.
+    """Finds a target in one image.
 
     Args:
         image: (h, w) grey image.
-        target: What to look for.
+        target: The target.
         view: The view's number.
-        quick: Whether nothing more is searched where a first, quick search fails.
-        name: What the session calls the target, where it has several.
+        quick: Whether to stop where a first, quick search fails.
+        name: Name of the target in the session, where it has several.
 
     Returns:
-        The corners, or why the view cannot be used; and whether markers were seen that lie
-        otherwise than on this target.
+        The corners, or why the view is rejected; and whether markers were seen in another layout
+        than the target's.
     """
     seen = find_target(image, target, quick=quick)
     if isinstance(seen, NotFound):
@@ -267,37 +264,37 @@ def look_for(
         reason = f"{reason} (looked for target {name})" if name else reason
         return Rejection(view, reason), seen.misfit
     blur = blur_at_corners(image, seen.px) if seen.blur_px is None else seen.blur_px
-    trouble = _trouble(target, seen.ids, blur)
-    if trouble:
-        return Rejection(view, trouble), False
+    reason = _why_unusable(target, seen.ids, blur)
+    if reason:
+        return Rejection(view, reason), False
     return Corners(view, seen.ids, seen.px, blur, seen.weights), False
 
 
-def _given(session: Session, view: View, resolution: tuple[int, int]) -> Corners | Rejection:
-    """The corners that another detector has found in a view, or why they do not serve."""
+def _imported(session: Session, view: View, resolution: tuple[int, int]) -> Corners | Rejection:
+    """A view's corners of corners.csv, or why they are not usable."""
     corners, target = session.corners[view.number], session.boards[session.board_of(view)]
     positions = corner_positions(target)
     size = np.array(resolution)
-    beyond = np.any((corners.px < -_OUTSIDE * size) | (corners.px > (1 + _OUTSIDE) * size), axis=1)
-    trouble = ""
-    if beyond.any():
-        at = int(np.argmax(beyond))
+    outside = np.any((corners.px < -_OUTSIDE * size) | (corners.px > (1 + _OUTSIDE) * size), axis=1)
+    reason = ""
+    if outside.any():
+        at = int(np.argmax(outside))
         u_px, v_px = corners.px[at].tolist()
-        trouble = (
+        reason = (
             f"corners.csv: point {point_numbers(target)[corners.ids[at]]} at ({u_px:g}, "
             f"{v_px:g}) px lies far outside the image of {size[0]} x {size[1]} px"
         )
     elif len(corners.ids) < _FEWEST_GIVEN:
-        trouble = (
+        reason = (
             f"too few corners: corners.csv has {len(corners.ids)} of {len(positions)}, needs "
             f"{_FEWEST_GIVEN}"
         )
     elif not determines_pose(positions[corners.ids]):
-        trouble = f"corners on one line: all {len(corners.ids)} of corners.csv, or all but one"
-    return Rejection(view.number, trouble) if trouble else corners
+        reason = f"corners on one line: all {len(corners.ids)} of corners.csv, or all but one"
+    return Rejection(view.number, reason) if reason else corners
 
 
-def _trouble(target: Target, ids: IntArray, blur_px: float) -> str:
+def _why_unusable(target: Target, ids: IntArray, blur_px: float) -> str:
     positions = corner_positions(target)
     needed = 4 if target.kind in ("marker", "points") else min(_FEWEST_FOUND, len(positions))
     if len(ids) < needed:
@@ -312,12 +309,12 @@ def _trouble(target: Target, ids: IntArray, blur_px: float) -> str:
 def _common_resolution(
     session: Session,
     views: Sequence[View],
-    looks: Sequence[Searched],
+    searches: Sequence[Searched],
     given: Sequence[View],
     stated: tuple[int, int] | None,
 ) -> tuple[int, int]:
-    """The camera's size, or that of most images; checks that more than half of them have it."""
-    sizes = [look.size for look in looks if look.size is not None]
+    """Stated or most common size of the images; checks that more than half of them have it."""
+    sizes = [search.size for search in searches if search.size is not None]
     if not sizes and given:
         if stated is None:
             raise DataError(
@@ -329,7 +326,8 @@ def _common_resolution(
             )
         return stated
     if not sizes:
-        reasons = [f"view {rejection.view}: {rejection.reason}" for rejection in _rejections(looks)]
+        rejections = _rejections(searches)
+        reasons = [f"view {rejection.view}: {rejection.reason}" for rejection in rejections]
         raise DataError(
             f"session {session.name!r}: none of its {len(views)} images can be read.",
             culprits=reasons,
@@ -339,12 +337,12 @@ def _common_resolution(
     line_of = {view.number: line for line, view in enumerate(session.views, start=2)}
     culprits = [
         f"views.csv line {line_of[view.number]}, column image: {view.image} is "
-        f"{look.size[0]} x {look.size[1]} px"
-        for view, look in zip(views, looks, strict=True)
-        if look.size is not None and look.size != wanted
+        f"{search.size[0]} x {search.size[1]} px"
+        for view, search in zip(views, searches, strict=True)
+        if search.size is not None and search.size != wanted
     ]
     if len(culprits) == len(sizes) and len(set(sizes)) == 1:
-        raise _other_size(session, views, sizes[0], wanted, culprits)
+        raise _other_size_error(session, views, sizes[0], wanted, culprits)
     if 2 * len(culprits) >= len(sizes):
         source = "the camera's resolution is" if stated else "most other images are"
         raise DataError(
@@ -356,23 +354,23 @@ def _common_resolution(
     return wanted
 
 
-def _of_size(look: Searched, view: View, resolution: tuple[int, int]) -> Searched:
-    """The look at an image; a rejection where it has another size than the camera's."""
-    if look.size in (None, resolution):
-        return look
-    (width, height), (wide, high) = look.size, resolution
+def _checked_size(search: Searched, view: View, resolution: tuple[int, int]) -> Searched:
+    """The search of an image; a rejection where it has another size than the camera's."""
+    if search.size in (None, resolution):
+        return search
+    (width, height), (wide, high) = search.size, resolution
     words = f"{view.image} is {width} x {height} px, and the camera's images are {wide} x {high}"
     return Searched(Rejection(view.number, words), None)
 
 
-def _other_size(
+def _other_size_error(
     session: Session,
     views: Sequence[View],
     size: tuple[int, int],
     stated: tuple[int, int],
     culprits: Sequence[str],
 ) -> DataError:
-    """What to raise where all images are of one other size than the camera's."""
+    """Error where all images have one other size than the camera's."""
     mine = name_of(session.declaration, "camera", views[0])
     camera = session.cameras[mine]
     words, step = "", f"In session.toml, write resolution = [{size[0]}, {size[1]}]"
@@ -398,45 +396,44 @@ def _other_size(
 
 def _sample(session: Session, views: Sequence[View], name: str) -> dict[int, Corners]:
     """The corners of a few views that show a board."""
-    found: dict[int, Corners] = {}
-    for view in [view for view in views if session.board_of(view) == name][:_MOST_LOOKED_AT]:
+    sample: dict[int, Corners] = {}
+    for view in [view for view in views if session.board_of(view) == name][:_MOST_SEARCHED]:
         image = image_of(session, view)
         if isinstance(image, Rejection):
             continue
-        seen, _ = look_for(image, session.boards[name], view.number)
-        if isinstance(seen, Corners):
-            found[view.number] = seen
-        if len(found) == _LAYOUT_SAMPLE:
+        corners, _ = look_for(image, session.boards[name], view.number)
+        if isinstance(corners, Corners):
+            sample[view.number] = corners
+        if len(sample) == _LAYOUT_SAMPLE:
             break
-    return found
+    return sample
 
 
 def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, int] | None:
-    """The size of the images of the camera that took some views, if it is stated."""
+    """Stated size of the images of some views; None without one."""
     names = {name_of(session.declaration, "camera", view) for view in views}
     sizes = {session.cameras[name].size for name in names & session.cameras.keys()} - {None}
     return sizes.pop() if len(sizes) == 1 else None
 
 
-def _rejections(looks: Sequence[Searched]) -> list[Rejection]:
-    return [look.found for look in looks if isinstance(look.found, Rejection)]
+def _rejections(searches: Sequence[Searched]) -> list[Rejection]:
+    return [search.found for search in searches if isinstance(search.found, Rejection)]
 
 
 def _check_layout(
-    session: Session, name: str, views: Sequence[View], looks: Sequence[Searched]
+    session: Session, name: str, views: Sequence[View], searches: Sequence[Searched]
 ) -> None:
-    """Refuses a board whose markers lie otherwise than declared in most views that show it."""
+    """Refuses a board whose markers have another layout than declared in most views of it."""
     target, board_of = session.boards[name], session.board_of
-    mine = [pair for pair in zip(views, looks, strict=True) if board_of(pair[0]) == name]
-    misfits = [view for view, look in mine if look.misfit]
-    shown = sum(isinstance(look.found, Corners) for _, look in mine)
+    mine = [pair for pair in zip(views, searches, strict=True) if board_of(pair[0]) == name]
+    misfits = [view for view, search in mine if search.misfit]
+    shown = sum(isinstance(search.found, Corners) for _, search in mine)
     if not misfits or len(misfits) <= shown:
         return
     culprits = [f"view {misfit.number}" for misfit in misfits]
     if target.kind != "charuco":
-        reasons = [
-            rejection.reason for rejection in _rejections([look for _, look in mine if look.misfit])
-        ]
+        wrong = _rejections([search for _, search in mine if search.misfit])
+        reasons = [rejection.reason for rejection in wrong]
         usual = max(set(reasons), key=reasons.count)
         raise DataError(
             f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views another "
@@ -451,7 +448,7 @@ def _check_layout(
         decode_image(session.images.read(misfit.image)) for misfit in misfits[:_LAYOUT_SAMPLE]
     ]
     fitting = [fitting_layouts(image, target) for image in images if not isinstance(image, str)]
-    common = [target for target in fitting[0] if all(target in others for others in fitting)]
+    common = [layout for layout in fitting[0] if all(layout in others for others in fitting)]
     seen = (
         f"target {target.name!r}: in {len(misfits)} of {len(misfits) + shown} views the markers do "
         f"not lie as on a ChArUco board of {target.columns} x {target.rows} squares with "

@@ -1,4 +1,4 @@
-"""Whether the residuals are noise: what they show beyond it, in words."""
+"""Residual tests for drift, steps and correlated errors, and their findings."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,25 +31,25 @@ from visioncal.estimation.slight_steps import (
 )
 from visioncal.estimation.solve import Solution
 
-# What may be otherwise from some stop on.
+# A change from some stop on: of a frame, a joint's offset or a board's size.
 Step: TypeAlias = Move | Slip | Resized
 _THINGS = {"cam": "The camera", "target": "The target", "instrument": "The instrument"}
-# Fewer stops than this leave no residuals to be tested.
+# Fewest stops whose residuals can be tested.
 _FEWEST_STOPS = 6
-# Of two steps, one is clearly the likelier where it is so by odds of a hundred to one.
+# Log-likelihood ratio, doubled, by which one step is clearly likelier: odds of a hundred to one.
 _CLEARLY = 2.0 * float(np.log(100.0))
 
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """What the residuals of one robot's stops show beyond noise.
+    """Deviations of the residuals of one robot's stops from noise.
 
     Attributes:
-        alike: Whether neighbouring stops err alike; None of an arm whose joints are not known,
-            whose covariance has that.
-        moved: How its base or what it looks at crept; None where noise explains it.
-        step: What moved at once, and where that explains more than a creep does.
-        rival: What explains about as much as that; None where nothing does.
+        alike: Correlation of neighbouring stops; None for an arm whose joints are not known, as
+            its covariance includes that.
+        moved: Drift of its base or of what it observes; None where noise explains it.
+        step: Sudden change that explains more than a drift; None without one.
+        rival: Another step that explains about as much; None without one.
     """
 
     alike: Neighbours | None
@@ -64,91 +64,88 @@ def misfits(
     errors: Mapping[str, ArmErrors],
     offsets: Mapping[str, FloatArray] = MappingProxyType({}),
 ) -> dict[str, ResidualTest]:
-    """Tests the residuals of each robot's stops for what is no noise; of few stops, none.
+    """Tests the residuals of each robot with enough stops for deviations from noise.
 
     Args:
-        problem: The observations, their stops in the order of the session.
-        fit: Their fit, at rest.
-        errors: Those of arms whose joints are not known, by the robot.
-        offsets: (s, 6, n) of the others, how their flanges move with the offsets of their joints.
+        problem: The observations, with stops in the order of the session.
+        fit: Their converged fit.
+        errors: Errors of arms whose joints are not known, by robot.
+        offsets: (s, 6, n) Jacobian of the flange by joint offsets, for the other robots.
     """
     robots = [robot for robot in problem.robots if len(stops_of(problem, robot)) >= _FEWEST_STOPS]
-    # Frames are those of all robots: what moved is sought once, and said once.
+    # Robots share frames: steps are searched, and reported, once for all of them.
     slight = _slight_move(problem, fit) if robots else None
     slipped = slipped_joint(
         problem, fit, {robot: offsets[robot] for robot in robots if robot in offsets}
     )
     resized = resized_board(problem, fit) if robots else None
-    found: dict[str, ResidualTest] = {}
+    tests: dict[str, ResidualTest] = {}
     for robot in robots:
         fitted = (problem, fit.state, fit.noise, robot)
-        crept, arm = drift(*fitted), errors.get(robot)
+        drifted, arm = drift(*fitted), errors.get(robot)
         alike = None if arm else neighbours(*fitted)
-        steps = _steps(problem, fit, (slight, slipped, resized), crept)
-        # What a process over postures or time explains as well is no motion.
+        steps = _steps(problem, fit, (slight, slipped, resized), drifted)
+        # Motion that arm errors, correlated by posture or time, explain as well is not reported.
         if arm:
-            beside = [*_beside_errors(problem, fit, steps, arm, robot)]
-            steps = sorted(beside, key=lambda step: -step.mahalanobis_sq)
-        if arm and crept and crept.mahalanobis_sq < arm.gain:
-            crept = None
+            beside_errors = _beside_errors(problem, fit, steps, arm, robot)
+            steps = sorted(beside_errors, key=lambda step: -step.mahalanobis_sq)
+        if arm and drifted and drifted.mahalanobis_sq < arm.gain:
+            drifted = None
         if steps:
-            # Before and after it, neighbours err alike because of it.
-            known = any(test.step for test in found.values())
+            # The step itself makes the errors of neighbouring stops correlate.
+            is_reported = any(test.step for test in tests.values())
             first, second = (*steps, None)[:2]
-            found[robot] = ResidualTest(None, None, *(() if known else (first, second)))
+            tests[robot] = ResidualTest(None, None, *(() if is_reported else (first, second)))
         else:
-            found[robot] = ResidualTest(alike, crept)
-    return found
+            tests[robot] = ResidualTest(alike, drifted)
+    return tests
 
 
 def _slight_move(problem: Problem, fit: Solution) -> Move | None:
     """The most significant step of a frame; None where noise explains all of them."""
-    # A push is in the noise of places alone, and makes up most of it: no test by the noise of all
-    # residuals finds it beside few views.
+    # A push shifts positions alone, and dominates their noise: with few views, no test by the noise
+    # of all residuals finds it.
     frames = tuple(problem.unknown)
-    pushed = slight_move(problem, fit, frames, kinds=2)
-    if pushed is None:
+    push = slight_move(problem, fit, frames, kinds=2)
+    if push is None:
         return None
-    if (found := slight_move(problem, fit, frames)) is not None:
-        return found
-    gain, *_ = evidence_gain(problem, fit, pushed)
-    return pushed if gain - _price(problem) > _CLEARLY else None
+    if (move := slight_move(problem, fit, frames)) is not None:
+        return move
+    gain, *_ = evidence_gain(problem, fit, push)
+    return push if gain - _search_penalty(problem) > _CLEARLY else None
 
 
 def _steps(
-    problem: Problem,
-    fit: Solution,
-    found: Sequence[Step | None],
-    crept: Drift | None,
+    problem: Problem, fit: Solution, candidates: Sequence[Step | None], drifted: Drift | None
 ) -> list[Step]:
-    """What moved at once, where that explains the residuals better than a creep from end to end."""
-    # A joint's or a size's has one number where a frame's has six, of which each must gain by as
-    # much as the Bayesian information criterion asks for (Schwarz 1978).
-    price = _price(problem)
-    each = float(np.log(problem.observations.directions.sum()))
+    """Steps that explain the residuals better than a drift does, most likely first."""
+    # The move of a frame has six parameters, a joint's offset or a board's size one: each is
+    # penalised as in the Bayesian information criterion (Schwarz 1978).
+    penalty = _search_penalty(problem)
+    per_parameter = float(np.log(problem.observations.directions.sum()))
     likely: list[tuple[float, Step]] = []
-    least = log_gain(problem, fit, crept.mahalanobis_sq) if crept else 0.0
-    for move in found:
-        gain = log_gain(problem, fit, move.mahalanobis_sq) - price if move else -np.inf
-        if move is None or gain < least:
+    least = log_gain(problem, fit, drifted.mahalanobis_sq) if drifted else 0.0
+    for step in candidates:
+        gain = log_gain(problem, fit, step.mahalanobis_sq) - penalty if step else -np.inf
+        if step is None or gain < least:
             continue
-        if not isinstance(move, Slip) and not leaves_noise(problem, fit, move):
+        if not isinstance(step, Slip) and not leaves_noise(problem, fit, step):
             continue
-        numbers = 6 if isinstance(move, Move) else 1
-        likely.append((gain - numbers * each, replace(move, mahalanobis_sq=gain)))
+        count = 6 if isinstance(step, Move) else 1
+        likely.append((gain - count * per_parameter, replace(step, mahalanobis_sq=gain)))
     likely.sort(key=lambda pair: -pair[0])
-    return [move for gain, move in likely if gain > likely[0][0] - _CLEARLY]
+    return [step for evidence, step in likely if evidence > likely[0][0] - _CLEARLY]
 
 
-def _price(problem: Problem) -> float:
-    """What a step has to gain more, as it may be at any stop and of any frame or joint."""
+def _search_penalty(problem: Problem) -> float:
+    """Penalty on the gain of a step, which may be at any stop and of any frame or joint."""
     return 2.0 * float(np.log(len(problem.unknown) * (1 + int(problem.observations.stops.max()))))
 
 
 def _beside_errors(
     problem: Problem, fit: Solution, steps: Sequence[Step], arm: ArmErrors, robot: str
 ) -> Iterator[Step]:
-    """The steps that a robot's errors do not explain, with what they gain beside these."""
+    """Steps that a robot's errors do not explain, with their gains beside these errors."""
     for step in steps:
         if isinstance(step, Slip):
             if step.mahalanobis_sq >= arm.gain:
@@ -158,9 +155,9 @@ def _beside_errors(
             continue
         gain, apart, there = evidence_gain(problem, fit, step)
         errors = find_pose_errors(apart, there.state, there.noise, robot)
-        beside = gain - _price(problem) + (errors.gain if errors else 0.0) - arm.gain
-        if beside > _CLEARLY:
-            yield replace(step, mahalanobis_sq=beside)
+        gain = gain - _search_penalty(problem) + (errors.gain if errors else 0.0) - arm.gain
+        if gain > _CLEARLY:
+            yield replace(step, mahalanobis_sq=gain)
 
 
 def doubts(
@@ -171,14 +168,14 @@ def doubts(
     *,
     calibrated: bool,
 ) -> Iterator[Finding]:
-    """Finds what of a robot's residuals is no noise, and what it probably is.
+    """Findings on deviations of a robot's residuals from noise.
 
     Args:
-        found: What the residuals show.
-        arm: The errors of an arm whose joints are not known.
-        cell: What the session calls its stops.
-        joint: Words a joint of a robot.
-        calibrated: Whether the arm was.
+        found: Results of the tests.
+        arm: Posture-dependent errors of the arm.
+        cell: The cell, for the names of its stops.
+        joint: Function that gives the joint of a slip in words.
+        calibrated: Whether the arm was calibrated.
     """
     alike, moved = found.alike, found.moved
     if arm is not None and arm.is_significant and not calibrated and arm.of_links:
@@ -197,9 +194,9 @@ def doubts(
             mahalanobis_sq=arm.gain,
         )
     if arm is not None and arm.is_significant and arm.look is not None:
-        yield _of_looks(arm, *(np.sqrt(3.0) * arm.look).tolist())
+        yield _arm_errors_finding(arm, *(np.sqrt(3.0) * arm.look).tolist())
     if found.step is not None:
-        yield _at_once(found.step, found.rival, cell, joint)
+        yield _step_finding(found.step, found.rival, cell, joint)
     if moved is not None:
         yield Finding(
             "moved_slowly",
@@ -217,13 +214,10 @@ def doubts(
         )
 
 
-def _at_once(
-    step: Step,
-    rival: Step | None,
-    cell: Cell,
-    joint: Callable[[Slip], str],
+def _step_finding(
+    step: Step, rival: Step | None, cell: Cell, joint: Callable[[Slip], str]
 ) -> Finding:
-    """Says what moved at once, and what may have in its place."""
+    """Finding on a step, and on a rival that may be the cause instead."""
     instead = (
         f" Or else, as these views leave it open: {_step_words(rival, cell, joint)}."
         if rival
@@ -249,7 +243,7 @@ def _at_once(
 
 def _step_words(step: Step, cell: Cell, joint: Callable[[Slip], str]) -> str:
     if isinstance(step, Slip):
-        # What is to be added to a reading so that it is the joint's angle, the other way round.
+        # The reading's change is opposite to the correction that gives the joint's angle.
         reads_deg, sigma_deg = (
             float(np.rad2deg(value)) for value in (-step.step_rad, step.sigma_rad)
         )
@@ -277,17 +271,17 @@ def _size(shift_m: float, turn_rad: float) -> str:
     return mm_and_deg(1e3 * shift_m, float(np.rad2deg(turn_rad)))
 
 
-def _of_looks(arm: ArmErrors, turned: float, shifted: float) -> Finding:
-    """What an arm does wrong whose joints are not known, by how far [rad, m] a look errs."""
+def _arm_errors_finding(arm: ArmErrors, turn_rad: float, shift_m: float) -> Finding:
+    """Finding on an arm whose joints are not known, with the rms error of a look [rad, m]."""
     away = ""
     if arm.away is not None:
-        there, predicted = (_size(float(place), float(turn)) for turn, place in arm.away)
-        away = f", at postures away from them by {there} (left out in turn; predicted {predicted})"
+        actual, predicted = (_size(float(shift), float(turn)) for turn, shift in arm.away)
+        away = f", at postures away from them by {actual} (left out in turn; predicted {predicted})"
     return Finding(
         "arm_errors",
         "Residuals follow the arm's posture, or last from stop to stop (likelihood ratio "
         f"{arm.gain:.0f}, noise stays under {SIGNIFICANT:.0f}): a look near the views errs by "
-        f"{_size(shifted, turned)} (rms){away}. More views will not help: joint angles or a "
+        f"{_size(shift_m, turn_rad)} (rms){away}. More views will not help: joint angles or a "
         "kinematic calibration of the arm will. What of its errors looks the same in all views is "
         "in no residual, and counts in the covariance.",
         NO_JOINTS,

@@ -1,4 +1,4 @@
-"""What speaks against a result: of what views, motion, corners and arms show."""
+"""Findings against a result, by its views, motion, corners and arms."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from visioncal.calibration.stages.cause_ranking import (
     MEASURE_BOARD,
     MOVED_AT_ONCE,
     NO_JOINTS,
-    adding,
+    add_views_remedy,
     run_evidence,
 )
 from visioncal.calibration.stages.findings import Findings, JudgedArm, JudgedPair, Sensor
@@ -20,7 +20,7 @@ from visioncal.core.types import Mount
 from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Remedy, look_at, or_alone
 from visioncal.results import Rms, ViewResult
 
-# Scatters under a nanometre and a micro-degree are rounding, and their ratios say nothing.
+# Scatter below a nanometre or a micro-degree is rounding, so that ratios mean nothing.
 _ROUNDING = 1e-6
 _LISTED_VIEWS, _LISTED_PARTS = 3, 3
 _CAMERA_CAUSES = (
@@ -33,23 +33,23 @@ _CAUSES: Mapping[Mount, str] = {
     "instrument": "an instrument or a tool that moved, readings paired with other poses, units or "
     "conventions of the poses",
 }
-# Limits of views whose poses were measured, over those of views with corners: of a board that is
-# seen squarely, sound ones are off by 8 times the median now and then.
+# Ratio of the outlier limit of measured poses to that of views with corners: sound poses of a board
+# that is seen squarely are off by 8 times the median now and then.
 _UNEVEN = 1.5
 # Kinds of findings about views that are left out.
 _LEFT_OUT = (EXCHANGED, "turned_images", "wrong_pose", "something_moved")
-# Views that disagree by less than so many times what their sensor's noise makes are explained: of a
-# small board far away, nothing better is to be had.
+# Largest ratio of residuals to those expected by the sensor's noise that counts as explained, as of
+# a small board far away.
 _OF_NOISE = 1.5
 
 
 def doubts_of(findings: Findings) -> list[Finding]:
-    """All that speaks against a result, in the order in which it is looked for."""
+    """All findings against a result, in the order of the checks."""
     limits = CalibrationLimits()
     robots = list(_robot_doubts(findings, limits))
     scatter = list(_scatter_doubts(findings, limits))
     if scatter:
-        # They are the measure then. Views that disagree do not make the robot's error smaller.
+        # Scatter replaces the robot's noise, and is accepted up to the same need at least.
         least = max((doubt.until_mm for doubt in robots), default=0.0)
         scatter = [replace(doubt, until_mm=max(doubt.until_mm, least)) for doubt in scatter]
         robots = []
@@ -59,7 +59,7 @@ def doubts_of(findings: Findings) -> list[Finding]:
         *(doubt for pair in pairs for doubt in _disagreement_doubts(pair)),
         *_outlier_doubts(findings, limits),
         *(doubt for pair in pairs for doubt in _holdout_doubts(pair, findings.mount, limits)),
-        # Sigmas of views that disagree wildly say nothing about the motion.
+        # With fatal scatter, sigmas say nothing about the motion.
         *(
             []
             if any(finding.is_fatal for finding in scatter)
@@ -78,15 +78,14 @@ def doubts_of(findings: Findings) -> list[Finding]:
 
 
 def is_scattered(findings: Findings) -> bool:
-    """Whether views disagree with each other by more than a sound cell's do."""
+    """Whether views disagree with each other by more than in a sound cell."""
     return any(_scatter_doubts(findings, CalibrationLimits()))
 
 
-def _warned(found: Finding, findings: Findings) -> Finding:
-    """A stage's warning, with what the result is without the views that it has left out."""
-    left_out = found.kind in _LEFT_OUT
-    without_it = _without(found.views, findings.held_out)
-    return replace(found, without_it=without_it) if left_out else found
+def _warned(warning: Finding, findings: Findings) -> Finding:
+    """A stage's warning, with the residuals of the other views where it left some out."""
+    without_it = _without(warning.views, findings.held_out)
+    return replace(warning, without_it=without_it) if warning.kind in _LEFT_OUT else warning
 
 
 def _without(views: Sequence[int], held_out: Rms) -> str:
@@ -94,11 +93,11 @@ def _without(views: Sequence[int], held_out: Rms) -> str:
     return f"Without {left_out}, the others predict each other to {held_out.words}."
 
 
-def _pairs(one: Rms, other: Rms) -> list[tuple[float, float]]:
-    """Two sets' residuals side by side: of position and, where both are known, of rotation."""
-    pairs = [(one.mm, other.mm)]
-    if one.deg is not None and other.deg is not None:
-        pairs.append((one.deg, other.deg))
+def _pairs(first: Rms, second: Rms) -> list[tuple[float, float]]:
+    """Residuals of two sets: of position and, where both are known, of rotation."""
+    pairs = [(first.mm, second.mm)]
+    if first.deg is not None and second.deg is not None:
+        pairs.append((first.deg, second.deg))
     return pairs
 
 
@@ -123,43 +122,43 @@ def _scatter_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
 
 
 def _is_of_arm(findings: Findings) -> bool:
-    """Whether what is uncertain is mostly what an arm does wrong whose joints are not known."""
+    """Whether most uncertainty comes from an arm whose joints are not known."""
     has_no_joints = any(warning.do is NO_JOINTS for warning in findings.warnings)
     return has_no_joints and _is_mostly_of(findings, "arm", "robot", "poses")
 
 
 def _is_of_board(findings: Findings) -> bool:
-    """Whether it is mostly how well boards are known, which no view tells."""
-    # A lens that is held has a part in what held values cost.
+    """Whether most uncertainty comes from the stated size of boards, which no view reduces."""
+    # Held values may include a lens.
     names = {name.partition(" of ")[0] for place in findings.places for name in place.budget_mm}
     held = () if "lens" in names else ("held values",)
     return _is_mostly_of(findings, "board", *held)
 
 
 def _is_mostly_of(findings: Findings, *sources: str) -> bool:
-    of_these = of_all = 0.0
+    of_sources = total = 0.0
     for place in findings.places:
         for name, mm in place.budget_mm.items():
-            of_these += mm**2 * name.startswith(sources)
-            of_all += mm**2 * (name == "total")
-    return of_these > 0.5 * of_all
+            of_sources += mm**2 * name.startswith(sources)
+            total += mm**2 * (name == "total")
+    return of_sources > 0.5 * total
 
 
 def helping(findings: Findings) -> Remedy | None:
-    """What makes a result less uncertain; None where that is said of the arm already."""
+    """Remedy that makes a result less uncertain; None where a finding on the arm has it."""
     if _is_of_board(findings):
         return MEASURE_BOARD
     if any(warning.do is NO_JOINTS for warning in findings.warnings):
         return None
     words = "Add views from other poses of the robot."
-    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
+    return add_views_remedy(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
 def _tilted(findings: Findings) -> Remedy:
     words = "Add 5 views or more, tilted by 20 to 40 degrees about different axes."
     if not all(arm.can_tilt for arm in findings.arms):
         words = "Add 5 views or more, all over the workspace and turned as far as the arm turns."
-    return adding(words, modelled=findings.plannable, purpose=findings.of_camera)
+    return add_views_remedy(words, modelled=findings.plannable, purpose=findings.of_camera)
 
 
 def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
@@ -178,8 +177,8 @@ def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
             if value is not None and value > max(check, _OF_NOISE * noise)
         ]
         if beyond:
-            away = " and ".join(name for name, _ in beyond)
-            words.append(f"{away} ({pair.name})" if pair.name else away)
+            sizes = " and ".join(name for name, _ in beyond)
+            words.append(f"{sizes} ({pair.name})" if pair.name else sizes)
             views += pair.views
             is_fatal |= any(flag for _, flag in beyond)
     if words:
@@ -206,7 +205,7 @@ def _worst_views(views: Sequence[ViewResult]) -> list[ViewResult]:
 
 
 def _disagreement_doubts(pair: JudgedPair) -> Iterator[Finding]:
-    """Names the views that were left out because they contradict the others."""
+    """Finding on outlier views of a pair."""
     out = pair.disagreeing
     if not out:
         return
@@ -227,19 +226,18 @@ def _disagreement_doubts(pair: JudgedPair) -> Iterator[Finding]:
         )
     )
     compared = sum(view.used for view in pair.views) + len(out)
-    found = Finding(
+    yield Finding(
         "something_moved" if run else "wrong_views",
         words,
         step,
         views,
         without_it=_without(views, pair.held_out),
         mahalanobis_sq=run_evidence(len(out), compared) if run else 0.0,
-    )
-    yield found.of(pair.name)
+    ).of(pair.name)
 
 
 def _run(pair: JudgedPair) -> str:
-    """Says so where the views that were left out follow each other, with no other between them."""
+    """Sentence on outlier views that are consecutive; empty where they are not."""
     out = [rejection.view for rejection in pair.disagreeing]
     compared = [view.view for view in pair.views if view.used or view.view in out]
     first = compared.index(out[0])
@@ -253,9 +251,8 @@ def _run(pair: JudgedPair) -> str:
 
 
 def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    """Names single views whose residual stands out from the others'."""
-    # Where the corners show how well each view sees the board, the consensus has judged them
-    # better.
+    """Findings on single views with outstanding residuals."""
+    # Where corners give the noise of each view, the outlier search has judged views better.
     if any(arm.away_mm is not None for arm in findings.arms):
         return
     for pair in findings.pairs:
@@ -275,17 +272,16 @@ def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[F
 def _outlying_views(
     views: Sequence[ViewResult], limit: float
 ) -> tuple[tuple[ViewResult, float], ...]:
-    """The used views whose residual is over so many times the median, with their ratios."""
+    """The used views whose ratio of residual to median is above a limit, with their ratios."""
     used = [view for view in views if view.used]
     if not used:
         return ()
-    away = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
-    ratios = (away / np.maximum(np.median(away, axis=0), _ROUNDING)).max(axis=1)
-    pairs = zip(used, ratios.tolist(), strict=True)
+    residuals = np.array([[view.residual_mm or 0.0, view.residual_deg or 0.0] for view in used])
+    ratios = (residuals / np.maximum(np.median(residuals, axis=0), _ROUNDING)).max(axis=1)
     return tuple(
-        (view, value)
-        for view, value in pairs
-        if value > (limit if view.rms_px is not None else _UNEVEN * limit)
+        (view, ratio)
+        for view, ratio in zip(used, ratios.tolist(), strict=True)
+        if ratio > (limit if view.rms_px is not None else _UNEVEN * limit)
     )
 
 
@@ -312,10 +308,10 @@ def _holdout_doubts(pair: JudgedPair, mount: Mount, limits: CalibrationLimits) -
 
 
 def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    """Judges the answer where it counts."""
-    # Edges are known in the arm's own frames. Those of a calibrated arm are as open as the errors
-    # of the first and the last link, which its poses make up for.
-    # What moved at once is in all that is known, and more views do not help.
+    """Findings on sigmas at points of interest and over the workspace."""
+    # Edges refer to the arm's own frames. Those of a calibrated arm are as undetermined as the
+    # errors of its first and last links, which compensate them in all poses.
+    # A step inflates all sigmas, and more views do not help.
     if any(warning.kind in MOVED_AT_ONCE for warning in findings.warnings):
         return
     if any(arm.workspace_mm is None for arm in findings.arms):
@@ -333,14 +329,14 @@ def _accuracy_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[
                 f"{figure(arm.workspace_mm)} mm (sigma, in the median; doubt begins at "
                 f"{limits.sigma_mm[0]:g}).{board if seen else ''}"
             )
-            step = adding(
+            step = add_views_remedy(
                 "Add views with other postures of the arm, all over the workspace.",
                 modelled=findings.plannable,
                 purpose=f" --for kinematics{findings.of_camera}",
             )
             is_fatal = arm.workspace_mm > limits.sigma_mm[1]
-            found = Finding("workspace", words, step, is_fatal=is_fatal, until_mm=0.0)
-            yield found.of(_robot(arm))
+            finding = Finding("workspace", words, step, is_fatal=is_fatal, until_mm=0.0)
+            yield finding.of(_robot(arm))
 
 
 def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
@@ -370,32 +366,29 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
             else f"Weakly determined by the motion, with their sigmas: {', '.join(weak)}; doubt "
             f"begins at {least}."
         )
+        step = Remedy(findings.tie.advice) if findings.tie else _tilted(findings)
         yield Finding(
             "weak_motion",
             words,
-            NO_JOINTS if of_arm else MEASURE_BOARD if of_board else _tied_or_tilted(findings),
+            NO_JOINTS if of_arm else MEASURE_BOARD if of_board else step,
             is_fatal=is_fatal,
             until_mm=0.0,
         )
 
 
-def _tied_or_tilted(findings: Findings) -> Remedy:
-    return Remedy(findings.tie.advice) if findings.tie else _tilted(findings)
-
-
 def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    """Says what makes the result uncertain where it is to be used."""
+    """Finding on the error budget of the worst point of interest."""
     beyond = [place for place in findings.places if place.budget_mm["total"] > limits.sigma_mm[0]]
-    # Where a lens and its mount make up for each other, what a camera sees is known better than
-    # what is stated in its frame.
+    # Where errors of a lens and its mount cancel, picks are more accurate than points in the
+    # camera's frame.
     if len(findings.places) == len(findings.picks) == 1:
         (picks,) = findings.picks
         beyond = beyond if picks.budget_mm["total"] > limits.sigma_mm[0] else []
     if not beyond:
         return
-    worst = max(beyond, key=lambda value: value.budget_mm["total"])
+    worst = max(beyond, key=lambda place: place.budget_mm["total"])
     budget = worst.budget_mm
-    parts = sorted((at for at in budget.items() if at[0] != "total"), key=lambda at: -at[1])
+    parts = sorted((part for part in budget.items() if part[0] != "total"), key=lambda at: -at[1])
     others = [
         f"{place.words} ({figure(place.budget_mm['total'])} mm)"
         for place in beyond
@@ -423,14 +416,14 @@ def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
             words = f"Only {counted} are used; {check} or more are needed to check the result."
             step, is_fatal = _tilted(findings), arm.stops < bad
             kind = "too_few_stops" if is_fatal else "few_stops"
-            found = Finding(kind, words, step, is_fatal=is_fatal, until_mm=0.0)
-            yield found.of(_robot(arm))
+            finding = Finding(kind, words, step, is_fatal=is_fatal, until_mm=0.0)
+            yield finding.of(_robot(arm))
 
 
 def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]:
     lost = sensor.lost
-    count_all = sensor.used + sensor.spared + len(lost)
-    share = len(lost) / max(count_all, 1)
+    total = sensor.used + sensor.spared + len(lost)
+    share = len(lost) / max(total, 1)
     if share > limits.lost_share[0]:
         details, disagree = "", {*sensor.disagreeing}
         others = [rejection for rejection in lost if rejection.view not in disagree]
@@ -440,11 +433,11 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
         if others:
             details += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             details += others[0].reason
-        words = f"{len(lost)} of {count_all} views are not used{details}."
-        words_do = "Correct the first of them and those like it, or repeat what is missing."
-        step = Remedy(words_do, look_at(others[0].view)) if others else None
+        words = f"{len(lost)} of {total} views are not used{details}."
+        advice = "Correct the first of them and those like it, or repeat what is missing."
+        step = Remedy(advice, look_at(others[0].view)) if others else None
         views, is_fatal = tuple(rejection.view for rejection in lost), share > limits.lost_share[1]
-        # Those that disagree have a finding of their own.
+        # Outliers have a finding of their own.
         kind = "lost_views" if others else "left_out"
         yield Finding(kind, words, step, views, is_fatal=is_fatal).of(sensor.name)
 
@@ -476,15 +469,15 @@ def _robot(arm: JudgedArm) -> str:
 
 
 def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
-    """An arm is a good instrument: what looks like its error is often something else's."""
-    # What chance makes of a good arm's noise, where poses are coarse, is no error. A task that
-    # needs ten times as much has an arm that is as good as it has to be.
+    """Findings on implausible noise of arms, which usually has another cause."""
+    # Only noise whose confidence interval is above the limit counts. For a task that needs ten
+    # times as much the arm is good enough.
     for arm in findings.arms:
         if arm.away_mm is None or arm.away_deg is None or arm.errs:
             continue
-        found_mm, found_deg = arm.surely or (arm.away_mm, arm.away_deg)
-        beyond = max(arm.away_mm / limits.robot_mm, arm.away_deg / limits.robot_deg)
-        if max(found_mm / limits.robot_mm, found_deg / limits.robot_deg) > 1.0:
+        least_mm, least_deg = arm.surely or (arm.away_mm, arm.away_deg)
+        ratio = max(arm.away_mm / limits.robot_mm, arm.away_deg / limits.robot_deg)
+        if max(least_mm / limits.robot_mm, least_deg / limits.robot_deg) > 1.0:
             words = (
                 "The residuals would take a flange that is off by "
                 f"{mm_and_deg(arm.away_mm, arm.away_deg)} from stop to stop; arms repeat to 0.1 mm."
@@ -499,5 +492,5 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
                 "this camera's, a model of the arm that is off by as much, or poses that were read "
                 "before the arm stood still (read one twice to see how well it repeats)."
             )
-            until_mm = 10.0 * beyond * limits.robot_mm
+            until_mm = 10.0 * ratio * limits.robot_mm
             yield Finding("unexplained", words, step, until_mm=until_mm).of(_robot(arm))

@@ -1,7 +1,4 @@
-"""What the stops say of the joints' springs: stiffnesses, and whether loads and bends fit.
-
-And of their play, where stops were approached from both sides.
-"""
+"""Joint stiffness and backlash by the stops, and the check of stated loads against deflections."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,28 +20,29 @@ from visioncal.estimation.bending import (
 )
 from visioncal.results.arm import ElasticResult, JointBacklash, JointSpring, LoadedStop, Sag
 
-# A joint is determined where the stops leave less than this share of its prior sigma.
+# A compliance is determined where its sigma is below this share of its prior sigma.
 _DETERMINED = 0.5
-# Torque on a joint from which on it counts as loaded [N m].
+# Least torque on a loaded joint [N m].
 _LOADED_NM = 0.05
+# Least compliance of a joint with a stiffness [sigma].
 _SURE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Elastic:
-    """The springs of an arm, and what the stops say of them.
+    """Compliances of an arm's joints, with the loads and deflections at the stops.
 
     Attributes:
-        springs: Joint by joint.
-        torques_nm: (m, n) on the joints at the stops [N m].
-        bends_rad: (m, n) how far each stop alone sees each joint bend [rad]; NaN where it cannot.
-        sag_mm: (m,) how far the loads of each stop move the flange [mm].
-        payload_kg: (m,) what it carried [kg].
-        payload: By which factor payload and force bend the arm beyond what is stated; None where
-            nothing hung on the flange.
+        springs: The springs, joint by joint.
+        torques_nm: (m, n) torques on the joints at the stops [N m].
+        bends_rad: (m, n) deflection of each joint by each stop alone [rad]; NaN where undetermined.
+        sag_mm: (m,) flange deflection under the loads of each stop [mm].
+        payload_kg: (m,) payload at each stop [kg].
+        payload: Ratio of the deflection under load to that expected from the stated load; None
+            without any load on the flange.
         weighs: Whether the model of the arm states the masses of its links.
-        weight_moments: (n, 4 n) how the joints yield to the weight of links whose masses are not
-            known (see `bent_joints`); None where they are, or where they hardly yield.
+        weight_moments: (n, 4 n) compliance of the joints to the weight of links of unknown mass
+            (see `bent_joints`); None where masses are known, or hardly matter.
     """
 
     springs: tuple[JointSpring, ...]
@@ -62,11 +60,7 @@ class Elastic:
         return tuple(spring.joint for spring in self.springs if not spring.determined)
 
     def result(self, views: Sequence[int]) -> ElasticResult:
-        """The springs as a section of a calibration.
-
-        Args:
-            views: (m,) by which views the stops go.
-        """
+        """The springs as a section of a calibration; `views` (m,) are those of the stops."""
         return ElasticResult(
             joints=self.springs,
             not_determined=self.rigid,
@@ -92,12 +86,7 @@ class Elastic:
 
 
 def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
-    """Tells what was found of the springs; None for a rigid arm.
-
-    Args:
-        arm: What was seen of it.
-        errors: Its errors by block, with their sizes before the stops were asked.
-    """
+    """Estimated springs of an arm, by its errors with prior sizes; None for a rigid one."""
     if not errors.keys() & {COMPLIANCE, WEIGHT}:
         return None
     model, q, loads = arm.model, arm.q, arm.loads
@@ -109,9 +98,9 @@ def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
         variances = np.diag(arm.arm_covariance)[model.place_of(COMPLIANCE)]
         sigmas = compliance_unit(model) * np.sqrt(variances)
         bends_rad = bends_seen(arm, torques)
-    determined = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _DETERMINED * prior)
+    is_determined = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _DETERMINED * prior)
     return Elastic(
-        tuple(_springs(model, np.minimum(sigmas, prior), determined, torques)),
+        tuple(_springs(model, np.minimum(sigmas, prior), is_determined, torques)),
         torques,
         bends_rad,
         1e3 * flange_bends(model, q, loads),
@@ -149,7 +138,7 @@ def _stiffness_words(spring: JointSpring) -> str:
 
 
 def remarks(elastic: Elastic) -> Iterator[str]:
-    """Says what was found of the springs, for the verdict."""
+    """Remarks on the springs, for the verdict."""
     words = ", ".join(filter(None, map(_stiffness_words, elastic.springs)))
     if words:
         yield (
@@ -177,7 +166,7 @@ def remarks(elastic: Elastic) -> Iterator[str]:
 
 
 def doubts(elastic: Elastic) -> Iterator[Finding]:
-    """Says where payload and bend do not fit together."""
+    """Findings where the stated load contradicts the deflection."""
     factor = elastic.payload
     if factor is not None and elastic.weighs and factor.is_off:
         more = "heavier or hangs farther out" if factor.value > 1.0 else "lighter or hangs nearer"
@@ -192,9 +181,10 @@ def doubts(elastic: Elastic) -> Iterator[Finding]:
 
 
 def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ...]:
-    """Tells the play of each joint; nothing where stops did not come from both sides.
+    """Backlash of each joint; empty where stops were not approached from both sides.
 
-    Joints lag. Where they lead as a whole, the column approach says which way they moved.
+    Joints lag behind their motion. Where they seem to lead as a whole, the column approach holds
+    the opposite direction, and the sign is turned.
 
     Args:
         model: The arm.
@@ -211,7 +201,7 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ..
 
 
 def play_remarks(plays: Sequence[JointBacklash]) -> Iterator[str]:
-    """Says which joints have play, for the verdict."""
+    """Remark on joints with significant backlash, for the verdict."""
     sure = [play for play in plays if play.is_sure]
     if not sure:
         return

@@ -1,4 +1,4 @@
-"""Which stops the observations fit that disagree with their own, and which are exchanged."""
+"""Search for other stops that outliers fit, and for pairs of exchanged rows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,8 +15,8 @@ from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.solve import Solution, by_noise_alone
 
-# An image fits another stop where it is as near to what is predicted there as noise may put it, and
-# twice as far: what is predicted has errors, too, and other stops are farther by far.
+# False-alarm probability of an observation at its own stop, and the factor on its squared distance
+# for other ones: the prediction has errors, too, and wrong stops are much farther.
 _CHANCE, _NEAR = 1e-3, 4.0
 
 
@@ -28,18 +28,18 @@ def other_stops(
     moves: Sequence[Move] = (),
     turns: Mapping[str, FloatArray] = MappingProxyType({}),
 ) -> dict[int, list[int]]:
-    """The other stops that observations fit which do not fit their own, best first.
+    """Other stops that outliers fit, best first, by observation.
 
     Args:
         problem: All n observations.
-        used: (n,) those that the fit was made from.
-        fit: The unknowns and the noise.
+        used: (n,) mask of those in the fit.
+        fit: The fit.
         out: Observations that are left out.
-        moves: What moved between stops.
+        moves: Frames that moved between stops.
         turns: (k, 4, 4) `target_from_turned` of targets that look the same turned, by frame.
     """
     seen = problem.observations
-    # Between the last stop before a move and the first one after it, either may be true.
+    # A move may have happened anywhere between the last stop before and the first one after it.
     late = {move.twin: move.stop for move in moves}
     early = {
         move.twin: int(seen.stops[seen.involves(move.frame) & used].max(initial=-1)) + 1
@@ -47,7 +47,7 @@ def other_stops(
     }
     found = {}
     for at in out.tolist():
-        # Of a target that looks the same turned, the pose was taken that fits its own stop best.
+        # The pose of a symmetric target was chosen to fit its own stop best.
         alike = turns.get(seen.observed[at].partition("@")[0], np.eye(4)[None])
         squares = np.min(
             [
@@ -57,7 +57,7 @@ def other_stops(
             ],
             axis=0,
         )
-        # Stops in one posture are no others: what fits one of them fits its own as well, or nearly.
+        # Stops in the same posture do not count: an observation fits its own about as well.
         limit = min(_NEAR * chi2_limit(_CHANCE, 6), squares[seen.stops[at]] / CLEAR_RATIO**2)
         near = np.flatnonzero(squares < limit)
         if len(near):
@@ -73,34 +73,34 @@ def _squares_by_stop(
     starts: Mapping[str, int],
     turn: FloatArray,
 ) -> FloatArray:
-    """Squared distances (s,) of an observation from what is predicted at every stop."""
-    # Infinite where a robot's pose is not known, or where no robot has a part in it. What moved is
-    # at its other place from the stops in `starts` on.
+    """Squared Mahalanobis distances (s,) of an observation from its prediction at every stop."""
+    # Infinite where a robot's pose is not known, or where no robot is in the chain. Frames that
+    # moved are at their second place from the stops in `starts` on.
     seen = problem.observations
     stops = np.arange(max(map(len, problem.poses.values()), default=0))
     repeated = np.full(len(stops), at)
     observer, observed = (pair[at].partition("@")[0] for pair in (seen.observers, seen.observed))
-    taken, turned = seen.take(repeated), adjoint(invert(turn))
-    here = replace(
-        taken,
+    copies, turned = seen.take(repeated), adjoint(invert(turn))
+    copies = replace(
+        copies,
         observers=(observer,) * len(stops),
         observed=(observed,) * len(stops),
         stops=stops,
-        measured=taken.measured @ turn,
-        covariance=turned @ taken.covariance @ turned.T,
+        measured=copies.measured @ turn,
+        covariance=turned @ copies.covariance @ turned.T,
     )
     for move in moves:
-        here = here.renamed(move.frame, move.twin, stops >= starts[move.twin])
+        copies = copies.renamed(move.frame, move.twin, stops >= starts[move.twin])
     effects = tuple(effect.take(repeated).carried(turned) for effect in problem.effects)
-    there = replace(problem, observations=here, effects=effects)
-    known, squares = _known(there), np.full(len(stops), np.inf)
-    if known.any() and any(step.robot for group in there.groups for step in group.path):
-        squares[known] = by_noise_alone(there.subset(known), fit)
+    at_stops = replace(problem, observations=copies, effects=effects)
+    known, squares = _has_robot_poses(at_stops), np.full(len(stops), np.inf)
+    if known.any() and any(step.robot for group in at_stops.groups for step in group.path):
+        squares[known] = by_noise_alone(at_stops.subset(known), fit)
     return squares
 
 
-def _known(problem: Problem) -> Mask:
-    """(n,) whether every robot in an observation's way has a known pose."""
+def _has_robot_poses(problem: Problem) -> Mask:
+    """Mask (n,) of observations with known poses of all robots in their chains."""
     known = np.ones(len(problem), dtype=bool)
     for group in problem.groups:
         for step in group.path:
@@ -111,17 +111,12 @@ def _known(problem: Problem) -> Mask:
 
 
 def exchanged(problem: Problem, fitting: Mapping[int, Sequence[int]]) -> dict[int, int]:
-    """Pairs of observations of the same two frames, of which each fits the other's stop.
-
-    Args:
-        problem: All observations.
-        fitting: The other stops that some of them fit; see `other_stops`.
-    """
-    seen, found = problem.observations, {}
+    """Pairs of observations that each fit the other's stop, by the result of `other_stops`."""
+    seen, pairs = problem.observations, {}
     first = [observer.partition("@")[0] for observer in seen.observers]
     second = [name.partition("@")[0] for name in seen.observed]
     for a, b in combinations(sorted(fitting), 2):
         alike = (first[a], second[a]) == (first[b], second[b])
         if alike and seen.stops[b] in fitting[a] and seen.stops[a] in fitting[b]:
-            found[a], found[b] = b, a
-    return found
+            pairs[a], pairs[b] = b, a
+    return pairs

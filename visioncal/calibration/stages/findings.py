@@ -1,4 +1,4 @@
-"""What a verdict is made of: cameras, robots and targets as the fit has them."""
+"""Inputs of the verdict: the quality of sensors, robots and pairs in the fit."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,14 +14,14 @@ from visioncal.session.frames import thing_name
 
 @dataclass(frozen=True)
 class JudgedPair:
-    """What one camera or instrument saw of one target.
+    """Views of one target by one camera or instrument.
 
     Attributes:
-        views: What became of each view.
-        disagreeing: Those whose robot pose and image do not belong together.
-        name: Both, by name; empty where there are no others.
-        noise: What the sensor's own noise makes of its views.
-        away: `held_out` with the same weights as `noise`; None where all views weigh alike.
+        views: Result of each view.
+        disagreeing: Outliers: views whose robot pose and image do not belong together.
+        name: Names of both; empty for a single pair.
+        noise: Expected residuals by the sensor's own noise.
+        away: `held_out` with the weights of `noise`; None where all views have equal weights.
     """
 
     views: Sequence[ViewResult]
@@ -32,12 +32,12 @@ class JudgedPair:
 
     @property
     def held_out(self) -> Rms:
-        """Residuals of the used ones, left out in turn."""
+        """Residuals of the used views, left out in turn."""
         return left_out_rms(self.views)
 
     @property
     def holdout(self) -> Rms | None:
-        """Residuals of those held back by the session; None where there are none."""
+        """Residuals of the views held back by the session; None without any."""
         return holdout_rms(self.views)
 
 
@@ -46,13 +46,13 @@ class Sensor:
     """A camera or an instrument.
 
     Attributes:
-        used: How many of its views are used.
-        lost: Those that could not be; those held back on purpose are not among them.
-        disagreeing: How many of these have a robot pose and an image that do not belong together.
+        used: Number of its used views.
+        lost: Rejected views, without those held back on purpose.
+        disagreeing: The outliers among these.
         pixel_px: Noise of a corner's coordinate; None without images [px].
-        level: By how much more its poses scatter than their noise says.
-        spared: How many were not needed, as others stand for them.
-        name: Its frame; empty where there is no other.
+        level: Ratio of the scatter of its poses to their predicted noise.
+        spared: Number of redundant views that were not needed.
+        name: Its frame; empty for a single sensor.
     """
 
     used: int
@@ -69,17 +69,17 @@ class JudgedArm:
     """A robot.
 
     Attributes:
-        stops: At how many stops it has a part in the fit.
+        stops: Number of its stops in the fit.
         away_mm: Noise of its flange; None where that cannot be separated from the cameras' [mm].
         away_deg: The same in rotation [deg].
-        surely: Ends of their 95 % intervals below [mm, deg]; as found where None.
-        errs: Whether its errors follow its posture, which is said elsewhere.
-        workspace_mm: Predicted sigma of a tool's place all over a calibrated arm's workspace, in
-            the median; None for a nominal arm [mm].
+        surely: Lower ends of their 95 % intervals [mm, deg]; None for the estimates themselves.
+        errs: Whether it has posture-dependent errors, which have a finding of their own.
+        workspace_mm: Median predicted position sigma of a calibrated arm's tool over the workspace;
+            None for a nominal arm [mm].
         modelled: Whether its model is known.
-        by_functions: Whether functions of its joints follow the very stops of the fit.
+        by_functions: Whether joint error functions were fitted to the stops.
         can_tilt: Whether its flange turns about more than one direction.
-        name: Its name; empty where there is no other.
+        name: Its name; empty for a single robot.
     """
 
     stops: int
@@ -96,12 +96,12 @@ class JudgedArm:
 
 @dataclass(frozen=True)
 class PointAccuracy:
-    """How well a place is known where it counts.
+    """Accuracy of a point of interest.
 
     Attributes:
-        words: What it is, in words.
+        words: The point in words.
         budget_mm: Its standard deviation by source, and as a `total` [mm].
-        radius95_mm: It is right to within this in 95 % of cases [mm].
+        radius95_mm: Radius of 95 % probability [mm].
     """
 
     words: str
@@ -111,12 +111,7 @@ class PointAccuracy:
 
 @dataclass(frozen=True)
 class StandingTie:
-    """That one view of what stands still ties a part of a cell to the rest.
-
-    Attributes:
-        words: Which view that is, as a part of a sentence.
-        advice: What to do about it, in a sentence.
-    """
+    """Single view of static frames that alone connects a part of a cell; in words, with advice."""
 
     words: str
     advice: str
@@ -124,21 +119,18 @@ class StandingTie:
 
 @dataclass(frozen=True)
 class Findings:
-    """What the verdict is made of.
+    """Inputs of the verdict.
 
     Attributes:
-        pairs: What each camera saw of each target.
-        sensors: The cameras and instruments.
-        arms: The robots.
-        worst: The worst directions of the unknown edges; the first is named in a good verdict. None
-            of those of a cell that take up what is open of a calibrated arm.
-        places: How well places are known; likewise.
-        warnings: What earlier stages had to say.
-        notes: What of it is no reason for doubt.
-        mount: What observed whom.
-        need: What the task needs; None where that is not said.
-        picks: What picks err by, by each camera and robot; empty where that is not predicted.
-        tie: What alone ties the frame that is known worst; None where more does.
+        worst: Directions of the unknown edges with the largest sigmas; the first is named in a good
+            verdict. Edges that absorb undetermined errors of a calibrated arm are left out.
+        places: Accuracy of points of interest, without the same edges.
+        warnings: Findings of earlier stages.
+        notes: Their remarks that are no reason for doubt.
+        mount: Mount of the sensor.
+        need: Required accuracy; None where it is not stated.
+        picks: Error budgets of picks by camera and robot; empty where they are not predicted.
+        tie: The only connection of the worst frame; None where there are more.
     """
 
     pairs: Sequence[JudgedPair]
@@ -155,13 +147,13 @@ class Findings:
 
     @property
     def plannable(self) -> bool:
-        """Whether views can be proposed: of cameras, by arms whose models are known."""
+        """Whether views can be planned: for cameras, by arms with known models."""
         has_images = any(sensor.pixel_px is not None for sensor in self.sensors)
         return has_images and all(arm.modelled for arm in self.arms)
 
     @property
     def of_camera(self) -> str:
-        """The option that names, of several cameras that a robot looks with, the least known."""
+        """Command option for the least accurate of several cameras; empty for one."""
         cameras = dict.fromkeys(pick.camera for pick in self.picks)
         if len({sensor.name for sensor in self.sensors}) < 2 or not cameras:
             return ""
@@ -176,7 +168,7 @@ class Findings:
 
     @property
     def views(self) -> tuple[ViewResult, ...]:
-        """What became of each view."""
+        """Result of each view."""
         return tuple(view for pair in self.pairs for view in pair.views)
 
     @property
@@ -186,7 +178,7 @@ class Findings:
 
     @property
     def held_out(self) -> Rms:
-        """Residuals of all of them, left out in turn."""
+        """Residuals of all used views, left out in turn."""
         return left_out_rms(self.views)
 
 

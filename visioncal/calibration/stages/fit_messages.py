@@ -1,4 +1,4 @@
-"""What the joint fit found of lenses and boards, in sentences for the user."""
+"""Findings of the joint fit on lenses and boards."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,13 +29,13 @@ from visioncal.estimation.solve import covariance_of, held_shift
 from visioncal.session.frames import frame_name
 from visioncal.vision.camera import normalise, project
 
-# A rig that is as stated seems not to be in one session of ten thousand.
+# False-alarm probability of the test of a rig's points.
 _FALSE_ALARM = 1e-4
-# Rigs are measured and made to so much, as a share.
+# Manufacturing accuracy of rigs, as a share of their size.
 _SAME_SIZE = 5e-4
-# Intrinsics that move by less, or corners by less, show in no image [px].
+# Changes of intrinsics or corners below this show in no image [px].
 _LEAST_MOVE_PX = 0.1
-# No printed board is as it was drawn to less [m].
+# Accuracy of printed boards [m].
 _LEAST_BEND_M = 1e-5
 _NEW_LENS = Remedy(
     "In session.toml, delete matrix and distortion, so that they are estimated, or calibrate "
@@ -47,35 +47,35 @@ _NEW_LENS = Remedy(
 def found_of_looks(
     side: Side, fitted: ConvergedFit, covariance: FloatArray, stated: Problem | None
 ) -> Iterator[Finding]:
-    """Says what a joint fit found of lenses and boards; what is no reason for doubt is a note.
+    """Findings of a joint fit on lenses and boards; those without reason for doubt are notes.
 
     Args:
         side: The frames' side of the fit.
-        fitted: The answer.
-        covariance: (p, p) of its unknowns, with all that counts beside the noise.
-        stated: The same observations with arms as stated; None where none was calibrated.
+        fitted: The converged fit.
+        covariance: (p, p) covariance of its unknowns, including other errors than noise.
+        stated: The same observations with nominal arms; None where none was calibrated.
     """
     looks = fitted.looks
     cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
     for (camera, problem), compressed in cameras:
         moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
-        scattered = _noise_found(
+        noise = _noise_findings(
             problem.stack, compressed.residuals, problem.unknowns(compressed, moving)
         )
         of = "" if camera == ONLY_CAMERA else camera
-        yield from (finding.of(of) for finding in (*scattered, *_lens_found(fitted, camera)))
+        yield from (finding.of(of) for finding in (*noise, *_lens_findings(fitted, camera)))
     scene = next(iter(looks.problems.values())).scene
     for board, target in enumerate(scene.targets):
         if board not in looks.printed:
-            yield from _points_found(target, looks.moved_points(board))
+            yield from _point_findings(target, looks.moved_points(board))
             frame = frame_name("target", scene.names[board])
             measured = measured_rig(side, fitted, frame, board)
             if stated is not None:
                 measured = rig_by_stated_arms(fitted, stated, frame, board) or measured
-            yield from _rig_size_found(target, measured)
+            yield from _rig_size_findings(target, measured)
             continue
         called = f"board {scene.names[board]}".strip()
-        if _moves(fitted, looks.scale_of(board)):
+        if _is_free(fitted, looks.scale_of(board)):
             (place,) = looks.scale_of(board)
             at = fitted.columns.start + int(np.searchsorted(fitted.seen.free, place))
             measured = measured_scale(side, fitted, board)
@@ -83,12 +83,12 @@ def found_of_looks(
                 measured, scale=float(looks.values[place]), sigma=float(covariance[at, at] ** 0.5)
             )
             yield scale_found(called, target, measured, written)
-        if _moved(fitted, looks.shape_of(board)):
-            yield _shape_found(fitted, board, called)
+        if _has_changed(fitted, looks.shape_of(board)):
+            yield _shape_finding(fitted, board, called)
 
 
-def _noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> Iterator[Finding]:
-    """Finds whether corners scatter otherwise than corners.csv states; less is no doubt."""
+def _noise_findings(stack: CornerStack, residuals: FloatArray, unknowns: int) -> Iterator[Finding]:
+    """Finding where the scatter of corners contradicts corners.csv; a note where it is less."""
     stated, shown = stack.stated_px, stack.shown_px(residuals, unknowns)
     if stated is None or not stack.contradicts(residuals, unknowns):
         return
@@ -109,7 +109,7 @@ def _noise_found(stack: CornerStack, residuals: FloatArray, unknowns: int) -> It
     )
 
 
-# What square_m is of a target that has no squares, and its name in the target's file.
+# Meaning of square_m for targets without squares, and its key in the target's file.
 _SIDES = {
     "aprilgrid": ("tags", "size_m"),
     "marker": ("a side", "size_m"),
@@ -120,19 +120,15 @@ _SIDES = {
 def scale_found(
     board: str, target: Target, measured: MeasuredScale, written: MeasuredScale
 ) -> Finding:
-    """Words another size than the file states; a note where that allows it.
+    """Finding on a board of another size than stated; a note where its stated sigma allows it.
 
-    Args:
-        board: What the board is called.
-        target: It, as stated.
-        measured: What the robot's motion says.
-        written: What the result has, with all that counts beside the noise.
+    `measured` is the scale by the robot's motion, `written` that of the result, with its total
+    sigma.
     """
     side, share = 1e3 * target.square_m, f"{figure(100 * measured.stated_sigma)} %"
     what, key = _SIDES.get(target.kind, ("squares", "square_m"))
     size = (
-        f"By the robot's motion the {board} is "
-        f"{figure(100 * abs(written.scale))} % "
+        f"By the robot's motion the {board} is {figure(100 * abs(written.scale))} % "
         f"{'larger' if written.scale > 0 else 'smaller'} than stated (sigma "
         f"{figure(100 * written.sigma)} %)"
     )
@@ -155,33 +151,30 @@ def scale_found(
     )
 
 
-def _shape_found(fitted: ConvergedFit, board: int, called: str) -> Finding:
-    """Words a board that is bent, longer one way than the other, or sheared; a note of the least.
-
-    Of these, what is more than chance is worded; all of them together are.
-    """
+def _shape_finding(fitted: ConvergedFit, board: int, called: str) -> Finding:
+    """Finding on a bent, stretched or sheared board; a note within the accuracy of printing."""
     looks = fitted.looks
     shape = looks.shape_of(board)
     aspect, *bends, shear = shape
     drawn = looks.with_values(shape, np.zeros(len(shape))).corners[board]
-    away = float(np.linalg.norm(looks.corners[board] - drawn, axis=1).max())
-    if away < _LEAST_BEND_M:
+    largest_m = float(np.linalg.norm(looks.corners[board] - drawn, axis=1).max())
+    if largest_m < _LEAST_BEND_M:
         return Finding(
-            NOTE, f"The {called} is within {figure(1e3 * away)} mm of its drawing, size aside."
+            NOTE, f"The {called} is within {figure(1e3 * largest_m)} mm of its drawing, size aside."
         )
     parts, steps = [], []
-    if _moved(fitted, np.array([aspect])):
+    if _has_changed(fitted, np.array([aspect])):
         longer = float(looks.values[aspect])
         far, near = ("y", "x") if longer > 0 else ("x", "y")
         parts.append(
             f"longer along its {far} than along its {near}, by {figure(100 * abs(longer))} %"
         )
-    if _moved(fitted, np.array([shear])):
+    if _has_changed(fitted, np.array([shear])):
         corner_deg = 90.0 - np.rad2deg(float(looks.values[shear]))
         parts.append(f"sheared: its rows and columns meet at {corner_deg:.3f} deg")
     if parts:
         steps.append("Print it anew on another printer.")
-    if _moved(fitted, np.array(bends)) or not parts:
+    if _has_changed(fitted, np.array(bends)) or not parts:
         depth = figure(1e3 * float(np.ptp(looks.corners[board][:, 2])))
         parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")
         steps.insert(0, "Put the board on a stiff, flat plate, and record again.")
@@ -192,8 +185,8 @@ def _shape_found(fitted: ConvergedFit, board: int, called: str) -> Finding:
     )
 
 
-def _points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
-    """Whether a rig's points lie farther from where its table has them than it says."""
+def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
+    """Finding where a point of a rig contradicts the rig's table."""
     if not target.point_sigmas_m:
         return
     if not len(moved_m):
@@ -204,20 +197,21 @@ def _points_found(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
         )
         return
     sigmas = np.array(target.point_sigmas_m)
-    away = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)
-    worst = int(np.argmax(away / sigmas))
-    if (away[worst] / sigmas[worst]) ** 2 > chi2_limit(_FALSE_ALARM / len(sigmas), 3):
+    distances = np.linalg.norm(moved_m.reshape(-1, 3), axis=1)
+    worst = int(np.argmax(distances / sigmas))
+    if (distances[worst] / sigmas[worst]) ** 2 > chi2_limit(_FALSE_ALARM / len(sigmas), 3):
         yield Finding(
             "board_shape",
             f"Point {target.point_numbers[worst]} of target {target.name} lies "
-            f"{figure(1e3 * float(away[worst]))} mm from where its table has it, which is stated "
-            f"to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by both.",
+            f"{figure(1e3 * float(distances[worst]))} mm from where its table has it, which is "
+            f"stated to {figure(1e3 * float(sigmas[worst]))} mm (sigma_m). The result goes by "
+            "both.",
             Remedy("Measure the point again."),
         )
 
 
-def _rig_size_found(target: Target, measured: MeasuredScale) -> Iterator[Finding]:
-    """Whether a rig is larger or smaller than its table, by the robot's motion."""
+def _rig_size_findings(target: Target, measured: MeasuredScale) -> Iterator[Finding]:
+    """Finding on a rig of another size than its table states, by the robot's motion."""
     if not measured.is_another or abs(measured.scale) < _SAME_SIZE:
         return
     word = "larger" if measured.scale > 0 else "smaller"
@@ -236,7 +230,7 @@ def _rig_size_found(target: Target, measured: MeasuredScale) -> Iterator[Finding
     )
 
 
-def _lens_found(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
+def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
     looks = fitted.looks
     problem, lens = looks.problems[camera], looks.lens_of(camera)
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
@@ -245,8 +239,8 @@ def _lens_found(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
             f"{len(problem.stack.views)} views leave too little to judge by."
         )
         yield Finding("remark", words, Remedy("Show a board with more corners, or more views."))
-    moved = np.intersect1d(lens, fitted.moving)
-    if not problem.scene.estimated and len(moved) and _moved(fitted, moved):
+    free = np.intersect1d(lens, fitted.moving)
+    if not problem.scene.estimated and len(free) and _has_changed(fitted, free):
         is_exact = problem.scene.matrix_sigma_px is None
         steps = (looks.values - looks.stated)[lens[:4]]
         words, do = other_images(problem.scene.camera, looks.values[lens[:4]])
@@ -254,35 +248,29 @@ def _lens_found(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
             yield Finding("lens", f"{words} It was refined.", Remedy(do, CALIBRATE))
         else:
             is_wrong = is_exact or contradicted_lens(fitted, camera)
-            moved_px = _corners_moved_px(problem, looks.camera(camera))
-            yield lens_found(steps, is_doubtful=is_wrong and moved_px > _LEAST_MOVE_PX)
+            moved_px = _largest_shift_px(problem, looks.camera(camera))
+            yield _refined_lens_finding(steps, is_doubtful=is_wrong and moved_px > _LEAST_MOVE_PX)
     if problem.contested:
         at = np.arange(fitted.problem.size)[fitted.columns]
         at = at[np.searchsorted(fitted.seen.free, lens[:4])]
         moves = held_shift(fitted.problem, fitted.fit)[at]
         if np.abs(moves).max() > _LEAST_MOVE_PX:
-            known = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
-            squared = float(moves @ np.linalg.solve(known, moves))
-            yield replace(_contest_found(problem.scene, moves), mahalanobis_sq=squared)
+            covariance = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]
+            squared = float(moves @ np.linalg.solve(covariance, moves))
+            yield replace(_held_lens_finding(problem.scene, moves), mahalanobis_sq=squared)
 
 
-def _corners_moved_px(problem: CornerProblem, refined: Camera) -> float:
-    """By how much a refined lens moves any corner that was seen, its ray being what it was [px]."""
+def _largest_shift_px(problem: CornerProblem, refined: Camera) -> float:
+    """Largest shift of a corner by a refined lens, with its ray held [px]."""
     stated = problem.scene.camera
     plane = normalise(stated, problem.stack.px)
     rays = np.column_stack([plane, np.ones(len(plane))])
-    moved = np.linalg.norm(project(refined, rays) - project(stated, rays), axis=1)
-    return float(np.nanmax(moved, initial=0.0))
+    shifts = np.linalg.norm(project(refined, rays) - project(stated, rays), axis=1)
+    return float(np.nanmax(shifts, initial=0.0))
 
 
-def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
-    """Words given intrinsics that were refined; a note where they are no reason for doubt.
-
-    Args:
-        steps_px: (4,) by how much fx, fy, cx, cy moved [px].
-        is_doubtful: Whether they were taken for exact, or for better than they are, and corners
-            show it.
-    """
+def _refined_lens_finding(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
+    """Finding on refined intrinsics, by the steps (4,) of fx, fy, cx, cy [px]; a note if sound."""
     if is_doubtful:
         return Finding(
             "lens",
@@ -297,8 +285,8 @@ def lens_found(steps_px: FloatArray, *, is_doubtful: bool) -> Finding:
     )
 
 
-def _contest_found(scene: Scene, moves_px: FloatArray) -> Finding:
-    """Words intrinsics that stay although the corners speak against them."""
+def _held_lens_finding(scene: Scene, moves_px: FloatArray) -> Finding:
+    """Finding on intrinsics that are held although the corners contradict them."""
     why = (
         'intrinsics = "hold" keeps them'
         if scene.mode == "hold"
@@ -312,15 +300,14 @@ def _contest_found(scene: Scene, moves_px: FloatArray) -> Finding:
     )
 
 
-def _moves(fitted: ConvergedFit, places: IntArray) -> bool:
+def _is_free(fitted: ConvergedFit, places: IntArray) -> bool:
     return bool(np.isin(places, fitted.moving).all())
 
 
-def _moved(fitted: ConvergedFit, places: IntArray) -> bool:
-    """Whether values were moved from what is stated by more than chance."""
-    return _moves(fitted, places) and moved_mahalanobis_sq(fitted, places) > chance_limit(
-        len(places)
-    )
+def _has_changed(fitted: ConvergedFit, places: IntArray) -> bool:
+    """Whether values differ significantly from the stated ones."""
+    limit = chance_limit(len(places))
+    return _is_free(fitted, places) and moved_mahalanobis_sq(fitted, places) > limit
 
 
 def _px(values: FloatArray) -> str:

@@ -1,4 +1,4 @@
-"""The unknown edges of one robot and one camera, AX = XB and AX = ZB, by every closed form."""
+"""Hand-eye calibration by closed forms, AX = XB and AX = ZB, for one robot and one camera."""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -18,9 +18,9 @@ SOLVER_NAMES: tuple[str, ...] = get_args(SolverName)
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """All edges (1 + b, 4, 4) by one solver, and the scatter of the targets that they leave.
+    """Edges (1 + b, 4, 4) by one solver, and the rms scatter of the targets.
 
-    That of their rotation is None where places alone were read.
+    The scatter of rotation is None where only positions were measured.
     """
 
     edges: FloatArray
@@ -29,43 +29,43 @@ class Answer:
 
 
 def compare_solvers(problem: Problem, state: State, mount: Mount, solver: str) -> dict[str, Answer]:
-    """What every solver makes of the same views, by its name.
+    """Results of all solvers for the same views, by solver.
 
     Args:
-        problem: What was measured; its unknown frames are the camera's and the targets'.
-        state: The answer.
-        mount: Where the camera is.
-        solver: Whose it is.
+        problem: The measurements; the unknown frames are the camera's and the targets'.
+        state: The fitted state.
+        mount: Mount of the camera.
+        solver: Solver of the fitted state.
 
     Returns:
-        The answer first where it is the joint fit's, then every closed form where poses were read.
+        The joint fit's result, where it is the solver; closed forms, where poses were measured.
     """
-    found = {"joint": state} if solver == "joint" else {}
+    states = {"joint": state} if solver == "joint" else {}
     if not problem.points:
-        found |= {name: closed_form_state(problem, name, state, mount) for name in SOLVERS}
-    return {name: _answer(problem, item) for name, item in found.items()}
+        states |= {name: closed_form_state(problem, name, state, mount) for name in SOLVERS}
+    return {name: _answer(problem, state) for name, state in states.items()}
 
 
 def closed_form_state(problem: Problem, solver: str, start: State, mount: Mount) -> State:
-    """The edges by a closed form, which takes several targets for one.
+    """Edges by a closed form, with all targets transformed to the first one.
 
     Args:
-        problem: What was measured.
-        solver: The closed form's name.
-        start: How the targets lie to each other, and the values of effects.
-        mount: Where the camera is.
+        problem: The measurements.
+        solver: Name of the closed form.
+        start: Relative poses of the targets, and values of effects.
+        mount: Mount of the camera.
     """
     seen, from_first = problem.observations, invert(start.edges[1:]) @ start.edges[1]
-    shown = [problem.unknown[name] - 1 for name in seen.observed]
+    targets = [problem.unknown[name] - 1 for name in seen.observed]
     robot = robot_part(problem.poses[problem.robots[0]][seen.stops], mount)
-    found = SOLVERS[solver](robot, seen.measured @ from_first[shown])
-    return State(np.stack([found.x, *(found.z @ invert(from_first))]), start.values)
+    edges = SOLVERS[solver](robot, seen.measured @ from_first[targets])
+    return State(np.stack([edges.x, *(edges.z @ invert(from_first))]), start.values)
 
 
 def _answer(problem: Problem, state: State) -> Answer:
-    away_m, away_rad = scatter(problem, problem, state)
+    residuals_m, residuals_rad = scatter(problem, problem, state)
     return Answer(
         state.edges,
-        float(np.sqrt(np.mean(away_m**2))),
-        None if problem.points else float(np.sqrt(np.mean(away_rad**2))),
+        float(np.sqrt(np.mean(residuals_m**2))),
+        None if problem.points else float(np.sqrt(np.mean(residuals_rad**2))),
     )
