@@ -1,4 +1,4 @@
-"""Where the robots stood: what their rows report, and whether joints belong to what is seen."""
+"""Reading of the robots' reports, and the check of their joints against the observations."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from visioncal.calibration.guess.misread import (
     JointGuess,
     guess_joints,
 )
-from visioncal.calibration.stages.joints import ARM_AS_FOUND, Matched, zero_taken
+from visioncal.calibration.stages.joints import EXPORT_ARM, Matched, zero_taken
 from visioncal.calibration.stages.motion import is_open
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -31,35 +31,33 @@ T = TypeVar("T", bound=Observed)
 
 
 def read_robots(seen: T) -> T:
-    """Takes up what rows report of the robots, by way of which something was observed.
+    """Reads the reported poses and joints of the robots.
 
     Raises:
-        DataError: Joints are all there is, and they are not as many as the robot's; or rows that
-            are said to be of one stop lie apart.
+        DataError: There are only joints, and they are not as many as the robot's; or rows of one
+            declared stop have different poses.
     """
-    session, found = seen.timed, {}
+    session, reports = seen.timed, {}
     for name in session.robots:
-        document = session.robot_documents.get(name)
-        mine = tuple(
+        model_document = session.robot_documents.get(name)
+        of_robot = tuple(
             view
             for view in session.views
             if name_of(session.declaration, "robot", view) == name
             and not (seen.clocks and is_open(view))
         )
-        model = None if document is None else Robot.from_document(document)
-        reported = reported_poses(replace(session, views=mine), model)
-        found[name] = _with_stops(session, name, reported)
-        seen = seen.noting(
-            (), (warning.of(_called(session, name)) for warning in reported.warnings)
-        )
-        notes = (remark.of(_called(session, name)).words for remark in remarks(reported.notes))
+        model = None if model_document is None else Robot.from_document(model_document)
+        reported = reported_poses(replace(session, views=of_robot), model)
+        reports[name] = _with_stops(session, name, reported)
+        seen = seen.noting((), (warning.of(_label(session, name)) for warning in reported.warnings))
+        notes = (remark.of(_label(session, name)).words for remark in remarks(reported.notes))
         seen = replace(seen, notes=(*seen.notes, *notes))
     rows = [
         observation
         for observation in session.observations
         if observation.view.number not in seen.spared
     ]
-    return replace(seen, robots=found).noting(_lost(session, rows, found))
+    return replace(seen, robots=reports).noting(_lost_views(session, rows, reports))
 
 
 def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
@@ -79,17 +77,17 @@ def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
     return replace(reported, base_from_flange=poses, matched=matched)
 
 
-def _lost(
-    session: Session, rows: Sequence[Observation], found: Mapping[str, Reported]
+def _lost_views(
+    session: Session, rows: Sequence[Observation], reports: Mapping[str, Reported]
 ) -> Iterator[Rejection]:
-    """Why where a robot stood is not known for an observation."""
+    """Rejections of observations without the pose of a robot."""
     reasons = {
-        name: {rejection.view: rejection.reason for rejection in at.rejections}
-        for name, at in found.items()
+        name: {rejection.view: rejection.reason for rejection in report.rejections}
+        for name, report in reports.items()
     }
     for row in rows:
         for name in (*row.lacks, *row.robots):
-            if row.view.number in found[name].base_from_flange:
+            if row.view.number in reports[name].base_from_flange:
                 continue
             why = reasons[name].get(row.robots.get(name, row.view).number, "")
             of = f" ({name})" if len(session.robots) > 1 else ""
@@ -98,22 +96,22 @@ def _lost(
             yield Rejection(row.view.number, f"{why}{of}")
 
 
-def _called(session: Session, robot: str) -> str:
-    """Names, of several robots, the one that findings are of."""
+def _label(session: Session, robot: str) -> str:
+    """The name of the robot that findings concern; empty with a single one."""
     return f"Robot {robot}" if len(session.robots) > 1 else ""
 
 
 def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
-    """Refuses joints that only fit what the cameras see where they are read otherwise.
+    """Refuses joints that only another reading makes fit the cameras' observations.
 
     Args:
-        seen: What is known.
-        drops: Whether to leave out readings whose pose and joints contradict each other, where the
-            joints are right.
-        takes: Whether a lost zero is taken for where it is.
+        seen: The observations.
+        drops: Whether to remove views whose pose and joints contradict each other, where the joints
+            are right.
+        takes: Whether to correct a lost zero.
 
     Raises:
-        DataError: They do.
+        DataError: Joints are misread.
     """
     for name, reported in seen.robots.items():
         if reported.matched is not None:
@@ -128,19 +126,21 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
     views = [pose for pose in poses if pose in joints]
     if not views:
         return seen
-    doubted = matched.contradicting
-    sound = [view for view in views if view not in doubted and view not in seen.held_back]
-    looks = {view: poses[view].cam_from_target[0] for view in views}
-    rows = np.array([looks[view] for view in sound])
-    q = np.array([joints[view] for view in sound]).reshape(len(sound), matched.robot.joint_count)
+    contradicted = matched.contradicting
+    consistent = [view for view in views if view not in contradicted and view not in seen.held_back]
+    observed = {view: poses[view].cam_from_target[0] for view in views}
+    rows = np.array([observed[view] for view in consistent])
+    q = np.array([joints[view] for view in consistent]).reshape(
+        len(consistent), matched.robot.joint_count
+    )
     guess = _guess_seen_joints(matched.arm, q, rows, mount)
     if drops:
-        both = {
-            view: (reported.base_from_flange[view], looks[view])
+        contradicting = {
+            view: (reported.base_from_flange[view], observed[view])
             for view in views
-            if view in doubted
+            if view in contradicted
         }
-        lost = tuple(_contradicted_joints(matched, guess, both, mount))
+        lost = tuple(_contradicted_joints(matched, guess, contradicting, mount))
         reported = reported.without({rejection.view for rejection in lost})
         seen = seen.noting(lost).with_robot(name, reported)
     if guess is None or not guess.stands_out:
@@ -151,22 +151,24 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
         has_poses = any(view.base_from_flange() is not None for view in mine)
         error = misread_joints(guess, matched.robot, has_poses=has_poses)
         raise error.within(f"robot {name}") if len(session.robots) > 1 else error
-    taken = takes and matched.zero is None
-    seen = seen.noting((), (_lost_zero(guess, zero, taken=taken).of(_called(session, name)),))
-    return seen.with_robot(name, reported.with_zero(zero)) if taken else seen
+    used = takes and matched.zero is None
+    seen = seen.noting(
+        (), (_lost_zero_finding(guess, zero, is_used=used).of(_label(session, name)),)
+    )
+    return seen.with_robot(name, reported.with_zero(zero)) if used else seen
 
 
 def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
-    """Refuses joints that only fit what an instrument reads where they are read otherwise.
+    """Refuses joints that only another reading makes fit an instrument's readings.
 
-    A lost zero is none of these: it is found with the arm.
+    A lost zero is not refused: it is estimated with the arm.
 
     Args:
-        seen: What is known.
-        probes: (4, 4) `instrument_from_probe` by view; empty where points do not give them.
+        seen: The observations.
+        probes: (4, 4) `instrument_from_probe` by view; empty where points do not determine them.
 
     Raises:
-        DataError: They do.
+        DataError: Joints are misread.
     """
     for reported in seen.robots.values():
         matched, joints = reported.matched, reported.joints_rad or {}
@@ -174,7 +176,7 @@ def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
         if matched is None or not views:
             continue
         q, looks = (np.array([by_view[view] for view in views]) for by_view in (joints, probes))
-        # The instrument stands still beside the robot, as a camera does.
+        # The instrument is fixed beside the robot, as a camera may be.
         guess = _guess_seen_joints(matched.arm, q, looks, "eye-to-hand")
         if guess is not None and guess.stands_out and guess.zero is None:
             mine = (view for view in seen.session.views if view.number in joints)
@@ -185,11 +187,11 @@ def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class CameraTargetPair:
-    """What one camera sees of one target by way of one robot alone.
+    """Observations of one target by one camera, with one robot between.
 
     Attributes:
         camera: The camera's frame.
-        target: The target's.
+        target: The target's frame.
         mount: Where the camera is.
         poses: The target's pose by view.
     """
@@ -204,9 +206,9 @@ _NO_PAIR = CameraTargetPair("", "", "eye-in-hand", {})
 
 
 def pairs_of(seen: Observed, robot: str) -> list[CameraTargetPair]:
-    """The pairs of a camera and a target by way of one robot alone, those of most views first.
+    """The pairs of a camera and a target with only this robot between, those of most views first.
 
-    Poses of different ones do not compare.
+    Poses of different pairs do not compare.
     """
     pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
     for observation in seen.timed.observations:
@@ -217,18 +219,18 @@ def pairs_of(seen: Observed, robot: str) -> list[CameraTargetPair]:
             and [*observation.robots, *observation.lacks] == [robot]
         ):
             pairs.setdefault((observation.seer, observation.seen), {})[view] = seen.poses[view]
-    flange, found = frame_name("flange", robot), []
+    flange, result = frame_name("flange", robot), []
     for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):
         on_flange = seen.session.frames[camera] == flange
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
-        found.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
-    return found
+        result.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
+    return result
 
 
 def _guess_seen_joints(
     robot: Robot, q: FloatArray, cam_from_target: FloatArray, mount: Mount
 ) -> JointGuess | None:
-    """Compares joint angles with what the camera sees, where there are enough views."""
+    """Searches for the right reading of joint angles, with enough views."""
     if len(q) < FEWEST_JOINT_ROWS:
         return None
     return guess_joints(robot, q, _as_flange(cam_from_target, mount), FITS_SEEN)
@@ -240,7 +242,7 @@ def _contradicted_joints(
     seen: Mapping[int, tuple[FloatArray, FloatArray]],
     mount: Mount,
 ) -> Iterator[Rejection]:
-    """Tells of the views whose pose and angles contradict each other where the angles are wrong."""
+    """Rejects the views whose pose and angles contradict each other with wrong angles."""
     for view, (pose, cam_from_target) in seen.items():
         reason = matched.contradicting[view]
         if guess is None:
@@ -248,24 +250,23 @@ def _contradicted_joints(
             continue
         model = guess.best.reading.poses(matched.joints_rad[view][None])[0]
         both = np.array([model, pose @ invert(matched.flange_from_reported)])
-        of_poses = invert(_as_flange(np.array([cam_from_target, cam_from_target]), mount))
+        flange_from_base = invert(_as_flange(np.array([cam_from_target, cam_from_target]), mount))
         fit = guess.best.fit
-        by_joints, by_pose = distances(of_poses, both, fit.lever, (fit.x, fit.z)).away
+        by_joints, by_pose = distances(flange_from_base, both, fit.lever, (fit.x, fit.z)).residuals
         if by_pose < by_joints:
             yield Rejection(view, f"{reason}, with which the camera agrees")
 
 
 def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
     """`base_from_flange` up to the two unknown edges."""
-    # It is `cam_from_target` of a camera that does not move, and its inverse where the target does
-    # not.
+    # For a fixed camera it is `cam_from_target`, for a fixed target its inverse.
     return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
 
 
 def misread_joints(
     guess: JointGuess, robot: Robot, *, has_poses: bool, seen: str = "what the camera sees"
 ) -> DataError:
-    """The error of a session whose angles fit what was observed in another reading only."""
+    """The error for joint angles that only another reading makes fit the observations."""
     sentence = guess.sentence(seen)
     also = " The reported poses are those of the same angles, and as wrong." if has_poses else ""
     columns = guess.best.reading.columns or range(robot.joint_count)
@@ -277,14 +278,14 @@ def misread_joints(
     )
 
 
-def _lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> Finding:
-    """Says which joint's zero is lost, and what becomes of it."""
+def _lost_zero_finding(guess: JointGuess, zero: JointReading, *, is_used: bool) -> Finding:
+    """Reports the joint with a lost zero, and how it is used."""
     words = (
         f"The joint angles do not belong to {zero.robot.name} as they are declared. "
         f"{guess.sentence('what the camera sees')}"
     )
-    if taken:
+    if is_used:
         return Finding(
-            "misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, ARM_AS_FOUND)
+            "misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, EXPORT_ARM)
         )
     return Finding("misread_joints", words, Remedy(zero.fix))
