@@ -26,13 +26,9 @@ _FORMS = ("quaternion-xyzw", "quaternion-wxyz", "quaternion-yzwx", "matrix", "ma
 
 @dataclass(frozen=True)
 class ChangedRows:
-    """Rows at one end of the recording that need another reading.
+    """Rows at one end of the recording that need another reading, ascending.
 
-    Attributes:
-        rows: The rows, ascending.
-        is_behind: Whether they come last.
-        reading: Their reading.
-        words: Its differences from the declared one.
+    `is_behind` is whether they come last, `words` are the differences from the declared reading.
     """
 
     rows: tuple[int, ...]
@@ -42,10 +38,7 @@ class ChangedRows:
 
 
 def changed_rows(recording: Recording) -> ChangedRows | None:
-    """Finds rows at either end that only another reading explains.
-
-    Args:
-        recording: Both sides' numbers, in the order of time.
+    """Finds rows at either end, in the order of time, that only another reading explains.
 
     Returns:
         The rows; None where all fit as declared, or no reading makes those of one end fit.
@@ -58,13 +51,10 @@ def changed_rows(recording: Recording) -> ChangedRows | None:
         rest = np.sort(order[count:])
         if count < _REFERENCE or len(rest) < _FEWEST:
             continue
-        reading = next(
-            (tried for tried in _readings(recording) if _explains(recording, tried, fit, rest)),
-            None,
-        )
-        if reading is not None:
-            is_behind = bool(rest[0] > order[0])
-            return ChangedRows(tuple(rest.tolist()), is_behind, reading, recording.changes(reading))
+        for reading in _readings(recording):
+            if _explains(recording, reading, fit, rest):
+                is_behind, words = bool(rest[0] > order[0]), recording.changes(reading)
+                return ChangedRows(tuple(rest.tolist()), is_behind, reading, words)
     return None
 
 
@@ -89,11 +79,8 @@ def _agreeing(agrees: Mask) -> int:
     count = np.arange(len(agreeing))
     change = int(np.argmax(2 * agreeing - count))
     share_behind = float(np.mean(agrees[change:])) if change < len(agrees) else 0.0
-    return (
-        change
-        if agreeing[change] >= _AGREEING_SHARE * change and share_behind <= _WRONG_SHARE
-        else 0
-    )
+    is_clear = agreeing[change] >= _AGREEING_SHARE * change and share_behind <= _WRONG_SHARE
+    return change if is_clear else 0
 
 
 def _readings(recording: Recording) -> Iterator[Hypothesis]:

@@ -134,9 +134,8 @@ def _searched(recording: Recording, chain: FloatArray | None) -> _MountSearch:
         best = swapped
         scored.append(best)
     if chain is not None and _is_half_turned(best.hypothesis, recording.robot, chain):
-        taken = replace(best.hypothesis.robot, half_turned=True)
-        turned = replace(best.hypothesis, robot=taken)
-        best = replace(best, hypothesis=turned, labels=())
+        turned = replace(best.hypothesis.robot, half_turned=True)
+        best = replace(best, hypothesis=replace(best.hypothesis, robot=turned), labels=())
         scored.append(best)
     return _MountSearch(recording, tuple(scored), best)
 
@@ -151,11 +150,10 @@ def _of_likelier_mount(
     if better.best.score > CLOSING_SCORE or worse.best.score > STANDS_OUT * better.best.score:
         return better
     by_hypothesis = {item.best.hypothesis: item for item in (first, second)}
-    by_joints = (
-        None if chain is None else _by_joints(tuple(by_hypothesis), first.recording.robot, chain)
-    )
-    if by_joints is not None:
-        return by_hypothesis[by_joints]
+    if chain is not None:
+        by_joints = _by_joints(tuple(by_hypothesis), first.recording.robot, chain)
+        if by_joints is not None:
+            return by_hypothesis[by_joints]
     other, likelier = sorted(
         (first, second),
         key=lambda value: (
@@ -285,24 +283,20 @@ def _guess(found: _MountSearch, chain: FloatArray | None, mount_note: str = "") 
     recording, best = found.recording, found.best
     candidates = {id(scored): _candidate(recording, scored) for scored in found.scored}
     declared, chosen = candidates[id(found.scored[0])], candidates[id(best)]
-    ranked = sorted(
-        candidates.values(), key=lambda candidate: (candidate is not chosen, candidate.score)
-    )[:_LISTED]
+    ranked = sorted(candidates.values(), key=lambda item: (item is not chosen, item.score))[
+        :_LISTED
+    ]
     if declared not in ranked:
         ranked[-1] = declared
-    is_poor = _is_poor(recording, best)
-    is_other = chosen is not declared
-    words = notes(
-        recording, best, has_chain=chain is not None, is_declared=not is_other, is_poor=is_poor
+    is_poor, is_other, has_chain = (
+        _is_poor(recording, best),
+        chosen is not declared,
+        chain is not None,
     )
-    return Guess(
-        declared,
-        tuple(ranked),
-        chosen,
-        is_other,
-        sentence(declared, chosen, ranked, is_poor=is_poor),
-        ((mount_note,) if mount_note else ()) + tuple(words),
-    )
+    words = notes(recording, best, has_chain=has_chain, is_declared=not is_other, is_poor=is_poor)
+    finding = sentence(declared, chosen, ranked, is_poor=is_poor)
+    all_notes = ((mount_note,) if mount_note else ()) + tuple(words)
+    return Guess(declared, tuple(ranked), chosen, is_other, finding, all_notes)
 
 
 def _candidate(recording: Recording, scored: Scored) -> Candidate:
@@ -366,18 +360,13 @@ def _is_half_turned(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArra
 def reordered(recording: Recording, declared: Scored) -> Scored | None:
     """Finds the order of all rows in which a chain closes that does not as declared.
 
-    Args:
-        recording: The recorded poses.
-        declared: The declared reading.
-
     Returns:
-        The same reading with its rows in that order; None where none closes the chain.
+        The declared reading with its rows in that order; None where none closes the chain.
     """
     rows = recording.common_rows()[:_MOST_ROWS]
     hypotheses = (replace(declared.hypothesis, order=order) for order in ROW_ORDERS)
-    best = min(
-        (fitted(recording, item, rows, _STARTS) for item in hypotheses), key=lambda item: item.score
-    )
+    fits = (fitted(recording, hypothesis, rows, _STARTS) for hypothesis in hypotheses)
+    best = min(fits, key=lambda scored: scored.score)
     is_clear = best.score <= CLOSING_SCORE and STANDS_OUT * best.score < declared.score
     return replace(best, cost=recording.cost(best.hypothesis)) if is_clear else None
 
@@ -391,8 +380,8 @@ def exchanged(recording: Recording, scored: Scored, *, is_poor: bool) -> Scored 
         is_poor: Whether the motion is so poor that few views agree with anything.
 
     Returns:
-        The same reading with the rows exchanged; None where no exchange explains the outliers, or
-        several do.
+        The reading with the rows exchanged; None where no exchange, or several, explain the
+        outliers.
     """
     if not scored.is_readable:
         return None
@@ -404,19 +393,17 @@ def exchanged(recording: Recording, scored: Scored, *, is_poor: bool) -> Scored 
     outliers = np.flatnonzero(fit.residuals > _OUTLIER * typical)
     if not 2 <= len(outliers) <= min(_MOST_OUTLIERS, len(fit.residuals) - 4):
         return None
-    robot_rows, candidates = tried.rows(len(recording.robot)), []
+    robot_rows, swaps = tried.rows(len(recording.robot)), []
     for pair in combinations(outliers, 2):
         rows = tuple(robot_rows[scored.rows[list(pair)]].tolist())
         refit = _with_edges(recording, scored, replace(tried, swap=rows))
         before, after = fit.residuals[list(pair)], refit.fit.residuals[list(pair)]
         if after.max() < _OUTLIER * typical and (after < before / _NEARER).all():
-            candidates.append((float(after.max()), refit))
-    candidates.sort(key=lambda value: value[0])
-    if not candidates or (
-        len(candidates) > 1 and candidates[1][0] < _BEYOND_NEXT * candidates[0][0]
-    ):
+            swaps.append((float(after.max()), refit))
+    swaps.sort(key=lambda value: value[0])
+    if not swaps or (len(swaps) > 1 and swaps[1][0] < _BEYOND_NEXT * swaps[0][0]):
         return None
-    return candidates[0][1]
+    return swaps[0][1]
 
 
 def _on_all_rows(recording: Recording, scored: Scored) -> Scored:
@@ -430,16 +417,16 @@ def _on_all_rows(recording: Recording, scored: Scored) -> Scored:
 
 def _exchanged_among_few(recording: Recording, scored: Scored) -> Scored | None:
     """Tries every exchange: among few views the right ones are no majority."""
-    tried, candidates = scored.hypothesis, []
+    tried, swaps = scored.hypothesis, []
     robot_rows = tried.rows(len(recording.robot))
     for pair in combinations(scored.rows, 2):
         rows = tuple(robot_rows[list(pair)].tolist())
         changed = replace(tried, swap=rows)
         robot, camera = changed.chain(recording.robot, recording.camera)
         fit = robust_fit(robot[scored.rows], camera[scored.rows])
-        candidates.append(Scored(changed, fit, scored.rows))
-    candidates.sort(key=lambda item: item.score)
-    best, second = candidates[:2]
+        swaps.append(Scored(changed, fit, scored.rows))
+    swaps.sort(key=lambda item: item.score)
+    best, second = swaps[:2]
     is_clear = best.score < CLOSING_SCORE and second.score > _BEYOND_NEXT * best.score
     return best if is_clear and scored.score > _NEARER * best.score else None
 

@@ -115,14 +115,12 @@ def _read(numbers: PoseNumbers, turns: Sequence[Turns]) -> Forms:
     for _, rotations in forms:
         rotations[~numbers.there] = np.nan
     # The declared form stays first even where it is unreadable.
-    readable = [
+    usable = [
         (item, rotations)
         for at, (item, rotations) in enumerate(forms)
         if at == 0 or np.isfinite(rotations[numbers.there]).all()
     ]
-    return Forms(
-        tuple(item for item, _ in readable), np.array([rotations for _, rotations in readable])
-    )
+    return Forms(tuple(turn for turn, _ in usable), np.array([array for _, array in usable]))
 
 
 def screen(robot: Forms, camera: Forms, rows: IntArray) -> tuple[Pairing, ...]:
@@ -133,12 +131,12 @@ def screen(robot: Forms, camera: Forms, rows: IntArray) -> tuple[Pairing, ...]:
     """
     return tuple(
         Pairing(robot_form, camera_form, shift, float(mismatch))
-        for camera_form, shift, mismatches in _mismatches_by_shift(robot, camera, rows)
+        for camera_form, shift, mismatches in _mismatches(robot, camera, rows)
         for robot_form, mismatch in enumerate(mismatches)
     )
 
 
-def _mismatches_by_shift(
+def _mismatches(
     robot: Forms, camera: Forms, rows: IntArray
 ) -> Iterator[tuple[int, int, FloatArray]]:
     for shift in SHIFTS:
@@ -148,19 +146,18 @@ def _mismatches_by_shift(
         robot_angles = _angles(robot.rotations[:, inside + shift])
         camera_angles = _angles(camera.rotations[:, inside])
         for form, angles in enumerate(camera_angles):
-            yield form, shift, _mismatches(robot_angles, angles)
+            yield form, shift, _low_quantiles(robot_angles, angles)
 
 
 def _angles(rotations: FloatArray) -> FloatArray:
     """(f, p) angles [rad] of the relative rotations of all pairs of views."""
-    count = rotations.shape[1]
-    flat = rotations.reshape(len(rotations), count, 9)
-    first, second = np.triu_indices(count, 1)
+    flat = rotations.reshape(*rotations.shape[:2], 9)
+    first, second = np.triu_indices(flat.shape[1], 1)
     traces = (flat @ np.swapaxes(flat, 1, 2))[:, first, second]
     return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
 
 
-def _mismatches(robot: FloatArray, camera: FloatArray) -> FloatArray:
+def _low_quantiles(robot: FloatArray, camera: FloatArray) -> FloatArray:
     """(f,) low quantile of the angles' differences; infinite with too few to compare."""
     difference = np.abs(robot - camera)
     difference = np.where(np.isfinite(difference), difference, np.inf)

@@ -34,13 +34,9 @@ _CLEAR_RATIO = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Poses of robot and camera as they were recorded.
+    """Declared poses of robot and camera as they were recorded.
 
-    Attributes:
-        robot: The robot's numbers, with the declared reading.
-        camera: The camera's.
-        mount: The declared mount.
-        is_measured: Whether the camera's poses were measured from images.
+    `is_measured` is whether the camera's poses were measured from images.
     """
 
     robot: PoseNumbers
@@ -51,11 +47,9 @@ class Recording:
     @property
     def declared(self) -> Hypothesis:
         """The declared reading."""
-        return Hypothesis(
-            SideReading.as_declared(self.robot.reading),
-            SideReading.as_declared(self.camera.reading),
-            self.mount,
-        )
+        readings = self.robot.reading, self.camera.reading
+        robot, camera = (SideReading.as_declared(reading) for reading in readings)
+        return Hypothesis(robot, camera, self.mount)
 
     def changes(self, tried: Hypothesis) -> tuple[str, ...]:
         """Words for each difference between a hypothesis and the declared reading."""
@@ -113,10 +107,8 @@ class Scored:
 def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int) -> Scored:
     """Fits both edges under a hypothesis, by the rows that are readable under it."""
     robot, camera = tried.chain(recording.robot, recording.camera)
-    readable = np.isfinite(robot[rows]).all(axis=(1, 2)) & np.isfinite(camera[rows]).all(
-        axis=(1, 2)
-    )
-    rows = rows[readable]
+    rows = rows[np.isfinite(robot[rows]).all(axis=(1, 2))]
+    rows = rows[np.isfinite(camera[rows]).all(axis=(1, 2))]
     # A shift leaves a row without its partner.
     if len(rows) < FEWEST_ROWS - 1:
         return Scored(tried, no_fit(len(rows)), rows)
@@ -126,9 +118,8 @@ def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int)
 def closes(recording: Recording) -> bool:
     """Whether the chain closes as declared; true with too few rows to show it."""
     rows = recording.common_rows()
-    if len(rows) < FEWEST_ROWS:
-        return True
-    return fitted(recording, recording.declared, rows, 0).score <= CLOSING_SCORE
+    few = len(rows) < FEWEST_ROWS
+    return few or fitted(recording, recording.declared, rows, 0).score <= CLOSING_SCORE
 
 
 def is_likely_unit(recording: Recording, unit: str) -> bool:

@@ -215,11 +215,8 @@ def differences(
 ) -> Iterator[str]:
     """Words for each difference between a hypothesis and the declared reading.
 
-    Args:
-        tried: The hypothesis.
-        declared: The declared reading.
-        places: Where in the files the robot's rows are.
-        is_board: Whether the camera's poses were measured from images of a board of stated size.
+    `places` are the locations of the robot's rows in the files, `is_board` is whether the camera's
+    poses were measured from images of a board of stated size.
     """
     yield from _side_differences("the robot's", tried.robot, declared.robot)
     if is_board and tried.camera.unit != declared.camera.unit:

@@ -11,11 +11,8 @@ def sentence(
 ) -> str:
     """States the finding, with its figures.
 
-    Args:
-        declared: The declared reading.
-        best: The reading that stands out; the declared one where none does.
-        ranked: The best readings, best first.
-        is_poor: Whether the views turn about one axis at most.
+    `best` is the declared reading where none stands out, `ranked` has the best readings first, and
+    `is_poor` is whether the views turn about one axis at most.
     """
     if best is not declared:
         return _best_sentence(declared, best)
@@ -66,12 +63,8 @@ def _other_mount(best: Candidate) -> str:
 
 
 def _figures(candidate: Candidate) -> str:
-    views = (
-        ""
-        if candidate.agreeing == candidate.rows
-        else f" in {candidate.agreeing} of {candidate.rows} views"
-    )
-    return f"{candidate.figures}{views}"
+    agreeing, rows = candidate.agreeing, candidate.rows
+    return f"{candidate.figures}{'' if agreeing == rows else f' in {agreeing} of {rows} views'}"
 
 
 def notes(

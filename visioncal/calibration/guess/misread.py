@@ -50,12 +50,7 @@ _OUTLIER = 5.0
 
 @dataclass(frozen=True, eq=False)
 class FittedJoints:
-    """A reading of the joints, and how well it explains the poses.
-
-    Attributes:
-        reading: The reading.
-        fit: Both constant transforms, and the residual of every row.
-    """
+    """A reading of the joints, and the fit of both constant transforms under it."""
 
     reading: JointReading
     fit: Fit
@@ -102,20 +97,17 @@ class JointGuess:
 
         Of joints with parallel axes it is the more likely one: only a fit of all determines which.
         """
-        lost = all(joint_reading.is_zero for joint_reading in (self.best.reading, *self.rivals))
-        return self.best.reading if lost else None
+        return self.best.reading if all(reading.is_zero for reading in self._readings) else None
+
+    @property
+    def _readings(self) -> tuple[JointReading, ...]:
+        return self.best.reading, *self.rivals
 
     def sentence(self, what: str) -> str:
         """States the finding; `what` is what the joints are compared with."""
-        readings = [self.best.reading, *self.rivals]
-        words = " or with ".join(reading.words for reading in readings)
-        fit = self.best.fit
-        agreeing = len(fit.residuals) - len(self.best.outliers)
-        rows = (
-            ""
-            if agreeing == len(fit.residuals)
-            else f" in {agreeing} of {len(fit.residuals)} views"
-        )
+        words = " or with ".join(reading.words for reading in self._readings)
+        count, outliers = len(self.best.fit.residuals), len(self.best.outliers)
+        rows = f" in {count - outliers} of {count} views" if outliers else ""
         return (
             f"With {words}, they fit {what} to {self.best.figures}{rows}; as recorded, to "
             f"{self.declared.figures}."
@@ -124,9 +116,7 @@ class JointGuess:
     @property
     def fix(self) -> str:
         """What the user can do about it."""
-        return " Or: ".join(
-            joint_reading.fix for joint_reading in (self.best.reading, *self.rivals)
-        )
+        return " Or: ".join(reading.fix for reading in self._readings)
 
 
 def guess_joints(robot: Robot, q: FloatArray, poses: FloatArray, fits: float = _FITS) -> JointGuess:
@@ -170,12 +160,9 @@ def _decided(start: FittedJoints, tried: Sequence[FittedJoints]) -> JointGuess:
     best, others = equivalent[0], equivalent[1:]
     if best.score > _MODEL_DEVIATION or start.score <= STANDS_OUT * best.score:
         return JointGuess(start, start)
-    rivals = tuple(
-        other.reading
-        for other in others
-        if other.reading.cost == best.reading.cost and other.score < _RIVALS * best.score
-    )
-    return JointGuess(start, best, rivals)
+    limit, cost = _RIVALS * best.score, best.reading.cost
+    rivals = (fit.reading for fit in others if fit.reading.cost == cost and fit.score < limit)
+    return JointGuess(start, best, tuple(rivals))
 
 
 def _with_zeros(start: FittedJoints, q: FloatArray, poses: FloatArray) -> Iterator[FittedJoints]:

@@ -104,27 +104,21 @@ class Variant:
 
 
 def solve_turn(
-    pairing: Pairing,
-    transposed: tuple[bool, bool],
-    rows: IntArray,
-    sides: tuple[FloatArray, FloatArray],
+    pairing: Pairing, transposed: tuple[bool, bool], rows: IntArray, sides: tuple[FloatArray, ...]
 ) -> TurnedPairing:
     """Solves for X's rotation by the views that agree best."""
     robot, camera = (
         np.swapaxes(side, 1, 2) if flip else side
         for side, flip in zip(sides, transposed, strict=True)
     )
-    zero, count = np.zeros(3), kept_count(len(rows))
-    kept = np.arange(len(rows))
+    zero, kept = np.zeros(3), np.arange(len(rows))
     x, angles = np.eye(3), np.zeros(len(rows))
     for _ in range(3):
         solve = SOLVERS["park"](compose(robot[kept], zero), compose(camera[kept], zero))
         x = solve.x[:3, :3]
-        target_rotations = robot @ x @ camera
-        angles = rotation_angle(
-            nearest_rotation(target_rotations[kept].mean(axis=0)).T @ target_rotations
-        )
-        kept = np.sort(np.argsort(angles)[:count])
+        placed = robot @ x @ camera
+        angles = rotation_angle(nearest_rotation(placed[kept].mean(axis=0)).T @ placed)
+        kept = np.sort(np.argsort(angles)[: kept_count(len(rows))])
     score = float(np.sqrt(np.mean(angles[kept] ** 2)))
     return TurnedPairing(pairing, transposed, rows, robot, camera, x, kept, score)
 
@@ -157,17 +151,16 @@ def _scaled_variants(
     # stated one are fitted elsewhere; here, units would be mistaken for them.
     declared = _ratio(recording.declared.robot.unit, recording.declared.camera.unit)
     kept = turned.kept
-    for item in (
-        variant for variant in variants if variant.ratio == declared and not variant.signs
-    ):
+    for item in variants:
+        if item.ratio != declared or item.signs:
+            continue
         right, lever = _right_sides(recording, turned, (item, replace(item, ratio=0.0)))
         right = (right - right[kept].mean(axis=0)) / lever
         # With a ratio of 0 only the camera's positions remain.
         of_camera = right[..., 1]
         left = np.concatenate([matrix, right[..., :1] - right[..., 1:]], axis=2)
-        solution = -np.linalg.pinv(left[kept].reshape(-1, 4), rcond=1e-3) @ of_camera[kept].reshape(
-            -1
-        )
+        inverse = np.linalg.pinv(left[kept].reshape(-1, 4), rcond=1e-3)
+        solution = -inverse @ of_camera[kept].reshape(-1)
         scale = 1.0 / solution[3] if solution[3] > 0.0 else np.inf
         if len(kept) < _FEWEST_SIZED or not _SMALLEST < abs(np.log(scale)) < _LARGEST:
             continue
@@ -180,12 +173,10 @@ def _variants(recording: Recording) -> Iterator[Variant]:
     ratios = sorted({_ratio(*pair) for pair in UNIT_PAIRS})
     declared = recording.declared
     inverse = declared.robot.inverse != (recording.mount == "eye-to-hand")
-    declared_variant = (
-        inverse != declared.camera.inverse,
-        _ratio(declared.robot.unit, declared.camera.unit),
-    )
+    is_carried = inverse != declared.camera.inverse
+    declared_ratio = _ratio(declared.robot.unit, declared.camera.unit)
     for carried, signs, ratio in product((False, True), SIGNS, ratios):
-        changes = (carried != declared_variant[0]) + (signs != "") + (ratio != declared_variant[1])
+        changes = (carried != is_carried) + (signs != "") + (ratio != declared_ratio)
         yield Variant(carried, signs, ratio, changes)
 
 
@@ -221,9 +212,8 @@ def _sign(signs: Signs) -> FloatArray:
 
 def thinned(rows: IntArray, most: int = _FITTED_ROWS) -> IntArray:
     """At most `most` rows, evenly spread."""
-    if len(rows) <= most:
-        return rows
-    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
+    spread = np.linspace(0, len(rows) - 1, most).round().astype(int)
+    return rows if len(rows) <= most else np.asarray(rows[spread])
 
 
 def search(recording: Recording) -> list[Scored]:
@@ -305,6 +295,7 @@ def _labels(
     # Inverting the robot's poses, inverting the camera's and changing the mount are equivalent;
     # units go in pairs.
     pairing = turned.pairing
+    of_robot, of_camera = robot.turns[pairing.robot], camera.turns[pairing.camera]
     transposed = turned.transposed[0] != variant.carried, turned.transposed[1]
     pairs = [
         (a, b)
@@ -318,19 +309,13 @@ def _labels(
     for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
         yield Hypothesis(
             SideReading(
-                robot.turns[pairing.robot],
+                of_robot,
                 unit,
                 variant.carried != ((mount == "eye-to-hand") != inverse),
                 transposed[0],
                 variant.signs,
             ),
-            SideReading(
-                camera.turns[pairing.camera],
-                camera_unit,
-                inverse,
-                transposed[1],
-                scale=variant.scale,
-            ),
+            SideReading(of_camera, camera_unit, inverse, transposed[1], scale=variant.scale),
             mount,
             pairing.shift,
         )
@@ -358,34 +343,24 @@ def _with_likelier(
 ) -> Scored:
     """Adds the simplest labels of the declared reading's class with a more plausible cell."""
     unit = declared.hypothesis.robot.unit
-    scored = [
-        fitted(recording, hypothesis, rows, _STARTS)
-        for hypothesis in own
-        if hypothesis.robot.unit == unit
-    ]
+    scored = [fitted(recording, item, rows, _STARTS) for item in own if item.robot.unit == unit]
     likelier = [item.hypothesis for item in scored if is_far_likelier(recording, item, declared)]
-    least = min((recording.cost(hypothesis) for hypothesis in likelier), default=0.0)
-    return replace(
-        declared,
-        labels=tuple(hypothesis for hypothesis in likelier if recording.cost(hypothesis) == least),
-    )
+    costs = [recording.cost(hypothesis) for hypothesis in likelier]
+    least = min(costs, default=0.0)
+    labels = (item for item, cost in zip(likelier, costs, strict=True) if cost == least)
+    return replace(declared, labels=tuple(labels))
 
 
 def _plausible(robot: Forms, camera: Forms, pairings: Sequence[Pairing]) -> list[Pairing]:
     """The declared pairing, then those with the least mismatch, simple ones first."""
-    best = min(pairing.mismatch_rad for pairing in pairings)
-    bound = _RATIO * best + _SLACK_RAD
+    bound = _RATIO * min(pairing.mismatch_rad for pairing in pairings) + _SLACK_RAD
     near = [pairing for pairing in pairings[1:] if pairing.mismatch_rad <= bound]
     near.sort(key=lambda item: _penalised(item.mismatch_rad, _pairing_cost(robot, camera, item)))
     return [pairings[0], *near[: _PAIRINGS - 1]]
 
 
 def _solved_pairings(
-    recording: Recording,
-    robot: Forms,
-    camera: Forms,
-    pairings: Sequence[Pairing],
-    rows: IntArray,
+    recording: Recording, robot: Forms, camera: Forms, pairings: Sequence[Pairing], rows: IntArray
 ) -> list[TurnedPairing]:
     """Solves for the rotations of each pairing, with each side as given and transposed."""
     solved = []
@@ -398,9 +373,8 @@ def _solved_pairings(
         if len(inside) < 3:
             continue
         sides = forms[0][inside + pairing.shift], forms[1][inside]
-        solved += [
-            solve_turn(pairing, pair, inside, sides) for pair in product((False, True), cameras)
-        ]
+        transposed = product((False, True), cameras)
+        solved += [solve_turn(pairing, pair, inside, sides) for pair in transposed]
     best = min((turned.score for turned in solved), default=0.0)
     near = [turned for turned in solved if turned.score <= _RATIO * best + _SLACK_RAD]
     near.sort(key=lambda item: _penalised(item.score, _pairing_cost(robot, camera, item.pairing)))

@@ -58,23 +58,18 @@ def init_network(
 ) -> ConnectedFrames:
     """Finds initial poses of the frames.
 
-    Args:
-        tree: The frames; its root's body is placed by known edges.
-        poses: (s, 4, 4) `base_from_flange` by robot and stop.
-        sighted: The observations.
-        priors: Measured relations between frames.
+    The root's body is placed by known edges; `poses` are (s, 4, 4) `base_from_flange` by robot and
+    stop.
     """
     with_priors = frozenset(name for prior in priors for name in (prior.first, prior.second))
     growth = Growth(tree, poses, sighted, _pairs(tree, sighted), (), with_priors)
     relations = [*_known_relations(tree), *mounted_points(growth)]
     for prior in priors:
         if prior.matrix is not None:
-            no_turns = np.eye(4)[None]
-            relations.append(
-                Relation(prior.first, prior.second, prior.matrix, prior.sigma_m, no_turns)
-            )
-    for pair in growth.oriented:
-        relations += _pair_relations(tree, poses, sighted, pair)
+            pair = prior.first, prior.second
+            relations.append(Relation(*pair, prior.matrix, prior.sigma_m, np.eye(4)[None]))
+    for frame_pair in growth.oriented:
+        relations += _pair_relations(growth, frame_pair)
     placed, ambiguous = spanning_tree(replace(growth, relations=relations))
     if not placed.keys() & {*tree.unknown}:
         # Whether the motion determines them is checked later.
@@ -85,9 +80,8 @@ def init_network(
         for name in tree.unknown
         if name in placed and tree.branches[name].parent in placed
     }
-    return ConnectedFrames(
-        edges, tuple(name for name in tree.unknown if name not in edges), ambiguous
-    )
+    untied = tuple(name for name in tree.unknown if name not in edges)
+    return ConnectedFrames(edges, untied, ambiguous)
 
 
 def _pairs(tree: Tree, sighted: Sighted) -> tuple[FramePair, ...]:
@@ -103,11 +97,9 @@ def _known_relations(tree: Tree) -> Iterator[Relation]:
             yield Relation(branch.parent, name, branch.known, 0.0, np.eye(4)[None])
 
 
-def _pair_relations(
-    tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted, pair: FramePair
-) -> Iterator[Relation]:
+def _pair_relations(growth: Growth, pair: FramePair) -> Iterator[Relation]:
     """The relations that one pair determines by itself."""
-    rows = sighted.early(pair.rows)
+    sighted, rows = growth.sighted, growth.sighted.early(pair.rows)
     if not pair.robots:
         matrix, _, sigma_m = common_transform(sighted.candidates.take(rows))
         yield Relation(pair.seer, pair.seen, matrix, sigma_m, sighted.turns_of(pair.seen))
@@ -118,9 +110,9 @@ def _pair_relations(
     for subset in (rows, pair.rows) if len(rows) < len(pair.rows) else (rows,):
         if len(subset) < FEWEST:
             continue
-        edges = hand_eye(*_robot_and_candidates(poses, sighted, pair, subset), mount)
+        edges = hand_eye(*_robot_and_candidates(growth, pair, subset), mount)
         if edges is not None:
-            yield from _edges_of_robot(tree, sighted, pair, *edges)
+            yield from _edges_of_robot(growth, pair, *edges)
             return
 
 
@@ -129,34 +121,32 @@ def _weak_relations(growth: Growth) -> Iterator[Relation]:
     pairs = [pair for pair in growth.oriented if len(pair.robots) == 1 and len(pair.rows) >= FEWEST]
     if pairs:
         pair = max(pairs, key=lambda value: len(value.rows))
-        x, z, _ = partial_hand_eye(
-            *_robot_and_candidates(growth.poses, growth.sighted, pair, pair.rows)
-        )
-        yield from _edges_of_robot(growth.tree, growth.sighted, pair, (x, z), (np.inf, np.inf))
+        x, z, _ = partial_hand_eye(*_robot_and_candidates(growth, pair, pair.rows))
+        yield from _edges_of_robot(growth, pair, (x, z), (np.inf, np.inf))
 
 
 def _edges_of_robot(
-    tree: Tree,
-    sighted: Sighted,
+    growth: Growth,
     pair: FramePair,
     edges: tuple[FloatArray, FloatArray],
     sigmas_m: tuple[float, float],
 ) -> Iterator[Relation]:
     """The transforms on both sides of the robot that is between a pair."""
     (step,) = pair.robots
-    flange, base = step.frame, tree.branches[step.frame].parent
+    flange, base = step.frame, growth.tree.branches[step.frame].parent
     near, far = (flange, base) if step.is_up else (base, flange)
     yield Relation(near, pair.seer, edges[0], sigmas_m[0], np.eye(4)[None])
-    yield Relation(far, pair.seen, edges[1], sigmas_m[1], sighted.turns_of(pair.seen))
+    turns = growth.sighted.turns_of(pair.seen)
+    yield Relation(far, pair.seen, edges[1], sigmas_m[1], turns)
 
 
 def _robot_and_candidates(
-    poses: Mapping[str, FloatArray], sighted: Sighted, pair: FramePair, rows: IntArray
+    growth: Growth, pair: FramePair, rows: IntArray
 ) -> tuple[FloatArray, Candidates]:
     """The robot's part of the chain (m, 4, 4) in some views of a pair, and their candidates."""
     (step,) = pair.robots
-    robot = poses[step.robot][sighted.stops[rows]]
-    return robot if step.is_up else invert(robot), sighted.candidates.take(rows)
+    robot = growth.poses[step.robot][growth.sighted.stops[rows]]
+    return robot if step.is_up else invert(robot), growth.sighted.candidates.take(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,11 +179,8 @@ def init_frames(
         DegenerateError: The motion leaves most views ambiguous.
     """
     seen, candidates = problem.observations, Candidates.of(views)
-    symmetries = {
-        frame: turns
-        for frame, target in targets.items()
-        if len(turns := rotation_transforms(target)) > 1
-    }
+    turns_of = {frame: rotation_transforms(target) for frame, target in targets.items()}
+    symmetries = {frame: turns for frame, turns in turns_of.items() if len(turns) > 1}
     sighted = Sighted(
         seen.observers, seen.observed, seen.stops, candidates, symmetries, ~seen.has_rotation
     )
@@ -201,28 +188,20 @@ def init_frames(
     distances = _distances(problem, candidates, tied)
     ambiguous = _is_ambiguous(problem, candidates, tied, distances)
     tied, picks = _numbered_as_first(problem, tied, distances.argmin(axis=1), symmetries)
-    if ambiguous.sum() > len(views) / 2:
+    clear, unclear = np.flatnonzero(~ambiguous).tolist(), np.flatnonzero(ambiguous).tolist()
+    if len(unclear) > len(views) / 2:
         raise DegenerateError(
-            f"pnp: {ambiguous.sum()} of {len(views)} views allow two poses of the target that the "
+            f"pnp: {len(unclear)} of {len(views)} views allow two poses of the target that the "
             "robot's motion cannot distinguish.",
-            culprits=[
-                f"view {view.view}" for view, value in zip(views, ambiguous, strict=True) if value
-            ],
+            culprits=[f"view {views[at].view}" for at in unclear],
             next_step="Add views tilted about different axes, or use a board without symmetry "
             "(ChArUco, or an odd sum of columns and rows).",
         )
-    rows = list(zip(views, picks.tolist(), ambiguous.tolist(), seen.observed, strict=True))
-    return InitialFrames(
-        tied,
-        tuple(
-            chosen(view, pick, targets.get(frame)) for view, pick, value, frame in rows if not value
-        ),
-        tuple(
-            Rejection(view.view, "ambiguous: two poses of the target fit image and motion alike")
-            for view, _, value, _ in rows
-            if value
-        ),
-    )
+    why = "ambiguous: two poses of the target fit image and motion alike"
+    rejections = tuple(Rejection(views[at].view, why) for at in unclear)
+    targets_seen = [targets.get(frame) for frame in seen.observed]
+    chosen_views = (chosen(views[at], int(picks[at]), targets_seen[at]) for at in clear)
+    return InitialFrames(tied, tuple(chosen_views), rejections)
 
 
 def _distances(problem: Problem, candidates: Candidates, tied: ConnectedFrames) -> FloatArray:
@@ -246,18 +225,18 @@ def _is_ambiguous(
     problem: Problem, candidates: Candidates, tied: ConnectedFrames, distances: FloatArray
 ) -> Mask:
     """(n,) whether another candidate is as likely as the nearest."""
-    seen, is_ambiguous = problem.observations, np.zeros(len(distances), dtype=bool)
+    seen, ambiguous = problem.observations, np.zeros(len(distances), dtype=bool)
     nearest = distances.min(axis=1)
     for group in problem.groups:
         if not any(step.frame in tied.untied for step in group.path):
             typical_m = max(float(np.median(nearest[group.rows])), float(np.median(nearest)))
-            is_ambiguous[group.rows] = has_rival(distances[group.rows], typical_m)
+            ambiguous[group.rows] = has_rival(distances[group.rows], typical_m)
     poses = (candidates.valid & (candidates.turns == 0)).sum(axis=1)
     for frame in tied.edges.keys() - _with_priors(problem):
         rows = seen.involves(frame)
         # Nothing else decides between the poses of a frame's only view.
-        is_ambiguous |= rows & (rows.sum() == 1) & (poses > 1)
-    return is_ambiguous
+        ambiguous |= rows & (rows.sum() == 1) & (poses > 1)
+    return ambiguous
 
 
 def _numbered_as_first(

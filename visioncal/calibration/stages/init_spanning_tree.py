@@ -15,6 +15,7 @@ with v in 24 orientations.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -60,6 +61,10 @@ _FEWEST_STOPS, _FEWEST_POINTS, _SPREAD_M = 4, 3, 0.02
 _ROUGH_M = 1e-2
 _READING_M = 1e-4
 
+# (4, 4) `body_from_frame` by name; and a frame with (t, 4, 4) candidate poses and a sigma [m].
+_Placed: TypeAlias = Mapping[str, FloatArray]
+_Option: TypeAlias = tuple[str, FloatArray, float]
+
 
 @dataclass(frozen=True, eq=False)
 class _Grown:
@@ -80,10 +85,8 @@ def spanning_tree(growth: Growth) -> tuple[dict[str, FloatArray], tuple[str, ...
     first = _grow(growth, ())
     if not first.by_turn:
         return first.placed, ()
-    tried = []
-    for chosen in _choices(first.counts):
-        grown = _grow(growth, chosen)
-        tried.append((_score(growth, grown.placed), chosen, grown))
+    grown = [(choice, _grow(growth, choice)) for choice in _choices(first.counts)]
+    tried = [(_score(growth, item.placed), choice, item) for choice, item in grown]
     tried.sort(key=lambda pair: pair[0])
     score, chosen, best = tried[0]
     rivals = [pair for value, pair, _ in tried[1:] if value < CLEAR_RATIO * score]
@@ -105,8 +108,7 @@ def _choices(counts: Sequence[int]) -> Iterator[tuple[int, ...]]:
 
 def _grow(growth: Growth, chosen: Sequence[int]) -> _Grown:
     tree = growth.tree
-    placed = {tree.root: np.eye(4)}
-    placed |= dict.fromkeys(tree.flanges.values(), np.eye(4))
+    placed = dict.fromkeys((tree.root, *tree.flanges.values()), np.eye(4))
     by_turn: list[str] = []
     counts: list[int] = []
     while options := (
@@ -127,28 +129,18 @@ def _grow(growth: Growth, chosen: Sequence[int]) -> _Grown:
     return _Grown(placed, tuple(by_turn), tuple(counts))
 
 
-def _related(
-    growth: Growth, placed: Mapping[str, FloatArray]
-) -> Iterator[tuple[str, FloatArray, float]]:
-    """Frames that a relation places: each with (t, 4, 4) candidate poses and a sigma [m]."""
+def _related(growth: Growth, placed: _Placed) -> Iterator[_Option]:
+    """Frames that a relation places."""
     for relation in growth.relations:
         if relation.first in placed and relation.second not in placed:
-            yield (
-                relation.second,
-                (placed[relation.first] @ relation.matrix)[None],
-                relation.sigma_m,
-            )
+            pose = placed[relation.first] @ relation.matrix
+            yield relation.second, pose[None], relation.sigma_m
         elif relation.second in placed and relation.first not in placed:
-            yield (
-                relation.first,
-                placed[relation.second] @ invert(relation.matrix @ relation.turns),
-                relation.sigma_m,
-            )
+            poses = placed[relation.second] @ invert(relation.matrix @ relation.turns)
+            yield relation.first, poses, relation.sigma_m
 
 
-def _completed(
-    growth: Growth, placed: Mapping[str, FloatArray]
-) -> Iterator[tuple[str, FloatArray, float]]:
+def _completed(growth: Growth, placed: _Placed) -> Iterator[_Option]:
     """Frames that are the only unplaced one in the chain of some views."""
     for pair in growth.oriented:
         rows = growth.sighted.early(pair.rows)
@@ -168,9 +160,7 @@ def _completed(
         yield factor.frame, np.array([matrix for matrix, *_ in fits]), fits[0][2]
 
 
-def _hand_eye_placed(
-    growth: Growth, placed: Mapping[str, FloatArray], *, partly: bool = False
-) -> Iterator[tuple[str, FloatArray, float]]:
+def _hand_eye_placed(growth: Growth, placed: _Placed, *, partly: bool = False) -> Iterator[_Option]:
     """Frames that are one of two unplaced ones in the chain of some views, with a robot between.
 
     Where the motion determines them in part, a prior may determine the rest: these are found with
@@ -194,9 +184,8 @@ def _hand_eye_placed(
             product_of(factors[begin + 1 : end], placed)
             for begin, end in pairwise([-1, *unplaced, len(factors)])
         ]
-        candidates = growth.sighted.candidates.take(rows).carried(
-            invert(parts[0]), invert(parts[-1])
-        )
+        candidates = growth.sighted.candidates.take(rows)
+        candidates = candidates.carried(invert(parts[0]), invert(parts[-1]))
         if len(unplaced) == 2:
             robot, edges = invert(parts[1]), None
             if not partly:
@@ -212,9 +201,8 @@ def _hand_eye_placed(
             yield _option(factors[unplaced[1]], *found_v)
 
 
-def _option(factor: Factor, matrix: FloatArray, sigma_m: float) -> tuple[str, FloatArray, float]:
-    there = invert(matrix) if factor.is_inverse else matrix
-    return factor.frame, there[None], sigma_m
+def _option(factor: Factor, matrix: FloatArray, sigma_m: float) -> _Option:
+    return factor.frame, (invert(matrix) if factor.is_inverse else matrix)[None], sigma_m
 
 
 def _score(growth: Growth, placed: Mapping[str, FloatArray]) -> float:
@@ -236,13 +224,10 @@ def _between_arms(
     if len(first) < _FEWEST or candidates.turns.max(initial=0) > 0:
         return None
     seen = candidates.poses[:, 0]
-    starts = Rotation.create_group("O").as_matrix()
-    tried = []
-    for turn in starts:
-        middle, median = _alternated(first, second, seen, compose(turn, np.zeros(3)), _ROUNDS)
-        tried.append((median, middle))
-    tried.sort(key=lambda pair: pair[0])
-    followed = [_alternated(first, second, seen, start, _LONG) for _, start in tried[:_FOLLOWED]]
+    starts = compose(Rotation.create_group("O").as_matrix(), np.zeros(3))
+    tried = [_alternated(first, second, seen, start, _ROUNDS) for start in starts]
+    tried.sort(key=lambda pair: pair[1])
+    followed = [_alternated(first, second, seen, start, _LONG) for start, _ in tried[:_FOLLOWED]]
     middle, median = min(followed, key=lambda pair: pair[1])
     return (middle, median) if median < _NEAR_M else None
 
@@ -289,17 +274,14 @@ def mounted_points(growth: Growth) -> Iterator[Relation]:
             np.full(len(rows), _READING_M),
         )
         mounting, residuals = find_mounting(places)
-        no_turns = np.eye(4)[None]
-        sigma_m = float(np.median(residuals)) + _ROUGH_M
+        no_turns, sigma_m = np.eye(4)[None], float(np.median(residuals)) + _ROUGH_M
         base = growth.tree.branches[flange].parent
         yield Relation(base, seer, mounting.base_from_instrument, sigma_m, no_turns)
         for pair, point in zip(pairs, mounting.on_flange, strict=True):
             yield Relation(flange, pair.seen, compose(np.eye(3), point), sigma_m, no_turns)
 
 
-def placed_by_points(
-    growth: Growth, placed: Mapping[str, FloatArray]
-) -> Iterator[tuple[str, FloatArray, float]]:
+def placed_by_points(growth: Growth, placed: _Placed) -> Iterator[_Option]:
     """Points that a placed instrument read, and instruments that read placed points."""
     unplaced_seers: dict[str, list[tuple[FloatArray, FloatArray]]] = {}
     for pair in growth.pointed:

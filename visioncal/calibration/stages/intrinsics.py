@@ -85,28 +85,21 @@ def estimate_intrinsics(
         )
     stack = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
-        fit = _first_fit(stack, model, resolution)
-        full_stack = stack
-        stack, fit, reasons = _gated(full_stack, fit)
+        first, full = _first_fit(stack, model, resolution), stack
+        stack, fit, reasons = _gated(full, first)
         if reasons:
             # With a wrong initial focal length a pose may tilt the other way and stay there: the
             # most tilted views, which determine the lens best, then seem outliers.
             plain = replace(fit.camera, distortion=np.zeros_like(fit.camera.distortion))
-            restarted = _gated(
-                full_stack, _fit(full_stack, plain, planar_poses(full_stack, plain).first)
-            )
+            restarted = _gated(full, _fit(full, plain, planar_poses(full, plain).first))
             if len(restarted[2]) < len(reasons):
                 stack, fit, reasons = restarted
         if model == "brown":
             fit = _with_rational_terms(stack, fit)
     _check(fit)
-    return Intrinsics(
-        fit.camera,
-        fit.covariance,
-        fit.sigma_px,
-        tuple(Rejection(*item) for item in reasons.items()),
-        tuple(_warnings(stack, fit)),
-    )
+    rejections = tuple(Rejection(*item) for item in reasons.items())
+    warnings = tuple(_warnings(stack, fit))
+    return Intrinsics(fit.camera, fit.covariance, fit.sigma_px, rejections, warnings)
 
 
 def _gated(stack: CornerStack, fit: BundleFit) -> tuple[CornerStack, BundleFit, dict[int, str]]:
@@ -212,18 +205,14 @@ def _check(fit: BundleFit) -> None:
 def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
     """States what the views do not determine, and why."""
     sigma = np.sqrt(np.diag(fit.covariance))
-    focal_sigma, centre_sigma = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
+    focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
     causes = list(_causes(fit)) if _is_flat(stack) else []
     why = "".join(f" {cause.words}" for cause in causes)
     step = causes[0].do if causes else Remedy("Add views, tilted and near the image's edges.")
-    undetermined = [f"the focal length to {100 * focal_sigma:.1f} %"] * bool(
-        focal_sigma > _FOCAL_LIMIT
-    )
-    undetermined += [f"the image centre to {centre_sigma:.1f} px"] * bool(
-        centre_sigma > _CENTRE_LIMIT_PX
-    )
-    if undetermined:
-        words = f"The corners alone determine {' and '.join(undetermined)} only.{why}"
+    weak = [f"the focal length to {100 * focal:.1f} %"] * bool(focal > _FOCAL_LIMIT)
+    weak += [f"the image centre to {centre:.1f} px"] * bool(centre > _CENTRE_LIMIT_PX)
+    if weak:
+        words = f"The corners alone determine {' and '.join(weak)} only.{why}"
         yield Finding("weak_lens", words, step, until_mm=0.0)
     else:
         yield from causes
@@ -241,24 +230,15 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
 
 def _causes(fit: BundleFit) -> Iterator[Finding]:
     poses = fit.cam_from_target
-    axis = poses[:, :3, 2]
-    tilt = np.rad2deg(np.arccos(np.clip(np.abs(axis[:, 2]), 0.0, 1.0)))
+    tilt = np.rad2deg(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0.0, 1.0)))
     if tilt.max() < _TILT_SPREAD_DEG:
-        yield Finding(
-            "weak_lens",
-            f"All views are frontal (tilted by at most {tilt.max():.0f} degrees).",
-            TILTED,
-            until_mm=0.0,
-        )
+        words = f"All views are frontal (tilted by at most {tilt.max():.0f} degrees)."
+        yield Finding("weak_lens", words, TILTED, until_mm=0.0)
     distance = np.linalg.norm(poses[:, :3, 3], axis=1)
     spread = distance.max() / distance.min()
     if spread < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
-        yield Finding(
-            "weak_lens",
-            f"All views are from one distance (within {100 * (spread - 1):.0f} %).",
-            Remedy("Vary the distance of the views."),
-            until_mm=0.0,
-        )
+        words = f"All views are from one distance (within {100 * (spread - 1):.0f} %)."
+        yield Finding("weak_lens", words, Remedy("Vary the distance of the views."), until_mm=0.0)
 
 
 def _unvisited(stack: CornerStack, resolution: tuple[int, int]) -> list[str]:

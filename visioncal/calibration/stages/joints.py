@@ -123,10 +123,6 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
     Poses that belong to the angles are `base_from_model @ FK(q) @ flange_from_reported` with two
     constant transforms: another base than the model's and a tool on its flange are no mistakes.
 
-    Args:
-        rows: The views with its pose.
-        robot: Its model, as the session names it.
-
     Returns:
         The angles that belong to it, and what is wrong with the others.
     """
@@ -138,10 +134,9 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
             f"Joint angles were not used: there are {min(counts)} a row, and {robot.name} has "
             f"{robot.joint_count} joints."
         )
-        step = Remedy(
-            "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
-        )
-        return Matched(robot, warnings=(Finding("misread_joints", words, step),) if poses else ())
+        step = "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
+        finding = Finding("misread_joints", words, Remedy(step))
+        return Matched(robot, warnings=(finding,) if poses else ())
     if not poses:
         return Matched(robot, joints)
     views, q = tuple(poses), np.array([joints[view] for view in poses])
@@ -160,8 +155,7 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
         misread = f"The angles of this session are misread. {sentence} {guess.fix}"
         doubt = Finding("misread_joints", words, Remedy(guess.fix))
         return Matched(robot, misread=misread, warnings=(doubt,))
-    zero = None if guess is None else guess.zero
-    if zero is not None and guess is not None:
+    if guess is not None and (zero := guess.zero) is not None:
         words = (
             "The joint angles do not belong to the reported poses as they are declared. "
             f"{guess.sentence('the reported poses')} {zero_taken(zero)}"
@@ -171,16 +165,15 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
     model = matched.arm.base_from_flange(q)
     constants = _fit_base_and_flange(model, poses, guess)
     typical_m, typical_rad = constants.typical
-    is_other = (
-        typical_m > _SAME_ARM_M or typical_rad > _SAME_ARM_RAD or constants.outliers.mean() >= _HALF
-    )
-    if is_other:
-        return Matched(robot, warnings=(_other_arm_unused(robot, constants),))
+    outliers = constants.outliers
+    if typical_m > _SAME_ARM_M or typical_rad > _SAME_ARM_RAD or outliers.mean() >= _HALF:
+        finding = _other_arm(robot, constants.figures)
+        words = f"{finding.words} The joint angles were not used."
+        return Matched(robot, warnings=(replace(finding, words=words),))
     matched = _report_outliers(matched, constants, views, (model, poses))
     if not np.array_equal(constants.fit.x, np.eye(4)):
         matched = replace(_report_base(matched, constants), robot=placed_at(robot, constants.fit.x))
-    inliers = ~constants.outliers
-    tool = mean_transform(invert(matched.arm.base_from_flange(q[inliers])) @ poses[inliers])
+    tool = mean_transform(invert(matched.arm.base_from_flange(q[~outliers])) @ poses[~outliers])
     return _report_tool_frame(replace(matched, flange_from_reported=tool), constants)
 
 
@@ -207,15 +200,15 @@ def _fit_base_and_flange(
         distances(flange_from_base, model, lever, (np.eye(4), invert(flange_from_reported[index])))
         for index in np.sort(first)
     ]
-    own_base = _BaseAndFlange(min(fits, key=lambda value: float(np.median(value.residuals))))
+    own = _BaseAndFlange(min(fits, key=lambda value: float(np.median(value.residuals))))
     if guess is None:
-        return own_base
-    other_base = _BaseAndFlange(guess.best.fit)
-    (own_m, own_rad), (other_m, other_rad) = own_base.typical, other_base.typical
+        return own
+    other = _BaseAndFlange(guess.best.fit)
+    (own_m, own_rad), (other_m, other_rad) = own.typical, other.typical
     disagree = own_m > _AGREE_M or own_rad > _AGREE_RAD
     better = own_m > _BETTER_BASE * other_m and own_rad >= other_rad
     better |= own_rad > _BETTER_BASE * other_rad and own_m >= other_m
-    return other_base if disagree and better else own_base
+    return other if disagree and better else own
 
 
 def _report_outliers(
@@ -309,9 +302,8 @@ def _report_tool_frame(matched: Matched, constants: _BaseAndFlange) -> Matched:
     """Reports the frame whose poses are given, and how well the model predicts them."""
     robot, tool = matched.robot, matched.flange_from_reported
     warnings, notes = list(matched.warnings), list(matched.notes)
-    shift, angle = (
-        array[~constants.outliers].max() for array in (constants.fit.shift, constants.fit.angle)
-    )
+    fit, inliers = constants.fit, ~constants.outliers
+    shift, angle = fit.shift[inliers].max(), fit.angle[inliers].max()
     if shift > _AGREE_M or angle > _AGREE_RAD:
         differ = _words(shift, angle)
         typical_m, typical_rad = constants.typical
@@ -335,11 +327,6 @@ def _report_tool_frame(matched: Matched, constants: _BaseAndFlange) -> Matched:
         )
         warnings.append(Finding("tool_frame", words, step))
     return replace(matched, warnings=tuple(warnings), notes=tuple(notes))
-
-
-def _other_arm_unused(robot: Robot, constants: _BaseAndFlange) -> Finding:
-    finding = _other_arm(robot, constants.figures)
-    return replace(finding, words=f"{finding.words} The joint angles were not used.")
 
 
 def _other_arm(robot: Robot, figures: str) -> Finding:

@@ -35,11 +35,9 @@ def judge(findings: Findings) -> Verdict:
         need, the probability that picks are within it decides: good from 0.95, check from 0.5, bad
         below, and never good with something unexplained.
     """
-    negligible = [
-        warning for warning in findings.warnings if is_negligible(warning, findings.picks)
-    ]
-    warnings = [warning for warning in findings.warnings if warning not in negligible]
-    notes = (*findings.notes, *(finding.words for finding in negligible))
+    small = [warning for warning in findings.warnings if is_negligible(warning, findings.picks)]
+    warnings = [warning for warning in findings.warnings if warning not in small]
+    notes = (*findings.notes, *(finding.words for finding in small))
     findings = replace(findings, warnings=warnings, notes=notes)
     doubts = doubts_of(findings)
     good_for_mm = _good_for_mm(findings.picks, doubts)
@@ -66,17 +64,15 @@ def judge(findings: Findings) -> Verdict:
             left_out_mm=findings.held_out.mm,
             is_scattered=is_scattered(findings),
         )
-    listed = list(ordered)
+    stated = list(ordered)
     if met is None:
-        listed += _good_for(findings, good_for_mm, status)
+        stated += _good_for(findings, good_for_mm, status)
     else:
-        listed.insert(
-            len(listed) * (met.probability >= NeedLimits.probability[0]),
-            Finding(NEED, _need_words(findings, met)),
-        )
-    listed += [] if doubts else [_agreement(findings, is_enough=status == "good")]
-    listed += [*hints, *(warning for warning in findings.warnings if warning.kind in NOT_USABLE)]
-    return Verdict(status, (*listed, *remarks(findings.notes, NOTE)), good_for_mm)
+        place = len(stated) * (met.probability >= NeedLimits.probability[0])
+        stated.insert(place, Finding(NEED, _need_words(findings, met)))
+    stated += [] if doubts else [_agreement(findings, is_enough=status == "good")]
+    stated += [*hints, *(warning for warning in findings.warnings if warning.kind in NOT_USABLE)]
+    return Verdict(status, (*stated, *remarks(findings.notes, NOTE)), good_for_mm)
 
 
 def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:

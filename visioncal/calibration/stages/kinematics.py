@@ -92,13 +92,9 @@ class Kinematics:
 def unseen_views(
     views: Sequence[int], before: FloatArray, after: FloatArray, turned: Mask
 ) -> tuple[UnseenView, ...]:
-    """Residuals of held-out views with the nominal arm and with the calibrated one.
+    """Residuals of held-out views with the nominal arm (`before`) and with the calibrated one.
 
-    Args:
-        views: (m,) the views.
-        before: (m, 2) of the nominal arm, rotation [rad] and distance [m].
-        after: (m, 2) of the calibrated arm.
-        turned: (m,) whether a rotation was measured.
+    Both are (m, 2), rotation [rad] and distance [m]; `turned` is whether a rotation was measured.
     """
     columns = zip(views, before.tolist(), after.tolist(), turned.tolist(), strict=True)
     return tuple(
@@ -170,8 +166,8 @@ def with_functions(
         state: The start.
         robot: The robot.
         model: The nominal arm.
-        stops: (s, m) which of the robot's m places each stop is at, (m, n) its joints and its loads
-            there.
+        stops: (s, m) incidence of the problem's stops and the robot's m places; (m, n) joints and
+            loads at the latter.
         noise: The noise's levels to start from.
     """
     placed, q, loads = stops
@@ -209,20 +205,15 @@ def _with_shifted_zero(
     zeroed = fits[NOMINAL]
     if nominal is None or zeroed is None:
         return dict(fits)
-    gain = 2.0 * (
-        _negative_log_likelihood(stated, nominal) - _negative_log_likelihood(problem, zeroed)
-    )
-    with_gain = {
-        name: None if fit is None else replace(fit, gain=fit.gain + gain)
-        for name, fit in fits.items()
-    }
+    gain = 2.0 * (_neg_log_likelihood(stated, nominal) - _neg_log_likelihood(problem, zeroed))
+    with_gain = {name: fit and replace(fit, gain=fit.gain + gain) for name, fit in fits.items()}
     if with_gain["offsets"] is None:
         errors = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
         with_gain["offsets"] = replace(zeroed, errors={"offsets": errors}, gain=gain)
     return with_gain | {NOMINAL: nominal}
 
 
-def _negative_log_likelihood(problem: Problem, fit: LevelFit) -> float:
+def _neg_log_likelihood(problem: Problem, fit: LevelFit) -> float:
     return robot_levels(problem, fit.fit.state, starting_noise(problem), from_above=True)[1]
 
 
@@ -283,10 +274,8 @@ def check_level(asked: str) -> None:
 def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
     """Refuses a level that the session cannot give.
 
-    Args:
-        asked: The level.
-        can: Whether there are joint angles that belong to the robot's model and poses.
-        misread: What is wrong with the joint angles, and what to do.
+    `can` is whether there are joint angles that belong to the robot's model and poses, `misread`
+    what is wrong with them, and what to do.
 
     Raises:
         DataError: There are no joint angles that belong to a known model.

@@ -14,12 +14,7 @@ _SAME_M, _SAME_RAD = 0.02, 0.02
 
 
 def check_stops(loads: Loads, views: Sequence[int], stops: Sequence[int | None]) -> None:
-    """Refuses views of one stop under different loads.
-
-    Args:
-        loads: The loads of m views.
-        views: Their numbers.
-        stops: The stop that each declares; None for none.
+    """Refuses views of one declared stop under different loads; `stops` has None for none.
 
     Raises:
         DataError: Two views of a stop differ; it names them.
@@ -41,11 +36,7 @@ def check_stops(loads: Loads, views: Sequence[int], stops: Sequence[int | None])
 
 
 def check_poses(loads: Loads, poses: FloatArray) -> None:
-    """Refuses loads that change while the arm stands still.
-
-    Args:
-        loads: The loads of m views.
-        poses: (m, 4, 4) reported flange poses.
+    """Refuses loads that change while the arm stands still at one reported flange pose (m, 4, 4).
 
     Raises:
         DegenerateError: The load changes, and all poses are the same.

@@ -77,12 +77,7 @@ def stream_of(session: Session, robot: str) -> str:
 
 
 def motion_of(session: Session, robot: Robot | None, name: str) -> RobotMotion:
-    """Reads a robot's stream.
-
-    Args:
-        session: A session with a stream of this name.
-        robot: The robot's model, where known.
-        name: The stream's name.
+    """Reads a robot's stream; without reported poses, by the robot's model where known.
 
     Raises:
         DataError: It has no poses, and no joints that match the robot's model.
@@ -119,11 +114,9 @@ def at_rest(flange: Trajectory, at_s: FloatArray) -> Mask:
 
 
 def slow_and_new(poses: FloatArray, speeds: FloatArray) -> IntArray:
-    """Selects the slowest moments with distinct poses.
+    """Selects the slowest moments with distinct flange poses (m, 4, 4) [m].
 
-    Args:
-        poses: (m, 4, 4) of the flange [m].
-        speeds: (m, 6) its twists per second [rad/s, m/s].
+    `speeds` are the flange's twists per second (m, 6) [rad/s, m/s].
 
     Returns:
         (k,) the moments, ascending.

@@ -101,13 +101,12 @@ class Picks:
         return {name: float(np.rad2deg(value)) for name, value in self._budget(slice(3)).items()}
 
     def _budget(self, axes: slice) -> dict[str, float]:
-        sources = {**self.parts, "total": self.spreads}
-        squares = {
-            name: np.trace(array[:, axes, axes], axis1=1, axis2=2)
-            for name, array in sources.items()
-        }
-        # Of two sources that compensate, one may be negative.
-        return {name: float(max(square.mean(), 0.0) ** 0.5) for name, square in squares.items()}
+        budget = {}
+        for name, covariances in {**self.parts, "total": self.spreads}.items():
+            squares = np.trace(covariances[:, axes, axes], axis1=1, axis2=2)
+            # Of two sources that compensate, one may be negative.
+            budget[name] = float(max(squares.mean(), 0.0) ** 0.5)
+        return budget
 
     def stays_within(self, need: Need | None) -> str:
         """The limits that 95 % of picks are within, in the units of a need."""
@@ -120,10 +119,7 @@ class Picks:
 def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) -> NeedMet | None:
     """The probability that picks are within a need; None without a need or predictions.
 
-    Args:
-        need: The task's need.
-        picks: The picks of each camera and robot.
-        whole: Whether pairs are distinguished.
+    With `whole`, it is reported for each pair of a camera and a robot, too.
     """
     if need is None or not picks:
         return None
@@ -168,9 +164,7 @@ class PickInputs:
 def picks_of(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
     """Predicts picks, for each camera and each robot between it and what it sees.
 
-    Args:
-        fitted: The fit.
-        need: Where picks are; where the views looked without.
+    They are at the need's place, or where the views looked.
     """
     problem = fitted.problem
     pairs: dict[tuple[str, str], list[int]] = {}
@@ -210,17 +204,14 @@ def _picks(
     problem, state, noise = fitted.problem, fitted.fit.state, fitted.fit.noise
     seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
     in_base = _base_from_targets(problem, state, base)
-    middles = np.array(
-        [fitted.middles.get(name.partition("@")[0], np.zeros(3)) for name in seen.observed]
-    )
+    frames = (name.partition("@")[0] for name in seen.observed)
+    middles = np.array([fitted.middles.get(frame, np.zeros(3)) for frame in frames])
     carries = np.array([_is_between(problem, observer, base, robot) for observer in seen.observers])
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
     as_noise = None if bias is None else errors
-    by_whole_chain = calibrated or (
-        as_noise is not None and (as_noise.of_links or as_noise.is_significant)
-    )
-    if by_whole_chain:
+    whole = calibrated or (as_noise is not None and (as_noise.of_links or as_noise.is_significant))
+    if whole:
         # The whole chain, in the targets' frames, includes the noise of its flanges.
         observations, at_m = _as_things(fitted), middles
     else:
@@ -228,15 +219,13 @@ def _picks(
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
     linearised, covariance, parts = observations.linear(state, ideal=True), fitted.covariance, {}
-    base_adjoint, column = adjoint(in_base), problem.robots.index(robot)
+    to_base, column = adjoint(in_base), problem.robots.index(robot)
     level = pick_level = noise.robots[column]
     if as_noise is not None and bias is not None:
         covariance = covariance - bias @ bias.T
         by_posture, in_time = _arm_covariances(fitted, robot, as_noise, bias)
-        if not by_whole_chain:
-            by_posture, in_time = (
-                base_adjoint @ array @ base_adjoint.mT for array in (by_posture, in_time)
-            )
+        if not whole:
+            by_posture, in_time = (to_base @ array @ to_base.mT for array in (by_posture, in_time))
         parts["arm"] = by_posture + in_time
         if as_noise.white is not None:
             level, levels = as_noise.white, noise.robots.copy()
@@ -248,10 +237,10 @@ def _picks(
     of_boards = _board_part(covariance, fitted.of_boards)
     parts["calibration"] = linearised.covariance(covariance - of_boards)
     parts["board"] = linearised.covariance(of_boards)
+    carried = carries[:, None, None]
     if problem.is_combined:
         # Combined noise counts as the robot's, where it carries the camera.
-        own = base_adjoint @ _noise_covariance(level) @ base_adjoint.mT
-        look = carries[:, None, None] * own
+        look = carried * (to_base @ _noise_covariance(level) @ to_base.mT)
     else:
         look = observations.total_covariance(linearised, noise) - observations.covariance(noise)
     parts["look"] = look
@@ -259,20 +248,18 @@ def _picks(
     at_camera = problem.measured(state)
     in_camera = apply_each(at_camera, middles)
     axes = np.swapaxes(at_camera[:, :3, :3], 1, 2)[:, :, 2]
-    if not by_whole_chain:
+    if not whole:
         axes = (in_base[:, :3, :3] @ axes[:, :, None])[:, :, 0]
     # A focal length that is longer by a share shows a thing nearer by the same share.
     focus_m = fitted.jitters.get(camera, 0.0) * in_camera[:, 2, None] * axes
     by_source["look"][:, 3:, 3:] += focus_m[:, :, None] * focus_m[:, None]
     # A carried camera looks from another posture than the robot then has; before one that is fixed
     # the posture is the same, and the noise of a whole chain is already in it.
-    fixed = 0.0 if by_whole_chain else _noise_covariance(level)
-    pick_noise = np.where(carries[:, None, None], _noise_covariance(pick_level), fixed)
+    fixed = 0.0 if whole else _noise_covariance(level)
+    pick_noise = np.where(carried, _noise_covariance(pick_level), fixed)
     by_source["pick"] = _flange_covariance(problem, robot, in_base, pick_noise)
     if as_noise is not None and not as_noise.of_links:
-        by_source["pick"] = by_source["pick"] + carries[:, None, None] * _at_points(
-            by_posture, at_m
-        )
+        by_source["pick"] = by_source["pick"] + carried * _at_points(by_posture, at_m)
     by_source["left out"] = np.broadcast_to(_excess_covariance(fitted), parts["look"].shape)
     return Picks(
         camera,
@@ -347,15 +334,13 @@ def _as_things(fitted: PickInputs) -> Problem:
     # then only moves its middle.
     problem, effects = fitted.problem, []
     unmoved, frames = np.zeros((3, len(fitted.of_boards))), problem.observations.observed
-    middle_jacobian = np.array(
-        [fitted.moved.get(frame.partition("@")[0], unmoved) for frame in frames]
-    )
+    jacobian = np.array([fitted.moved.get(frame.partition("@")[0], unmoved) for frame in frames])
     for effect in problem.effects:
         columns, by_sensor = problem.effect_columns[effect.name], effect.by_sensor
         of_boards = np.isin(np.arange(columns.start, columns.stop), fitted.of_boards)
         if by_sensor is not None and of_boards.any():
             by_sensor = by_sensor.copy()
-            by_sensor[:, :3, of_boards], by_sensor[:, 3:, of_boards] = 0.0, -middle_jacobian
+            by_sensor[:, :3, of_boards], by_sensor[:, 3:, of_boards] = 0.0, -jacobian
         effects.append(replace(effect, by_sensor=by_sensor))
     return replace(problem, effects=tuple(effects))
 

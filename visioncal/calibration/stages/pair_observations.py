@@ -47,14 +47,10 @@ class Sighted:
 
 @dataclass(frozen=True, eq=False)
 class Relation:
-    """A transform between two frames of one body.
+    """A transform `first_from_second` (4, 4) between two frames of one body.
 
-    Attributes:
-        first: The first frame.
-        second: The second frame.
-        matrix: (4, 4) `first_from_second`.
-        sigma_m: Its sigma, rotations on a lever [m].
-        turns: (t, 4, 4) symmetries by which the second may have been seen turned.
+    `sigma_m` has rotations on a lever [m]; `turns` (t, 4, 4) are symmetries by which the second
+    frame may have been seen turned.
     """
 
     first: str
@@ -66,14 +62,7 @@ class Relation:
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """The observations of one pair of frames.
-
-    Attributes:
-        seer: The observing frame.
-        seen: The observed frame.
-        rows: The observations, in the order of time.
-        way: The path between them in the tree.
-    """
+    """The observations of a pair of frames (rows, in the order of time), and their path."""
 
     seer: str
     seen: str

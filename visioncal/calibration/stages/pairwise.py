@@ -52,13 +52,12 @@ class Candidates:
     def of(views: Sequence[ViewPoses]) -> "Candidates":
         """Collects the candidates of views."""
         most = max(len(view.cam_from_target) for view in views)
-        indices = [np.minimum(np.arange(most), len(view.cam_from_target) - 1) for view in views]
+        counts = [len(view.cam_from_target) for view in views]
+        indices = [np.minimum(np.arange(most), count - 1) for count in counts]
         padded = list(zip(views, indices, strict=True))
-        return Candidates(
-            np.array([view.cam_from_target[rows] for view, rows in padded]),
-            np.array([np.array(view.turns)[rows] for view, rows in padded]),
-            np.array([np.arange(most) < len(view.cam_from_target) for view in views]),
-        )
+        poses = np.array([view.cam_from_target[rows] for view, rows in padded])
+        turns = np.array([np.array(view.turns)[rows] for view, rows in padded])
+        return Candidates(poses, turns, np.array([np.arange(most) < count for count in counts]))
 
     def take(self, rows: IntArray) -> "Candidates":
         """Returns the candidates of some views."""
@@ -96,14 +95,9 @@ def solve_edges(
     picks: IntArray,
     solver: Solver = SOLVERS["park"],
 ) -> HandEyeEdges:
-    """Solves for both edges by one candidate each of some views.
+    """Solves for both edges by one candidate (`picks`) each of some views (`rows`).
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: The candidates of each view.
-        rows: The views to solve from.
-        picks: Their candidates.
-        solver: The closed form.
+    `robot` is (m, 4, 4), the robot's part of the chain.
     """
     edges = solver(robot[rows], candidates.poses[rows, picks])
     return HandEyeEdges(edges.x, edges.z, candidates.distances(invert(robot @ edges.x) @ edges.z))
@@ -114,10 +108,7 @@ def trimmed_edges(
 ) -> tuple[Mask, HandEyeEdges]:
     """Solves for both edges by the better half of the views, with any of their candidates.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: The candidates of each view.
-        solver: The closed form.
+    `robot` is (m, 4, 4), the robot's part of the chain.
 
     Returns:
         (m,) mask of that half, and the edges.
@@ -138,9 +129,7 @@ def trimmed_edges(
 def common_transform(candidates: Candidates, turn: int = 0) -> tuple[FloatArray, float, float]:
     """Finds the transform that most views agree on.
 
-    Args:
-        candidates: The candidates of each view.
-        turn: The target's turn relative to the best agreeing view's.
+    With `turn`, the target is turned by it relative to the view that agrees best.
 
     Returns:
         (4, 4), the mean distance of these views from it, and its sigma [m].
@@ -162,10 +151,7 @@ def hand_eye(
 ) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]] | None:
     """Solves for both edges of `robot * x * camera = z` by a consensus of m views.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: The candidates of each view.
-        mount: Which mount the robot's noise is modelled for.
+    `robot` is (m, 4, 4), the robot's part of the chain; its noise is modelled for the mount.
 
     Returns:
         (4, 4) x and z, and the sigma of each, rotations on a lever [m]; None where the motion
@@ -195,10 +181,6 @@ def partial_hand_eye(
     robot: FloatArray, candidates: Candidates
 ) -> tuple[FloatArray, FloatArray, float]:
     """Solves for both edges of `robot * x * camera = z` as far as the motion determines them.
-
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: The candidates of each view.
 
     Returns:
         (4, 4) x and z, and the mean distance of the better half of the views [m].

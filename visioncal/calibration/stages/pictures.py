@@ -98,11 +98,7 @@ def _empty_rows(session: Session) -> Iterator[Finding]:
     observes = [is_seen(view) or is_read(view) for view in session.views]
     if is_whole_cell(session) or all(observes) or not any(observes):
         return
-    empty = [
-        view
-        for view, has_observation in zip(session.views, observes, strict=True)
-        if not has_observation
-    ]
+    empty = [view for view, seen in zip(session.views, observes, strict=True) if not seen]
     views, last = tuple(view.number for view in empty), len(observes) - len(empty) - 1
     named, these = some_of([*map(str, views)], _LISTED), "these rows" if views[1:] else "this row"
     words = f"{len(views)} of {len(observes)} rows of views.csv observe nothing: view {named}"
@@ -110,9 +106,8 @@ def _empty_rows(session: Session) -> Iterator[Finding]:
     if any(view.has_corners for view in session.views):
         words = f"{words}; without an image, a view needs rows in corners.csv"
         if all(observes[: last + 1]):
-            words = (
-                f"{words}, which ends with view {session.views[last].number}, as if it was cut off"
-            )
+            number = session.views[last].number
+            words = f"{words}, which ends with view {number}, as if it was cut off"
         step = Remedy(f"Write corners.csv again, as a whole; or in views.csv, delete {these}.")
     many = len(views) > CalibrationLimits().lost_share[0] * len(observes)
     yield Finding("lost_rows" if many else EMPTY_ROWS, f"{words}.", step, views, until_mm=0.0)
@@ -171,11 +166,7 @@ def _unnamed_paths(session: Session) -> list[str]:
 
 
 def unseen_cause(seen: Observed) -> Finding | None:
-    """Finds why images show nothing after the search: missing files, or another board.
-
-    Returns:
-        The finding; None where the target is in most of the images, or nothing else is seen.
-    """
+    """Finds why most images show nothing after the search, if known: files or another board."""
     session = seen.session
     with_image = [view for view in session.views if view.image and not view.has_corners]
     with_target = seen.poses.keys() | seen.corners.keys()
@@ -195,11 +186,7 @@ def because(error: VisioncalError, cause: Finding) -> VisioncalError:
 
 
 def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
-    """Identifies the board in images in which the declared target is not seen.
-
-    Args:
-        session: The session; of one target.
-        unseen: Its views without the target.
+    """Identifies the board in images of a session's views without the declared target.
 
     Returns:
         The finding; None where nothing else is seen either.
@@ -220,7 +207,7 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
             unreadable = unreadable or _blurred_finding(view, why, existing)
             continue
         identity = _identified(image, declared)
-        cause = _unread_cause(view, image, identity, declared)
+        cause = _unread(view, image, identity, declared)
         if cause is not None and (identity is not None or cause.kind == _MIRRORED):
             return cause
         unreadable = unreadable or cause
@@ -258,10 +245,8 @@ def _identified(image: Image, declared: Target) -> Identity | None:
 
 def _is_its_tag(identity: Identity, declared: Target) -> bool:
     """Whether a single marker is of the declared board's dictionary."""
-    return identity.kind == "marker" and declared.dictionary in (
-        identity.dictionary,
-        *identity.larger,
-    )
+    dictionaries = (identity.dictionary, *identity.larger)
+    return identity.kind == "marker" and declared.dictionary in dictionaries
 
 
 def _has_its_squares(identity: Identity, declared: Target) -> bool:
@@ -338,10 +323,8 @@ def _counting_mistake(identity: Identity, declared: Target) -> str:
     """The likely mistake in counting inner corners, in words; empty for another difference."""
     if identity.kind != "checkerboard" or declared.kind != "checkerboard":
         return ""
-    declared_counts, seen_counts = (
-        sorted((target.columns, target.rows)) for target in (declared, identity)
-    )
-    differences = {a - b for a, b in zip(declared_counts, seen_counts, strict=True)}
+    counts = (sorted((target.columns, target.rows)) for target in (declared, identity))
+    differences = {stated - seen for stated, seen in zip(*counts, strict=True)}
     if differences == {1}:
         return " The squares were counted: columns and rows are of inner corners, one less each."
     if differences == {-1}:
@@ -349,7 +332,7 @@ def _counting_mistake(identity: Identity, declared: Target) -> str:
     return ""
 
 
-def _unread_cause(
+def _unread(
     view: View, image: Image, identity: Identity | None, declared: Target
 ) -> Finding | None:
     """Finding for an image without a readable board, or with its squares alone."""

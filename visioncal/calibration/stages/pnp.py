@@ -139,9 +139,8 @@ def _with_starts(
             next_step="Check the distortion coefficients: their number, order and model.",
         )
     lost = [view for view, solved in zip(stack.views, guess.solved, strict=True) if not solved]
-    reasons |= dict.fromkeys(
-        lost, "no pose: the lens's distortion cannot be inverted where its corners are"
-    )
+    why = "no pose: the lens's distortion cannot be inverted where its corners are"
+    reasons |= dict.fromkeys(lost, why)
     first, second = guess.first[guess.solved], guess.second[guess.solved]
     return stack.keep(guess.solved[stack.view_of]), (first, second)
 
@@ -169,9 +168,8 @@ def _with_rivals(
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
         turns, by_turn = turns_of[board], adjoints[board]
-        has_rival = differ[at] > _SAME_RAD and _is_rival(
-            mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px
-        )
+        square, rival = (values[at] for values in mean_squares)
+        has_rival = differ[at] > _SAME_RAD and _is_rival(square, rival, stack.counts[at], sigma_px)
         fits = (best, other) if has_rival else (best,)
         covariances = [
             by_turn @ covariance[at] @ np.swapaxes(by_turn, 1, 2)

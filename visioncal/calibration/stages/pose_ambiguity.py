@@ -17,11 +17,8 @@ _ROUNDS = 10
 def has_rival(distances: FloatArray, typical_m: float) -> Mask:
     """(m,) whether another candidate of a view is as likely as the nearest.
 
-    Views that are far from all others with any candidate are outliers and not reported here.
-
-    Args:
-        distances: (m, k) distances of the candidates from the prediction [m].
-        typical_m: Distance of a good view's pose [m].
+    `distances` are those of (m, k) candidates from the prediction, `typical_m` that of a good
+    view's pose [m]. Views that are far with any candidate are outliers and not reported here.
     """
     ordered = np.sort(distances, axis=1)
     best, second = ordered[:, 0], ordered[:, 1:].min(axis=1, initial=np.inf)
@@ -30,23 +27,14 @@ def has_rival(distances: FloatArray, typical_m: float) -> Mask:
 
 
 def choose_by(view: ViewPoses, predicted: FloatArray, target: Target | None) -> ViewPoses:
-    """Chooses the candidate of one view that is nearest to a predicted pose.
-
-    Args:
-        view: The view with its candidates.
-        predicted: (4, 4) `cam_from_target`.
-        target: The target, for its symmetries.
-    """
+    """Chooses the candidate of one view that is nearest to a predicted `cam_from_target` (4, 4)."""
     return chosen(view, int(Candidates.of([view]).distances(predicted[None]).argmin()), target)
 
 
 def settled(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
     """Solves for both edges from all views and updates each view's candidate until none changes.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: The candidates of each view.
-        picks: (m,) the initial choice.
+    `robot` is (m, 4, 4), the robot's part of the chain, `picks` (m,) the initial choice.
 
     Returns:
         (m, k) distances of the candidates from the predictions [m].

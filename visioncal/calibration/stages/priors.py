@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -86,24 +87,11 @@ class Component:
 
 
 def components(
-    problem: Problem,
-    state: State,
-    covariance: FloatArray,
-    priors: Sequence[FramePrior],
+    problem: Problem, state: State, covariance: FloatArray, priors: Sequence[FramePrior]
 ) -> tuple[Component, ...]:
-    """The measured components of priors, beside what the observations alone determine of them.
-
-    Args:
-        problem: The observations in the fit.
-        state: The solution.
-        covariance: (p, p) covariance of the unknowns.
-        priors: Priors, in the problem or left out of it.
-    """
-    return tuple(
-        component
-        for prior in priors
-        for component in _components(prior, problem, state, covariance)
-    )
+    """The measured components of priors, used or not, beside the observations' estimates."""
+    found = (_components(prior, problem, state, covariance) for prior in priors)
+    return tuple(chain.from_iterable(found))
 
 
 def _components(
@@ -113,22 +101,14 @@ def _components(
     used = {(frame_prior.name, axis) for frame_prior in problem.priors for axis in frame_prior.axes}
     sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, covariance, jacobian)) * prior.sigma_m
     # The position's rows follow those of the rotation, which are not reported.
-    position_rows = slice(len(residuals) - len(prior.axes), len(residuals))
-    for axis, stated, residual_m, sigma in zip(
-        prior.axes,
-        prior.values_m,
-        (residuals[position_rows] * prior.sigma_m).tolist(),
-        sigmas[position_rows].tolist(),
-        strict=True,
-    ):
+    rows = slice(len(residuals) - len(prior.axes), len(residuals))
+    offs_m = (residuals[rows] * prior.sigma_m).tolist()
+    columns = zip(prior.axes, prior.values_m, offs_m, sigmas[rows].tolist(), strict=True)
+    for axis, stated_m, off_m, sigma_m in columns:
         is_used = (prior.name, axis) in used
-        by_views = (
-            _without_prior(residual_m, sigma, prior.sigma_m) if is_used else (residual_m, sigma)
-        )
-        label = f"{_COMPONENTS[axis]} of {prior.name}"
-        yield Component(
-            label, axis, is_used, stated, prior.sigma_m, stated + by_views[0], by_views[1]
-        )
+        seen = _without_prior(off_m, sigma_m, prior.sigma_m) if is_used else (off_m, sigma_m)
+        label, seen_m = f"{_COMPONENTS[axis]} of {prior.name}", stated_m + seen[0]
+        yield Component(label, axis, is_used, stated_m, prior.sigma_m, seen_m, seen[1])
 
 
 def _without_prior(off_m: float, sigma_m: float, prior_m: float) -> tuple[float, float]:
@@ -140,11 +120,7 @@ def _without_prior(off_m: float, sigma_m: float, prior_m: float) -> tuple[float,
 
 
 def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
-    """Reads the priors of a cell's frames.
-
-    Args:
-        tables: `[prior.A_from_B]` by its name: the pose of frame B in frame A.
-        tree: The frames.
+    """Reads the priors of a cell's frames: `[prior.A_from_B]` is the pose of frame B in frame A.
 
     Raises:
         DataError: A frame is unknown, or a robot moves one of the two relative to the other.
@@ -184,16 +160,7 @@ def loosened(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]:
 def without_most_contradicted(
     problem: Problem, state: State, covariance: FloatArray
 ) -> tuple[FramePrior, ...] | None:
-    """The priors without the component that the observations contradict most.
-
-    Args:
-        problem: The observations in the fit.
-        state: The solution.
-        covariance: (p, p) covariance of the unknowns.
-
-    Returns:
-        The remaining priors; None where none is contradicted.
-    """
+    """The priors without the most contradicted component; None where none is contradicted."""
     contradicted = [
         (component.contradiction, at, component.axis)
         for at, prior in enumerate(problem.priors)
@@ -203,9 +170,8 @@ def without_most_contradicted(
     if not contradicted:
         return None
     _, worst, axis = max(contradicted)
-    kept = [
-        prior.without(axis) if at == worst else prior for at, prior in enumerate(problem.priors)
-    ]
+    kept = list(problem.priors)
+    kept[worst] = kept[worst].without(axis)
     return tuple(prior for prior in kept if prior.axes or prior.rotation is not None)
 
 
@@ -214,11 +180,7 @@ def prior_words(
 ) -> Iterator[Finding]:
     """Reports used priors as notes, and contradicted ones as findings.
 
-    Args:
-        problem: The observations in the fit, with the priors that these do not contradict.
-        state: The solution.
-        covariance: (p, p) covariance of the unknowns.
-        stated: All stated priors, whole.
+    `problem` has the priors that the observations do not contradict, `stated` are all, whole.
     """
     for component in components(problem, state, covariance, tuple(stated)):
         if component.is_used:

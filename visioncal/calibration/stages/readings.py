@@ -156,10 +156,6 @@ def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses
 def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...]:
     """Finds readings of one robot's points whose names are exchanged.
 
-    Args:
-        seen: The observations, with the robot's poses.
-        readings: Readings of positions.
-
     Raises:
         DataError: No view can be used.
         DegenerateError: There are too few stops.
@@ -205,9 +201,8 @@ def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
             f"its name: {', '.join(instrument_names())}.",
         )
     instrument = stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
-    if instrument.sigma_rad is None and any(
-        row.instrument_from_probe() is not None for row in rows
-    ):
+    has_rotations = any(row.instrument_from_probe() is not None for row in rows)
+    if instrument.sigma_rad is None and has_rotations:
         raise DataError(
             f"session.toml: rows have rotations of a probe (meas_qx ...), but how good they are "
             f"is not known of the instrument {table.name!r}.",
@@ -232,9 +227,7 @@ def _check_unit(rows: Sequence[View]) -> None:
 def _are_poses(rows: Sequence[View]) -> bool:
     has_rotation = [view.instrument_from_probe() is not None for view in rows]
     if any(has_rotation) and not all(has_rotation):
-        without = [
-            str(row.number) for row, has_one in zip(rows, has_rotation, strict=True) if not has_one
-        ]
+        without = [str(row.number) for row in rows if row.instrument_from_probe() is None]
         raise DataError(
             f"views.csv: {sum(has_rotation)} of {len(rows)} readings have the probe's rotation "
             f"(meas_qx ...); view{'s' if len(without) > 1 else ''} {some_of(without)} have none.",
@@ -314,20 +307,20 @@ def _exchanged(
     rows_of = [rows for rows in stops if len(rows) > 1]
     if not rows_of:
         return
-    usual_m = max(
-        float(np.median([_scatter_m(errors[rows]) for rows in rows_of])), _LEAST_SCATTER_M
-    )
-    for rows in rows_of:
-        if _scatter_m(errors[rows]) < _EXCHANGED * usual_m:
+    scatter_m = [_scatter_m(errors[rows]) for rows in rows_of]
+    usual_m = max(float(np.median(scatter_m)), _LEAST_SCATTER_M)
+    for rows, before_m in zip(rows_of, scatter_m, strict=True):
+        if before_m < _EXCHANGED * usual_m:
             continue
         for first, second in combinations(rows.tolist(), 2):
             restored = errors[rows] - _change(places, mounting, rows, first, second)
-            if _scatter_m(restored) < _USUAL * usual_m:
+            after_m = _scatter_m(restored)
+            if after_m < _USUAL * usual_m:
                 names = [readings.names[places.points[index]] for index in (first, second)]
                 words = (
                     f"the points {names[0]} and {names[1]} are exchanged at this stop: changed "
-                    f"back, its points agree to {figure(1e3 * _scatter_m(restored))} mm, not "
-                    f"{figure(1e3 * _scatter_m(errors[rows]))} mm"
+                    f"back, its points agree to {figure(1e3 * after_m)} mm, not "
+                    f"{figure(1e3 * before_m)} mm"
                 )
                 yield from (Rejection(views[index], words) for index in (first, second))
                 break
@@ -337,11 +330,9 @@ def _change(
     places: Places, mounting: Mounting, rows: IntArray, first: int, second: int
 ) -> FloatArray:
     """Change of the residuals (r, 3) of a stop's rows when two rows exchange their points."""
-    difference = (
-        mounting.on_flange[places.points[second]] - mounting.on_flange[places.points[first]]
-    )
+    before, after = mounting.on_flange[places.points[[first, second]]]
     sign = (rows == first).astype(float) - (rows == second)
-    return np.asarray(sign[:, None] * difference)
+    return np.asarray(sign[:, None] * (after - before))
 
 
 def _scatter_m(errors: FloatArray) -> float:

@@ -66,12 +66,7 @@ def refined(
     """Fits lenses, boards and frames to all corners together; see `chosen`.
 
     With these fitted, the residuals determine the noise of each view, and all is fitted once more
-    with that.
-
-    Args:
-        side: The frames' side.
-        looks: The corners, with stated lenses and boards.
-        frames: Initial poses of the unknown frames.
+    with that. `looks` has stated lenses and boards, `frames` the initial poses of unknown frames.
 
     Returns:
         The fit, and the side with the errors of its arms.
@@ -102,10 +97,8 @@ def _fit_with_levels(
     levels = looks.levels
     fitted, side = _fit_with_own_weights(side, looks, frames)
     looks = fitted.looks.weighed(fitted.seen)
-    if any(
-        problem.stack is not fitted.looks.problems[name].stack
-        for name, problem in looks.problems.items()
-    ):
+    stacks = {name: problem.stack for name, problem in fitted.looks.problems.items()}
+    if any(problem.stack is not stacks[name] for name, problem in looks.problems.items()):
         fitted = again(fitted, side, fitted.moving, looks)
     elif np.array_equal(fitted.moving, looks.first) and not (levels or side.has_errors):
         return fitted, side
@@ -172,12 +165,9 @@ def lens_levels(side: Side, fitted: ConvergedFit) -> dict[str, LensLevels]:
     looks = fitted.seen.looks
     # The board's size is left to the motion: a wrong one would look like breathing, and so would a
     # focal length.
+    doubted = {name: item for name, item in looks.problems.items() if len(item.doubted)}
     looks = looks.doubting(
-        {
-            name: (lens_prior(problem.scene), problem.doubted[:0])
-            for name, problem in looks.problems.items()
-            if len(problem.doubted)
-        }
+        {name: (lens_prior(item.scene), item.doubted[:0]) for name, item in doubted.items()}
     )
     sizes = [looks.scale_of(index) for index in looks.printed]
     unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
@@ -263,7 +253,7 @@ def _still_significant(side: Side, stated: ConvergedFit, answer: ConvergedFit) -
         and not np.isin(array, stated.moving).any()
         and moved_mahalanobis_sq(refit, array) > chance_limit(len(array))
     ]
-    sizes, refit = _still_significant_sizes(side, refit)
+    sizes, refit = _significant_sizes(side, refit)
     places = np.concatenate([stated.moving, *kept, *sizes])
     without_prior = places[np.isinf(looks.prior_sigma[places])]
     restated = stated.looks.without_prior(without_prior.tolist())
@@ -271,26 +261,22 @@ def _still_significant(side: Side, stated: ConvergedFit, answer: ConvergedFit) -
     return settle(restated, side, np.unique(places), answer.frames)
 
 
-def _still_significant_sizes(
-    side: Side, refit: ConvergedFit
-) -> tuple[list[IntArray], ConvergedFit]:
+def _significant_sizes(side: Side, fit: ConvergedFit) -> tuple[list[IntArray], ConvergedFit]:
     """The board scales that still differ from the stated ones, and the fit with these free."""
     # An error common to all boards looks like one of the arms' links, and with all free together
     # none is significant: the least significant one is reset, and the others are measured again.
-    looks = refit.looks
-    boards = [
-        index for index in looks.printed if np.isin(looks.scale_of(index), refit.moving).all()
-    ]
+    looks = fit.looks
+    boards = [board for board in looks.printed if np.isin(looks.scale_of(board), fit.moving).all()]
     while boards:
-        measured = [measured_scale(side, refit, board) for board in boards]
+        measured = [measured_scale(side, fit, board) for board in boards]
         least = min(measured, key=lambda value: abs(value.scale) / value.sigma)
         if least.is_another:
             break
         boards.remove(least.board)
         place = looks.scale_of(least.board)
-        restated = refit.looks.with_values(place, looks.stated[place])
-        refit = again(refit, side, np.setdiff1d(refit.moving, place), restated)
-    return [looks.scale_of(index) for index in boards], refit
+        restated = fit.looks.with_values(place, looks.stated[place])
+        fit = again(fit, side, np.setdiff1d(fit.moving, place), restated)
+    return [looks.scale_of(index) for index in boards], fit
 
 
 def _measured_size(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScale:
@@ -322,16 +308,12 @@ def _measured_size(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScal
 
 
 def chosen(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
-    """Frees the values that the data support.
+    """Frees the values that the data support, beside those that are free from the start.
 
     The boards' bends, given intrinsics together with them, and the boards' scales are freed where
     corners and chains support it significantly, the frames stay determined, and held-out views are
     not predicted worse. Held values that the corners contradict, and a held scale, count by their
     priors in the covariance.
-
-    Args:
-        side: The frames' side.
-        fitted: The fit with the values that are free from the start.
     """
     best = fitted
     for moving in _shape_sets(side, fitted):
@@ -479,10 +461,7 @@ def remade(
 ) -> tuple[ViewPoses, ...]:
     """Recomputes the poses of views that are not in the fit, with the fitted lens and board.
 
-    Args:
-        views: The views, each with its one pose and its corners.
-        free: Lens and board.
-        sigma_px: Noise of a corner's coordinate [px].
+    Each view has its one pose and its corners; `sigma_px` is the noise of a corner's coordinate.
     """
     if not views:
         return ()

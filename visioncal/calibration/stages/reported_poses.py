@@ -78,16 +78,9 @@ class Reported:
 
 
 def reported_poses(session: Session, robot: Robot | None) -> Reported:
-    """Collects `base_from_flange` of each view.
+    """Collects `base_from_flange` of each view, and matches joints with poses.
 
     Reported poses are preferred; for a view with joints only, the robot's model gives the pose.
-
-    Args:
-        session: The session.
-        robot: The nominal model of its robot, where known.
-
-    Returns:
-        The poses, and whether joints and poses belong together.
 
     Raises:
         DataError: There are only joints, and they are not as many as the robot's; or rows of one

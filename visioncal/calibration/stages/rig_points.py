@@ -69,7 +69,7 @@ def leave_out_wrong_points(seen: T) -> T:
         if not positions:
             continue
         label = name if len(targets) > 1 else target.name
-        seen = seen.noting((), (_wrong_points_finding(target, positions, label),))
+        seen = seen.noting((), (_finding(target, positions, label),))
         wrong = np.array([first + point for point in positions])
         for frame, look in seen.cameras.items():
             kept = {
@@ -163,17 +163,13 @@ def _triangulated(rows: Sequence[tuple[_RigView, int]]) -> tuple[FloatArray, flo
     position = np.linalg.lstsq(np.concatenate(factors), np.concatenate(values), rcond=None)[0]
     residuals = []
     for rig_view, row in rows:
-        in_camera = rig_view.cam_from_target[:3, :3] @ position + rig_view.cam_from_target[:3, 3]
-        residuals.append(
-            rig_view.focal_px
-            * np.linalg.norm(in_camera[:2] / in_camera[2] - rig_view.rays[row, :2])
-        )
+        point = rig_view.cam_from_target[:3, :3] @ position + rig_view.cam_from_target[:3, 3]
+        difference = point[:2] / point[2] - rig_view.rays[row, :2]
+        residuals.append(rig_view.focal_px * np.linalg.norm(difference))
     return position, float(np.median(residuals))
 
 
-def _wrong_points_finding(
-    target: Target, positions: Mapping[int, FloatArray], name: str
-) -> Finding:
+def _finding(target: Target, positions: Mapping[int, FloatArray], name: str) -> Finding:
     """Reports the wrong points, and the correction."""
     table, labels = np.array(target.points_m), [str(number) for number in target.point_numbers]
     measured = table.copy()
@@ -186,7 +182,7 @@ def _wrong_points_finding(
     if reordered:
         parts.append(f"the numbers of points are not those of its table: {numbering.words(labels)}")
         steps.append("correct the numbers of these points in corners.csv or in the rig's table")
-    others = [position for position in positions if position not in reordered]
+    others = [point for point in positions if point not in reordered]
     if others:
         listing = ", ".join(
             f"{labels[other]} by "
@@ -198,8 +194,5 @@ def _wrong_points_finding(
         steps.append("measure these points again, and correct the rig's table")
     words = f"target {name}: {'; '.join(parts)}, by the views' other points. They were left out."
     step = " and ".join(steps)
-    return Finding(
-        "rig_points",
-        words[0].upper() + words[1:],
-        Remedy(f"{step[0].upper()}{step[1:]}.", CALIBRATE),
-    )
+    remedy = Remedy(f"{step[0].upper()}{step[1:]}.", CALIBRATE)
+    return Finding("rig_points", words[0].upper() + words[1:], remedy)

@@ -49,14 +49,11 @@ def read_robots(seen: T) -> T:
         model = None if model_document is None else Robot.from_document(model_document)
         reported = reported_poses(replace(session, views=of_robot), model)
         reports[name] = _with_stops(session, name, reported)
-        seen = seen.noting((), (warning.of(_label(session, name)) for warning in reported.warnings))
-        notes = (remark.of(_label(session, name)).words for remark in remarks(reported.notes))
+        label = _label(session, name)
+        seen = seen.noting((), (warning.of(label) for warning in reported.warnings))
+        notes = (remark.of(label).words for remark in remarks(reported.notes))
         seen = replace(seen, notes=(*seen.notes, *notes))
-    rows = [
-        observation
-        for observation in session.observations
-        if observation.view.number not in seen.spared
-    ]
+    rows = [row for row in session.observations if row.view.number not in seen.spared]
     return replace(seen, robots=reports).noting(_lost_views(session, rows, reports))
 
 
@@ -65,10 +62,8 @@ def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
     poses, matched = dict(reported.base_from_flange), reported.matched
     joints = {} if matched is None else dict(matched.joints_rad)
     for observation in session.observations:
-        view, row = (
-            observation.view.number,
-            observation.robots[name].number if name in observation.robots else None,
-        )
+        view, of_stop = observation.view.number, observation.robots.get(name)
+        row = None if of_stop is None else of_stop.number
         if row in poses and view not in poses:
             poses[view] = poses[row]
             joints |= {view: joints[row]} if row in joints else {}
@@ -104,11 +99,8 @@ def _label(session: Session, robot: str) -> str:
 def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
     """Refuses joints that only another reading makes fit the cameras' observations.
 
-    Args:
-        seen: The observations.
-        drops: Whether to remove views whose pose and joints contradict each other, where the joints
-            are right.
-        takes: Whether to correct a lost zero.
+    With `drops`, views are removed whose pose and joints contradict each other, where the joints
+    are right; with `takes`, a lost zero is corrected.
 
     Raises:
         DataError: Joints are misread.
@@ -122,25 +114,23 @@ def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
 def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tuple[bool, bool]) -> T:
     session, joints, (drops, takes) = seen.session, reported.joints_rad or {}, how
     pair = next(iter(pairs_of(seen, name)), _NO_PAIR)
-    mount, poses = pair.mount, pair.poses
-    views = [pose for pose in poses if pose in joints]
-    if not views:
+    observed = {
+        view: poses.cam_from_target[0] for view, poses in pair.poses.items() if view in joints
+    }
+    if not observed:
         return seen
-    contradicted = matched.contradicting
-    consistent = [view for view in views if view not in contradicted and view not in seen.held_back]
-    observed = {view: poses[view].cam_from_target[0] for view in views}
-    rows = np.array([observed[view] for view in consistent])
-    q = np.array([joints[view] for view in consistent]).reshape(
-        len(consistent), matched.robot.joint_count
-    )
-    guess = _guess_seen_joints(matched.arm, q, rows, mount)
+    excluded = {*matched.contradicting, *seen.held_back}
+    views = [view for view in observed if view not in excluded]
+    rows = np.array([observed[view] for view in views])
+    q = np.array([joints[view] for view in views]).reshape(len(views), matched.robot.joint_count)
+    guess = _guess_seen_joints(matched.arm, q, rows, pair.mount)
     if drops:
         contradicting = {
-            view: (reported.base_from_flange[view], observed[view])
-            for view in views
-            if view in contradicted
+            view: (reported.base_from_flange[view], pose)
+            for view, pose in observed.items()
+            if view in matched.contradicting
         }
-        lost = tuple(_contradicted_joints(matched, guess, contradicting, mount))
+        lost = tuple(_contradicted_joints(matched, guess, contradicting, pair.mount))
         reported = reported.without({rejection.view for rejection in lost})
         seen = seen.noting(lost).with_robot(name, reported)
     if guess is None or not guess.stands_out:
@@ -152,20 +142,16 @@ def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tupl
         error = misread_joints(guess, matched.robot, has_poses=has_poses)
         raise error.within(f"robot {name}") if len(session.robots) > 1 else error
     used = takes and matched.zero is None
-    seen = seen.noting(
-        (), (_lost_zero_finding(guess, zero, is_used=used).of(_label(session, name)),)
-    )
+    finding = _lost_zero_finding(guess, zero, is_used=used)
+    seen = seen.noting((), (finding.of(_label(session, name)),))
     return seen.with_robot(name, reported.with_zero(zero)) if used else seen
 
 
 def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
     """Refuses joints that only another reading makes fit an instrument's readings.
 
-    A lost zero is not refused: it is estimated with the arm.
-
-    Args:
-        seen: The observations.
-        probes: (4, 4) `instrument_from_probe` by view; empty where points do not determine them.
+    `probes` has (4, 4) `instrument_from_probe` by view; it is empty where points do not determine
+    them. A lost zero is not refused: it is estimated with the arm.
 
     Raises:
         DataError: Joints are misread.
@@ -187,14 +173,7 @@ def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class CameraTargetPair:
-    """Observations of one target by one camera, with one robot between.
-
-    Attributes:
-        camera: The camera's frame.
-        target: The target's frame.
-        mount: Where the camera is.
-        poses: The target's pose by view.
-    """
+    """Observations of a target (poses by view) by a camera, with one robot between."""
 
     camera: str
     target: str
@@ -213,18 +192,15 @@ def pairs_of(seen: Observed, robot: str) -> list[CameraTargetPair]:
     pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
     for observation in seen.timed.observations:
         view = observation.view.number
-        if (
-            view in seen.poses
-            and is_seen(observation.view)
-            and [*observation.robots, *observation.lacks] == [robot]
-        ):
+        is_alone = [*observation.robots, *observation.lacks] == [robot]
+        if view in seen.poses and is_seen(observation.view) and is_alone:
             pairs.setdefault((observation.seer, observation.seen), {})[view] = seen.poses[view]
-    flange, result = frame_name("flange", robot), []
+    flange, found_pairs = frame_name("flange", robot), []
     for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):
         on_flange = seen.session.frames[camera] == flange
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
-        result.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
-    return result
+        found_pairs.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
+    return found_pairs
 
 
 def _guess_seen_joints(
@@ -284,8 +260,6 @@ def _lost_zero_finding(guess: JointGuess, zero: JointReading, *, is_used: bool) 
         f"The joint angles do not belong to {zero.robot.name} as they are declared. "
         f"{guess.sentence('what the camera sees')}"
     )
-    if is_used:
-        return Finding(
-            "misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, EXPORT_ARM)
-        )
-    return Finding("misread_joints", words, Remedy(zero.fix))
+    if not is_used:
+        return Finding("misread_joints", words, Remedy(zero.fix))
+    return Finding("misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, EXPORT_ARM))

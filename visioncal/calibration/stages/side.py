@@ -71,16 +71,13 @@ class FramesSide:
     def whole(self, seen: LinearisedCorners) -> Problem:
         """The problem of all observations, with the poses by current lenses and boards."""
         problem, rows = self.observed, self._all_rows(seen)
-        seen_rows, observations = rows >= 0, problem.observations
-        measured, covariance = observations.measured.copy(), observations.covariance.copy()
-        measured[seen_rows], covariance[seen_rows] = (
-            seen.looks.poses[rows[seen_rows]],
-            seen.covariance[rows[seen_rows]],
-        )
-        arms = effects_of(self.arms, freely=self.freely)
-        return replace(
-            problem, observations=replace(observations, measured=measured, covariance=covariance)
-        ).with_effects([seen.effect(rows), *self.effects, *arms])
+        has_corners, stated = rows >= 0, problem.observations
+        measured, covariance = stated.measured.copy(), stated.covariance.copy()
+        measured[has_corners] = seen.looks.poses[rows[has_corners]]
+        covariance[has_corners] = seen.covariance[rows[has_corners]]
+        observations = replace(stated, measured=measured, covariance=covariance)
+        effects = [seen.effect(rows), *self.effects, *effects_of(self.arms, freely=self.freely)]
+        return replace(problem, observations=observations).with_effects(effects)
 
     def with_errors(self, fitted: ConvergedFit) -> Self:
         """Tests for errors of the arms that are not free yet."""
@@ -124,21 +121,15 @@ class FramesSide:
     def looks(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]
     ) -> CameraParameters:
-        """The corners, with stated lenses and boards.
-
-        Args:
-            scenes: The scene of each camera, by its frame.
-            views: Its views, each with its one pose.
-        """
+        """The corners of scenes and views (by camera frame), with stated lenses and boards."""
         shares, problems, poses = self._shares, {}, {}
         for frame, scene in scenes.items():
             corners: dict[int, Corners] = {
                 view.view: view.corners for view in views[frame] if view.corners is not None
             }
             problems[frame] = CornerProblem.of(scene, corners, shares)
-            poses[frame] = np.array(
-                [view.cam_from_target[0] for view in views[frame] if view.view in corners]
-            )
+            seen = [view for view in views[frame] if view.view in corners]
+            poses[frame] = np.array([view.cam_from_target[0] for view in seen])
         return CameraParameters.of(problems, poses)
 
     @property
@@ -148,6 +139,5 @@ class FramesSide:
         pairs = list(zip(seen.observers, seen.observed, strict=True))
         has_robot = {pair: any(step.robot for step in tree.path(*pair)) for pair in set(pairs)}
         rows = zip(self.views, pairs, seen.stops.tolist(), strict=True)
-        return repeat_shares(
-            {index: (pair, stop if has_robot[pair] else None) for index, pair, stop in rows}
-        )
+        kinds = {view: (pair, stop if has_robot[pair] else None) for view, pair, stop in rows}
+        return repeat_shares(kinds)

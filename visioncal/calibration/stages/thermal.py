@@ -118,10 +118,6 @@ class Heat:
 def heating(heat: Heat | None, asked: str) -> Inputs | None:
     """The inputs that heat an arm; None where not requested, or not determined by the session.
 
-    Args:
-        heat: The recording; None where the arm's joints are not known.
-        asked: How far the arm is to be calibrated.
-
     Raises:
         DataError: The level requires it, and the session lacks data.
         DegenerateError: The level requires it, and all views were taken about equally warm.
@@ -157,12 +153,7 @@ def find_drift(
 ) -> ThermalFit:
     """Fits an arm's drift with the frames and, where these have significant errors, its links.
 
-    Args:
-        problem: The observations, with the arm as reported.
-        start: The start.
-        stops: The arm's stops, with times.
-        inputs: What heats it.
-        nominal: Its model.
+    `problem` has the arm as reported, `nominal` is its model.
     """
     robot, poses = stops.robot, problem.poses[stops.robot]
     model = ArmModel.of(nominal, stops.q, poses[stops.places])
@@ -211,12 +202,7 @@ def drift_result(
 ) -> ThermalResult:
     """A drift's coefficients and its course, as a section of a calibration.
 
-    Args:
-        fit: The drift.
-        stops: The arm's stops, with times.
-        views: (m,) a view of each of these stops.
-        problem: The inlier observations.
-        solved: Their fit.
+    `views` has a view of each stop, `problem` the inlier observations, and `solved` is their fit.
     """
     model = fit.model
     return ThermalResult(
@@ -231,7 +217,7 @@ def drift_result(
         trained_s=float(np.ptp(stops.stamps_s)),
         course=_course(fit, _typical_posture(stops.q)),
         seen=_observed_drift(fit, stops, views, problem, solved.state),
-        views=_view_drifts(fit, stops, views),
+        views=_by_view(fit, stops, views),
     )
 
 
@@ -255,9 +241,7 @@ def _joints(model: ThermalModel) -> tuple[JointDrift, ...]:
     )
 
 
-def _view_drifts(
-    fit: ThermalFit, stops: ThermalStops, views: Sequence[int]
-) -> tuple[ViewDrift, ...]:
+def _by_view(fit: ThermalFit, stops: ThermalStops, views: Sequence[int]) -> tuple[ViewDrift, ...]:
     """Drift of the flange at (m,) views, and the largest temperature rise of a link."""
     drift_m = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
     rises = fit.model.rises(fit.links_c(stops)).max(axis=1)
@@ -291,19 +275,17 @@ def _observed_drift(
     of, members = problem.units
     slots = (members[of[pair.rows]] == problem.robots.index(stops.robot)).argmax(axis=1)
     stop_ids, first = np.unique(problem.observations.stops[pair.rows], return_index=True)
-    is_typical = np.abs(stops.q - _typical_posture(stops.q)).max(axis=1) < _SAME_RAD
-    _, chosen, at_stops = np.intersect1d(
-        np.where(is_typical, stops.places, -1), stop_ids, return_indices=True
-    )
+    typical = np.abs(stops.q - _typical_posture(stops.q)).max(axis=1) < _SAME_RAD
+    places = np.where(typical, stops.places, -1)
+    _, chosen, at_stops = np.intersect1d(places, stop_ids, return_indices=True)
     if not len(chosen):
         return ()
     rows, slots = pair.rows[first[at_stops]], slots[first[at_stops]]
     errors = linearised.by_errors[rows].reshape(len(rows), 6, -1, 6)[np.arange(len(rows)), :, slots]
     # A point alone does not separate a flange's rotation from its position: all counts as position.
     used = problem.observations.has_rotation[rows, None] | (np.arange(6) >= 3)
-    residual_m = -(np.linalg.pinv(errors * used[:, None]) @ linearised.residuals[rows, :, None])[
-        :, 3:, 0
-    ]
+    of_flange = np.linalg.pinv(errors * used[:, None]) @ linearised.residuals[rows, :, None]
+    residual_m = -of_flange[:, 3:, 0]
     drift_m = fit.motion(stops)[chosen, :3, 3]
     # With hardly any drift there is no direction: that of the largest drift is used for all.
     lengths = np.linalg.norm(drift_m, axis=1)
@@ -324,11 +306,6 @@ def _typical_posture(q: FloatArray) -> FloatArray:
 
 def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | None, str]:
     """Reads the inputs that heat an arm from a session; temperatures come before currents.
-
-    Args:
-        session: The session.
-        joints: Number of joints of the arm.
-        robot: Its name, where the session has several.
 
     Returns:
         The inputs; or None, and what is missing.
@@ -372,12 +349,12 @@ def _averaged(inputs: Inputs) -> Inputs:
 
 def _views_as_stream(session: Session, robot: str) -> Stream:
     """A robot's views with a time, as a stream of their numbers."""
-    of_robot = [
-        view for view in session.views if name_of(session.declaration, "robot", view) == robot
-    ]
-    rows = sorted(
-        {view.stamp_s: view.numbers for view in of_robot if view.stamp_s is not None}.items()
-    )
+    numbers = {
+        view.stamp_s: view.numbers
+        for view in session.views
+        if view.stamp_s is not None and name_of(session.declaration, "robot", view) == robot
+    }
+    rows = sorted(numbers.items())
     names = sorted({name for _, row in rows for name in row} - {STAMP})
     values = [[stamp_s, *(row.get(name, np.nan) for name in names)] for stamp_s, row in rows]
     return Stream((STAMP, *names), np.array(values).reshape(len(rows), len(names) + 1))

@@ -163,23 +163,19 @@ def fit_thermal(
     warming = _WarmingUnknowns(problem, stops, inputs, _start(robot, nominal, inputs))
     with one_blas_thread():
         cold = fit_problem(problem, state)
-        warm_state, noise = _minimised(
-            warming, _WarmState(cold.state, np.zeros(warming.size)), cold.noise
-        )
-        warm_problem, warm_at = warming.problem(warm_state.values), warming.at(warm_state)
-        gain = _negative_log_likelihood(problem, cold.state, noise) - _negative_log_likelihood(
-            warm_problem, warm_at, noise
-        )
-        information = fisher_information(warm_problem, warm_at, noise)
-        covariance = covariance_among(information, warm_problem.counted)[
-            -warming.size :, -warming.size :
-        ]
+        start, free = _WarmState(cold.state, np.zeros(warming.size)), slice(-warming.size, None)
+        warm, noise = _minimised(warming, start, cold.noise)
+        drifted, at = warming.problem(warm.values), warming.at(warm)
+        gain = _neg_log_likelihood(problem, cold.state, noise)
+        gain -= _neg_log_likelihood(drifted, at, noise)
+        information = fisher_information(drifted, at, noise)
+        covariance = covariance_among(information, drifted.counted)[free, free]
         before_m = _rms_m(problem, cold.state, stops.robot)
-        after_m = _rms_m(warm_problem, warm_at, stops.robot)
-    model, sigmas = warming.model(warm_state.values), warming.sigmas
+        after_m = _rms_m(drifted, at, stops.robot)
+    model, sigmas = warming.model(warm.values), warming.sigmas
     return ThermalFit(
         replace(model, covariance=covariance * np.outer(sigmas, sigmas)),
-        warm_state.values,
+        warm.values,
         sigmas,
         np.sqrt(np.diag(covariance)),
         2.0 * gain,
@@ -203,7 +199,7 @@ def _minimised(
     return state, noise
 
 
-def _negative_log_likelihood(problem: Problem, state: State, noise: Noise) -> float:
+def _neg_log_likelihood(problem: Problem, state: State, noise: Noise) -> float:
     return robot_levels(problem, state, noise, from_above=True)[1]
 
 
@@ -232,11 +228,10 @@ class _WarmingUnknowns:
 
     @property
     def sigmas(self) -> FloatArray:
-        count = self.start.joint_count
         kind = self.inputs.kind
         sizes = [_GROWTH_SIGMA_PER_K, _DRIFT_SIGMA_RAD_PER_K, _TAU_SIGMA[kind]]
         sizes += [_GAIN_SIGMA] * (kind == "currents")
-        return np.repeat(sizes, count)
+        return np.repeat(sizes, self.start.joint_count)
 
     @property
     def size(self) -> int:
@@ -260,14 +255,13 @@ class _WarmingUnknowns:
         problem = self.problem(warm.values)
         information, gradient, cost = equations_and_cost(problem, self.at(warm), noise)
         moving = problem.moving
-        free, free_gradient = information[np.ix_(moving, moving)], gradient[moving]
+        free = information[np.ix_(moving, moving)]
 
         def step(damping: float) -> _WarmState:
             change = np.zeros(problem.size)
-            change[moving] = damped_step(free, free_gradient, damping)
-            return _WarmState(
-                warm.state.moved(change[: -self.size]), warm.values + change[-self.size :]
-            )
+            change[moving] = damped_step(free, gradient[moving], damping)
+            state = warm.state.moved(change[: -self.size])
+            return _WarmState(state, warm.values + change[-self.size :])
 
         return Linearised(warm, cost + float(warm.values @ warm.values), step)
 
@@ -277,8 +271,7 @@ class _WarmingUnknowns:
         links = model.heating.links_c(self.inputs, stops.stamps_s)
         moved = poses[stops.robot].copy()
         moved[stops.places] = moved[stops.places] @ model.motion(stops.q, links)
-        count = len(moved)
-        effect = _effect(model, values, self.sigmas, stops, self.inputs, count)
+        effect = _effect(model, values, self.sigmas, stops, self.inputs, len(moved))
         warm = replace(self.cold, poses=poses | {stops.robot: moved})
         return warm.with_effects([*warm.effects, effect])
 

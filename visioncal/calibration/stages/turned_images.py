@@ -21,12 +21,7 @@ _OF_SPACING = 0.15
 
 @dataclass(frozen=True)
 class ImageTurn:
-    """A rotation or reflection of an image.
-
-    Attributes:
-        words: Its description.
-        option: The ImageMagick option that undoes it.
-    """
+    """A rotation or reflection of an image, in words, and ImageMagick's option that undoes it."""
 
     words: str
     option: str
@@ -70,13 +65,12 @@ def turned_how(
     """
     predicted = predicted_px[np.isfinite(predicted_px).all(axis=1)]
     limit_px = min(_AGREEMENT * max(typical_px, _LEAST_PX), _OF_SPACING * _spacing_px(predicted))
-    if not len(predicted) or _rms_distance_px(px, predicted) < limit_px:
+    if not len(predicted) or _rms_px(px, predicted) < limit_px:
         return None
     candidates = {**_UNDONE, **(_QUARTERS if size[0] == size[1] else {})}
-    turn = min(
-        candidates, key=lambda index: _rms_distance_px(candidates[index](px, *size), predicted)
-    )
-    return turn if _rms_distance_px(candidates[turn](px, *size), predicted) < limit_px else None
+    undone = ((_rms_px(undo(px, *size), predicted), turn) for turn, undo in candidates.items())
+    rms_px, turn = min(undone, key=lambda pair: pair[0])
+    return turn if rms_px < limit_px else None
 
 
 def _spacing_px(places: FloatArray) -> float:
@@ -88,7 +82,7 @@ def _spacing_px(places: FloatArray) -> float:
     return float(np.sqrt(np.median(squares.min(axis=1))))
 
 
-def _rms_distance_px(px: FloatArray, places: FloatArray) -> float:
+def _rms_px(px: FloatArray, places: FloatArray) -> float:
     """RMS distance of points from the nearest of others [px]."""
     squares = np.sum((px[:, None] - places) ** 2, axis=2).min(axis=1)
     return float(np.sqrt(squares.mean()))

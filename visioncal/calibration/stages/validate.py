@@ -80,10 +80,8 @@ def _needed_frames(problem: Problem) -> Mask:
     """(n, u) the unknown frames in the path of each observation."""
     needed = np.zeros((len(problem), len(problem.unknown)), dtype=bool)
     for group in problem.groups:
-        frames = [
-            problem.unknown[step.frame] for step in group.path if step.frame in problem.unknown
-        ]
-        needed[group.rows[:, None], frames] = True
+        frames = [step.frame for step in group.path if step.frame in problem.unknown]
+        needed[group.rows[:, None], [problem.unknown[frame] for frame in frames]] = True
     return needed
 
 
@@ -120,10 +118,8 @@ def chain_rms_px(
         counts = [len(corners.ids) for _, _, corners in views]
         view_of = np.repeat(rows, counts)
         points = positions[np.concatenate([corners.ids for _, _, corners in views])]
-        points = apply_each(poses[view_of], points)
-        residuals = project(camera, points) - np.concatenate(
-            [corners.px for _, _, corners in views]
-        )
+        observed = np.concatenate([corners.px for _, _, corners in views])
+        residuals = project(camera, apply_each(poses[view_of], points)) - observed
         # A corner behind the camera counts as a whole image width of error.
         residuals = np.nan_to_num(residuals, nan=float(max(camera.resolution)))
         squares = np.bincount(view_of, np.sum(residuals**2, axis=1), minlength=len(poses))
