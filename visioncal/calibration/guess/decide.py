@@ -265,24 +265,24 @@ def _only_exchanges_frames(recording: Recording, scored: Scored) -> bool:
     return is_same and scored.cost <= 1 and len(scored.rows) >= _FEWEST_ROUGH
 
 
-def _are_same(recording: Recording, one: Scored, other: Scored) -> bool:
+def _are_same(recording: Recording, best: Scored, rival: Scored) -> bool:
     """Whether two readings give the same poses, so that choosing does not matter."""
-    rows = np.intersect1d(one.rows, other.rows)
+    rows = np.intersect1d(best.rows, rival.rows)
     (first, _), (second, _) = (
-        scored.hypothesis.chain(recording.robot, recording.camera) for scored in (one, other)
+        item.hypothesis.chain(recording.robot, recording.camera) for item in (best, rival)
     )
     difference = invert(first[rows]) @ second[rows]
-    shift, angle = one.fit.rms
+    shift, angle = best.fit.rms
     return bool(
         np.sqrt(np.mean(rotation_angle(difference) ** 2)) <= _SAME * angle
         and np.sqrt(np.mean(np.sum(difference[:, :3, 3] ** 2, axis=1))) <= _SAME * shift
     )
 
 
-def _guess(found: _MountSearch, chain: FloatArray | None, mount_note: str = "") -> Guess:
-    recording, best = found.recording, found.best
-    candidates = {id(scored): _candidate(recording, scored) for scored in found.scored}
-    declared, chosen = candidates[id(found.scored[0])], candidates[id(best)]
+def _guess(result: _MountSearch, chain: FloatArray | None, mount_note: str = "") -> Guess:
+    recording, best = result.recording, result.best
+    candidates = {id(scored): _candidate(recording, scored) for scored in result.scored}
+    declared, chosen = candidates[id(result.scored[0])], candidates[id(best)]
     ranked = sorted(candidates.values(), key=lambda item: (item is not chosen, item.score))[
         :_LISTED
     ]

@@ -190,12 +190,12 @@ class Hypothesis:
     def robot_numbers(self, robot: PoseNumbers) -> PoseNumbers:
         """The robot's numbers, corrected and in the order of the camera's rows."""
         rows = self.rows(len(robot))
-        there = (rows >= 0)[:, None]
+        has_row = (rows >= 0)[:, None]
         ordered = self.robot.corrected(robot).rows(np.maximum(rows, 0))
         return replace(
             ordered,
-            positions=np.where(there, ordered.positions, np.nan),
-            rotations=np.where(there, ordered.rotations, np.nan),
+            positions=np.where(has_row, ordered.positions, np.nan),
+            rotations=np.where(has_row, ordered.rotations, np.nan),
         )
 
     def camera_numbers(self, camera: PoseNumbers) -> PoseNumbers:

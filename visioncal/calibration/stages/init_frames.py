@@ -24,7 +24,7 @@ from visioncal.calibration.stages.pairwise import (
     partial_hand_eye,
 )
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.pose_ambiguity import chosen, has_rival, settled
+from visioncal.calibration.stages.pose_ambiguity import chosen, has_rival, settle_candidates
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection, Target
@@ -178,11 +178,16 @@ def init_frames(
     Raises:
         DegenerateError: The motion leaves most views ambiguous.
     """
-    seen, candidates = problem.observations, Candidates.of(views)
+    observations, candidates = problem.observations, Candidates.of(views)
     turns_of = {frame: rotation_transforms(target) for frame, target in targets.items()}
     symmetries = {frame: turns for frame, turns in turns_of.items() if len(turns) > 1}
     sighted = Sighted(
-        seen.observers, seen.observed, seen.stops, candidates, symmetries, ~seen.has_rotation
+        observations.observers,
+        observations.observed,
+        observations.stops,
+        candidates,
+        symmetries,
+        ~observations.has_rotation,
     )
     tied = init_network(problem.tree, problem.poses, sighted, problem.priors)
     distances = _distances(problem, candidates, tied)
@@ -199,7 +204,7 @@ def init_frames(
         )
     why = "ambiguous: two poses of the target fit image and motion alike"
     rejections = tuple(Rejection(views[at].view, why) for at in unclear)
-    targets_seen = [targets.get(frame) for frame in seen.observed]
+    targets_seen = [targets.get(frame) for frame in observations.observed]
     chosen_views = (chosen(views[at], int(picks[at]), targets_seen[at]) for at in clear)
     return InitialFrames(tied, tuple(chosen_views), rejections)
 
@@ -217,7 +222,9 @@ def _distances(problem: Problem, candidates: Candidates, tied: ConnectedFrames) 
             # A fit to most views is more precise than one to the earliest.
             robot = problem.poses[robots[0].robot][problem.observations.stops[rows]]
             robot = robot if robots[0].is_up else invert(robot)
-            distances[rows] = settled(robot, candidates.take(rows), distances[rows].argmin(axis=1))
+            distances[rows] = settle_candidates(
+                robot, candidates.take(rows), distances[rows].argmin(axis=1)
+            )
     return distances
 
 
@@ -225,7 +232,7 @@ def _is_ambiguous(
     problem: Problem, candidates: Candidates, tied: ConnectedFrames, distances: FloatArray
 ) -> Mask:
     """(n,) whether another candidate is as likely as the nearest."""
-    seen, ambiguous = problem.observations, np.zeros(len(distances), dtype=bool)
+    observations, ambiguous = problem.observations, np.zeros(len(distances), dtype=bool)
     nearest = distances.min(axis=1)
     for group in problem.groups:
         if not any(step.frame in tied.untied for step in group.path):
@@ -233,7 +240,7 @@ def _is_ambiguous(
             ambiguous[group.rows] = has_rival(distances[group.rows], typical_m)
     poses = (candidates.valid & (candidates.turns == 0)).sum(axis=1)
     for frame in tied.edges.keys() - _with_priors(problem):
-        rows = seen.involves(frame)
+        rows = observations.involves(frame)
         # Nothing else decides between the poses of a frame's only view.
         ambiguous |= rows & (rows.sum() == 1) & (poses > 1)
     return ambiguous

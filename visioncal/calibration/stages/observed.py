@@ -211,49 +211,49 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
     )
 
 
-def all_held_back(seen: Observed) -> DataError:
+def all_held_back(observed: Observed) -> DataError:
     """The error where the session keeps every usable view out of the fit."""
     return DataError(
-        f"session {seen.session.name!r}: all views that could be used are held back (role = "
+        f"session {observed.session.name!r}: all views that could be used are held back (role = "
         "holdout), and none is left to fit.",
         next_step="Clear role in the rows that the fit may use.",
     )
 
 
-def nothing_seen(seen: Observed) -> DataError:
+def nothing_seen(observed: Observed) -> DataError:
     """The error where no view shows anything to calibrate by."""
-    if seen.corners and seen.corners.keys() <= seen.held_back:
-        return all_held_back(seen)
-    if not any(view.image or view.has_corners for view in seen.session.views):
+    if observed.corners and observed.corners.keys() <= observed.held_back:
+        return all_held_back(observed)
+    if not any(view.image or view.has_corners for view in observed.session.views):
         return DataError(
-            f"session {seen.session.name!r}: there are neither images nor measured poses.",
+            f"session {observed.session.name!r}: there are neither images nor measured poses.",
             next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
-    few = [view for view in seen.lost_views if "too few corners" in view]
+    few = [view for view in observed.lost_views if "too few corners" in view]
     if few:
         return DataError(
-            f"session {seen.session.name!r}: no view shows enough of the target.",
+            f"session {observed.session.name!r}: no view shows enough of the target.",
             next_step="Bring more of the board into the images; one of 4 x 4 squares or more has "
             "corners enough.",
         )
-    outside = [view for view in seen.lost_views if "lies far outside the image" in view]
-    if 2 * len(outside) > len(seen.lost_views):
+    outside = [view for view in observed.lost_views if "lies far outside the image" in view]
+    if 2 * len(outside) > len(observed.lost_views):
         return DataError(
-            f"session {seen.session.name!r}: the corners lie outside the image: resolution in "
+            f"session {observed.session.name!r}: the corners lie outside the image: resolution in "
             "[camera] is not that of the images in which they were found.",
             culprits=outside,
             next_step="In session.toml, give the resolution of these images, with the matrix that "
             "belongs to it.",
         )
     return DataError(
-        f"session {seen.session.name!r}: no view shows the target.",
+        f"session {observed.session.name!r}: no view shows the target.",
         next_step="Look at an image: is the board in it, and is it the one that the session "
-        f"declares?{_identify_command(seen)}",
+        f"declares?{_identify_command(observed)}",
     )
 
 
-def _identify_command(seen: Observed) -> str:
+def _identify_command(observed: Observed) -> str:
     """The command that identifies the board in an image, where images are files."""
-    image = next((view.image for view in seen.session.views if view.image), "")
-    has_files = image and isinstance(seen.session.images, FolderImages)
+    image = next((view.image for view in observed.session.views if view.image), "")
+    has_files = image and isinstance(observed.session.images, FolderImages)
     return f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""

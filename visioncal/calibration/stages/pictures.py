@@ -165,11 +165,11 @@ def _unnamed_paths(session: Session) -> list[str]:
     return sorted(set(paths) - named)
 
 
-def unseen_cause(seen: Observed) -> Finding | None:
+def unseen_cause(observed: Observed) -> Finding | None:
     """Finds why most images show nothing after the search, if known: files or another board."""
-    session = seen.session
+    session = observed.session
     with_image = [view for view in session.views if view.image and not view.has_corners]
-    with_target = seen.poses.keys() | seen.corners.keys()
+    with_target = observed.poses.keys() | observed.corners.keys()
     unseen = [view for view in with_image if view.number not in with_target]
     if not with_image or 3 * len(unseen) < len(with_image):
         return None
@@ -274,20 +274,22 @@ def _lacks_markers(image: Image, identity: Identity, declared: Target) -> bool:
     return blur > _PLAIN and not _is_larger(identity, declared)
 
 
-def _is_larger(found: Identity, declared: Target) -> bool:
+def _is_larger(identity: Identity, declared: Target) -> bool:
     """Whether a checkerboard has more squares along a side than a ChArUco board."""
-    seen, inner = (sorted((identity.columns, identity.rows)) for identity in (found, declared))
-    return any(one > other - 1 for one, other in zip(seen, inner, strict=True))
+    squares, inner = (sorted((board.columns, board.rows)) for board in (identity, declared))
+    return any(
+        count > declared_count - 1 for count, declared_count in zip(squares, inner, strict=True)
+    )
 
 
-def _is_better(found: Identity, before: Identity) -> bool:
-    return (found.whole, found.corners_seen) > (before.whole, before.corners_seen)
+def _is_better(new: Identity, best: Identity) -> bool:
+    return (new.whole, new.corners_seen) > (best.whole, best.corners_seen)
 
 
 def _matches(identity: Identity, target: Target) -> bool:
     """Whether the seen board is the target, except for its size."""
-    seen = identity.target(target.name, target.square_m)
-    is_same = all(getattr(seen, name) == getattr(target, name) for name in _COMPARED)
+    as_target = identity.target(target.name, target.square_m)
+    is_same = all(getattr(as_target, name) == getattr(target, name) for name in _COMPARED)
     return is_same and target.dictionary in ("", identity.dictionary, *identity.larger)
 
 

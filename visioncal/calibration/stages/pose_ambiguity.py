@@ -31,7 +31,7 @@ def choose_by(view: ViewPoses, predicted: FloatArray, target: Target | None) -> 
     return chosen(view, int(Candidates.of([view]).distances(predicted[None]).argmin()), target)
 
 
-def settled(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
+def settle_candidates(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
     """Solves for both edges from all views and updates each view's candidate until none changes.
 
     `robot` is (m, 4, 4), the robot's part of the chain, `picks` (m,) the initial choice.

@@ -90,8 +90,8 @@ def components(
     problem: Problem, state: State, covariance: FloatArray, priors: Sequence[FramePrior]
 ) -> tuple[Component, ...]:
     """The measured components of priors, used or not, beside the observations' estimates."""
-    found = (_components(prior, problem, state, covariance) for prior in priors)
-    return tuple(chain.from_iterable(found))
+    by_prior = (_components(prior, problem, state, covariance) for prior in priors)
+    return tuple(chain.from_iterable(by_prior))
 
 
 def _components(
@@ -102,21 +102,23 @@ def _components(
     sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, covariance, jacobian)) * prior.sigma_m
     # The position's rows follow those of the rotation, which are not reported.
     rows = slice(len(residuals) - len(prior.axes), len(residuals))
-    offs_m = (residuals[rows] * prior.sigma_m).tolist()
-    columns = zip(prior.axes, prior.values_m, offs_m, sigmas[rows].tolist(), strict=True)
-    for axis, stated_m, off_m, sigma_m in columns:
+    residuals_m = (residuals[rows] * prior.sigma_m).tolist()
+    columns = zip(prior.axes, prior.values_m, residuals_m, sigmas[rows].tolist(), strict=True)
+    for axis, stated_m, residual_m, sigma_m in columns:
         is_used = (prior.name, axis) in used
-        seen = _without_prior(off_m, sigma_m, prior.sigma_m) if is_used else (off_m, sigma_m)
-        label, seen_m = f"{_COMPONENTS[axis]} of {prior.name}", stated_m + seen[0]
-        yield Component(label, axis, is_used, stated_m, prior.sigma_m, seen_m, seen[1])
+        by_views = (
+            _without_prior(residual_m, sigma_m, prior.sigma_m) if is_used else (residual_m, sigma_m)
+        )
+        label, seen_m = f"{_COMPONENTS[axis]} of {prior.name}", stated_m + by_views[0]
+        yield Component(label, axis, is_used, stated_m, prior.sigma_m, seen_m, by_views[1])
 
 
-def _without_prior(off_m: float, sigma_m: float, prior_m: float) -> tuple[float, float]:
+def _without_prior(residual_m: float, sigma_m: float, prior_m: float) -> tuple[float, float]:
     """Distance of the views' own value from a measured component, and its sigma [m]."""
     information = max(sigma_m**-2.0 - prior_m**-2.0, 0.0)
-    views_m = np.inf if information == 0.0 else 1.0 / np.sqrt(information)
+    views_sigma_m = np.inf if information == 0.0 else 1.0 / np.sqrt(information)
     # The estimate is the mean of views and prior, weighted by information.
-    return float(off_m + off_m * (views_m / prior_m) ** 2), float(views_m)
+    return float(residual_m + residual_m * (views_sigma_m / prior_m) ** 2), float(views_sigma_m)
 
 
 def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
@@ -134,11 +136,11 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     label = f"session.toml: prior.{name}"
     for frame in (first, second):
         if frame not in tree.branches:
-            known = [branch for branch in tree.branches if branch != frame]
+            names = [branch for branch in tree.branches if branch != frame]
             raise DataError(
-                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(known)}.",
+                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(names)}.",
                 culprits=[label],
-                next_step=did_you_mean(frame, known)
+                next_step=did_you_mean(frame, names)
                 or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
             )
     moved_by = [step.robot for step in tree.path(first, second) if step.robot]

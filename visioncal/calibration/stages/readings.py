@@ -153,7 +153,7 @@ def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses
     return ViewPoses(view, None, probe[None], (0,), covariance[None], np.zeros((1, 6, 0)))
 
 
-def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...]:
+def exchanged_points(observed: Observed, readings: Readings) -> tuple[Rejection, ...]:
     """Finds readings of one robot's points whose names are exchanged.
 
     Raises:
@@ -161,12 +161,15 @@ def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...
         DegenerateError: There are too few stops.
     """
     stop_of = {
-        observation.view.number: observation.station for observation in seen.session.observations
+        observation.view.number: observation.station
+        for observation in observed.session.observations
     }
-    poses = seen.base_from_flange
-    views = [index for index in readings.read_m if index in poses and index not in seen.held_back]
+    poses = observed.base_from_flange
+    views = [
+        index for index in readings.read_m if index in poses and index not in observed.held_back
+    ]
     if not views:
-        raise nothing_seen(seen)
+        raise nothing_seen(observed)
     stops = np.unique([stop_of[view] for view in views], return_inverse=True)[1]
     _check_stops(readings, stops)
     places = readings.places(views, poses, stops)
@@ -267,12 +270,12 @@ def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], l
 
 
 def _read_once(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejection:
-    known = [word for word, views in others.items() if len(views) > 1]
-    hint = did_you_mean(name, known)
+    names = [word for word, views in others.items() if len(views) > 1]
+    hint = did_you_mean(name, names)
     if hint:
         raise DataError(
             f"views.csv: view {view} reads a point {name!r} that no other row names; the points "
-            f"are {some_of(known)}.",
+            f"are {some_of(names)}.",
             culprits=[f"views.csv: view {view}, point"],
             next_step=hint,
         )

@@ -121,17 +121,19 @@ def _fit_with_own_weights(
     if not looks.levels:
         levels = lens_levels(side, _with_measured_sizes(side, stated))
         stated = again(stated, side, stated.moving, stated.looks.with_levels(levels))
-    answer = chosen(side, stated)
-    new_side = side.with_errors(answer)
+    selected = chosen(side, stated)
+    new_side = side.with_errors(selected)
     if not any(error.is_significant for error in new_side.errors):
-        return answer, new_side
+        return selected, new_side
     under_stated = side.with_errors(stated)
     freeing = (under_stated if under_stated.errors else new_side).freed(freely=True)
-    answer = chosen(freeing, _still_significant(freeing, stated, answer))
+    selected = chosen(freeing, _still_significant(freeing, stated, selected))
     estimating = freeing.freed(freely=False)
     if all(error.is_estimated for error in freeing.errors):
-        return answer, estimating
-    fitted = settle(answer.looks, estimating, answer.moving, answer.frames, before=answer.seen)
+        return selected, estimating
+    fitted = settle(
+        selected.looks, estimating, selected.moving, selected.frames, before=selected.seen
+    )
     new_side = estimating.with_errors(fitted)
     # Errors that were not significant under the stated lenses may be so under these.
     if [error.is_estimated for error in new_side.errors] != [
@@ -237,19 +239,19 @@ def _with_lens_priors(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     return _with_contested_lenses(side, again(fitted, side, free, looks.doubting(doubts)))
 
 
-def _still_significant(side: Side, stated: ConvergedFit, answer: ConvergedFit) -> ConvergedFit:
+def _still_significant(side: Side, stated: ConvergedFit, fitted: ConvergedFit) -> ConvergedFit:
     """The fit with arm errors and with those freed values that are still significant."""
     # Before, these errors were part of the noise: values that had absorbed them return to the
     # stated ones, and real deviations are clear now.
-    refit = settle(answer.looks, side, answer.moving, answer.frames, before=answer.seen)
-    looks = answer.looks
+    refit = settle(fitted.looks, side, fitted.moving, fitted.frames, before=fitted.seen)
+    looks = fitted.looks
     groups = [looks.shape_of(index) for index in looks.printed] + [
         looks.lens_of(problem) for problem in looks.problems
     ]
     kept = [
         array
         for array in groups
-        if np.isin(array, answer.moving).all()
+        if np.isin(array, fitted.moving).all()
         and not np.isin(array, stated.moving).any()
         and moved_mahalanobis_sq(refit, array) > chance_limit(len(array))
     ]
@@ -258,7 +260,7 @@ def _still_significant(side: Side, stated: ConvergedFit, answer: ConvergedFit) -
     without_prior = places[np.isinf(looks.prior_sigma[places])]
     restated = stated.looks.without_prior(without_prior.tolist())
     restated = restated.with_values(places, refit.looks.values[places])
-    return settle(restated, side, np.unique(places), answer.frames)
+    return settle(restated, side, np.unique(places), fitted.frames)
 
 
 def _significant_sizes(side: Side, fit: ConvergedFit) -> tuple[list[IntArray], ConvergedFit]:
@@ -328,12 +330,12 @@ def chosen(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
     return _with_contested_lenses(side, resized)
 
 
-def _with_contested_lenses(side: Side, answer: ConvergedFit) -> ConvergedFit:
+def _with_contested_lenses(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     """The fit with the uncertainty of held intrinsics that corners contradict."""
-    contested = _contested_cameras(side, answer)
-    if contested == [name for name, problem in answer.looks.problems.items() if problem.contested]:
-        return answer
-    return again(answer, side, answer.moving, answer.looks.contesting(contested))
+    contested = _contested_cameras(side, fitted)
+    if contested == [name for name, problem in fitted.looks.problems.items() if problem.contested]:
+        return fitted
+    return again(fitted, side, fitted.moving, fitted.looks.contesting(contested))
 
 
 def _fit_freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
@@ -354,41 +356,41 @@ def _with_freed_scales(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
     """Frees the boards' scales where the robot measures others than are stated."""
     # One after the other: a wrong size biases the others, too, and the arm's errors, beside which a
     # size is tested.
-    answer, sizes = fitted, list[MeasuredScale]()
+    result, sizes = fitted, list[MeasuredScale]()
     for _ in fitted.looks.printed:
-        size = _most_wrong_size(side, answer)
+        size = _most_wrong_size(side, result)
         if size is None:
             break
-        resized = _with_scale(side, answer, size)
-        if not _is_determined(resized, answer):
+        resized = _with_scale(side, result, size)
+        if not _is_determined(resized, result):
             break
-        answer = resized
+        result = resized
         sizes.append(size)
-    if not (sizes and side.poses_alone):
-        return answer
-    covariance = side.covariance_by_posture(answer)
-    significant = [size for size in sizes if _is_clear(side, answer, size, covariance)]
+    if not (sizes and side.arms_without_joints):
+        return result
+    covariance = side.covariance_with_pose_errors(result)
+    significant = [size for size in sizes if _is_clear(side, result, size, covariance)]
     if len(significant) < len(sizes):
-        answer = fitted
+        result = fitted
         for size in significant:
-            answer = _with_scale(side, answer, size)
-    return answer
+            result = _with_scale(side, result, size)
+    return result
 
 
-def _with_scale(side: FramesSide, answer: ConvergedFit, size: MeasuredScale) -> ConvergedFit:
+def _with_scale(side: FramesSide, fitted: ConvergedFit, size: MeasuredScale) -> ConvergedFit:
     """The fit with the scale of a board free, from its measured value."""
-    place = answer.looks.scale_of(size.board)
-    looks = answer.looks.with_values(place, np.array([size.scale]))
+    place = fitted.looks.scale_of(size.board)
+    looks = fitted.looks.with_values(place, np.array([size.scale]))
     if size.contradicts:
         looks = looks.without_prior(place.tolist())
-    return again(answer, side, np.union1d(answer.moving, place), looks)
+    return again(fitted, side, np.union1d(fitted.moving, place), looks)
 
 
-def _most_wrong_size(side: FramesSide, answer: ConvergedFit) -> MeasuredScale | None:
+def _most_wrong_size(side: FramesSide, fitted: ConvergedFit) -> MeasuredScale | None:
     """The held board scale that differs most significantly from the stated one, or None."""
-    looks = answer.looks
-    held = [index for index in looks.printed if looks.scale_of(index)[0] not in answer.moving]
-    measured = [_measured_size(side, answer, board) for board in held]
+    looks = fitted.looks
+    held = [index for index in looks.printed if looks.scale_of(index)[0] not in fitted.moving]
+    measured = [_measured_size(side, fitted, board) for board in held]
     wrong = [size for size in measured if _is_wrong(side, size)]
     return max(wrong, key=lambda value: abs(value.scale) / value.sigma, default=None)
 
@@ -437,9 +439,9 @@ def _largest_sigmas(fitted: ConvergedFit) -> FloatArray:
     return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(place, place)])[-1] for place in places])
 
 
-def _contested_cameras(side: Side, answer: ConvergedFit) -> list[str]:
+def _contested_cameras(side: Side, fitted: ConvergedFit) -> list[str]:
     """Cameras with held intrinsics that the corners contradict."""
-    looks, moving = answer.looks, answer.moving
+    looks, moving = fitted.looks, fitted.moving
     held = [
         problem for problem in looks.problems if not np.isin(looks.lens_of(problem), moving).all()
     ]
@@ -447,7 +449,7 @@ def _contested_cameras(side: Side, answer: ConvergedFit) -> list[str]:
         return []
     bent = np.union1d(moving, looks.shape)
     lenses = {name: looks.lens_of(name) for name in held}
-    scores = Scores.of(side, answer, np.concatenate([bent, *lenses.values()]))
+    scores = Scores.of(side, fitted, np.concatenate([bent, *lenses.values()]))
     least = scores.gain(bent)
     return [
         name

@@ -57,39 +57,39 @@ class _RigView:
     focal_px: float
 
 
-def leave_out_wrong_points(seen: T) -> T:
+def leave_out_wrong_points(observed: T) -> T:
     """Reports and removes points of rigs that are not where their tables have them."""
-    targets = tuple(seen.session.boards.values())
+    targets = tuple(observed.session.boards.values())
     for first, (name, target) in zip(
-        first_corners(targets).tolist(), seen.session.boards.items(), strict=True
+        first_corners(targets).tolist(), observed.session.boards.items(), strict=True
     ):
         if target.kind != "points":
             continue
-        positions = _wrong_points(seen, target, first)
+        positions = _wrong_points(observed, target, first)
         if not positions:
             continue
         label = name if len(targets) > 1 else target.name
-        seen = seen.noting((), (_finding(target, positions, label),))
+        observed = observed.noting((), (_finding(target, positions, label),))
         wrong = np.array([first + point for point in positions])
-        for frame, look in seen.cameras.items():
+        for frame, look in observed.cameras.items():
             kept = {
                 view: view_corners.take(~np.isin(view_corners.ids, wrong))
                 for view, view_corners in look.corners.items()
             }
-            seen = seen.with_camera(frame, replace(look, corners=kept))
-    return seen
+            observed = observed.with_camera(frame, replace(look, corners=kept))
+    return observed
 
 
-def _wrong_points(seen: Observed, target: Target, first: int) -> dict[int, FloatArray]:
+def _wrong_points(observed: Observed, target: Target, first: int) -> dict[int, FloatArray]:
     """Measured positions of wrong points in the rig's frame [m], by index in the table."""
     table = np.array(target.points_m)
     rig_views: list[_RigView] = []
-    for look in seen.cameras.values():
+    for look in observed.cameras.values():
         if look.lens is None:
             continue
         for view, corners in look.corners.items():
             of_rig = (corners.ids >= first) & (corners.ids < first + len(table))
-            if view not in seen.reasons and view not in seen.held_back and of_rig.any():
+            if view not in observed.reasons and view not in observed.held_back and of_rig.any():
                 indices = corners.ids[of_rig] - first
                 rig_views += _rig_views(indices, corners.px[of_rig], table, look.lens.camera)
     return _consistent_positions(rig_views, table, target.point_sigmas_m)

@@ -30,31 +30,31 @@ from visioncal.session.kinds import is_seen, name_of
 T = TypeVar("T", bound=Observed)
 
 
-def read_robots(seen: T) -> T:
+def read_robots(observed: T) -> T:
     """Reads the reported poses and joints of the robots.
 
     Raises:
         DataError: There are only joints, and they are not as many as the robot's; or rows of one
             declared stop have different poses.
     """
-    session, reports = seen.timed, {}
+    session, reports = observed.timed, {}
     for name in session.robots:
         model_document = session.robot_documents.get(name)
         of_robot = tuple(
             view
             for view in session.views
             if name_of(session.declaration, "robot", view) == name
-            and not (seen.clocks and is_open(view))
+            and not (observed.clocks and is_open(view))
         )
         model = None if model_document is None else Robot.from_document(model_document)
         reported = reported_poses(replace(session, views=of_robot), model)
         reports[name] = _with_stops(session, name, reported)
         label = _label(session, name)
-        seen = seen.noting((), (warning.of(label) for warning in reported.warnings))
+        observed = observed.noting((), (warning.of(label) for warning in reported.warnings))
         notes = (remark.of(label).words for remark in remarks(reported.notes))
-        seen = replace(seen, notes=(*seen.notes, *notes))
-    rows = [row for row in session.observations if row.view.number not in seen.spared]
-    return replace(seen, robots=reports).noting(_lost_views(session, rows, reports))
+        observed = replace(observed, notes=(*observed.notes, *notes))
+    rows = [row for row in session.observations if row.view.number not in observed.spared]
+    return replace(observed, robots=reports).noting(_lost_views(session, rows, reports))
 
 
 def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
@@ -96,7 +96,7 @@ def _label(session: Session, robot: str) -> str:
     return f"Robot {robot}" if len(session.robots) > 1 else ""
 
 
-def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
+def check_joints(observed: T, *, drops: bool, takes: bool) -> T:
     """Refuses joints that only another reading makes fit the cameras' observations.
 
     With `drops`, views are removed whose pose and joints contradict each other, where the joints
@@ -105,49 +105,51 @@ def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
     Raises:
         DataError: Joints are misread.
     """
-    for name, reported in seen.robots.items():
+    for name, reported in observed.robots.items():
         if reported.matched is not None:
-            seen = _checked(seen, name, reported, reported.matched, (drops, takes))
-    return seen
+            observed = _checked(observed, name, reported, reported.matched, (drops, takes))
+    return observed
 
 
-def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tuple[bool, bool]) -> T:
-    session, joints, (drops, takes) = seen.session, reported.joints_rad or {}, how
-    pair = next(iter(pairs_of(seen, name)), _NO_PAIR)
-    observed = {
+def _checked(
+    observed: T, name: str, reported: Reported, matched: Matched, options: tuple[bool, bool]
+) -> T:
+    session, joints, (drops, takes) = observed.session, reported.joints_rad or {}, options
+    pair = next(iter(pairs_of(observed, name)), _NO_PAIR)
+    target_poses = {
         view: poses.cam_from_target[0] for view, poses in pair.poses.items() if view in joints
     }
-    if not observed:
-        return seen
-    excluded = {*matched.contradicting, *seen.held_back}
-    views = [view for view in observed if view not in excluded]
-    rows = np.array([observed[view] for view in views])
+    if not target_poses:
+        return observed
+    excluded = {*matched.contradicting, *observed.held_back}
+    views = [view for view in target_poses if view not in excluded]
+    rows = np.array([target_poses[view] for view in views])
     q = np.array([joints[view] for view in views]).reshape(len(views), matched.robot.joint_count)
     guess = _guess_seen_joints(matched.arm, q, rows, pair.mount)
     if drops:
         contradicting = {
             view: (reported.base_from_flange[view], pose)
-            for view, pose in observed.items()
+            for view, pose in target_poses.items()
             if view in matched.contradicting
         }
         lost = tuple(_contradicted_joints(matched, guess, contradicting, pair.mount))
         reported = reported.without({rejection.view for rejection in lost})
-        seen = seen.noting(lost).with_robot(name, reported)
+        observed = observed.noting(lost).with_robot(name, reported)
     if guess is None or not guess.stands_out:
-        return seen
+        return observed
     zero = guess.zero
     if zero is None:
-        mine = [view for view in session.views if view.number in reported.base_from_flange]
-        has_poses = any(view.base_from_flange() is not None for view in mine)
+        of_robot = [view for view in session.views if view.number in reported.base_from_flange]
+        has_poses = any(view.base_from_flange() is not None for view in of_robot)
         error = misread_joints(guess, matched.robot, has_poses=has_poses)
         raise error.within(f"robot {name}") if len(session.robots) > 1 else error
     used = takes and matched.zero is None
     finding = _lost_zero_finding(guess, zero, is_used=used)
-    seen = seen.noting((), (finding.of(_label(session, name)),))
-    return seen.with_robot(name, reported.with_zero(zero)) if used else seen
+    observed = observed.noting((), (finding.of(_label(session, name)),))
+    return observed.with_robot(name, reported.with_zero(zero)) if used else observed
 
 
-def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
+def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> None:
     """Refuses joints that only another reading makes fit an instrument's readings.
 
     `probes` has (4, 4) `instrument_from_probe` by view; it is empty where points do not determine
@@ -156,19 +158,19 @@ def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
     Raises:
         DataError: Joints are misread.
     """
-    for reported in seen.robots.values():
+    for reported in observed.robots.values():
         matched, joints = reported.matched, reported.joints_rad or {}
-        views = [probe for probe in probes if probe in joints and probe not in seen.held_back]
+        views = [probe for probe in probes if probe in joints and probe not in observed.held_back]
         if matched is None or not views:
             continue
-        q, looks = (np.array([by_view[view] for view in views]) for by_view in (joints, probes))
+        q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, probes))
         # The instrument is fixed beside the robot, as a camera may be.
-        guess = _guess_seen_joints(matched.arm, q, looks, "eye-to-hand")
+        guess = _guess_seen_joints(matched.arm, q, poses, "eye-to-hand")
         if guess is not None and guess.stands_out and guess.zero is None:
-            mine = (view for view in seen.session.views if view.number in joints)
-            has_poses = any(view.base_from_flange() is not None for view in mine)
-            by = "what the instrument reads"
-            raise misread_joints(guess, matched.robot, has_poses=has_poses, seen=by)
+            with_joints = (view for view in observed.session.views if view.number in joints)
+            has_poses = any(view.base_from_flange() is not None for view in with_joints)
+            source = "what the instrument reads"
+            raise misread_joints(guess, matched.robot, has_poses=has_poses, seen=source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,20 +186,20 @@ class CameraTargetPair:
 _NO_PAIR = CameraTargetPair("", "", "eye-in-hand", {})
 
 
-def pairs_of(seen: Observed, robot: str) -> list[CameraTargetPair]:
+def pairs_of(observed: Observed, robot: str) -> list[CameraTargetPair]:
     """The pairs of a camera and a target with only this robot between, those of most views first.
 
     Poses of different pairs do not compare.
     """
     pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
-    for observation in seen.timed.observations:
+    for observation in observed.timed.observations:
         view = observation.view.number
         is_alone = [*observation.robots, *observation.lacks] == [robot]
-        if view in seen.poses and is_seen(observation.view) and is_alone:
-            pairs.setdefault((observation.seer, observation.seen), {})[view] = seen.poses[view]
+        if view in observed.poses and is_seen(observation.view) and is_alone:
+            pairs.setdefault((observation.seer, observation.seen), {})[view] = observed.poses[view]
     flange, found_pairs = frame_name("flange", robot), []
     for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):
-        on_flange = seen.session.frames[camera] == flange
+        on_flange = observed.session.frames[camera] == flange
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
         found_pairs.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
     return found_pairs

@@ -92,16 +92,16 @@ class FramesSide:
         return replace(self, arms=arms)
 
     @property
-    def poses_alone(self) -> dict[str, RobotArm]:
+    def arms_without_joints(self) -> dict[str, RobotArm]:
         """The arms without joint angles."""
         return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
 
-    def covariance_by_posture(self, fitted: ConvergedFit) -> FloatArray:
+    def covariance_with_pose_errors(self, fitted: ConvergedFit) -> FloatArray:
         """(p, p) covariance of a fit, with the errors of arms without joint angles.
 
         These are treated as noise, with sigmas by `find_pose_errors`.
         """
-        problem, arms = fitted.problem, self.poses_alone
+        problem, arms = fitted.problem, self.arms_without_joints
         for arm in arms.values():
             problem = arm.without_errors(problem)
         values, free = problem.start_values.copy(), len(fitted.seen.free)
@@ -128,16 +128,16 @@ class FramesSide:
                 view.view: view.corners for view in views[frame] if view.corners is not None
             }
             problems[frame] = CornerProblem.of(scene, corners, shares)
-            seen = [view for view in views[frame] if view.view in corners]
-            poses[frame] = np.array([view.cam_from_target[0] for view in seen])
+            with_corners = [view for view in views[frame] if view.view in corners]
+            poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
         return CameraParameters.of(problems, poses)
 
     @property
     def _shares(self) -> dict[int, float]:
         """Weight of each view for lenses and boards; views of one stop share one weight."""
-        seen, tree = self.observed.observations, self.observed.tree
-        pairs = list(zip(seen.observers, seen.observed, strict=True))
+        observations, tree = self.observed.observations, self.observed.tree
+        pairs = list(zip(observations.observers, observations.observed, strict=True))
         has_robot = {pair: any(step.robot for step in tree.path(*pair)) for pair in set(pairs)}
-        rows = zip(self.views, pairs, seen.stops.tolist(), strict=True)
-        kinds = {view: (pair, stop if has_robot[pair] else None) for view, pair, stop in rows}
-        return repeat_shares(kinds)
+        rows = zip(self.views, pairs, observations.stops.tolist(), strict=True)
+        repeated = {view: (pair, stop if has_robot[pair] else None) for view, pair, stop in rows}
+        return repeat_shares(repeated)

@@ -88,10 +88,10 @@ def _needed_frames(problem: Problem) -> Mask:
 def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """Residuals (n,) [m] and (n,) [rad] of observations."""
     away_m, away_rad = distances(problem.measured(state), problem.predicted(state))
-    seen = problem.observations
+    observations = problem.observations
     # The rotation of a mere point is arbitrary.
-    is_point = np.isin(seen.observed, list(problem.points))
-    return away_m, np.where(seen.has_rotation & ~is_point, away_rad, np.nan)
+    is_point = np.isin(observations.observed, list(problem.points))
+    return away_m, np.where(observations.has_rotation & ~is_point, away_rad, np.nan)
 
 
 def chain_rms_px(
