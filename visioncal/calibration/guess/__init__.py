@@ -1,4 +1,4 @@
-"""Which reading of the poses is right: units, inverses, rotations, pairing, mount."""
+"""Search for the right reading of recorded poses: units, inverses, rotations, pairing, mount."""
 
 from visioncal.calibration.guess.decide import guess_reading
 from visioncal.calibration.guess.result import Candidate, Guess

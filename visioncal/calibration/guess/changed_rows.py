@@ -1,6 +1,6 @@
-"""How rows have to be read from some row on, where only those before it are as declared.
+"""Rows that need another reading from some row on, while those before it are as declared.
 
-A driver that was set up anew midway writes other units or rotations; an image that was lost, or a
+A driver that is set up anew midway writes other units or rotations; an image that was lost, or a
 pose that was recorded twice, shifts all rows behind it.
 """
 
@@ -15,24 +15,20 @@ from visioncal.calibration.guess.hypothesis import Hypothesis, SideReading, Turn
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M
 from visioncal.core.types import IntArray, Mask
 
-# Rows at one end that determine both edges, and the fewest that show another reading.
+# Fewest rows at one end that determine both edges, and fewest that show another reading.
 _REFERENCE, _FEWEST = 6, 3
-# So many of the rows as declared agree, and of those that are read otherwise; of others so few.
-_MOST, _FEW = 0.9, 0.2
+# Least share of rows that agree with their reading, and largest share with a wrong one.
+_AGREEING_SHARE, _WRONG_SHARE = 0.9, 0.2
 _SHIFTS = (1, -1, 2, -2)
-# Others are no slip of a driver, but of a whole program.
+# Other forms are mistakes of a whole program, not of a driver.
 _FORMS = ("quaternion-xyzw", "quaternion-wxyz", "quaternion-yzwx", "matrix", "matrix-transposed")
 
 
 @dataclass(frozen=True)
 class ChangedRows:
-    """Rows at one end that are to be read otherwise than the rest.
+    """Rows at one end of the recording that need another reading, ascending.
 
-    Attributes:
-        rows: The rows, ascending.
-        is_behind: Whether they come last.
-        reading: How they are to be read.
-        words: In what that departs from what is declared.
+    `is_behind` is whether they come last, `words` are the differences from the declared reading.
     """
 
     rows: tuple[int, ...]
@@ -42,41 +38,35 @@ class ChangedRows:
 
 
 def changed_rows(recording: Recording) -> ChangedRows | None:
-    """Finds rows, from some row on or before one, that only another reading explains.
-
-    Args:
-        recording: Both sides' numbers, in the order of time.
+    """Finds rows at either end, in the order of time, that only another reading explains.
 
     Returns:
-        Them; None where all rows fit as declared, or no reading makes those of one end fit.
+        The rows; None where all fit as declared, or no reading makes those of one end fit.
     """
     rows = recording.common_rows()
     if len(rows) < _REFERENCE + _FEWEST:
         return None
     for order in (rows, rows[::-1]):
-        fit, count = _as_declared(recording, order)
+        fit, count = _declared_fit(recording, order)
         rest = np.sort(order[count:])
         if count < _REFERENCE or len(rest) < _FEWEST:
             continue
-        found = next(
-            (tried for tried in _readings(recording) if _explains(recording, tried, fit, rest)),
-            None,
-        )
-        if found is not None:
-            is_behind = bool(rest[0] > order[0])
-            return ChangedRows(tuple(rest.tolist()), is_behind, found, recording.changes(found))
+        for reading in _readings(recording):
+            if _explains(recording, reading, fit, rest):
+                is_behind, words = bool(rest[0] > order[0]), recording.changes(reading)
+                return ChangedRows(tuple(rest.tolist()), is_behind, reading, words)
     return None
 
 
-def _as_declared(recording: Recording, order: IntArray) -> tuple[Fit, int]:
-    """The fit of the first rows of an order that agree as declared, and how many these are."""
+def _declared_fit(recording: Recording, order: IntArray) -> tuple[Fit, int]:
+    """Fit of the first rows of an order that agree as declared, and their number."""
     robot, camera = (
         side[order] for side in recording.declared.chain(recording.robot, recording.camera)
     )
     count = _REFERENCE
     for _ in range(2):
         fit = robust_fit(robot[:count], camera[:count])
-        agrees = distances(robot, camera, fit.lever, (fit.x, fit.z)).away < CLOSING_SCORE
+        agrees = distances(robot, camera, fit.lever, (fit.x, fit.z)).residuals < CLOSING_SCORE
         count = _agreeing(agrees)
         if count < _REFERENCE:
             break
@@ -84,16 +74,17 @@ def _as_declared(recording: Recording, order: IntArray) -> tuple[Fit, int]:
 
 
 def _agreeing(agrees: Mask) -> int:
-    """How many rows agree before those of which hardly any does; 0 where there is no such place."""
-    before = np.append(0, np.cumsum(agrees))
-    count = np.arange(len(before))
-    best = int(np.argmax(2 * before - count))
-    behind = float(np.mean(agrees[best:])) if best < len(agrees) else 0.0
-    return best if before[best] >= _MOST * best and behind <= _FEW else 0
+    """Number of rows before the change point; 0 without a clear one."""
+    agreeing = np.append(0, np.cumsum(agrees))
+    count = np.arange(len(agreeing))
+    change = int(np.argmax(2 * agreeing - count))
+    share_behind = float(np.mean(agrees[change:])) if change < len(agrees) else 0.0
+    is_clear = agreeing[change] >= _AGREEING_SHARE * change and share_behind <= _WRONG_SHARE
+    return change if is_clear else 0
 
 
 def _readings(recording: Recording) -> Iterator[Hypothesis]:
-    """Other readings of the robot's rows, the likelier ones first."""
+    """Other readings of the robot's rows, the more likely ones first."""
     declared, size = recording.declared, recording.robot.rotations.shape[1]
     yield from (replace(declared, shift=shift) for shift in _SHIFTS)
     sides = (
@@ -108,13 +99,13 @@ def _readings(recording: Recording) -> Iterator[Hypothesis]:
 
 
 def _explains(recording: Recording, tried: Hypothesis, fit: Fit, rows: IntArray) -> bool:
-    """Whether some rows, read so, close the chain of the others."""
+    """Whether the rows under another reading close the chain of the others."""
     robot, camera = (side[rows] for side in tried.chain(recording.robot, recording.camera))
-    there = np.isfinite(robot).all(axis=(1, 2))
-    if not there.any():
+    readable = np.isfinite(robot).all(axis=(1, 2))
+    if not readable.any():
         return False
-    away = distances(robot[there], camera[there], fit.lever, (fit.x, fit.z)).away
-    # A shift leaves as many rows without a partner: at the end of the table where images are lost,
-    # and where it begins where poses are.
+    residuals = distances(robot[readable], camera[readable], fit.lever, (fit.x, fit.z)).residuals
+    # A shift leaves as many rows without a partner: at the table's end where images are lost, at
+    # its beginning where poses are.
     paired = len(rows) - abs(tried.shift)
-    return bool(np.sum(away < CLOSING_SCORE) >= max(_FEWEST, _MOST * paired))
+    return bool(np.sum(residuals < CLOSING_SCORE) >= max(_FEWEST, _AGREEING_SHARE * paired))

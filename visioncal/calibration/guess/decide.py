@@ -1,8 +1,7 @@
-"""Whether a reading stands out, and under which mount; rows in another order.
+"""Decision whether a reading stands out, and under which mount; rows in another order.
 
-Reported poses are `base_from_model @ FK(q) @ flange_from_tool` with two constant transforms: a base
-that is turned, and an inverse that could as well be another mount, show in the robot's own joints
-alone.
+Reported poses are `base_from_model @ FK(q) @ flange_from_tool` with two constant transforms: a
+turned base, and an inverse that may as well be another mount, show only in the robot's own joints.
 """
 
 from collections.abc import Sequence
@@ -35,44 +34,45 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, pose_difference, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
 
-# Readings this near to the best are as good; of them, the one with the fewest changes is meant.
-_ALIKE = 2.0
-# A rival as simple as the best leaves the matter open while it is this near.
+# Ratio to the best score within which readings are equivalent; the one with the fewest changes is
+# chosen.
+_EQUIVALENT = 2.0
+# An equally simple rival within this ratio of the best makes the reading ambiguous.
 _RIVALS = 1.5
-# Views beyond this many typical distances do not agree with the others.
+# Views within this many scores agree with the others.
 _AGREES = 5.0
 _LISTED = 12
-# Of the few readings that only exchange frames one may be right though the poses are poor: with
-# turns of 5 degrees of noise, say. Fewer views would close so far by chance.
+# A reading that only exchanges frames may be right though the poses are poor: with 5 degrees of
+# noise, say. Fewer views would close so far by chance.
 _ROUGHLY, _FEWEST_ROUGH = 2.0 * CLOSING_SCORE, 8
-# Poses of two readings that differ by less than this share of what is left are the same.
+# Poses of two readings that differ by less than this share of the residuals are the same.
 _SAME = 0.3
-# Nominal models differ from the controller's by a few millimetres; a half turn is far from that.
+# Nominal models differ from the controller's by a few millimetres; a half turn, by far more.
 _NEAR_MM, _NEAR_DEG = 10.0, 2.0
-# Poses of this many times the scatter of the others are not those of the joints.
-_CLEARLY = 3.0
+# The joints choose a reading whose score is better than the others' by this factor.
+_CLEAR_RATIO = 3.0
 _FEWEST_ROWS = 4
-# A reading that is right agrees with the joints within this share of the distances.
+# The right reading agrees with the joints within this share of the distances.
 _SAME_CHAIN = 0.02
 
-# A view stands out from here, in the typical distance of those that agree. Exchanged back it has
-# to be nearer than that, and by this many times nearer than it was.
-_OUT, _NEARER = 5.0, 3.0
-# A fit of all pairs of views takes time with the square of these.
+# Outlier views have residuals beyond this many scores. Exchanged back, a residual has to be below
+# that, and smaller than before by the second factor.
+_OUTLIER, _NEARER = 5.0, 3.0
+# Most rows that are fitted again: time grows with the square.
 _MOST_ROWS = 200
-# Up to so many views every exchange is tried.
+# Up to this many views, every exchange is tried.
 _FEW = 8
-# The best exchange is meant where no other comes within this many times of it.
+# The best exchange is taken where the next is worse by this factor.
 _BEYOND_NEXT = 2.0
-# More views than this that disagree are no two rows exchanged.
-_MOST = 8
-# Sets of views from which the fit of an order is begun.
+# More outlier views are not two rows exchanged.
+_MOST_OUTLIERS = 8
+# Random subsets from which the fit of an order starts.
 _STARTS = 12
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """What the search finds under one mount: the declared reading first, and the best."""
+class _MountSearch:
+    """Result of the search under one mount: the declared reading first, and the best."""
 
     recording: Recording
     scored: tuple[Scored, ...]
@@ -87,15 +87,14 @@ def guess_reading(
     chain: FloatArray | None = None,
     is_measured: bool = False,
 ) -> Guess:
-    """Tries every plausible reading of the poses and says which closes the chain.
+    """Tries every plausible reading of the poses and finds the one that closes the chain.
 
     Args:
-        robot: `base_from_flange` of n rows, with the reading that is declared.
+        robot: `base_from_flange` of n rows, with the declared reading.
         camera: `cam_from_target` of the same rows, likewise; NaN where the target was not seen.
-        mount: The declared mount; None where it is not known: it then is the one of the likelier
-            cell.
-        chain: (n, 4, 4) `base_from_flange` through a robot's model at the recorded joints, NaN in
-            rows without; it shows what no camera can.
+        mount: The declared mount; None to take the one with the more plausible cell.
+        chain: (n, 4, 4) `base_from_flange` by a robot's model at the recorded joints, NaN in rows
+            without; it shows what no camera can.
         is_measured: Whether the camera's poses were measured from images by visioncal, so that
             only the board's stated size can be wrong about them.
 
@@ -104,28 +103,28 @@ def guess_reading(
 
     Raises:
         DataError: The rows do not match, a rotation has not as many numbers as its form, or
-            the mount is not known.
+            both mounts fit and none was declared.
         DegenerateError: Too few rows have both poses.
     """
     mounts = MOUNTS if mount is None else (mount,)
     recordings = [Recording(robot, camera, name, is_measured) for name in mounts]
     _check(recordings[0])
     with one_blas_thread():
-        found = [_found(recording, chain) for recording in recordings]
+        searches = [_searched(recording, chain) for recording in recordings]
         if mount is not None:
-            return _guess(found[0], chain)
-        chosen = _of_likelier_mount(found[0], found[1], chain)
+            return _guess(searches[0], chain)
+        chosen = _of_likelier_mount(searches[0], searches[1], chain)
         return _guess(chosen, chain, _mount_note(chosen))
 
 
-def _found(recording: Recording, chain: FloatArray | None) -> _Found:
+def _searched(recording: Recording, chain: FloatArray | None) -> _MountSearch:
     declared, *others = search(recording)
     if chain is not None:
         others = [_by_chain(other, recording, chain) for other in others]
     scored = [declared, *others]
     best = _decided(recording, scored)
     if best.hypothesis.shift or best.score > CLOSING_SCORE:
-        # Rows that are sorted as text follow each other by shifts, a few at a time.
+        # Rows sorted as text follow each other with shifts, a few at a time.
         in_order = reordered(recording, declared)
         if in_order is not None and _explains_more(recording, in_order, best):
             best = in_order
@@ -135,24 +134,26 @@ def _found(recording: Recording, chain: FloatArray | None) -> _Found:
         best = swapped
         scored.append(best)
     if chain is not None and _is_half_turned(best.hypothesis, recording.robot, chain):
-        taken = replace(best.hypothesis.robot, half_turned=True)
-        turned = replace(best.hypothesis, robot=taken)
-        best = replace(best, hypothesis=turned, labels=())
+        turned = replace(best.hypothesis.robot, half_turned=True)
+        best = replace(best, hypothesis=replace(best.hypothesis, robot=turned), labels=())
         scored.append(best)
-    return _Found(recording, tuple(scored), best)
+    return _MountSearch(recording, tuple(scored), best)
 
 
-def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) -> _Found:
-    """Chooses the mount: by residuals, by the joints, by what cells look like, by the changes."""
-    # An inverse of the poses closes the chain under the wrong mount as poses as they are do under
-    # the right one, so that the number of changes alone says nothing.
+def _of_likelier_mount(
+    first: _MountSearch, second: _MountSearch, chain: FloatArray | None
+) -> _MountSearch:
+    """Chooses the mount: by residuals, by the joints, by plausibility, by the changes."""
+    # Inverted poses close the chain under the wrong mount as well as the poses do under the right
+    # one: the number of changes alone decides nothing.
     better, worse = sorted((first, second), key=lambda value: value.best.score)
     if better.best.score > CLOSING_SCORE or worse.best.score > STANDS_OUT * better.best.score:
         return better
-    both = {found.best.hypothesis: found for found in (first, second)}
-    by_joints = None if chain is None else _by_joints(tuple(both), first.recording.robot, chain)
-    if by_joints is not None:
-        return both[by_joints]
+    by_hypothesis = {item.best.hypothesis: item for item in (first, second)}
+    if chain is not None:
+        by_joints = _by_joints(tuple(by_hypothesis), first.recording.robot, chain)
+        if by_joints is not None:
+            return by_hypothesis[by_joints]
     other, likelier = sorted(
         (first, second),
         key=lambda value: (
@@ -165,8 +166,8 @@ def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) 
     if is_same or (is_clear and not _is_poor(likelier.recording, likelier.best)):
         return likelier
     readings = " and ".join(
-        f"{found.best.hypothesis.mount} ({_candidate(found.recording, found.best).words})"
-        for found in (first, second)
+        f"{item.best.hypothesis.mount} ({_candidate(item.recording, item.best).words})"
+        for item in (first, second)
     )
     raise DataError(
         f"The mount is not given, and the poses fit both ways of mounting: {readings}.",
@@ -174,7 +175,7 @@ def _of_likelier_mount(first: _Found, second: _Found, chain: FloatArray | None) 
     )
 
 
-def _mount_note(chosen: _Found) -> str:
+def _mount_note(chosen: _MountSearch) -> str:
     if chosen.best.score > CLOSING_SCORE:
         return ""
     on_flange_m, at_base_m = flange_and_cell_m(chosen.best)
@@ -186,7 +187,7 @@ def _mount_note(chosen: _Found) -> str:
 
 
 def _check(recording: Recording) -> None:
-    """Makes sure that the numbers can be paired and looked at."""
+    """Checks that the numbers can be paired and read."""
     robot, camera = recording.robot, recording.camera
     if len(robot) != len(camera):
         raise DataError(
@@ -220,43 +221,43 @@ def _by_chain(scored: Scored, recording: Recording, chain: FloatArray) -> Scored
 
 
 def _decided(recording: Recording, scored: Sequence[Scored]) -> Scored:
-    """The reading that stands out from the declared one and from its rivals; else the declared."""
+    """The reading that stands out from the declared one and its rivals; else the declared one."""
     declared, *others = scored
     if not others:
         return declared
-    least = min(other.score for other in others)
-    alike = [other for other in others if other.score <= _ALIKE * least]
-    alike.sort(key=lambda item: (item.cost, item.score))
-    best, rivals = alike[0], alike[1:]
-    if best.score > (_ROUGHLY if _is_turned_about(recording, best) else CLOSING_SCORE):
+    least_score = min(other.score for other in others)
+    equivalent = [other for other in others if other.score <= _EQUIVALENT * least_score]
+    equivalent.sort(key=lambda item: (item.cost, item.score))
+    best, rivals = equivalent[0], equivalent[1:]
+    if best.score > (_ROUGHLY if _only_exchanges_frames(recording, best) else CLOSING_SCORE):
         return declared
-    # Declared in units in which no camera could see the target, the chain may close as well.
+    # In declared units in which no camera could see the target, the chain may close as well.
     is_likely = is_likely_unit(recording, declared.hypothesis.camera.unit)
     if is_likely and declared.score <= STANDS_OUT * best.score:
         return declared
-    is_open = any(
+    is_ambiguous = any(
         rival.cost == best.cost
         and rival.score < _RIVALS * best.score
         and not _are_same(recording, rival, best)
         for rival in rivals
     )
-    return declared if is_open or _is_poor(recording, best) else best
+    return declared if is_ambiguous or _is_poor(recording, best) else best
 
 
 def _explains_more(recording: Recording, tried: Scored, best: Scored) -> bool:
-    """Whether more views agree with an order of the rows than with what is best without it."""
+    """Whether more views agree under an order of the rows than under the best without."""
     if _is_poor(recording, tried):
         return False
     return best.score > CLOSING_SCORE or _agreeing(tried.fit) > _agreeing(best.fit)
 
 
 def _agreeing(fit: Fit) -> int:
-    """How many views agree with each other."""
-    return int((fit.away <= _AGREES * max(fit.score, SCORE_FLOOR)).sum())
+    """Number of views that agree with each other."""
+    return int((fit.residuals <= _AGREES * max(fit.score, SCORE_FLOOR)).sum())
 
 
-def _is_turned_about(recording: Recording, scored: Scored) -> bool:
-    """Whether a reading of many views is but an inverse or another mount."""
+def _only_exchanges_frames(recording: Recording, scored: Scored) -> bool:
+    """Whether a reading of many views differs only by an inverse or another mount."""
     tried, declared = scored.hypothesis, recording.declared
     robot = replace(tried.robot, inverse=declared.robot.inverse)
     camera = replace(tried.camera, inverse=declared.camera.inverse)
@@ -264,42 +265,38 @@ def _is_turned_about(recording: Recording, scored: Scored) -> bool:
     return is_same and scored.cost <= 1 and len(scored.rows) >= _FEWEST_ROUGH
 
 
-def _are_same(recording: Recording, one: Scored, other: Scored) -> bool:
-    """Whether two readings have the same poses, so that it does not matter which is meant."""
-    rows = np.intersect1d(one.rows, other.rows)
+def _are_same(recording: Recording, best: Scored, rival: Scored) -> bool:
+    """Whether two readings give the same poses, so that choosing does not matter."""
+    rows = np.intersect1d(best.rows, rival.rows)
     (first, _), (second, _) = (
-        scored.hypothesis.chain(recording.robot, recording.camera) for scored in (one, other)
+        item.hypothesis.chain(recording.robot, recording.camera) for item in (best, rival)
     )
-    away = invert(first[rows]) @ second[rows]
-    shift, angle = one.fit.rms
+    difference = invert(first[rows]) @ second[rows]
+    shift, angle = best.fit.rms
     return bool(
-        np.sqrt(np.mean(rotation_angle(away) ** 2)) <= _SAME * angle
-        and np.sqrt(np.mean(np.sum(away[:, :3, 3] ** 2, axis=1))) <= _SAME * shift
+        np.sqrt(np.mean(rotation_angle(difference) ** 2)) <= _SAME * angle
+        and np.sqrt(np.mean(np.sum(difference[:, :3, 3] ** 2, axis=1))) <= _SAME * shift
     )
 
 
-def _guess(found: _Found, chain: FloatArray | None, mount_note: str = "") -> Guess:
-    recording, best = found.recording, found.best
-    candidates = {id(scored): _candidate(recording, scored) for scored in found.scored}
-    declared, chosen = candidates[id(found.scored[0])], candidates[id(best)]
-    ranked = sorted(
-        candidates.values(), key=lambda candidate: (candidate is not chosen, candidate.score)
-    )[:_LISTED]
+def _guess(result: _MountSearch, chain: FloatArray | None, mount_note: str = "") -> Guess:
+    recording, best = result.recording, result.best
+    candidates = {id(scored): _candidate(recording, scored) for scored in result.scored}
+    declared, chosen = candidates[id(result.scored[0])], candidates[id(best)]
+    ranked = sorted(candidates.values(), key=lambda item: (item is not chosen, item.score))[
+        :_LISTED
+    ]
     if declared not in ranked:
         ranked[-1] = declared
-    is_poor = _is_poor(recording, best)
-    is_other = chosen is not declared
-    words = notes(
-        recording, best, has_chain=chain is not None, is_declared=not is_other, is_poor=is_poor
+    is_poor, is_other, has_chain = (
+        _is_poor(recording, best),
+        chosen is not declared,
+        chain is not None,
     )
-    return Guess(
-        declared,
-        tuple(ranked),
-        chosen,
-        is_other,
-        sentence(declared, chosen, ranked, is_poor=is_poor),
-        ((mount_note,) if mount_note else ()) + tuple(words),
-    )
+    words = notes(recording, best, has_chain=has_chain, is_declared=not is_other, is_poor=is_poor)
+    finding = sentence(declared, chosen, ranked, is_poor=is_poor)
+    all_notes = ((mount_note,) if mount_note else ()) + tuple(words)
+    return Guess(declared, tuple(ranked), chosen, is_other, finding, all_notes)
 
 
 def _candidate(recording: Recording, scored: Scored) -> Candidate:
@@ -313,14 +310,14 @@ def _candidate(recording: Recording, scored: Scored) -> Candidate:
         rms_deg=float(np.rad2deg(angle)),
         score=scored.score,
         agreeing=_agreeing(fit),
-        rows=len(fit.away),
+        rows=len(fit.residuals),
         is_board=recording.is_measured,
         other_mount=() if scored.other_mount is None else recording.changes(scored.other_mount),
     )
 
 
 def _is_poor(recording: Recording, best: Scored) -> bool:
-    """Whether the views turn about one axis at most, by the camera's account."""
+    """Whether the camera turns about one axis at most."""
     if not best.is_readable:
         return False
     _, camera = best.hypothesis.chain(recording.robot, recording.camera)
@@ -328,31 +325,31 @@ def _is_poor(recording: Recording, best: Scored) -> bool:
 
 
 def _chain_fit(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray) -> Fit | None:
-    """Compares the poses of a reading with those of the joints."""
+    """Fits the poses of a reading to those of the joints."""
     poses = hypothesis.robot.poses(robot)
-    there = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(chain).all(axis=(1, 2))
-    if there.sum() < _FEWEST_ROWS:
+    readable = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(chain).all(axis=(1, 2))
+    if readable.sum() < _FEWEST_ROWS:
         return None
-    return robust_fit(invert(poses[there]), chain[there])
+    return robust_fit(invert(poses[readable]), chain[readable])
 
 
 def _by_joints(
     labels: Sequence[Hypothesis], robot: PoseNumbers, chain: FloatArray
 ) -> Hypothesis | None:
-    """The reading, of several that close the camera's chain alike, that the joints speak for."""
+    """The reading that the joints support, of several that close the camera's chain alike."""
     scored = [
         (fit.score, at)
         for at, label in enumerate(labels)
         if (fit := _chain_fit(label, robot, chain)) is not None
     ]
     scored.sort()
-    if len(scored) < 2 or scored[1][0] < _CLEARLY * scored[0][0]:
+    if len(scored) < 2 or scored[1][0] < _CLEAR_RATIO * scored[0][0]:
         return None
     return labels[scored[0][1]]
 
 
 def _is_half_turned(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArray) -> bool:
-    """Whether the poses are in a base that is turned by 180 degrees about z against the model's."""
+    """Whether the base is turned by 180 degrees about z relative to the model's."""
     fit = _chain_fit(hypothesis, robot, chain)
     if fit is None or fit.score > _SAME_CHAIN:
         return False
@@ -363,81 +360,78 @@ def _is_half_turned(hypothesis: Hypothesis, robot: PoseNumbers, chain: FloatArra
 def reordered(recording: Recording, declared: Scored) -> Scored | None:
     """Finds the order of all rows in which a chain closes that does not as declared.
 
-    Args:
-        recording: What was recorded.
-        declared: The declared reading.
-
     Returns:
-        The same reading with its rows in that order; None where none of them closes the chain.
+        The declared reading with its rows in that order; None where none closes the chain.
     """
     rows = recording.common_rows()[:_MOST_ROWS]
-    ways = (replace(declared.hypothesis, order=order) for order in ROW_ORDERS)
-    best = min((fitted(recording, way, rows, _STARTS) for way in ways), key=lambda way: way.score)
+    hypotheses = (replace(declared.hypothesis, order=order) for order in ROW_ORDERS)
+    fits = (fitted(recording, hypothesis, rows, _STARTS) for hypothesis in hypotheses)
+    best = min(fits, key=lambda scored: scored.score)
     is_clear = best.score <= CLOSING_SCORE and STANDS_OUT * best.score < declared.score
     return replace(best, cost=recording.cost(best.hypothesis)) if is_clear else None
 
 
 def exchanged(recording: Recording, scored: Scored, *, is_poor: bool) -> Scored | None:
-    """Finds the exchange of two rows that makes two views agree which stood out.
+    """Finds the exchange of two rows that makes two outlier views agree.
 
     Args:
-        recording: What was recorded.
+        recording: The recorded poses.
         scored: The reading under which most views agree.
         is_poor: Whether the motion is so poor that few views agree with anything.
 
     Returns:
-        The same reading with the rows exchanged; None where no exchange explains anything, or
-        several do.
+        The reading with the rows exchanged; None where no exchange, or several, explain the
+        outliers.
     """
     if not scored.is_readable:
         return None
     scored = _on_all_rows(recording, scored)
     fit, tried = scored.fit, scored.hypothesis
-    if len(fit.away) <= _FEW and fit.score > CLOSING_SCORE:
+    if len(fit.residuals) <= _FEW and fit.score > CLOSING_SCORE:
         return None if is_poor else _exchanged_among_few(recording, scored)
     typical = max(fit.score, SCORE_FLOOR)
-    out = np.flatnonzero(fit.away > _OUT * typical)
-    if not 2 <= len(out) <= min(_MOST, len(fit.away) - 4):
+    outliers = np.flatnonzero(fit.residuals > _OUTLIER * typical)
+    if not 2 <= len(outliers) <= min(_MOST_OUTLIERS, len(fit.residuals) - 4):
         return None
-    of_robot, found = tried.rows(len(recording.robot)), []
-    for pair in combinations(out, 2):
-        rows = tuple(of_robot[scored.rows[list(pair)]].tolist())
-        again = _with(recording, scored, replace(tried, swap=rows))
-        before, after = fit.away[list(pair)], again.fit.away[list(pair)]
-        if after.max() < _OUT * typical and (after < before / _NEARER).all():
-            found.append((float(after.max()), again))
-    found.sort(key=lambda value: value[0])
-    if not found or (len(found) > 1 and found[1][0] < _BEYOND_NEXT * found[0][0]):
+    robot_rows, swaps = tried.rows(len(recording.robot)), []
+    for pair in combinations(outliers, 2):
+        rows = tuple(robot_rows[scored.rows[list(pair)]].tolist())
+        refit = _with_edges(recording, scored, replace(tried, swap=rows))
+        before, after = fit.residuals[list(pair)], refit.fit.residuals[list(pair)]
+        if after.max() < _OUTLIER * typical and (after < before / _NEARER).all():
+            swaps.append((float(after.max()), refit))
+    swaps.sort(key=lambda value: value[0])
+    if not swaps or (len(swaps) > 1 and swaps[1][0] < _BEYOND_NEXT * swaps[0][0]):
         return None
-    return found[0][1]
+    return swaps[0][1]
 
 
 def _on_all_rows(recording: Recording, scored: Scored) -> Scored:
-    """The same with the rows that the search left out to save time: any two may be exchanged."""
+    """Fits the rows, too, that the search skipped: any two may be exchanged."""
     rows = recording.common_rows()[:_MOST_ROWS]
     if len(rows) <= len(scored.rows):
         return scored
-    whole = fitted(recording, scored.hypothesis, rows, starts=0)
-    return replace(scored, fit=whole.fit, rows=whole.rows)
+    refit = fitted(recording, scored.hypothesis, rows, starts=0)
+    return replace(scored, fit=refit.fit, rows=refit.rows)
 
 
 def _exchanged_among_few(recording: Recording, scored: Scored) -> Scored | None:
-    """Tries every exchange: among few views the right ones are no majority to be seen by."""
-    tried, found = scored.hypothesis, []
-    of_robot = tried.rows(len(recording.robot))
+    """Tries every exchange: among few views the right ones are no majority."""
+    tried, swaps = scored.hypothesis, []
+    robot_rows = tried.rows(len(recording.robot))
     for pair in combinations(scored.rows, 2):
-        rows = tuple(of_robot[list(pair)].tolist())
+        rows = tuple(robot_rows[list(pair)].tolist())
         changed = replace(tried, swap=rows)
         robot, camera = changed.chain(recording.robot, recording.camera)
         fit = robust_fit(robot[scored.rows], camera[scored.rows])
-        found.append(Scored(changed, fit, scored.rows))
-    found.sort(key=lambda item: item.score)
-    best, second = found[:2]
+        swaps.append(Scored(changed, fit, scored.rows))
+    swaps.sort(key=lambda item: item.score)
+    best, second = swaps[:2]
     is_clear = best.score < CLOSING_SCORE and second.score > _BEYOND_NEXT * best.score
     return best if is_clear and scored.score > _NEARER * best.score else None
 
 
-def _with(recording: Recording, scored: Scored, changed: Hypothesis) -> Scored:
+def _with_edges(recording: Recording, scored: Scored, changed: Hypothesis) -> Scored:
     """The same edges, with rows exchanged."""
     robot, camera = changed.chain(recording.robot, recording.camera)
     fit, rows = scored.fit, scored.rows

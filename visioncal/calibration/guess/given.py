@@ -1,8 +1,8 @@
-"""What the search is given, how it keeps what it finds, and which of it is a cell as cells are.
+"""Input of the search, its scored hypotheses, and what makes a cell plausible.
 
-The inverse of the robot's poses, that of the camera's, and another mount exchange the unknown
-edges: no residual distinguishes them, but what sits on the flange is near it, and a camera looks at
-what is before it.
+Inverting the robot's poses, inverting the camera's, and changing the mount all exchange the unknown
+edges: no residual distinguishes them. Plausibility does: what is mounted on the flange is near it,
+and the target is in front of the camera.
 """
 
 from dataclasses import dataclass, replace
@@ -14,33 +14,29 @@ from visioncal.calibration.guess.hypothesis import Hypothesis, SideReading, diff
 from visioncal.core.conventions import UNITS_M, PoseNumbers
 from visioncal.core.types import IntArray, Mount
 
-# Fewer views than these agree with too many readings.
+# With fewer views too many readings agree.
 FEWEST_ROWS = 4
-# Scores under this [rad, or share of the distance] are as good as each other: a tenth of a
-# millimetre at one metre.
+# Scores below this [rad, or share of the distance] are equivalent: a tenth of a millimetre at one
+# metre.
 SCORE_FLOOR = 1e-4
-# A chain that closes to this share of the distance, or angle [rad], is closed by the right reading:
-# poses with 10 mm and 1 degree of noise leave less, wrong readings ten times more.
+# A right reading closes the chain to this share of the distance, or angle [rad]: poses with 10 mm
+# and 1 degree of noise leave less, wrong readings ten times more.
 CLOSING_SCORE = 0.05
-# How many times better than the declared reading another has to close the chain. Where views turn
+# Ratio of the declared reading's score to that of a reading that replaces it. Where views turn
 # about two axes a sound reading is beaten by none, and a wrong one by ten times and more: see
 # tests/benchmarks/guess.py.
 STANDS_OUT = 3.0
-# Cameras look at boards from here [m].
-_SEEN_FROM_M = (0.02, 30.0)
-# Of edges whose lengths differ by less either may be the one on the flange.
-_CLEARLY = 1.5
+# Plausible distances between camera and board [m].
+_BOARD_DISTANCE_M = (0.02, 30.0)
+# Edges whose lengths have a smaller ratio may be exchanged.
+_CLEAR_RATIO = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What the search looks at.
+    """Declared poses of robot and camera as they were recorded.
 
-    Attributes:
-        robot: The robot's numbers, as declared.
-        camera: The camera's.
-        mount: The mount, as declared.
-        is_measured: Whether the camera's poses were measured from images.
+    `is_measured` is whether the camera's poses were measured from images.
     """
 
     robot: PoseNumbers
@@ -50,30 +46,29 @@ class Recording:
 
     @property
     def declared(self) -> Hypothesis:
-        """What was declared."""
-        return Hypothesis(
-            SideReading.as_declared(self.robot.reading),
-            SideReading.as_declared(self.camera.reading),
-            self.mount,
-        )
+        """The declared reading."""
+        readings = self.robot.reading, self.camera.reading
+        robot, camera = (SideReading.as_declared(reading) for reading in readings)
+        return Hypothesis(robot, camera, self.mount)
 
     def changes(self, tried: Hypothesis) -> tuple[str, ...]:
-        """Words for each thing in which a hypothesis departs from what was declared."""
-        return differences(tried, self.declared, self.robot.places, is_board=self.is_measured)
+        """Words for each difference between a hypothesis and the declared reading."""
+        places, is_board = self.robot.places, self.is_measured
+        return tuple(differences(tried, self.declared, places, is_board=is_board))
 
     def cost(self, tried: Hypothesis) -> float:
-        """How unlikely a hypothesis is beside what was declared: its changes, strange ones more."""
+        """Number of changes of the declared reading, strange ones weighted more."""
         declared = self.declared
         sides = ((tried.robot, declared.robot), (tried.camera, declared.camera))
         strange = sum(strangeness(a.turns) for a, b in sides if a.turns != b.turns)
         return len(self.changes(tried)) + strange
 
     def part(self, rows: IntArray) -> "Recording":
-        """The same of some rows alone."""
+        """The recording restricted to some rows."""
         return replace(self, robot=self.robot.rows(rows), camera=self.camera.rows(rows))
 
     def common_rows(self) -> IntArray:
-        """The rows in which both sides have numbers."""
+        """The rows with a pose of both sides."""
         return np.flatnonzero(self.robot.there & self.camera.there)
 
 
@@ -85,11 +80,10 @@ class Scored:
         hypothesis: The reading.
         fit: Its fit.
         rows: The camera's rows in the fit.
-        labels: Readings that close the chain in the same way: all that are as simple; of the
-            declared reading those under which the cell is likelier.
-        cost: How unlikely the reading is beside the declared one.
-        other_mount: Of the labels, one with the other mount that is as likely; None where there is
-            none.
+        labels: Equivalent readings that close the chain in the same way: the simplest ones; of the
+            declared reading, those with a more plausible cell.
+        cost: See `Recording.cost`.
+        other_mount: An equally plausible label with the other mount; None without one.
     """
 
     hypothesis: Hypothesis
@@ -101,7 +95,7 @@ class Scored:
 
     @property
     def score(self) -> float:
-        """The fit's score, not under what makes no difference."""
+        """The fit's score, not below `SCORE_FLOOR`."""
         return max(self.fit.score, SCORE_FLOOR)
 
     @property
@@ -111,10 +105,10 @@ class Scored:
 
 
 def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int) -> Scored:
-    """Fits a hypothesis in full, by those of the rows that can be read in its way."""
+    """Fits both edges under a hypothesis, by the rows that are readable under it."""
     robot, camera = tried.chain(recording.robot, recording.camera)
-    there = np.isfinite(robot[rows]).all(axis=(1, 2)) & np.isfinite(camera[rows]).all(axis=(1, 2))
-    rows = rows[there]
+    rows = rows[np.isfinite(robot[rows]).all(axis=(1, 2))]
+    rows = rows[np.isfinite(camera[rows]).all(axis=(1, 2))]
     # A shift leaves a row without its partner.
     if len(rows) < FEWEST_ROWS - 1:
         return Scored(tried, no_fit(len(rows)), rows)
@@ -122,24 +116,23 @@ def fitted(recording: Recording, tried: Hypothesis, rows: IntArray, starts: int)
 
 
 def closes(recording: Recording) -> bool:
-    """Whether the chain closes as declared; also where too few rows could show it."""
+    """Whether the chain closes as declared; true with too few rows to show it."""
     rows = recording.common_rows()
-    if len(rows) < FEWEST_ROWS:
-        return True
-    return fitted(recording, recording.declared, rows, 0).score <= CLOSING_SCORE
+    few = len(rows) < FEWEST_ROWS
+    return few or fitted(recording, recording.declared, rows, 0).score <= CLOSING_SCORE
 
 
 def is_likely_unit(recording: Recording, unit: str) -> bool:
-    """Whether the target is at a likely distance where the camera's positions have this unit."""
-    seen_from = np.nanmedian(np.linalg.norm(recording.camera.positions, axis=1))
-    low, high = _SEEN_FROM_M
-    return bool(low < UNITS_M[unit] * seen_from < high)
+    """Whether this unit of the camera's positions puts the target at a likely distance."""
+    distance = np.nanmedian(np.linalg.norm(recording.camera.positions, axis=1))
+    low, high = _BOARD_DISTANCE_M
+    return bool(low < UNITS_M[unit] * distance < high)
 
 
-def _is_before(recording: Recording, scored: Scored) -> bool:
-    """Whether the target is before the camera."""
-    camera = scored.hypothesis.camera.poses(recording.camera)
-    return bool(np.median(camera[scored.rows, 2, 3]) > 0.0)
+def _is_in_front(recording: Recording, scored: Scored) -> bool:
+    """Whether the target is in front of the camera."""
+    cam_from_target = scored.hypothesis.camera.poses(recording.camera)
+    return bool(np.median(cam_from_target[scored.rows, 2, 3]) > 0.0)
 
 
 def flange_and_cell_m(scored: Scored) -> tuple[float, float]:
@@ -150,16 +143,16 @@ def flange_and_cell_m(scored: Scored) -> tuple[float, float]:
 
 
 def likeness(recording: Recording, scored: Scored) -> tuple[bool, bool]:
-    """A key by which likely cells come last."""
+    """Sort key by which plausible cells come last."""
     on_flange_m, at_base_m = flange_and_cell_m(scored)
-    return _is_before(recording, scored), on_flange_m < at_base_m
+    return _is_in_front(recording, scored), on_flange_m < at_base_m
 
 
 def is_far_likelier(recording: Recording, scored: Scored, other: Scored) -> bool:
-    """Whether a reading is that of a cell and another, with its edges exchanged, is not."""
-    before, other_before = _is_before(recording, scored), _is_before(recording, other)
-    if before != other_before:
-        return before
+    """Whether a reading gives a plausible cell and another, with edges exchanged, none."""
+    in_front, other_in_front = _is_in_front(recording, scored), _is_in_front(recording, other)
+    if in_front != other_in_front:
+        return in_front
     on_flange_m, at_base_m = flange_and_cell_m(scored)
     other_on_flange_m, other_at_base_m = flange_and_cell_m(other)
-    return _CLEARLY * on_flange_m < at_base_m and other_on_flange_m > other_at_base_m
+    return _CLEAR_RATIO * on_flange_m < at_base_m and other_on_flange_m > other_at_base_m

@@ -1,4 +1,4 @@
-"""One way to take the numbers of a recording, and what it changes of what was declared."""
+"""A hypothesis about how recorded numbers are to be read, and its differences from the declared."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,13 +18,13 @@ MIRROR_WORDS = (
 )
 SIGNS: tuple[Signs, ...] = ("", "mirror", "x", "y", "z")
 
-# Mirroring any one axis is the same up to half turns of both frames; y is taken.
+# Mirroring another axis is equivalent, up to half turns of both frames.
 _MIRROR = np.array([1.0, -1.0, 1.0])
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-# The other three angles about three axes of the same rotation [deg]: the outer ones half a turn
-# farther on, the middle one's supplement.
+# The second triple of angles about three axes of the same rotation [deg]: the outer ones half a
+# turn farther on, the supplement of the middle one.
 _HALF_TURNED, _BEYOND = 180.0, np.array([-1.0, 1.0, -1.0])
-# The orders of turns that makers of robots and libraries use, about moving and about fixed axes.
+# Euler angle orders that robot makers and libraries use, about moving and about fixed axes.
 _ORDERS = {
     form.rotation.split("-")[1].upper()
     for form in POSE_FORMS.values()
@@ -38,10 +38,11 @@ class Turns:
 
     Attributes:
         form: A name among `ROTATION_FORMS`.
-        written: Where the numbers at hand were made by misreading others: the form in which those
-            were taken by mistake. They are got back by writing in it, and are read as `form`.
-        is_beyond: Whether their middle angles were beyond 90 degrees, to which those about three
-            axes are written: angles about two axes reach 180, as of a tool that points down.
+        written: Where the recorded numbers came from misreading others: the form in which those
+            were misread. Writing the rotations in it gets them back, and they are read as `form`.
+        is_beyond: Whether the middle angles so got back are replaced by those beyond 90 degrees:
+            angles about three axes are written up to 90, those about two axes, as of a tool that
+            points down, reach 180.
     """
 
     form: str
@@ -49,33 +50,32 @@ class Turns:
     is_beyond: bool = False
 
     def numbers(self, numbers: PoseNumbers) -> FloatArray:
-        """(n, k) the numbers that `form` reads."""
+        """(n, k) the numbers that are read as `form`."""
         if not self.written:
             return numbers.rotations
         rotations = ROTATION_FORMS[numbers.reading.rotation].read(numbers.rotations)
-        there: Mask = np.asarray(np.isfinite(rotations).all(axis=(1, 2)))
-        written = np.full((len(rotations), ROTATION_FORMS[self.written].size), np.nan)
-        written[there] = ROTATION_FORMS[self.written].write(rotations[there])
-        return _HALF_TURNED - written * _BEYOND if self.is_beyond else written
+        valid: Mask = np.asarray(np.isfinite(rotations).all(axis=(1, 2)))
+        misread = np.full((len(rotations), ROTATION_FORMS[self.written].size), np.nan)
+        misread[valid] = ROTATION_FORMS[self.written].write(rotations[valid])
+        return _HALF_TURNED - misread * _BEYOND if self.is_beyond else misread
 
     def rotations(self, numbers: PoseNumbers) -> FloatArray:
-        """(n, 3, 3) rotations; NaN where the numbers are none."""
+        """(n, 3, 3) rotations; NaN where the numbers give none."""
         return ROTATION_FORMS[self.form].read(self.numbers(numbers))
 
 
 @dataclass(frozen=True)
 class SideReading:
-    """How one side's numbers, the robot's or the camera's, are taken.
+    """How one side's numbers, the robot's or the camera's, are read.
 
     Attributes:
         turns: How rotations are read.
         unit: The positions' unit, a name among `UNITS_M`.
-        inverse: Whether the inverse of the wanted pose is given.
+        inverse: Whether the numbers give the inverse of the wanted pose.
         transposed: Whether rotations are transposed while positions are not those of an inverse.
-        signs: Whether an axis has the wrong sign.
-        half_turned: Whether the base is to be turned by half a turn about its z.
-        scale: What distances are to be multiplied with besides: those to a target of another size
-            than was stated.
+        signs: Which axis has the wrong sign.
+        half_turned: Whether the base has to be turned by 180 degrees about its z.
+        scale: Further factor of distances, for a target of another size than stated.
     """
 
     turns: Turns
@@ -88,12 +88,12 @@ class SideReading:
 
     @classmethod
     def as_declared(cls, reading: Reading) -> "SideReading":
-        """What a reading says."""
+        """The side as a declared reading has it."""
         return cls(Turns(reading.rotation), reading.unit, reading.inverse)
 
     @property
     def reading(self) -> Reading | None:
-        """The same as a reading of the numbers as they stand; None where it takes more."""
+        """The equivalent `Reading` of the recorded numbers; None where there is none."""
         form = self.turns.form
         if self.transposed and form in ("matrix", "matrix-transposed"):
             form = "matrix" if form == "matrix-transposed" else "matrix-transposed"
@@ -104,7 +104,7 @@ class SideReading:
         return Reading(form, self.unit, self.inverse)
 
     def poses(self, numbers: PoseNumbers) -> FloatArray:
-        """(n, 4, 4) transforms [m]; NaN in a row without one."""
+        """(n, 4, 4) transforms [m]; NaN in rows without a pose."""
         rotations = self.turns.rotations(numbers)
         positions = UNITS_M[self.unit] * self.scale * numbers.positions
         if self.signs == "mirror":
@@ -114,14 +114,14 @@ class SideReading:
             positions = positions * np.where(np.arange(3) == "xyz".index(self.signs), -1.0, 1.0)
         if self.transposed:
             rotations = np.swapaxes(rotations, 1, 2)
-        there = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(positions).all(axis=1)
+        valid = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(positions).all(axis=1)
         poses = compose(rotations, positions)
-        poses[~there] = np.nan
+        poses[~valid] = np.nan
         poses = invert(poses) if self.inverse else poses
         return HALF_TURN @ poses if self.half_turned else poses
 
     def corrected(self, numbers: PoseNumbers) -> PoseNumbers:
-        """Returns numbers whose `poses()` are right, as they stand where a reading suffices."""
+        """Returns numbers whose `poses()` are right, unchanged where a reading suffices."""
         if self.reading is not None:
             return numbers.read_as(self.reading)
         poses = self.poses(numbers)
@@ -139,11 +139,11 @@ def _as_text(count: int) -> IntArray:
 
 
 def _as_text_from_one(count: int) -> IntArray:
-    """(count,) the same where the first has the number 1."""
+    """(count,) the same for rows that are numbered from 1."""
     return np.array(sorted(range(1, count + 1), key=str)) - 1
 
 
-# Orders in which the robot's rows stand beside the camera's, and which row belongs to each of
+# Orders of the robot's rows beside the camera's: functions that return the robot's row for each of
 # `count` views.
 ROW_ORDERS: dict[str, Callable[[int], IntArray]] = {
     "the robot's poses in reverse order": lambda count: np.arange(count)[::-1].copy(),
@@ -158,15 +158,15 @@ ROW_ORDERS: dict[str, Callable[[int], IntArray]] = {
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One way to take a whole recording.
+    """One reading of a whole recording.
 
     Attributes:
-        robot: How the robot's numbers are taken.
-        camera: How the camera's are.
+        robot: How the robot's numbers are read.
+        camera: How the camera's are read.
         mount: How the camera is mounted.
         shift: The robot's row `i + shift` belongs to the camera's row `i`.
         swap: Two of the robot's rows that are exchanged; empty for none.
-        order: In which of `ROW_ORDERS` the rows stand; empty where it is that of the views.
+        order: Order of the rows, a name among `ROW_ORDERS`; empty for that of the views.
     """
 
     robot: SideReading
@@ -177,7 +177,7 @@ class Hypothesis:
     order: str = ""
 
     def rows(self, count: int) -> IntArray:
-        """(n,) which of `count` rows of the robot belongs to each of the camera's; -1 for none."""
+        """(count,) the robot's row for each of the camera's rows; -1 for none."""
         rows = ROW_ORDERS[self.order](count) if self.order else np.arange(count)
         rows += self.shift
         rows[(rows < 0) | (rows >= count)] = -1
@@ -190,12 +190,12 @@ class Hypothesis:
     def robot_numbers(self, robot: PoseNumbers) -> PoseNumbers:
         """The robot's numbers, corrected and in the order of the camera's rows."""
         rows = self.rows(len(robot))
-        there = (rows >= 0)[:, None]
+        has_row = (rows >= 0)[:, None]
         ordered = self.robot.corrected(robot).rows(np.maximum(rows, 0))
         return replace(
             ordered,
-            positions=np.where(there, ordered.positions, np.nan),
-            rotations=np.where(there, ordered.rotations, np.nan),
+            positions=np.where(has_row, ordered.positions, np.nan),
+            rotations=np.where(has_row, ordered.rotations, np.nan),
         )
 
     def camera_numbers(self, camera: PoseNumbers) -> PoseNumbers:
@@ -203,7 +203,7 @@ class Hypothesis:
         return self.camera.corrected(camera)
 
     def chain(self, robot: PoseNumbers, camera: PoseNumbers) -> tuple[FloatArray, FloatArray]:
-        """(n, 4, 4) the robot's part of the chain and `cam_from_target`; NaN where one lacks."""
+        """(n, 4, 4) the robot's part of the chain and `cam_from_target`; NaN in rows without."""
         base_from_flange = self.robot.poses(robot)
         rows = self.rows(len(robot))
         part = base_from_flange if self.mount == "eye-in-hand" else invert(base_from_flange)
@@ -212,26 +212,17 @@ class Hypothesis:
 
 def differences(
     tried: Hypothesis, declared: Hypothesis, places: tuple[str, ...], *, is_board: bool
-) -> tuple[str, ...]:
-    """Words for each thing in which a hypothesis departs from what was declared.
-
-    Args:
-        tried: The hypothesis.
-        declared: What was declared.
-        places: Where the robot's rows stand.
-        is_board: Whether the camera's poses were measured from images of a board of stated size.
-    """
-    return tuple(_differences(tried, declared, places, is_board=is_board))
-
-
-def _differences(
-    tried: Hypothesis, declared: Hypothesis, places: tuple[str, ...], *, is_board: bool
 ) -> Iterator[str]:
-    yield from _of_side("the robot's", tried.robot, declared.robot)
+    """Words for each difference between a hypothesis and the declared reading.
+
+    `places` are the locations of the robot's rows in the files, `is_board` is whether the camera's
+    poses were measured from images of a board of stated size.
+    """
+    yield from _side_differences("the robot's", tried.robot, declared.robot)
     if is_board and tried.camera.unit != declared.camera.unit:
         yield f"the board's size in {tried.camera.unit}"
     elif not is_board:
-        yield from _of_side("the camera's", tried.camera, declared.camera)
+        yield from _side_differences("the camera's", tried.camera, declared.camera)
     if tried.camera.scale != declared.camera.scale:
         yield f"the target {figure(tried.camera.scale)} times as large as stated"
     if tried.mount != declared.mount:
@@ -247,7 +238,7 @@ def _differences(
         yield f"the robot's poses of {first} and {second} exchanged"
 
 
-def _of_side(whose: str, tried: SideReading, declared: SideReading) -> Iterator[str]:
+def _side_differences(whose: str, tried: SideReading, declared: SideReading) -> Iterator[str]:
     if tried.unit != declared.unit:
         yield f"{whose} positions in {tried.unit}"
     if tried.turns != declared.turns:
@@ -270,10 +261,10 @@ def _of_side(whose: str, tried: SideReading, declared: SideReading) -> Iterator[
 
 
 def strangeness(turns: Turns) -> float:
-    """What makes a form less likely than another: angles once misread, orders that nobody uses."""
+    """Extra cost of an unlikely form: misread angles, orders of axes that nobody uses."""
     names = [name.split("-") for name in (turns.form, turns.written) if name.startswith("euler-")]
     orders = [order for _, order, _ in names]
     unused = any(order.upper() not in _ORDERS for order in orders)
-    # Degrees taken for radians are one slip; in another order besides they are two.
-    one_slip = len(orders) == 2 and orders[0] == orders[1]
-    return (0.25 if one_slip else 0.5) * bool(turns.written) + 0.25 * unused
+    # Degrees taken for radians are one mistake; with another order they are two.
+    one_mistake = len(orders) == 2 and orders[0] == orders[1]
+    return (0.25 if one_mistake else 0.5) * bool(turns.written) + 0.25 * unused

@@ -1,4 +1,4 @@
-"""Ways in which joint angles, or the model that they belong to, are commonly mistaken."""
+"""Common misreadings of joint angles and of the robot model they belong to."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -9,23 +9,23 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.robot import Robot, load_robot, other_convention, robot_names
 
-# Joint 3 counted from the horizontal, or from the link before: the second row's share in it.
+# Joint 3 counted from the link before it, or from the horizontal: joint 2's share in it.
 _COUPLINGS = ((1.0, "from the link before it"), (-1.0, "from the horizontal"))
 _COUPLED = (1, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class JointReading:
-    """One way to take a session's joint angles.
+    """One reading of a session's joint angles.
 
     Attributes:
         robot: The model.
-        mixing: (n, n) the angles meant are `mixing @ recorded + zeros`.
-        zeros: (n,) what is added to each joint's zero [rad].
-        words: What is different from what was declared; empty for the declared reading.
+        mixing: (n, n) the true angles are `mixing @ recorded + zeros`.
+        zeros: (n,) correction of each joint's zero [rad].
+        words: The difference from the declared reading; empty for the declared reading itself.
         fix: What the user can do about it.
-        columns: The columns that it is about, numbered from 0; empty for all.
-        cost: How many mistakes it takes; a lost zero counts more than one.
+        columns: The columns concerned, numbered from 0; empty for all.
+        cost: Number of mistakes it implies; a lost zero counts more than one.
     """
 
     robot: Robot
@@ -38,40 +38,39 @@ class JointReading:
 
     @property
     def is_zero(self) -> bool:
-        """Whether a joint's zero is all that it changes."""
+        """Whether it changes a joint's zero, and nothing else."""
         return bool(np.any(self.zeros))
 
     def angles(self, recorded: FloatArray) -> FloatArray:
-        """The angles (m, n) that are meant by those that are recorded [rad]."""
+        """The true angles (m, n) for recorded ones [rad]."""
         return np.asarray(recorded @ self.mixing.T + self.zeros)
 
     def poses(self, recorded: FloatArray) -> FloatArray:
-        """(m, 4, 4) `base_from_flange` by this reading [m]."""
+        """(m, 4, 4) `base_from_flange` under this reading [m]."""
         return self.robot.base_from_flange(self.angles(recorded))
 
 
 def declared_reading(robot: Robot) -> JointReading:
-    """The joints as they are recorded."""
+    """The joint angles as recorded."""
     return JointReading(robot, np.eye(robot.joint_count), np.zeros(robot.joint_count))
 
 
 def joint_readings(robot: Robot) -> Iterator[JointReading]:
-    """All other readings that are tried, but for lost zeros: one mistake, then two."""
+    """All other readings but lost zeros: one mistake, then two."""
     declared = declared_reading(robot)
     columns = [*_exchanges(declared), *_signs(declared)]
-    units = list(unit_readings(declared))
-    yield from units
-    yield from columns
+    units = [*unit_readings(declared)]
+    yield from (*units, *columns)
     yield from _couplings(declared)
     yield from _models(declared)
     for unit in units:
-        yield from (_both(unit, column) for column in columns)
+        yield from (_combined(unit, column) for column in columns)
     for first, second in combinations(_signs(declared), 2):
-        yield _both(first, second)
+        yield _combined(first, second)
 
 
 def with_zero(declared: JointReading, joint: int, zero_rad: float) -> JointReading:
-    """The reading in which one joint's zero is elsewhere."""
+    """The reading in which one joint's zero is shifted."""
     zeros = declared.zeros.copy()
     zeros[joint] += zero_rad
     name, degrees = declared.robot.joint_names[joint], np.rad2deg(zero_rad)
@@ -82,27 +81,27 @@ def with_zero(declared: JointReading, joint: int, zero_rad: float) -> JointReadi
         fix=f"Home {name} anew, or add {degrees:.2f} deg to q{joint + 1}_rad; --level offsets "
         "finds it to the precision of the views.",
         columns=(joint,),
-        # A number that is fitted explains more than it means.
+        # A fitted number explains more by chance.
         cost=1.5,
     )
 
 
 def unit_readings(declared: JointReading) -> Iterator[JointReading]:
-    """The readings in which angles are in degrees, or were taken for degrees."""
-    turns = ~declared.robot.chain.prismatic
-    many = f"q1_rad to q{len(turns)}_rad"
+    """The readings with angles in degrees, or in radians that were taken for degrees."""
+    revolute = ~declared.robot.chain.prismatic
+    columns = f"q1_rad to q{len(revolute)}_rad"
     yield replace(
         declared,
-        mixing=np.diag(np.where(turns, np.pi / 180.0, 1.0)),
+        mixing=np.diag(np.where(revolute, np.pi / 180.0, 1.0)),
         words="the angles in degrees",
-        fix=f"Where the angles are recorded, multiply {many} by pi / 180.",
+        fix=f"Where the angles are recorded, multiply {columns} by pi / 180.",
         cost=1,
     )
     yield replace(
         declared,
-        mixing=np.diag(np.where(turns, 180.0 / np.pi, 1.0)),
+        mixing=np.diag(np.where(revolute, 180.0 / np.pi, 1.0)),
         words="the angles in radians that were taken for degrees",
-        fix=f"Where the angles are recorded, multiply {many} by 180 / pi.",
+        fix=f"Where the angles are recorded, multiply {columns} by 180 / pi.",
         cost=1,
     )
 
@@ -110,11 +109,11 @@ def unit_readings(declared: JointReading) -> Iterator[JointReading]:
 def _exchanges(declared: JointReading) -> Iterator[JointReading]:
     names = declared.robot.joint_names
     count = len(names)
-    # ROS's joint_states come in the alphabetical order of the joints' names.
-    sorted_to = [sorted(names).index(name) for name in names]
-    for order, words in ((sorted_to, "names' alphabet"), (range(count)[::-1], "reverse")):
-        moved = tuple(at for at in range(count) if order[at] != at)
-        if len(moved) > 2:
+    # ROS's joint_states are sorted by the joints' names.
+    alphabetical = [sorted(names).index(name) for name in names]
+    for order, words in ((alphabetical, "names' alphabet"), (range(count)[::-1], "reverse")):
+        changed = tuple(at for at in range(count) if order[at] != at)
+        if len(changed) > 2:
             yield replace(
                 declared,
                 mixing=np.eye(count)[list(order)],
@@ -122,7 +121,7 @@ def _exchanges(declared: JointReading) -> Iterator[JointReading]:
                 if words != "reverse"
                 else "the columns of the joints in reverse order",
                 fix="Put the columns into the order from the base to the flange.",
-                columns=moved,
+                columns=changed,
                 cost=1,
             )
     for pair in combinations(range(count), 2):
@@ -134,7 +133,7 @@ def _exchanges(declared: JointReading) -> Iterator[JointReading]:
             declared,
             mixing=np.eye(count)[order],
             words=f"the columns {first} and {second} exchanged"
-            + (of_ros if order == sorted_to else ""),
+            + (of_ros if order == alphabetical else ""),
             fix=f"Exchange the headings {first} and {second} in views.csv.",
             columns=pair,
             cost=1,
@@ -156,7 +155,7 @@ def _signs(declared: JointReading) -> Iterator[JointReading]:
 
 
 def _couplings(declared: JointReading) -> Iterator[JointReading]:
-    """Makers of palletisers and of arms with a parallelogram count joint 3 from the horizontal."""
+    """Joint 3 counted from the horizontal: palletisers and arms with a parallelogram do so."""
     before, after = _COUPLED
     if declared.robot.joint_count <= after:
         return
@@ -176,8 +175,7 @@ def _couplings(declared: JointReading) -> Iterator[JointReading]:
 
 
 def _models(declared: JointReading) -> Iterator[JointReading]:
-    robot = declared.robot
-    other = other_convention(robot)
+    robot, other = declared.robot, other_convention(declared.robot)
     if other is not None:
         table, convention = other
         yield replace(
@@ -199,7 +197,7 @@ def _models(declared: JointReading) -> Iterator[JointReading]:
             )
 
 
-def _both(first: JointReading, second: JointReading) -> JointReading:
+def _combined(first: JointReading, second: JointReading) -> JointReading:
     return replace(
         first,
         mixing=first.mixing @ second.mixing,

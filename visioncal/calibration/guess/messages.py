@@ -1,4 +1,4 @@
-"""What a guess found, in sentences."""
+"""Sentences and notes of a guess."""
 
 from collections.abc import Iterator, Sequence
 
@@ -9,16 +9,13 @@ from visioncal.calibration.guess.result import Candidate
 def sentence(
     declared: Candidate, best: Candidate, ranked: Sequence[Candidate], *, is_poor: bool
 ) -> str:
-    """Says what was found, with its figures.
+    """States the finding, with its figures.
 
-    Args:
-        declared: The reading that was declared.
-        best: The one that stands out; the declared one where none does.
-        ranked: All that come near, the best first.
-        is_poor: Whether the views turn about one axis at most.
+    `best` is the declared reading where none stands out, `ranked` has the best readings first, and
+    `is_poor` is whether the views turn about one axis at most.
     """
     if best is not declared:
-        return _found(declared, best)
+        return _best_sentence(declared, best)
     if not declared.is_readable:
         return (
             "As declared, the rotations of the robot or of the camera are none, and no other "
@@ -43,7 +40,7 @@ def sentence(
     )
 
 
-def _found(declared: Candidate, best: Candidate) -> str:
+def _best_sentence(declared: Candidate, best: Candidate) -> str:
     closes = f"With {best.words}, the chain closes to {_figures(best)}"
     if not declared.is_readable:
         return f"{closes}; as declared, the numbers are no rotations."
@@ -66,32 +63,28 @@ def _other_mount(best: Candidate) -> str:
 
 
 def _figures(candidate: Candidate) -> str:
-    views = (
-        ""
-        if candidate.agreeing == candidate.rows
-        else f" in {candidate.agreeing} of {candidate.rows} views"
-    )
-    return f"{candidate.figures}{views}"
+    agreeing, rows = candidate.agreeing, candidate.rows
+    return f"{candidate.figures}{'' if agreeing == rows else f' in {agreeing} of {rows} views'}"
 
 
 def notes(
     recording: Recording, best: Scored, *, has_chain: bool, is_declared: bool, is_poor: bool
 ) -> Iterator[str]:
-    """Says what residuals cannot show here.
+    """States what residuals cannot show here.
 
     Args:
-        recording: What was recorded.
-        best: The reading that is taken.
+        recording: The recorded poses.
+        best: The chosen reading.
         has_chain: Whether the joints were compared.
-        is_declared: Whether it is the declared one.
+        is_declared: Whether the chosen reading is the declared one.
         is_poor: Whether the views turn about one axis at most.
     """
-    # Other units for both make the cell as much larger.
-    own = best.hypothesis.robot.unit, best.hypothesis.camera.unit
+    # Other units for both sides only scale the cell.
+    units = best.hypothesis.robot.unit, best.hypothesis.camera.unit
     others = [
         label
         for label in best.labels
-        if label != best.hypothesis and (label.robot.unit, label.camera.unit) == own
+        if label != best.hypothesis and (label.robot.unit, label.camera.unit) == units
     ]
     also = " or with ".join("; ".join(recording.changes(other)) for other in others)
     if also and not is_declared:

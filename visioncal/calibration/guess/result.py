@@ -1,4 +1,4 @@
-"""What a guess gives: the readings by how well they close the chain, and what to make of it."""
+"""Result of a guess: the candidate readings, ranked, and the one that stands out."""
 
 from dataclasses import dataclass
 
@@ -14,20 +14,20 @@ _LONG_MM, _WHOLE_FROM = 1000.0, 99.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A way to read the poses, and how well it closes the chain.
+    """A reading of the poses, and how well it closes the chain.
 
     Attributes:
         hypothesis: The reading.
-        declared: What was declared.
-        differences: Words for each thing that is not as declared.
-        rms_mm: Scatter of the target's place over the views that agree best [mm].
-        rms_deg: The same of its orientation [deg].
-        score: The same without unit, by which readings compare.
-        agreeing: How many views agree with each other.
-        rows: How many views were looked at.
+        declared: The declared reading.
+        differences: Words for each difference from the declared reading.
+        rms_mm: Scatter of the target's position over the kept views [mm].
+        rms_deg: Scatter of its orientation [deg].
+        score: Both in one figure without unit, by which readings are compared.
+        agreeing: Number of views that agree with each other.
+        rows: Number of views in the fit.
         is_board: Whether the camera's poses were measured from images.
-        other_mount: Words for what is different in a reading with the other mount that is as good
-            and as likely; none where there is none.
+        other_mount: Differences of an equally good and likely reading with the other mount; empty
+            without one.
     """
 
     hypothesis: Hypothesis
@@ -43,27 +43,27 @@ class Candidate:
 
     @property
     def words(self) -> str:
-        """What is different from what was declared."""
+        """The differences from the declared reading, in words."""
         return "; ".join(self.differences) or "as declared"
 
     @property
     def changes(self) -> int:
-        """How many things are different from what was declared."""
+        """Number of differences from the declared reading."""
         return len(self.differences)
 
     @property
     def closes(self) -> bool:
-        """Whether the chain closes as well as it does under a right reading."""
+        """Whether the chain closes as well as under a right reading."""
         return self.score <= CLOSING_SCORE
 
     @property
     def is_readable(self) -> bool:
-        """Whether rotations can be read of the numbers at all."""
+        """Whether the numbers can be read as rotations at all."""
         return bool(np.isfinite(self.rms_mm))
 
     @property
     def figures(self) -> str:
-        """How well the chain closes, in words."""
+        """The closing error, in words."""
         if not self.is_readable:
             return "no rotations"
         is_long = self.rms_mm > _LONG_MM
@@ -72,7 +72,7 @@ class Candidate:
 
     @property
     def board_scale(self) -> float:
-        """What the sizes of the board are to be multiplied with, where images were measured."""
+        """Factor for the board's sizes, where images were measured; else 1."""
         if not self.is_board:
             return 1.0
         camera = self.hypothesis.camera
@@ -80,21 +80,21 @@ class Candidate:
 
 
 def _short(value: float) -> str:
-    """Two digits; whole numbers from a hundred on."""
+    """Formats two digits; whole numbers from a hundred on."""
     return f"{value:.0f}" if value > _WHOLE_FROM else figure(value)
 
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Which reading of the poses is right.
+    """The reading of the poses that is right, and its rivals.
 
     Attributes:
-        declared: The reading that was declared.
-        candidates: The readings that come near, the best first, the declared one among them; one
-            stands for all that residuals cannot distinguish from it.
+        declared: The declared reading.
+        candidates: The best readings, best first, with the declared one; each represents all
+            readings that residuals cannot distinguish from it.
         best: The reading that stands out; the declared one where none does.
         stands_out: Whether another reading than the declared one is clearly right.
-        sentence: What was found, with its figures.
+        sentence: The finding, with its figures.
         notes: What residuals cannot show here, in sentences.
     """
 

@@ -1,10 +1,10 @@
-"""The search: from all ways to take the numbers to the few that close the chain.
+"""Search of all readings for the few that close the chain.
 
 What is cheap and independent goes first: relative angles (forms, shifted rows), then rotations
-(inverse or not), then positions (units, signs), each leaving a handful to the next; the handful at
-the end is fitted in full. With the rotations known the chain is linear in the positions of both
-unknown edges, and all ways to take the numbers are solved for at once: they share the left side of
-the equations.
+(inverse or not), then positions (units, signs), each leaving a handful to the next; the last
+handful
+is fitted in full. With the rotations known the chain is linear in the positions of both unknown
+edges, and all variants are solved for at once: they share the left side of the equations.
 """
 
 from collections.abc import Iterator, Sequence
@@ -43,23 +43,23 @@ from visioncal.core.transforms import compose, nearest_rotation, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, IntArray
 from visioncal.estimation.closed_form import SOLVERS
 
-# Rows looked at: more would add time and no certainty.
-_MOST_ROWS = 40
-# A stage hands on what is within this many times of its best, and at most so many.
-_REACH, _PAIRINGS, _TURNED, _LABELLED, _FITTED = 3.0, 32, 24, 80, 12
-# The half of a degree that noisy poses of few views add to any bound.
+# Most rows that are fitted: more add time and no certainty.
+_FITTED_ROWS = 40
+# A stage hands on what is within this ratio of its best score, and at most the numbers that follow.
+_RATIO, _PAIRINGS, _TURNED, _LABELLED, _FITTED = 3.0, 32, 24, 80, 12
+# Half a degree, which noisy poses of few views add to any bound.
 _SLACK_RAD = 5e-3
-# By how much a change makes a reading less likely than one that does without.
-_PRICE = 0.3
+# Relative penalty of a score per change of the declared reading.
+_PENALTY = 0.3
 _STARTS = 12
 
-# Poses are written in these; micrometres are for instruments. Nobody has a robot in inches and a
-# camera in centimetres, but a target of another size than stated looks like it.
+# Units of poses; micrometres are for instruments. Nobody has a robot in inches and a camera in
+# centimetres, but a target of another size than stated looks like it.
 _UNITS = ("m", "mm", "cm", "inch")
 UNIT_PAIRS = tuple(pair for pair in product(_UNITS, _UNITS) if {*pair} != {"cm", "inch"})
 
-# Sizes of targets that are looked for, as logarithms of their share of the stated size: a half more
-# or less is fitted elsewhere. Fewer views could be of any.
+# Limits of a target's size relative to the stated one, as logarithms: up to a half more or less is
+# fitted elsewhere. Fewer views than the last number fit any size.
 _SMALLEST, _LARGEST, _FEWEST_SIZED = np.log(1.5), np.log(20.0), 5
 
 
@@ -83,17 +83,17 @@ class TurnedPairing:
 
 @dataclass(frozen=True)
 class Variant:
-    """What the robot's positions may be beside its rotations.
+    """A reading of the positions beside given rotations.
 
     The inverse of both sides is the same chain with its unknown edges exchanged, so that the
     camera's positions can stay as they are.
 
     Attributes:
-        carried: Whether they are those of the inverse pose: by the rotations, negated.
-        signs: As in `Taken`.
-        ratio: Their unit over the unit of the camera's.
-        scale: What the camera's are to be multiplied with besides.
-        changes: In how many of these the variant departs from what was declared.
+        carried: Whether the robot's are those of the inverse pose: rotated and negated.
+        signs: As in `SideReading`.
+        ratio: The robot's unit over the camera's.
+        changes: Number of differences from the declared reading.
+        scale: Further factor of the camera's positions.
     """
 
     carried: bool
@@ -104,70 +104,68 @@ class Variant:
 
 
 def solve_turn(
-    pairing: Pairing,
-    transposed: tuple[bool, bool],
-    rows: IntArray,
-    sides: tuple[FloatArray, FloatArray],
+    pairing: Pairing, transposed: tuple[bool, bool], rows: IntArray, sides: tuple[FloatArray, ...]
 ) -> TurnedPairing:
     """Solves for X's rotation by the views that agree best."""
     robot, camera = (
         np.swapaxes(side, 1, 2) if flip else side
         for side, flip in zip(sides, transposed, strict=True)
     )
-    nowhere, count = np.zeros(3), kept_count(len(rows))
-    kept = np.arange(len(rows))
+    zero, kept = np.zeros(3), np.arange(len(rows))
     x, angles = np.eye(3), np.zeros(len(rows))
     for _ in range(3):
-        solve = SOLVERS["park"](compose(robot[kept], nowhere), compose(camera[kept], nowhere))
+        solve = SOLVERS["park"](compose(robot[kept], zero), compose(camera[kept], zero))
         x = solve.x[:3, :3]
         placed = robot @ x @ camera
         angles = rotation_angle(nearest_rotation(placed[kept].mean(axis=0)).T @ placed)
-        kept = np.sort(np.argsort(angles)[:count])
+        kept = np.sort(np.argsort(angles)[: kept_count(len(rows))])
     score = float(np.sqrt(np.mean(angles[kept] ** 2)))
     return TurnedPairing(pairing, transposed, rows, robot, camera, x, kept, score)
 
 
 def score_variants(recording: Recording, turned: TurnedPairing) -> Iterator[tuple[float, Variant]]:
-    """Scores all ways to take the positions, at once: they share the equations' left sides.
+    """Scores all readings of the positions at once.
 
-    `R_i t_X - t_Z = -(p_i + R_i R_X c_i)` for all views; t_Z goes with the means.
+    `R_i t_X - t_Z = -(p_i + R_i R_X c_i)` for all views; subtracting means eliminates t_Z. All
+    variants share the left side.
     """
     variants = tuple(_variants(recording))
-    steps, lever = _steps(recording, turned, variants)
+    right, lever = _right_sides(recording, turned, variants)
     kept = turned.kept
     matrix = turned.robot - turned.robot[kept].mean(axis=0)
-    steps -= steps[kept].mean(axis=0)
+    right -= right[kept].mean(axis=0)
     left = matrix[kept].reshape(-1, 3)
-    found = -np.linalg.pinv(left, rcond=1e-3) @ steps[kept].reshape(len(left), -1)
-    away = np.linalg.norm(steps + matrix @ found, axis=1) / lever
-    nearest = np.partition(away, len(kept) - 1, axis=0)[: len(kept)]
+    solution = -np.linalg.pinv(left, rcond=1e-3) @ right[kept].reshape(len(left), -1)
+    distances = np.linalg.norm(right + matrix @ solution, axis=1) / lever
+    nearest = np.partition(distances, len(kept) - 1, axis=0)[: len(kept)]
     scores = np.hypot(np.sqrt(np.mean(nearest**2, axis=0)), turned.score)
     yield from zip(scores, variants, strict=True)
-    yield from _of_another_size(recording, turned, variants, matrix)
+    yield from _scaled_variants(recording, turned, variants, matrix)
 
 
-def _of_another_size(
+def _scaled_variants(
     recording: Recording, turned: TurnedPairing, variants: Sequence[Variant], matrix: FloatArray
 ) -> Iterator[tuple[float, Variant]]:
-    """Scores the positions as they are, or of the inverse, with the size of the target unknown."""
+    """Scores the positions, or the inverse's, with the size of the target unknown."""
     # `R_i t_X + r p_i - t_Z = -R_i R_X c_i`, whose r is the ratio over the scale. Sizes near the
-    # stated one are found by whoever fits them; here, units would be taken for them.
+    # stated one are fitted elsewhere; here, units would be mistaken for them.
     declared = _ratio(recording.declared.robot.unit, recording.declared.camera.unit)
     kept = turned.kept
-    for item in (
-        variant for variant in variants if variant.ratio == declared and not variant.signs
-    ):
-        steps, lever = _steps(recording, turned, (item, replace(item, ratio=0.0)))
-        steps = (steps - steps[kept].mean(axis=0)) / lever
-        # Without the robot's positions the camera's are left.
-        towards = steps[..., 1]
-        left = np.concatenate([matrix, steps[..., :1] - steps[..., 1:]], axis=2)
-        found = -np.linalg.pinv(left[kept].reshape(-1, 4), rcond=1e-3) @ towards[kept].reshape(-1)
-        scale = 1.0 / found[3] if found[3] > 0.0 else np.inf
+    for item in variants:
+        if item.ratio != declared or item.signs:
+            continue
+        right, lever = _right_sides(recording, turned, (item, replace(item, ratio=0.0)))
+        right = (right - right[kept].mean(axis=0)) / lever
+        # With a ratio of 0 only the camera's positions remain.
+        of_camera = right[..., 1]
+        left = np.concatenate([matrix, right[..., :1] - right[..., 1:]], axis=2)
+        inverse = np.linalg.pinv(left[kept].reshape(-1, 4), rcond=1e-3)
+        solution = -inverse @ of_camera[kept].reshape(-1)
+        scale = 1.0 / solution[3] if solution[3] > 0.0 else np.inf
         if len(kept) < _FEWEST_SIZED or not _SMALLEST < abs(np.log(scale)) < _LARGEST:
             continue
-        away = np.sort(np.linalg.norm(towards + left @ found, axis=1))[: len(kept)]
-        score = float(np.hypot(np.sqrt(np.mean(away**2)), turned.score))
+        distances = np.sort(np.linalg.norm(of_camera + left @ solution, axis=1))[: len(kept)]
+        score = float(np.hypot(np.sqrt(np.mean(distances**2)), turned.score))
         yield score, replace(item, changes=item.changes + 1, scale=float(scale))
 
 
@@ -175,9 +173,10 @@ def _variants(recording: Recording) -> Iterator[Variant]:
     ratios = sorted({_ratio(*pair) for pair in UNIT_PAIRS})
     declared = recording.declared
     inverse = declared.robot.inverse != (recording.mount == "eye-to-hand")
-    given = (inverse != declared.camera.inverse, _ratio(declared.robot.unit, declared.camera.unit))
+    is_carried = inverse != declared.camera.inverse
+    declared_ratio = _ratio(declared.robot.unit, declared.camera.unit)
     for carried, signs, ratio in product((False, True), SIGNS, ratios):
-        changes = (carried != given[0]) + (signs != "") + (ratio != given[1])
+        changes = (carried != is_carried) + (signs != "") + (ratio != declared_ratio)
         yield Variant(carried, signs, ratio, changes)
 
 
@@ -185,44 +184,43 @@ def _ratio(robot_unit: str, camera_unit: str) -> float:
     return round(UNITS_M[robot_unit] / UNITS_M[camera_unit], 9)
 
 
-def _steps(
+def _right_sides(
     recording: Recording, turned: TurnedPairing, variants: Sequence[Variant]
 ) -> tuple[FloatArray, float]:
-    """(n, 3, v) what must be made constant, and the lever, in the unit of the camera's numbers."""
+    """(n, 3, v) right sides p_i + R_i R_X c_i, and the lever, in the camera's unit."""
     p = recording.robot.positions[turned.rows + turned.pairing.shift]
     c = recording.camera.positions[turned.rows]
-    towards = (turned.robot @ turned.x @ c[..., None])[..., 0]
-    moved = {}
+    of_camera = (turned.robot @ turned.x @ c[..., None])[..., 0]
+    of_robot = {}
     for signs in SIGNS:
-        given = p * _sign(signs)
-        moved[signs, False] = given
-        moved[signs, True] = -(turned.robot @ given[..., None])[..., 0]
-    steps = [
-        variant.ratio * moved[variant.signs, variant.carried] + towards for variant in variants
+        signed = p * _sign(signs)
+        of_robot[signs, False] = signed
+        of_robot[signs, True] = -(turned.robot @ signed[..., None])[..., 0]
+    right = [
+        variant.ratio * of_robot[variant.signs, variant.carried] + of_camera for variant in variants
     ]
     lever = max(float(np.median(np.linalg.norm(c, axis=1))), 1e-12)
-    return np.stack(steps, axis=2), lever
+    return np.stack(right, axis=2), lever
 
 
 def _sign(signs: Signs) -> FloatArray:
-    """What positions are multiplied with: a mirrored frame is one with all positions negated."""
+    """Factors of the positions: a mirrored frame is equivalent to negating all of them."""
     if signs == "mirror":
         return -np.ones(3)
     return np.where(np.arange(3) == "xyz".find(signs or "-"), -1.0, 1.0)
 
 
-def thinned(rows: IntArray, most: int = _MOST_ROWS) -> IntArray:
-    """At most so many rows, evenly spread."""
-    if len(rows) <= most:
-        return rows
-    return np.asarray(rows[np.linspace(0, len(rows) - 1, most).round().astype(int)])
+def thinned(rows: IntArray, most: int = _FITTED_ROWS) -> IntArray:
+    """At most `most` rows, evenly spread."""
+    spread = np.linspace(0, len(rows) - 1, most).round().astype(int)
+    return rows if len(rows) <= most else np.asarray(rows[spread])
 
 
 def search(recording: Recording) -> list[Scored]:
     """Finds the readings that close the chain best.
 
     Returns:
-        The declared reading first; then the others, the best first, one for each class of readings
+        The declared reading first; then the others, best first, one for each class of readings
         that residuals can distinguish.
     """
     kept = thinned(recording.common_rows())
@@ -231,8 +229,8 @@ def search(recording: Recording) -> list[Scored]:
     robot = robot_forms(part.robot)
     camera = camera_forms(part.camera, is_measured=part.is_measured)
     pairings = _plausible(robot, camera, screen(robot, camera, rows))
-    turned = _turned(part, robot, camera, pairings, rows)
-    own, classes = _closing(part, robot, camera, turned)
+    turned = _solved_pairings(part, robot, camera, pairings, rows)
+    own, classes = _classes(part, robot, camera, turned)
     declared = _with_likelier(part, fitted(part, part.declared, rows, _STARTS), own, rows)
     others = [_best_label(part, labels, rows) for labels in classes]
     others.sort(key=lambda other: other.score)
@@ -240,23 +238,23 @@ def search(recording: Recording) -> list[Scored]:
 
 
 def _with_neighbours(rows: IntArray, count: int) -> IntArray:
-    """Rows and those that shifts pair them with: next to each other among these as among all."""
+    """Rows and those that shifts pair them with; their indices keep the shifts."""
     near = np.unique(np.add.outer(rows, SHIFTS))
     return np.asarray(near[(near >= 0) & (near < count)])
 
 
-def _closing(
+def _classes(
     recording: Recording, robot: Forms, camera: Forms, turned: Sequence[TurnedPairing]
 ) -> tuple[list[Hypothesis], list[list[Hypothesis]]]:
-    """The declared reading's class, and the others to be fitted, as their simplest readings."""
+    """The declared reading's class, and the simplest readings of the other classes to fit."""
     scored = [
         (float(score), turn, variant)
         for turn in turned
         for score, variant in score_variants(recording, turn)
     ]
     best = min((score for score, *_ in scored), default=0.0)
-    close = [pair for pair in scored if pair[0] <= _REACH * best + _SLACK_RAD]
-    close.sort(key=lambda pair: _priced(pair[0], _cheap_cost(robot, camera, pair[1], pair[2])))
+    close = [pair for pair in scored if pair[0] <= _RATIO * best + _SLACK_RAD]
+    close.sort(key=lambda pair: _penalised(pair[0], _cheap_cost(robot, camera, pair[1], pair[2])))
     own: list[Hypothesis] = []
     classes = []
     for score, turn, variant in close[:_LABELLED]:
@@ -267,24 +265,24 @@ def _closing(
         costs = [recording.cost(label) for label in labels]
         least = min(costs)
         simplest = [label for label, cost in zip(labels, costs, strict=True) if cost == least]
-        classes.append((_priced(score, least), simplest))
+        classes.append((_penalised(score, least), simplest))
     classes.sort(key=lambda pair: pair[0])
     return own, [labels for _, labels in classes[:_FITTED]]
 
 
-def _priced(score: float, cost: float) -> float:
-    """A score by which simple readings come before others that are as good."""
-    return (score + SCORE_FLOOR) * (1.0 + _PRICE * cost)
+def _penalised(score: float, cost: float) -> float:
+    """Score that ranks simple readings before equally good others."""
+    return (score + SCORE_FLOOR) * (1.0 + _PENALTY * cost)
 
 
 def _cheap_cost(robot: Forms, camera: Forms, turned: TurnedPairing, variant: Variant) -> float:
-    """About `Recording.cost` of the simplest reading of a class, without building it."""
+    """Approximates `Recording.cost` of a class's simplest reading, without building it."""
     transposed = (turned.transposed[0] != variant.carried) + turned.transposed[1]
     return _pairing_cost(robot, camera, turned.pairing) + variant.changes + transposed
 
 
 def _pairing_cost(robot: Forms, camera: Forms, pairing: Pairing) -> float:
-    """About `Recording.cost` of a pairing alone."""
+    """Approximates `Recording.cost` of a pairing alone."""
     of_robot = 1.0 + strangeness(robot.turns[pairing.robot]) if pairing.robot else 0.0
     of_camera = 1.0 + strangeness(camera.turns[pairing.camera]) if pairing.camera else 0.0
     return of_robot + of_camera + (pairing.shift != 0)
@@ -294,9 +292,10 @@ def _labels(
     recording: Recording, robot: Forms, camera: Forms, turned: TurnedPairing, variant: Variant
 ) -> Iterator[Hypothesis]:
     """All readings that give the same chain."""
-    # An inverse of the robot's poses, one of the camera's and another mount are the same change;
+    # Inverting the robot's poses, inverting the camera's and changing the mount are equivalent;
     # units go in pairs.
     pairing = turned.pairing
+    of_robot, of_camera = robot.turns[pairing.robot], camera.turns[pairing.camera]
     transposed = turned.transposed[0] != variant.carried, turned.transposed[1]
     pairs = [
         (a, b)
@@ -310,27 +309,20 @@ def _labels(
     for mount, inverse, (unit, camera_unit) in product(MOUNTS, inverses, likely or pairs):
         yield Hypothesis(
             SideReading(
-                robot.turns[pairing.robot],
+                of_robot,
                 unit,
                 variant.carried != ((mount == "eye-to-hand") != inverse),
                 transposed[0],
                 variant.signs,
             ),
-            SideReading(
-                camera.turns[pairing.camera],
-                camera_unit,
-                inverse,
-                transposed[1],
-                scale=variant.scale,
-            ),
+            SideReading(of_camera, camera_unit, inverse, transposed[1], scale=variant.scale),
             mount,
             pairing.shift,
         )
 
 
 def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArray) -> Scored:
-    """Chooses among readings of one class by what cells look like."""
-    # The target is before the camera, and what sits on the flange is near it.
+    """Chooses the reading with the most plausible cell among those of one class."""
     scored = [fitted(recording, label, rows, _STARTS) for label in labels]
     chosen = max(
         scored,
@@ -349,56 +341,41 @@ def _best_label(recording: Recording, labels: Sequence[Hypothesis], rows: IntArr
 def _with_likelier(
     recording: Recording, declared: Scored, own: Sequence[Hypothesis], rows: IntArray
 ) -> Scored:
-    """Tells of the simplest readings of the declared one's class that make a likelier cell."""
+    """Adds the simplest labels of the declared reading's class with a more plausible cell."""
     unit = declared.hypothesis.robot.unit
-    scored = [
-        fitted(recording, hypothesis, rows, _STARTS)
-        for hypothesis in own
-        if hypothesis.robot.unit == unit
-    ]
+    scored = [fitted(recording, item, rows, _STARTS) for item in own if item.robot.unit == unit]
     likelier = [item.hypothesis for item in scored if is_far_likelier(recording, item, declared)]
-    least = min((recording.cost(hypothesis) for hypothesis in likelier), default=0.0)
-    return replace(
-        declared,
-        labels=tuple(hypothesis for hypothesis in likelier if recording.cost(hypothesis) == least),
-    )
+    costs = [recording.cost(hypothesis) for hypothesis in likelier]
+    least = min(costs, default=0.0)
+    labels = (item for item, cost in zip(likelier, costs, strict=True) if cost == least)
+    return replace(declared, labels=tuple(labels))
 
 
 def _plausible(robot: Forms, camera: Forms, pairings: Sequence[Pairing]) -> list[Pairing]:
-    """The pairings with the best mismatch, simple ones first, and the declared one."""
-    best = min(pairing.mismatch_rad for pairing in pairings)
-    bound = _REACH * best + _SLACK_RAD
+    """The declared pairing, then those with the least mismatch, simple ones first."""
+    bound = _RATIO * min(pairing.mismatch_rad for pairing in pairings) + _SLACK_RAD
     near = [pairing for pairing in pairings[1:] if pairing.mismatch_rad <= bound]
-    near.sort(
-        key=lambda pairing: _priced(pairing.mismatch_rad, _pairing_cost(robot, camera, pairing))
-    )
+    near.sort(key=lambda item: _penalised(item.mismatch_rad, _pairing_cost(robot, camera, item)))
     return [pairings[0], *near[: _PAIRINGS - 1]]
 
 
-def _turned(
-    recording: Recording,
-    robot: Forms,
-    camera: Forms,
-    pairings: Sequence[Pairing],
-    rows: IntArray,
+def _solved_pairings(
+    recording: Recording, robot: Forms, camera: Forms, pairings: Sequence[Pairing], rows: IntArray
 ) -> list[TurnedPairing]:
     """Solves for the rotations of each pairing, with each side as given and transposed."""
     solved = []
     cameras = (False,) if recording.is_measured else (False, True)
     for pairing in pairings:
-        turns = robot.rotations[pairing.robot], camera.rotations[pairing.camera]
-        inside = rows[(rows + pairing.shift >= 0) & (rows + pairing.shift < turns[0].shape[0])]
-        there = np.isfinite(turns[0][inside + pairing.shift]).all(axis=(1, 2))
-        inside = inside[there & np.isfinite(turns[1][inside]).all(axis=(1, 2))]
+        forms = robot.rotations[pairing.robot], camera.rotations[pairing.camera]
+        inside = rows[(rows + pairing.shift >= 0) & (rows + pairing.shift < forms[0].shape[0])]
+        readable = np.isfinite(forms[0][inside + pairing.shift]).all(axis=(1, 2))
+        inside = inside[readable & np.isfinite(forms[1][inside]).all(axis=(1, 2))]
         if len(inside) < 3:
             continue
-        sides = turns[0][inside + pairing.shift], turns[1][inside]
-        solved += [
-            solve_turn(pairing, pair, inside, sides) for pair in product((False, True), cameras)
-        ]
+        sides = forms[0][inside + pairing.shift], forms[1][inside]
+        transposed = product((False, True), cameras)
+        solved += [solve_turn(pairing, pair, inside, sides) for pair in transposed]
     best = min((turned.score for turned in solved), default=0.0)
-    near = [turned for turned in solved if turned.score <= _REACH * best + _SLACK_RAD]
-    near.sort(
-        key=lambda turned: _priced(turned.score, _pairing_cost(robot, camera, turned.pairing))
-    )
+    near = [turned for turned in solved if turned.score <= _RATIO * best + _SLACK_RAD]
+    near.sort(key=lambda item: _penalised(item.score, _pairing_cost(robot, camera, item.pairing)))
     return near[:_TURNED]

@@ -1,12 +1,12 @@
-"""Where all frames are to begin with, and by which of its poses each view goes.
+"""Initial poses of all frames, and the choice among each view's candidate poses.
 
 The mirrored solutions of a planar target, and the turns of a board with a rotational symmetry, look
 alike in one image; the robots' motion separates them.
 
 Every pair of frames of which one saw the other at several stops is solved by itself, by a consensus
-of its earliest views: what moves later on has not moved yet. A pair that no robot parts gives one
-transform; one that a robot parts gives two, as a hand-eye calibration does. Of all that is so
-found the best transforms are taken first (Prim 1957), until every frame hangs on the tree.
+of its earliest views: what moves later has not moved yet. A pair with no robot between gives one
+transform; with one robot between it gives two, by a hand-eye calibration. The best transforms are
+taken first (Prim 1957), until every frame is connected to the tree.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ from visioncal.calibration.stages.pairwise import (
     partial_hand_eye,
 )
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.pose_ambiguity import chosen, has_rival, settled
+from visioncal.calibration.stages.pose_ambiguity import chosen, has_rival, settle_candidates
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection, Target
@@ -35,14 +35,14 @@ from visioncal.vision.targets import rotation_transforms
 
 
 @dataclass(frozen=True, eq=False)
-class Tied:
-    """A start.
+class ConnectedFrames:
+    """Initial poses of the frames that are connected to the tree.
 
     Attributes:
-        edges: (4, 4) `parent_from_frame` of the unknown frames that are tied.
+        edges: (4, 4) `parent_from_frame` of the unknown frames that are connected.
         untied: The unknown frames that are not.
-        ambiguous: Frames that are tied by nothing but boards that look the same turned, so that
-            they might as well be elsewhere.
+        ambiguous: Frames that are connected only through boards that look the same turned, so that
+            other poses fit as well.
     """
 
     edges: Mapping[str, FloatArray]
@@ -55,36 +55,33 @@ def init_network(
     poses: Mapping[str, FloatArray],
     sighted: Sighted,
     priors: Sequence[FramePrior] = (),
-) -> Tied:
-    """Finds where the frames are.
+) -> ConnectedFrames:
+    """Finds initial poses of the frames.
 
-    Args:
-        tree: The frames; its root's body has its place by known edges.
-        poses: (s, 4, 4) `base_from_flange` by robot and stop.
-        sighted: What was seen.
-        priors: Where frames were measured to be.
+    The root's body is placed by known edges; `poses` are (s, 4, 4) `base_from_flange` by robot and
+    stop.
     """
-    measured = frozenset(name for prior in priors for name in (prior.first, prior.second))
-    growth = Growth(tree, poses, sighted, _pairs(tree, sighted), (), measured)
-    relations = [*_known(tree), *mounted_points(growth)]
+    with_priors = frozenset(name for prior in priors for name in (prior.first, prior.second))
+    growth = Growth(tree, poses, sighted, _pairs(tree, sighted), (), with_priors)
+    relations = [*_known_relations(tree), *mounted_points(growth)]
     for prior in priors:
         if prior.matrix is not None:
-            unturned = np.eye(4)[None]
-            relation = Relation(prior.first, prior.second, prior.matrix, prior.sigma_m, unturned)
-            relations.append(relation)
-    for pair in growth.oriented:
-        relations += _solved(tree, poses, sighted, pair)
+            pair = prior.first, prior.second
+            relations.append(Relation(*pair, prior.matrix, prior.sigma_m, np.eye(4)[None]))
+    for frame_pair in growth.oriented:
+        relations += _pair_relations(growth, frame_pair)
     placed, ambiguous = spanning_tree(replace(growth, relations=relations))
     if not placed.keys() & {*tree.unknown}:
-        # What the motion leaves open is for those to say who know how far it does.
-        relations += _loose(growth)
+        # Whether the motion determines them is checked later.
+        relations += _weak_relations(growth)
         placed, ambiguous = spanning_tree(replace(growth, relations=relations))
     edges = {
         name: invert(placed[tree.branches[name].parent]) @ placed[name]
         for name in tree.unknown
         if name in placed and tree.branches[name].parent in placed
     }
-    return Tied(edges, tuple(name for name in tree.unknown if name not in edges), ambiguous)
+    untied = tuple(name for name in tree.unknown if name not in edges)
+    return ConnectedFrames(edges, untied, ambiguous)
 
 
 def _pairs(tree: Tree, sighted: Sighted) -> tuple[FramePair, ...]:
@@ -94,78 +91,76 @@ def _pairs(tree: Tree, sighted: Sighted) -> tuple[FramePair, ...]:
     return tuple(FramePair(*pair, np.array(at), tree.path(*pair)) for pair, at in rows.items())
 
 
-def _known(tree: Tree) -> Iterator[Relation]:
+def _known_relations(tree: Tree) -> Iterator[Relation]:
     for name, branch in tree.branches.items():
         if branch.known is not None:
             yield Relation(branch.parent, name, branch.known, 0.0, np.eye(4)[None])
 
 
-def _solved(
-    tree: Tree, poses: Mapping[str, FloatArray], sighted: Sighted, pair: FramePair
-) -> Iterator[Relation]:
-    """What one pair says by itself."""
-    rows = sighted.early(pair.rows)
+def _pair_relations(growth: Growth, pair: FramePair) -> Iterator[Relation]:
+    """The relations that one pair determines by itself."""
+    sighted, rows = growth.sighted, growth.sighted.early(pair.rows)
     if not pair.robots:
         matrix, _, sigma_m = common_transform(sighted.candidates.take(rows))
         yield Relation(pair.seer, pair.seen, matrix, sigma_m, sighted.turns_of(pair.seen))
     if len(pair.robots) != 1:
         return
     mount: Mount = "eye-in-hand" if pair.robots[0].is_up else "eye-to-hand"
-    # Where the earliest views do not agree by half, perhaps all do.
-    for mine in (rows, pair.rows) if len(rows) < len(pair.rows) else (rows,):
-        if len(mine) < FEWEST:
+    # Where the earliest views do not agree by half, all may.
+    for subset in (rows, pair.rows) if len(rows) < len(pair.rows) else (rows,):
+        if len(subset) < FEWEST:
             continue
-        found = hand_eye(*_parted(poses, sighted, pair, mine), mount)
-        if found is not None:
-            yield from _both(tree, sighted, pair, *found)
+        edges = hand_eye(*_robot_and_candidates(growth, pair, subset), mount)
+        if edges is not None:
+            yield from _edges_of_robot(growth, pair, *edges)
             return
 
 
-def _loose(growth: Growth) -> Iterator[Relation]:
-    """What the pair with the most views says, however little that is."""
+def _weak_relations(growth: Growth) -> Iterator[Relation]:
+    """The relations of the pair with the most views, even if partly determined."""
     pairs = [pair for pair in growth.oriented if len(pair.robots) == 1 and len(pair.rows) >= FEWEST]
     if pairs:
         pair = max(pairs, key=lambda value: len(value.rows))
-        x, z, _ = partial_hand_eye(*_parted(growth.poses, growth.sighted, pair, pair.rows))
-        yield from _both(growth.tree, growth.sighted, pair, (x, z), (np.inf, np.inf))
+        x, z, _ = partial_hand_eye(*_robot_and_candidates(growth, pair, pair.rows))
+        yield from _edges_of_robot(growth, pair, (x, z), (np.inf, np.inf))
 
 
-def _both(
-    tree: Tree,
-    sighted: Sighted,
+def _edges_of_robot(
+    growth: Growth,
     pair: FramePair,
     edges: tuple[FloatArray, FloatArray],
     sigmas_m: tuple[float, float],
 ) -> Iterator[Relation]:
-    """The transforms on both sides of the robot that parts a pair."""
+    """The transforms on both sides of the robot that is between a pair."""
     (step,) = pair.robots
-    flange, base = step.frame, tree.branches[step.frame].parent
+    flange, base = step.frame, growth.tree.branches[step.frame].parent
     near, far = (flange, base) if step.is_up else (base, flange)
     yield Relation(near, pair.seer, edges[0], sigmas_m[0], np.eye(4)[None])
-    yield Relation(far, pair.seen, edges[1], sigmas_m[1], sighted.turns_of(pair.seen))
+    turns = growth.sighted.turns_of(pair.seen)
+    yield Relation(far, pair.seen, edges[1], sigmas_m[1], turns)
 
 
-def _parted(
-    poses: Mapping[str, FloatArray], sighted: Sighted, pair: FramePair, rows: IntArray
+def _robot_and_candidates(
+    growth: Growth, pair: FramePair, rows: IntArray
 ) -> tuple[FloatArray, Candidates]:
-    """The robot's part of the chain (m, 4, 4) in some views of a pair, and what these allow."""
+    """The robot's part of the chain (m, 4, 4) in some views of a pair, and their candidates."""
     (step,) = pair.robots
-    robot = poses[step.robot][sighted.stops[rows]]
-    return robot if step.is_up else invert(robot), sighted.candidates.take(rows)
+    robot = growth.poses[step.robot][growth.sighted.stops[rows]]
+    return robot if step.is_up else invert(robot), growth.sighted.candidates.take(rows)
 
 
 @dataclass(frozen=True, eq=False)
 class InitialFrames:
-    """A start.
+    """Initial poses of the frames, and one pose of each view.
 
     Attributes:
-        tied: Where the frames are.
-        views: The views that are clear, with one pose each; where a turned pose was chosen, the
+        tied: The frames.
+        views: The unambiguous views, with one pose each; where a turned pose was chosen, the
             corners are renumbered to match.
-        rejections: The others.
+        rejections: The ambiguous views.
     """
 
-    tied: Tied
+    tied: ConnectedFrames
     views: tuple[ViewPoses, ...]
     rejections: tuple[Rejection, ...]
 
@@ -173,105 +168,98 @@ class InitialFrames:
 def init_frames(
     problem: Problem, views: Sequence[ViewPoses], targets: Mapping[str, Target]
 ) -> InitialFrames:
-    """Finds where the frames are, and which pose of each view goes with that.
+    """Finds initial poses of the frames, and the pose of each view that fits them.
 
     Args:
-        problem: What the views measured, one observation a view, each by any of its poses.
+        problem: The observations, one a view, each by any of its poses.
         views: The views with their candidates.
         targets: The printed targets by their frames.
 
     Raises:
         DegenerateError: The motion leaves most views ambiguous.
     """
-    seen, candidates = problem.observations, Candidates.of(views)
-    turned = {
-        frame: turns
-        for frame, target in targets.items()
-        if len(turns := rotation_transforms(target)) > 1
-    }
+    observations, candidates = problem.observations, Candidates.of(views)
+    turns_of = {frame: rotation_transforms(target) for frame, target in targets.items()}
+    symmetries = {frame: turns for frame, turns in turns_of.items() if len(turns) > 1}
     sighted = Sighted(
-        seen.observers,
-        seen.observed,
-        seen.stops,
+        observations.observers,
+        observations.observed,
+        observations.stops,
         candidates,
-        turned,
-        ~seen.has_rotation,
+        symmetries,
+        ~observations.has_rotation,
     )
     tied = init_network(problem.tree, problem.poses, sighted, problem.priors)
-    away = _distances(problem, candidates, tied)
-    unclear = _unclear(problem, candidates, tied, away)
-    tied, picks = _numbered_as_first(problem, tied, away.argmin(axis=1), turned)
-    if unclear.sum() > len(views) / 2:
+    distances = _distances(problem, candidates, tied)
+    ambiguous = _is_ambiguous(problem, candidates, tied, distances)
+    tied, picks = _numbered_as_first(problem, tied, distances.argmin(axis=1), symmetries)
+    clear, unclear = np.flatnonzero(~ambiguous).tolist(), np.flatnonzero(ambiguous).tolist()
+    if len(unclear) > len(views) / 2:
         raise DegenerateError(
-            f"pnp: {unclear.sum()} of {len(views)} views allow two poses of the target that the "
+            f"pnp: {len(unclear)} of {len(views)} views allow two poses of the target that the "
             "robot's motion cannot distinguish.",
-            culprits=[
-                f"view {view.view}" for view, value in zip(views, unclear, strict=True) if value
-            ],
+            culprits=[f"view {views[at].view}" for at in unclear],
             next_step="Add views tilted about different axes, or use a board without symmetry "
             "(ChArUco, or an odd sum of columns and rows).",
         )
-    rows = list(zip(views, picks.tolist(), unclear.tolist(), seen.observed, strict=True))
-    return InitialFrames(
-        tied,
-        tuple(
-            chosen(view, pick, targets.get(frame)) for view, pick, value, frame in rows if not value
-        ),
-        tuple(
-            Rejection(view.view, "ambiguous: two poses of the target fit image and motion alike")
-            for view, _, value, _ in rows
-            if value
-        ),
-    )
+    why = "ambiguous: two poses of the target fit image and motion alike"
+    rejections = tuple(Rejection(views[at].view, why) for at in unclear)
+    targets_seen = [targets.get(frame) for frame in observations.observed]
+    chosen_views = (chosen(views[at], int(picks[at]), targets_seen[at]) for at in clear)
+    return InitialFrames(tied, tuple(chosen_views), rejections)
 
 
-def _distances(problem: Problem, candidates: Candidates, tied: Tied) -> FloatArray:
-    """(n, k) how far the views' candidates are from what the start predicts [m]."""
-    # Of views of frames that are not tied, they say nothing.
+def _distances(problem: Problem, candidates: Candidates, tied: ConnectedFrames) -> FloatArray:
+    """(n, k) distances of the views' candidates from their predictions [m]."""
+    # The distances of views of unconnected frames have no meaning.
     frames = {name: tied.edges.get(name, np.eye(4)) for name in problem.unknown}
-    away = candidates.distances(problem.predicted(problem.start(frames)))
+    distances = candidates.distances(problem.predicted(problem.start(frames)))
     for group in problem.groups:
         rows, robots = group.rows, [step for step in group.path if step.robot]
         if not candidates.valid[rows, 1:].any():
             continue
-        if len(robots) == 1 and max(FEWEST, len(away) / 2) <= len(rows):
-            # What most views say by themselves is nearer than what the earliest say.
+        if len(robots) == 1 and max(FEWEST, len(distances) / 2) <= len(rows):
+            # A fit to most views is more precise than one to the earliest.
             robot = problem.poses[robots[0].robot][problem.observations.stops[rows]]
             robot = robot if robots[0].is_up else invert(robot)
-            away[rows] = settled(robot, candidates.take(rows), away[rows].argmin(axis=1))
-    return away
+            distances[rows] = settle_candidates(
+                robot, candidates.take(rows), distances[rows].argmin(axis=1)
+            )
+    return distances
 
 
-def _unclear(problem: Problem, candidates: Candidates, tied: Tied, away: FloatArray) -> Mask:
-    """(n,) for which views another pose is as likely as the nearest."""
-    seen, unclear = problem.observations, np.zeros(len(away), dtype=bool)
-    least = away.min(axis=1)
+def _is_ambiguous(
+    problem: Problem, candidates: Candidates, tied: ConnectedFrames, distances: FloatArray
+) -> Mask:
+    """(n,) whether another candidate is as likely as the nearest."""
+    observations, ambiguous = problem.observations, np.zeros(len(distances), dtype=bool)
+    nearest = distances.min(axis=1)
     for group in problem.groups:
         if not any(step.frame in tied.untied for step in group.path):
-            typical = max(float(np.median(least[group.rows])), float(np.median(least)))
-            unclear[group.rows] = has_rival(away[group.rows], typical)
+            typical_m = max(float(np.median(nearest[group.rows])), float(np.median(nearest)))
+            ambiguous[group.rows] = has_rival(distances[group.rows], typical_m)
     poses = (candidates.valid & (candidates.turns == 0)).sum(axis=1)
-    for frame in tied.edges.keys() - _measured(problem):
-        rows = seen.involves(frame)
-        # Nothing else speaks for one of the poses of the only view.
-        unclear |= rows & (rows.sum() == 1) & (poses > 1)
-    return unclear
+    for frame in tied.edges.keys() - _with_priors(problem):
+        rows = observations.involves(frame)
+        # Nothing else decides between the poses of a frame's only view.
+        ambiguous |= rows & (rows.sum() == 1) & (poses > 1)
+    return ambiguous
 
 
 def _numbered_as_first(
-    problem: Problem, tied: Tied, picks: IntArray, turned: Mapping[str, FloatArray]
-) -> tuple[Tied, IntArray]:
-    """Turns boards that look the same turned so that their first views keep their numbering."""
-    # Those stay that were measured to be somewhere.
+    problem: Problem, tied: ConnectedFrames, picks: IntArray, symmetries: Mapping[str, FloatArray]
+) -> tuple[ConnectedFrames, IntArray]:
+    """Turns symmetric boards so that first views keep their corner numbers."""
+    # Frames with priors are left as they are.
     edges, picks = dict(tied.edges), picks.copy()
-    for frame in edges.keys() & turned.keys() - _measured(problem):
-        rows, turns = problem.observations.involves(frame), turned[frame]
+    for frame in edges.keys() & symmetries.keys() - _with_priors(problem):
+        rows, turns = problem.observations.involves(frame), symmetries[frame]
         # A target's turns are powers of the first, and candidates come in blocks of all turns.
-        planar, turn = np.divmod(picks[rows], len(turns))
-        picks[rows] = planar * len(turns) + (turn - turn[0]) % len(turns)
-        edges[frame] = edges[frame] @ invert(turns[turn[0]])
+        planar, turned = np.divmod(picks[rows], len(turns))
+        picks[rows] = planar * len(turns) + (turned - turned[0]) % len(turns)
+        edges[frame] = edges[frame] @ invert(turns[turned[0]])
     return replace(tied, edges=edges), picks
 
 
-def _measured(problem: Problem) -> set[str]:
+def _with_priors(problem: Problem) -> set[str]:
     return {name for prior in problem.priors for name in (prior.first, prior.second)}

@@ -1,4 +1,4 @@
-"""The camera's intrinsics, where the session gives none."""
+"""Estimation of the camera's intrinsics, where the session states none."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ _FEWEST_VIEWS = 3
 _ROUNDS = 3
 # Starts for the focal length, in image widths, where Zhang's own start does not converge.
 _FOCAL_WIDTHS = (0.3, 0.6, 1.0, 2.0)
-# The rational model has to explain this share more, of views in the fit and of views left out.
+# Least relative gain of the rational model, of views in the fit and of held-out ones.
 _LEAST_GAIN = 0.02
 _FOLDS = 5
 # Limits of the warnings: the focal length as a share, the principal point in pixels.
@@ -40,7 +40,7 @@ class Intrinsics:
         camera: The intrinsics.
         covariance: (4 + k, 4 + k) of fx, fy, cx, cy and the distortion.
         sigma_px: Standard deviation of a corner's coordinate, stated or by the residuals [px].
-        rejections: Views whose residual is no noise.
+        rejections: Outlier views.
         warnings: What the views do not determine.
     """
 
@@ -57,14 +57,14 @@ def estimate_intrinsics(
     resolution: tuple[int, int],
     model: CameraKind,
 ) -> Intrinsics:
-    """Estimates the intrinsics from views of targets (Zhang 2000 where these are planar).
+    """Estimates the intrinsics from views of targets (Zhang 2000 for planar ones).
 
-    Brown's model has 5 coefficients of distortion, or 8 where these predict views better that the
-    fit has not seen; a fisheye has 4.
+    Brown's model has 5 coefficients of distortion, or 8 where these predict held-out views better;
+    a fisheye has 4.
 
     Args:
         corners: The corners by view.
-        targets: What was seen; the corners of several are numbered through.
+        targets: The targets; the corners of several are numbered through.
         resolution: (width, height) [px].
         model: `brown` or `fisheye`.
 
@@ -85,51 +85,46 @@ def estimate_intrinsics(
         )
     stack = CornerStack.of(corners, numbered_positions(targets))
     with one_blas_thread():
-        fit = _first_fit(stack, model, resolution)
-        every = stack
-        stack, fit, reasons = _gated(every, fit)
+        first, full = _first_fit(stack, model, resolution), stack
+        stack, fit, reasons = _gated(full, first)
         if reasons:
-            # A pose that began under a wrong focal length may tilt the other way, and stays there:
-            # the views that are tilted most, and say most of the lens, pass for outliers.
+            # With a wrong initial focal length a pose may tilt the other way and stay there: the
+            # most tilted views, which determine the lens best, then seem outliers.
             plain = replace(fit.camera, distortion=np.zeros_like(fit.camera.distortion))
-            again = _gated(every, _fit(every, plain, planar_poses(every, plain).first))
-            if len(again[2]) < len(reasons):
-                stack, fit, reasons = again
+            restarted = _gated(full, _fit(full, plain, planar_poses(full, plain).first))
+            if len(restarted[2]) < len(reasons):
+                stack, fit, reasons = restarted
         if model == "brown":
             fit = _with_rational_terms(stack, fit)
     _check(fit)
-    return Intrinsics(
-        fit.camera,
-        fit.covariance,
-        fit.sigma_px,
-        tuple(Rejection(*item) for item in reasons.items()),
-        tuple(_warnings(stack, fit)),
-    )
+    rejections = tuple(Rejection(*item) for item in reasons.items())
+    warnings = tuple(_warnings(stack, fit))
+    return Intrinsics(fit.camera, fit.covariance, fit.sigma_px, rejections, warnings)
 
 
 def _gated(stack: CornerStack, fit: BundleFit) -> tuple[CornerStack, BundleFit, dict[int, str]]:
-    """Fits without corners and views whose residuals are no noise; reasons by view."""
+    """Refits without outlier corners and views; reasons by view."""
     reasons: dict[int, str] = {}
     for _ in range(_ROUNDS):
-        passed = gate(stack, fit.residuals)
-        if passed.is_open:
+        gated = gate(stack, fit.residuals)
+        if gated.is_open:
             break
-        reasons |= passed.reasons
-        kept = stack.keep(passed.mask)
+        reasons |= gated.reasons
+        kept = stack.keep(gated.mask)
         poses = fit.cam_from_target[np.isin(stack.views, kept.views)]
         stack, fit = kept, _fit(kept, fit.camera, poses)
     return stack, fit, reasons
 
 
 def _fit(stack: CornerStack, camera: Camera, poses: FloatArray) -> BundleFit:
-    """Fits with priors far wider than any lens, which only keep the undetermined in place."""
+    """Fits with priors far wider than any lens, which only bound undetermined directions."""
     size = np.array(camera.resolution, dtype=float)
     sigma = np.concatenate([np.full(2, size[0]), size / 4, np.full(len(camera.distortion), 100.0)])
     return fit_bundle(stack, camera, poses, sigma)
 
 
 def _first_fit(stack: CornerStack, model: CameraKind, resolution: tuple[int, int]) -> BundleFit:
-    """Fits from Zhang's start and from a row of focal lengths; the first good one wins."""
+    """Fits from Zhang's start and further focal lengths until a fit is good."""
     best: BundleFit | None = None
     coefficients = 4 if model == "fisheye" else 5
     for focal in _focal_starts(stack, resolution):
@@ -139,7 +134,7 @@ def _first_fit(stack: CornerStack, model: CameraKind, resolution: tuple[int, int
         fit = _fit(stack, camera, planar_poses(stack, camera).first)
         if best is None or fit.sigma_px < best.sigma_px:
             best = fit
-        # Corners are found to a few tenths of a pixel; a wrong basin is off by many pixels.
+        # Corners are found to a few tenths of a pixel; a wrong minimum is off by many pixels.
         if best.sigma_px < 1.0 and best.settled:
             break
     if best is None or not np.isfinite(best.sigma_px):
@@ -161,27 +156,27 @@ def _focal_starts(stack: CornerStack, resolution: tuple[int, int]) -> Iterator[f
 
 
 def _is_flat(stack: CornerStack) -> bool:
-    """Whether all targets are planes of constant z, as printed ones are."""
+    """Whether all targets are in the plane z = 0, as printed ones are."""
     return not stack.points[:, 2].any()
 
 
 def _with_rational_terms(stack: CornerStack, fit: BundleFit) -> BundleFit:
-    """Takes 8 coefficients instead of 5 where views that were left out are predicted better."""
-    # From the polynomial: from nowhere, a pole and a zero may cancel inside the image.
+    """Takes 8 coefficients instead of 5 where held-out views are predicted better."""
+    # Starts from the polynomial: from zero, a pole and a zero may cancel inside the image.
     camera = fit.camera
     padded = replace(camera, distortion=np.concatenate([camera.distortion, np.zeros(3)]))
     wider = _fit(stack, padded, fit.cam_from_target)
     gain = 1.0 - float(np.sum(wider.residuals**2) / np.sum(fit.residuals**2))
     if not wider.settled or gain < _LEAST_GAIN or len(stack.views) < 2 * _FOLDS:
         return fit
-    # By the typical view: where a fold leaves out an edge of the image, the wider model may run
-    # away there, and with all views it does not.
+    # The median, because where a fold leaves out an edge of the image, the wider model may diverge
+    # there, which it does not with all views.
     ratio = float(np.median(_held_out(stack, wider) / _held_out(stack, fit)))
     return wider if ratio < 1.0 - _LEAST_GAIN else fit
 
 
 def _held_out(stack: CornerStack, fit: BundleFit) -> FloatArray:
-    """Mean squared error (v,) [px^2] of views that the intrinsics were not fitted to."""
+    """(v,) mean squared error [px^2] of held-out views."""
     fold = np.arange(len(stack.views)) % _FOLDS
     squares = np.zeros(len(stack.views))
     for left_out in range(_FOLDS):
@@ -208,7 +203,7 @@ def _check(fit: BundleFit) -> None:
 
 
 def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
-    """Says what the views do not determine, and what about the views is the cause."""
+    """States what the views do not determine, and why."""
     sigma = np.sqrt(np.diag(fit.covariance))
     focal, centre = (sigma[:2] / fit.camera.matrix[:2]).max(), sigma[2:4].max()
     causes = list(_causes(fit)) if _is_flat(stack) else []
@@ -228,31 +223,22 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
             f"No corner was ever seen in the {listed(empty)} of the image, so the lens is "
             "extrapolated there.",
             Remedy(f"In some views, move the target into the {listed(empty)} of the image."),
-            # What is needed is needed where the views looked, or at a declared place.
+            # Picks are where the views looked, or at a declared place.
             until_mm=0.0,
         )
 
 
 def _causes(fit: BundleFit) -> Iterator[Finding]:
     poses = fit.cam_from_target
-    axis = poses[:, :3, 2]
-    tilt = np.rad2deg(np.arccos(np.clip(np.abs(axis[:, 2]), 0.0, 1.0)))
+    tilt = np.rad2deg(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0.0, 1.0)))
     if tilt.max() < _TILT_SPREAD_DEG:
-        yield Finding(
-            "weak_lens",
-            f"All views are frontal (tilted by at most {tilt.max():.0f} degrees).",
-            TILTED,
-            until_mm=0.0,
-        )
+        words = f"All views are frontal (tilted by at most {tilt.max():.0f} degrees)."
+        yield Finding("weak_lens", words, TILTED, until_mm=0.0)
     distance = np.linalg.norm(poses[:, :3, 3], axis=1)
     spread = distance.max() / distance.min()
     if spread < _DISTANCE_SPREAD and tilt.max() < 2 * _TILT_SPREAD_DEG:
-        yield Finding(
-            "weak_lens",
-            f"All views are from one distance (within {100 * (spread - 1):.0f} %).",
-            Remedy("Vary the distance of the views."),
-            until_mm=0.0,
-        )
+        words = f"All views are from one distance (within {100 * (spread - 1):.0f} %)."
+        yield Finding("weak_lens", words, Remedy("Vary the distance of the views."), until_mm=0.0)
 
 
 def _unvisited(stack: CornerStack, resolution: tuple[int, int]) -> list[str]:

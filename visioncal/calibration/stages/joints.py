@@ -1,4 +1,4 @@
-"""Whether joint angles belong to the robot's model and to its reported poses."""
+"""Check of joint angles against the robot's model and its reported poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,40 +20,41 @@ from visioncal.session import View
 from visioncal.session.table import reported_matrices
 
 # Controllers print poses to 0.01 mm or 1e-5 rad at worst; a model of another robot, another tip or
-# another convention is off by far more.
+# another convention differs by far more.
 _AGREE_M, _AGREE_RAD = 1e-3, 2e-3
-# Controllers that know their own arm's calibration report poses so far from the nominal model.
+# Controllers with their own arm's calibration report poses that differ from the nominal model by up
+# to this.
 _CALIBRATED_M, _CALIBRATED_RAD = 1e-2, 2e-2
-# Beyond, the model is of another arm.
+# Beyond this, the model is of another arm.
 _SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
-# Another base explains the poses where it leaves so much less than the model's own.
-_CLEARLY = 3.0
-# A half turn of the base is meant within this [mm], [deg]: nominal models err less.
+# Ratio of the model's own base's residuals to those of another base that is preferred.
+_BETTER_BASE = 3.0
+# Limits for a half turn of the base [mm], [deg]: nominal models err less.
 _NEAR_MM, _NEAR_DEG = 10.0, 2.0
-# A row does not belong to the others beyond this many times their median distance.
-_OUT = 7.0
-# More rows than this that disagree are no two rows exchanged.
-_MOST = 8
-# Where at least this share of the rows disagrees, it is not the rows that are wrong.
+# Outlier rows have residuals beyond this many medians.
+_OUTLIER = 7.0
+# More outlier rows are not two rows exchanged.
+_MOST_OUTLIERS = 8
+# With at least this share of outlier rows, it is not the rows that are wrong.
 _HALF = 0.5
 _LISTED_COLUMNS = 7
-# The arm as it was calibrated, for other programs.
-ARM_AS_FOUND = "visioncal export OUT --to robot-urdf -o robot.urdf"
+# Exports the calibrated arm for other programs.
+EXPORT_ARM = "visioncal export OUT --to robot-urdf -o robot.urdf"
 
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """The joint angles of a session beside its reported poses.
+    """Joint angles of a session, matched with its reported poses.
 
     Attributes:
         robot: The model, its base in the frame of the poses.
         joints_rad: (n,) by view, those that belong to it [rad].
-        flange_from_reported: (4, 4) the frame of the poses in the model's flange.
-        zero: The joint whose zero is elsewhere, as the poses show; None for none.
-        misread: What is wrong with the angles or the model, and the fix; empty where nothing is.
-        contradicting: What is wrong with the angles, if it is not the pose, by view.
-        warnings: What to mend.
-        notes: What is good to know.
+        flange_from_reported: (4, 4) the poses' frame in the model's flange.
+        zero: The reading with the joint whose zero is shifted, by the poses; None for none.
+        misread: What is wrong with the angles or the model, and the fix; empty for nothing.
+        contradicting: What is wrong with the angles, unless the pose is, by view.
+        warnings: Findings to be mended.
+        notes: Remarks.
     """
 
     robot: Robot
@@ -67,7 +68,7 @@ class Matched:
 
     @property
     def arm(self) -> Robot:
-        """The model with its zeros where the poses have them."""
+        """The model with its zeros as the poses determine them."""
         return self.robot if self.zero is None else with_zeros(self.robot, self.zero.zeros)
 
     def pose(self, joints: FloatArray) -> FloatArray:
@@ -87,8 +88,8 @@ class Matched:
 
 
 @dataclass(frozen=True, eq=False)
-class _Constants:
-    """Where the model's base and the poses' flange are, and what is left of each row.
+class _BaseAndFlange:
+    """Constant transforms between model and reported poses, and the residual of each row.
 
     `fit` has x, the model's base in the poses' base, and z, its flange in the poses' flange.
     """
@@ -97,37 +98,33 @@ class _Constants:
 
     @property
     def typical(self) -> tuple[float, float]:
-        """What is left of most rows [m], [rad]."""
+        """Median residual [m], [rad]."""
         return float(np.median(self.fit.shift)), float(np.median(self.fit.angle))
 
     def limits(self) -> tuple[float, float]:
-        """From where on a row does not belong to the others [m], [rad]."""
+        """Limits beyond which a row is an outlier [m], [rad]."""
         shift, angle = self.typical
-        return max(_AGREE_M, _OUT * shift), max(_AGREE_RAD, _OUT * angle)
+        return max(_AGREE_M, _OUTLIER * shift), max(_AGREE_RAD, _OUTLIER * angle)
 
     @property
-    def out(self) -> Mask:
-        """(n,) the rows that do not belong to the others."""
+    def outliers(self) -> Mask:
+        """(n,) outlier rows."""
         shift, angle = self.limits()
         return np.asarray((self.fit.shift > shift) | (self.fit.angle > angle))
 
     @property
     def figures(self) -> str:
-        return _away(self.fit.shift.max(), self.fit.angle.max())
+        return _words(self.fit.shift.max(), self.fit.angle.max())
 
 
 def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
     """Compares the joint angles of a robot with its reported poses.
 
     Poses that belong to the angles are `base_from_model @ FK(q) @ flange_from_reported` with two
-    constants: another base than the model's and a tool on its flange are no mistakes.
-
-    Args:
-        rows: The views with its pose.
-        robot: Its model, as the session names it.
+    constant transforms: another base than the model's and a tool on its flange are no mistakes.
 
     Returns:
-        The angles that belong to it, and what does not.
+        The angles that belong to it, and what is wrong with the others.
     """
     joints = {row.number: q for row in rows if (q := row.joints_rad) is not None}
     poses = reported_matrices([row for row in rows if row.number in joints])
@@ -137,10 +134,9 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
             f"Joint angles were not used: there are {min(counts)} a row, and {robot.name} has "
             f"{robot.joint_count} joints."
         )
-        step = Remedy(
-            "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
-        )
-        return Matched(robot, warnings=(Finding("misread_joints", words, step),) if poses else ())
+        step = "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
+        finding = Finding("misread_joints", words, Remedy(step))
+        return Matched(robot, warnings=(finding,) if poses else ())
     if not poses:
         return Matched(robot, joints)
     views, q = tuple(poses), np.array([joints[view] for view in poses])
@@ -159,30 +155,30 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
         misread = f"The angles of this session are misread. {sentence} {guess.fix}"
         doubt = Finding("misread_joints", words, Remedy(guess.fix))
         return Matched(robot, misread=misread, warnings=(doubt,))
-    zero = None if guess is None else guess.zero
-    if zero is not None and guess is not None:
+    if guess is not None and (zero := guess.zero) is not None:
         words = (
             "The joint angles do not belong to the reported poses as they are declared. "
             f"{guess.sentence('the reported poses')} {zero_taken(zero)}"
         )
-        lost = Finding("misread_joints", words, Remedy(zero.fix, ARM_AS_FOUND))
-        matched = replace(matched, zero=zero, warnings=(lost,))
+        shifted = Finding("misread_joints", words, Remedy(zero.fix, EXPORT_ARM))
+        matched = replace(matched, zero=zero, warnings=(shifted,))
     model = matched.arm.base_from_flange(q)
-    found = _constants(model, poses, guess)
-    typical_m, typical_rad = found.typical
-    is_other = typical_m > _SAME_ARM_M or typical_rad > _SAME_ARM_RAD or found.out.mean() >= _HALF
-    if is_other:
-        return Matched(robot, warnings=(_of_another_arm(robot, found),))
-    matched = _rows_out(matched, found, views, (model, poses))
-    if not np.array_equal(found.fit.x, np.eye(4)):
-        matched = replace(_based(matched, found), robot=placed_at(robot, found.fit.x))
-    sound = ~found.out
-    tool = mean_transform(invert(matched.arm.base_from_flange(q[sound])) @ poses[sound])
-    return _described(replace(matched, flange_from_reported=tool), found)
+    constants = _fit_base_and_flange(model, poses, guess)
+    typical_m, typical_rad = constants.typical
+    outliers = constants.outliers
+    if typical_m > _SAME_ARM_M or typical_rad > _SAME_ARM_RAD or outliers.mean() >= _HALF:
+        finding = _other_arm(robot, constants.figures)
+        words = f"{finding.words} The joint angles were not used."
+        return Matched(robot, warnings=(replace(finding, words=words),))
+    matched = _report_outliers(matched, constants, views, (model, poses))
+    if not np.array_equal(constants.fit.x, np.eye(4)):
+        matched = replace(_report_base(matched, constants), robot=placed_at(robot, constants.fit.x))
+    tool = mean_transform(invert(matched.arm.base_from_flange(q[~outliers])) @ poses[~outliers])
+    return _report_tool_frame(replace(matched, flange_from_reported=tool), constants)
 
 
 def _is_calibrated(robot: Robot, guess: JointGuess) -> bool:
-    """Whether a model of one's own is a built-in arm's but for what calibration changes.
+    """Whether the user's model is a built-in arm's except for what calibration changes.
 
     Its controller computes with the built-in one, which fits the poses that it reports exactly.
     """
@@ -192,44 +188,45 @@ def _is_calibrated(robot: Robot, guess: JointGuess) -> bool:
     return bool(is_near and is_other and robot.name not in robot_names())
 
 
-def _constants(model: FloatArray, poses: FloatArray, guess: JointGuess | None) -> _Constants:
-    """The model's own base, with whatever is on its flange; another base where that is clear."""
-    flange_from_reported, of_poses = invert(model) @ poses, invert(poses)
+def _fit_base_and_flange(
+    model: FloatArray, poses: FloatArray, guess: JointGuess | None
+) -> _BaseAndFlange:
+    """Fits the flange with the model's own base; another base where clearly better."""
+    flange_from_reported, flange_from_base = invert(model) @ poses, invert(poses)
     lever = max(float(np.median(np.linalg.norm(model[:, :3, 3], axis=1))), _AGREE_M)
-    # The most central one, which wrong rows do not move as they would move the mean.
-    # Rows of one stop give the same.
+    # The most central one, robust to wrong rows; those of one stop give the same.
     first = np.unique(flange_from_reported, axis=0, return_index=True)[1]
-    around = [
-        distances(of_poses, model, lever, (np.eye(4), invert(flange_from_reported[index])))
+    fits = [
+        distances(flange_from_base, model, lever, (np.eye(4), invert(flange_from_reported[index])))
         for index in np.sort(first)
     ]
-    same = _Constants(min(around, key=lambda value: float(np.median(value.away))))
+    own = _BaseAndFlange(min(fits, key=lambda value: float(np.median(value.residuals))))
     if guess is None:
-        return same
-    other = _Constants(guess.best.fit)
-    (same_m, same_rad), (other_m, other_rad) = same.typical, other.typical
-    disagree = same_m > _AGREE_M or same_rad > _AGREE_RAD
-    better = same_m > _CLEARLY * other_m and same_rad >= other_rad
-    better |= same_rad > _CLEARLY * other_rad and same_m >= other_m
-    return other if disagree and better else same
+        return own
+    other = _BaseAndFlange(guess.best.fit)
+    (own_m, own_rad), (other_m, other_rad) = own.typical, other.typical
+    disagree = own_m > _AGREE_M or own_rad > _AGREE_RAD
+    better = own_m > _BETTER_BASE * other_m and own_rad >= other_rad
+    better |= own_rad > _BETTER_BASE * other_rad and own_m >= other_m
+    return other if disagree and better else own
 
 
-def _rows_out(
+def _report_outliers(
     matched: Matched,
-    found: _Constants,
+    constants: _BaseAndFlange,
     views: Sequence[int],
     sides: tuple[FloatArray, FloatArray],
 ) -> Matched:
-    """Names the views whose pose is not that of their angles."""
-    out = np.flatnonzero(found.out)
-    if not len(out):
+    """Reports the views whose pose is not that of their angles."""
+    outliers = np.flatnonzero(constants.outliers)
+    if not len(outliers):
         return matched
-    swapped = _exchanged(found, out, sides)
+    swapped = _exchanged(constants, outliers, sides)
     reasons: dict[int, str] = {}
     warnings = list(matched.warnings)
-    for row in out.tolist():
-        away = _away(found.fit.shift[row], found.fit.angle[row])
-        reasons[views[row]] = f"its joint angles lead {away} away from its pose"
+    for row in outliers.tolist():
+        residual = _words(constants.fit.shift[row], constants.fit.angle[row])
+        reasons[views[row]] = f"its joint angles lead {residual} away from its pose"
         if row in swapped:
             mate = views[sum(swapped) - row]
             reasons[views[row]] = f"its joint angles are those of view {mate}"
@@ -245,13 +242,13 @@ def _rows_out(
             CALIBRATE,
         )
         warnings.append(Finding("exchanged_joints", words, step, (first, second)))
-    rest = [row for row in out.tolist() if row not in swapped]
+    rest = [row for row in outliers.tolist() if row not in swapped]
     if rest:
-        shift, angle = found.fit.shift[rest].max(), found.fit.angle[rest].max()
+        shift, angle = constants.fit.shift[rest].max(), constants.fit.angle[rest].max()
         words = (
             f"Pose and joint angles disagree in "
             f"{', '.join(f'view {views[index]}' for index in rest)}, "
-            f"by up to {_away(shift, angle)}; in the other views they agree. The hand-eye result "
+            f"by up to {_words(shift, angle)}; in the other views they agree. The hand-eye result "
             "uses the poses."
         )
         step = Remedy("Correct what is wrong there in views.csv.")
@@ -261,13 +258,13 @@ def _rows_out(
 
 
 def _exchanged(
-    found: _Constants, out: IntArray, sides: tuple[FloatArray, FloatArray]
+    constants: _BaseAndFlange, outliers: IntArray, sides: tuple[FloatArray, FloatArray]
 ) -> tuple[int, ...]:
-    """The two rows whose angles lead to each other's pose; empty where there are none, or more."""
+    """The two rows whose angles lead to each other's pose; empty for none or several."""
     model, poses = sides
-    fit, limits = found.fit, found.limits()
+    fit, limits = constants.fit, constants.limits()
     pairs = []
-    for pair in combinations(out.tolist(), 2) if len(out) <= _MOST else ():
+    for pair in combinations(outliers.tolist(), 2) if len(outliers) <= _MOST_OUTLIERS else ():
         crossed = distances(
             invert(poses[list(pair)]), model[list(pair[::-1])], fit.lever, (fit.x, fit.z)
         )
@@ -276,9 +273,9 @@ def _exchanged(
     return pairs[0] if len(pairs) == 1 else ()
 
 
-def _based(matched: Matched, found: _Constants) -> Matched:
-    """Says in which frame the poses are."""
-    name, base = matched.robot.name, found.fit.x
+def _report_base(matched: Matched, constants: _BaseAndFlange) -> Matched:
+    """Reports the frame in which the poses are."""
+    name, base = matched.robot.name, constants.fit.x
     away_mm, away_deg = pose_difference(HALF_TURN, base)
     if away_mm < _NEAR_MM and away_deg < _NEAR_DEG:
         words = (
@@ -301,20 +298,21 @@ def _based(matched: Matched, found: _Constants) -> Matched:
     return replace(matched, notes=(*matched.notes, words))
 
 
-def _described(matched: Matched, found: _Constants) -> Matched:
-    """Says of which frame the poses are, and how well the model predicts them."""
+def _report_tool_frame(matched: Matched, constants: _BaseAndFlange) -> Matched:
+    """Reports the frame whose poses are given, and how well the model predicts them."""
     robot, tool = matched.robot, matched.flange_from_reported
     warnings, notes = list(matched.warnings), list(matched.notes)
-    shift, angle = (array[~found.out].max() for array in (found.fit.shift, found.fit.angle))
+    fit, inliers = constants.fit, ~constants.outliers
+    shift, angle = fit.shift[inliers].max(), fit.angle[inliers].max()
     if shift > _AGREE_M or angle > _AGREE_RAD:
-        away = _away(shift, angle)
-        typical_m, typical_rad = found.typical
+        differ = _words(shift, angle)
+        typical_m, typical_rad = constants.typical
         if typical_m > _CALIBRATED_M or typical_rad > _CALIBRATED_RAD:
-            warnings.append(_disagree(robot, away))
+            warnings.append(_other_arm(robot, differ))
         else:
             notes.append(
                 f"Through the model of {robot.name} the joint angles give poses that differ by up "
-                f"to {away} from the reported ones, as where one of model and controller has the "
+                f"to {differ} from the reported ones, as where one of model and controller has the "
                 "arm's calibration, and the other has not."
             )
     offset_mm, turn_deg = pose_difference(np.eye(4), tool)
@@ -331,12 +329,7 @@ def _described(matched: Matched, found: _Constants) -> Matched:
     return replace(matched, warnings=tuple(warnings), notes=tuple(notes))
 
 
-def _of_another_arm(robot: Robot, found: _Constants) -> Finding:
-    disagree = _disagree(robot, found.figures)
-    return replace(disagree, words=f"{disagree.words} The joint angles were not used.")
-
-
-def _disagree(robot: Robot, figures: str) -> Finding:
+def _other_arm(robot: Robot, figures: str) -> Finding:
     return Finding(
         "other_arm",
         f"Poses and joint angles disagree: through the model of {robot.name} the joints give poses "
@@ -346,10 +339,10 @@ def _disagree(robot: Robot, figures: str) -> Finding:
 
 
 def zero_taken(zero: JointReading) -> str:
-    """Says what becomes of a lost zero that is used."""
+    """States how a shifted zero is used."""
     name = zero.robot.joint_names[zero.columns[0]]
     return f"The zero of {name} was taken so, and the arm is calibrated from there."
 
 
-def _away(shift_m: float, angle_rad: float) -> str:
+def _words(shift_m: float, angle_rad: float) -> str:
     return mm_and_deg(1e3 * shift_m, float(np.rad2deg(angle_rad)))

@@ -1,4 +1,4 @@
-"""Whether a result can be trusted, in plain sentences: of one camera and robot, or of many."""
+"""Verdict whether a result can be trusted, in plain sentences."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,12 +28,12 @@ from visioncal.results import NeedMet
 
 
 def judge(findings: Findings) -> Verdict:
-    """Says whether the result can be trusted, why, and what to do next.
+    """Decides whether the result can be trusted, why, and what to do next.
 
     Returns:
-        `bad` with a reason that settles it, `check` with doubts, `good` without. Where the task
-        says what it needs, the chance that picks land within it decides: good from 0.95, check from
-        0.5, bad below, and never good where something is not explained.
+        `bad` with a fatal finding, `check` with doubts, `good` without. Where the task states its
+        need, the probability that picks are within it decides: good from 0.95, check from 0.5, bad
+        below, and never good with something unexplained.
     """
     small = [warning for warning in findings.warnings if is_negligible(warning, findings.picks)]
     warnings = [warning for warning in findings.warnings if warning not in small]
@@ -47,10 +47,10 @@ def judge(findings: Findings) -> Verdict:
     if met is None:
         status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
     elif met.probability >= NeedLimits.probability[0]:
-        enough = met.need.mm or 0.0
-        # Where nothing was seen, later picks may be all the same.
+        need_mm = met.need.mm or 0.0
+        # Picks may all avoid the part of the image where nothing was seen.
         hints = [replace(doubt, kind=NOTE) for doubt in doubts if doubt.kind == EMPTY_IMAGE]
-        doubts = [doubt for doubt in doubts if doubt.until_mm > enough]
+        doubts = [doubt for doubt in doubts if doubt.until_mm > need_mm]
         status = "check" if doubts else "good"
     else:
         status = "check" if met.probability >= NeedLimits.probability[1] else "bad"
@@ -64,21 +64,19 @@ def judge(findings: Findings) -> Verdict:
             left_out_mm=findings.held_out.mm,
             is_scattered=is_scattered(findings),
         )
-    said = list(ordered)
+    stated = list(ordered)
     if met is None:
-        said += _good_for(findings, good_for_mm, status)
+        stated += _good_for(findings, good_for_mm, status)
     else:
-        said.insert(
-            len(said) * (met.probability >= NeedLimits.probability[0]),
-            Finding(NEED, _met_words(findings, met)),
-        )
-    said += [] if doubts else [_praise(findings, is_enough=status == "good")]
-    said += [*hints, *(warning for warning in findings.warnings if warning.kind in NOT_USABLE)]
-    return Verdict(status, (*said, *remarks(findings.notes, NOTE)), good_for_mm)
+        place = len(stated) * (met.probability >= NeedLimits.probability[0])
+        stated.insert(place, Finding(NEED, _need_words(findings, met)))
+    stated += [] if doubts else [_agreement(findings, is_enough=status == "good")]
+    stated += [*hints, *(warning for warning in findings.warnings if warning.kind in NOT_USABLE)]
+    return Verdict(status, (*stated, *remarks(findings.notes, NOTE)), good_for_mm)
 
 
 def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:
-    """The least need that would be met by all pairs; None where none would, or none is known."""
+    """The least need that all pairs would meet; None without one, or where unknown."""
     least = max((doubt.until_mm for doubt in doubts), default=0.0)
     if not picks or np.isinf(least):
         return None
@@ -100,8 +98,8 @@ def _good_for(
     return (Finding(GOOD_FOR, words),)
 
 
-def _met_words(findings: Findings, met: NeedMet) -> str:
-    """How likely picks land within what is needed."""
+def _need_words(findings: Findings, met: NeedMet) -> str:
+    """States the probability that picks are within the need."""
     need, worst = met.need, min(findings.picks, key=lambda pick: pick.probability(met.need))
     within = [f"{value:g} {unit}" for value, unit in ((need.mm, "mm"), (need.deg, "deg")) if value]
     where = "where the views looked" if need.at == "views" else f"at {list(need.at)} m in the base"
@@ -112,19 +110,19 @@ def _met_words(findings: Findings, met: NeedMet) -> str:
     )
 
 
-def _praise(findings: Findings, *, is_enough: bool) -> Finding:
+def _agreement(findings: Findings, *, is_enough: bool) -> Finding:
     keep = Remedy(
         "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
         "compare later stops with it."
     )
     used = sum(view.used for view in findings.views)
-    known = "".join(
+    worst_known = "".join(
         f", and {worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm"
         for worst in findings.worst[:1]
     )
     return Finding(
         AGREEMENT,
         f"All {used} used views agree: left out of the fit, they are predicted to "
-        f"{findings.held_out.words} (rms){known}.",
+        f"{findings.held_out.words} (rms){worst_known}.",
         keep if is_enough else None,
     )

@@ -1,8 +1,8 @@
-"""Corners that an earlier search has found, kept beside the session by what was searched.
+"""Cache of detected corners beside the session.
 
-They are a copy that can be deleted. Each entry is named by the digest of the image's bytes and of
-the board, so that what belongs to another image or board is not found; a file of another version of
-visioncal or OpenCV, or one that cannot be read, counts as none.
+It can be deleted. Each entry is named by the digests of the image's bytes and of the board, so that
+entries of another image or board are not found; a file of another version of visioncal or OpenCV,
+or an unreadable one, counts as none.
 """
 
 import json
@@ -28,12 +28,12 @@ _MADE_BY = {"visioncal": __version__, "opencv": cv2.__version__}
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """What a search of one image gave.
+    """Result of searching one image.
 
     Attributes:
         found: The corners, or why there are none.
         size: (width, height) of the image [px]; None where it cannot be read.
-        misfit: Whether markers were seen that lie otherwise than on the target.
+        misfit: Whether markers were seen whose layout is not the target's.
     """
 
     found: Corners | Rejection
@@ -43,13 +43,13 @@ class Searched:
 
 @dataclass(frozen=True, eq=False)
 class KeptCorners:
-    """Searches by the digests of what was searched.
+    """Cached searches by the digests of what was searched.
 
     Attributes:
-        file: Where they are kept; None of a session without a folder.
-        grows: Whether what comes to it is kept for the next search.
-        entries: What is known, as it stands in the file.
-        new: What came to it.
+        file: The cache; None for a session without a folder.
+        grows: Whether new entries are saved.
+        entries: The entries of the file.
+        new: Entries that were added.
     """
 
     file: Path | None
@@ -60,7 +60,7 @@ class KeptCorners:
 
     @classmethod
     def beside(cls, session: Session, *, grows: bool) -> "KeptCorners":
-        """Reads those of a session; there are none of one without a folder."""
+        """Reads a session's cache; empty for one without a folder."""
         if not isinstance(session.images, FolderImages):
             return cls(None, grows, {})
         file = session.images.folder / FOLDER / FILE
@@ -68,31 +68,31 @@ class KeptCorners:
         if file.exists():
             with suppress(DataError, ValueError):
                 document = json.loads(read_text(file))
-        known = isinstance(document, dict) and document.get("made_by") == _MADE_BY
-        entries = document.get("searches") if known else None
+        is_current = isinstance(document, dict) and document.get("made_by") == _MADE_BY
+        entries = document.get("searches") if is_current else None
         return cls(file, grows, entries if isinstance(entries, dict) else {})
 
     def key(self, image: bytes, target: Target, name: str) -> str:
-        """The name of a search: of an image's bytes, for a board."""
-        board = json.dumps([asdict(target), name], default=_plain, sort_keys=True)
+        """The name of an entry: of an image's bytes and a board."""
+        board = json.dumps([asdict(target), name], default=_jsonable, sort_keys=True)
         return f"{sha256(image)}-{sha256(board.encode())}"
 
     def get(self, key: str, view: int) -> Searched | None:
-        """What was found before, of a view by its number; None where nothing is known."""
+        """The cached result for a view, by its number; None without one."""
         try:
-            return _searched(self.entries[key], view)
+            return _from_document(self.entries[key], view)
         except (KeyError, TypeError, ValueError):
             return None
 
     def put(self, key: str, searched: Searched) -> None:
-        """Adds what was found, by any thread, where it is to be kept."""
+        """Adds a result, from any thread, where new entries are saved."""
         if not self.grows:
             return
         with self._lock:
             self.new[key] = _document(searched)
 
     def save(self) -> None:
-        """Writes what is new beside what was known; where that cannot be written, nothing."""
+        """Writes the file with the new entries; does nothing where it cannot be written."""
         if self.file is None or not self.new:
             return
         document = {"made_by": _MADE_BY, "searches": {**self.entries, **self.new}}
@@ -114,22 +114,21 @@ def _document(searched: Searched) -> dict[str, Any]:
     }
 
 
-def _searched(entry: Any, view: int) -> Searched:  # noqa: ANN401 - as it was read
+def _from_document(entry: Any, view: int) -> Searched:  # noqa: ANN401 - as it was read
     width, height = (int(value) for value in entry["size"])
     if "reason" in entry:
-        return Searched(
-            Rejection(view, str(entry["reason"])), (width, height), bool(entry["misfit"])
-        )
+        reason = Rejection(view, str(entry["reason"]))
+        return Searched(reason, (width, height), bool(entry["misfit"]))
     weights = entry["weights"]
-    found = Corners(
+    corners = Corners(
         view,
         np.array(entry["ids"], dtype=np.int64),
         np.array(entry["px"], dtype=np.float64).reshape(-1, 2),
         float(entry["blur_px"]),
         None if weights is None else np.array(weights, dtype=np.float64),
     )
-    return Searched(found, (width, height), bool(entry["misfit"]))
+    return Searched(corners, (width, height), bool(entry["misfit"]))
 
 
-def _plain(value: object) -> object:
+def _jsonable(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray) else str(value)

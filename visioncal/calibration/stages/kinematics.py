@@ -1,4 +1,4 @@
-"""The arm's errors that data determine: none, offsets, links, eccentric gears, any functions."""
+"""Selection of the arm's error model: none, offsets, links, eccentric gears, joint functions."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,10 +29,11 @@ from visioncal.results import Rms
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
 from visioncal.robot import Loads
 
-# What a zero that was found from the target's poses is still off by, before the corners are asked,
-# and the zeros of the other joints with it [rad].
+# Prior sigma of a zero that was found from the target's poses, and of the other joints' zeros
+# [rad].
 _ZERO_SIGMA_RAD = 5e-4
-# What may be asked for: the quick one after a lost encoder, or all that the data determine.
+# Levels by what the user asks for: the quick one after a lost encoder, or all that the data
+# determine.
 ASKED: Mapping[str, tuple[str, ...]] = {
     "offsets": ("offsets",),
     "kinematics": ("geometry", "eccentricity"),
@@ -40,22 +41,22 @@ ASKED: Mapping[str, tuple[str, ...]] = {
     "thermal": tuple(LEVELS),
     "auto": tuple(LEVELS),
 }
-# The level of an arm whose joints err by functions of their angles; of fewer stops it is not asked.
+# The level with joint errors that are functions of their angles, and the fewest stops for it.
 FUNCTIONS, _FEWEST_STOPS = "functions", 20
-# Those that ask for no level of the geometry.
-_ALL = ("auto", "thermal")
+# Requests that leave the level of the geometry to the data.
+_AUTOMATIC = ("auto", "thermal")
 
 
 @dataclass(frozen=True, eq=False)
 class Kinematics:
-    """The level of the arm's model that the views speak for.
+    """The level of the arm's model that the views support.
 
     Attributes:
         level: Its name; `nominal` where none explains more than chance.
-        fits: Those of all that were tried, the nominal arm's first.
+        fits: All fits, the nominal arm's first.
         was_asked: Whether the user named the level.
-        views: (m,) by which view each residual of these goes.
-        functions: Of its joints; None where they are not beyond chance.
+        views: (m,) the view of each residual of these.
+        functions: Functions of the joints; None where these are not significant.
     """
 
     level: str
@@ -71,11 +72,11 @@ class Kinematics:
 
     @property
     def errors(self) -> Mapping[str, ArmErrors]:
-        """The arm's errors by block, as the level has them."""
+        """The arm's errors by block, at this level."""
         return self.fits[self.level].errors
 
     def left_out(self) -> tuple[UnseenView, ...]:
-        """How far stops that are left out in turn are off by both arms, by view."""
+        """Residuals of held-out stops with both arms, by view."""
         before, after = (
             np.linalg.norm(level_fit.left_out.reshape(-1, 2, 3), axis=2)
             for level_fit in (self.nominal, self.fits[self.level])
@@ -84,20 +85,16 @@ class Kinematics:
 
     @cached_property
     def result(self) -> ArmResult:
-        """The levels that were compared, as a section of a calibration."""
+        """The compared levels, as a section of a calibration."""
         return ArmResult(level=self.level, levels=tuple(map(_level, self.fits, self.fits.values())))
 
 
 def unseen_views(
     views: Sequence[int], before: FloatArray, after: FloatArray, turned: Mask
 ) -> tuple[UnseenView, ...]:
-    """How far views that no fit has seen are off by the nominal arm and by the calibrated.
+    """Residuals of held-out views with the nominal arm (`before`) and with the calibrated one.
 
-    Args:
-        views: (m,) the views.
-        before: (m, 2) by the one, rotation [rad] and distance [m].
-        after: (m, 2) by the other.
-        turned: (m,) whether a rotation was measured.
+    Both are (m, 2), rotation [rad] and distance [m]; `turned` is whether a rotation was measured.
     """
     columns = zip(views, before.tolist(), after.tolist(), turned.tolist(), strict=True)
     return tuple(
@@ -121,19 +118,19 @@ def choose_level(
     stated: Problem | None = None,
     noise: Noise | None = None,
 ) -> Kinematics:
-    """Chooses how much of a robot's arm to free.
+    """Selects the level of a robot's arm model.
 
-    A level is taken where it is likelier than all others by more than chance, with the price of its
-    unknowns in the likelihood, and predicts stops that are left out better than the nominal arm.
+    A level is chosen if its likelihood, with a penalty for its unknowns, exceeds the others' by
+    more than chance, and it predicts held-out stops better than the nominal arm.
 
     Args:
         problem: The observations, without errors of this arm.
-        state: The answer with the nominal arm.
+        state: The solution with the nominal arm.
         robot: The robot.
-        bases: (s, 6, p) by stop, how the flange moves with the errors of each block.
+        bases: (s, 6, p) Jacobian of the flange pose by stop, for the errors of each block.
         asked: A key of `ASKED`.
-        stated: The same observations with a lost zero where the model has it, where `problem` has
-            it where it is; None where none is lost. Then offsets are what is taken at the least.
+        stated: The observations with zeros as in the model, where `problem` has a shifted zero
+            corrected; None without one. Then offsets are the least level.
         noise: The noise's levels to start from; those from above where None.
     """
     with one_blas_thread():
@@ -142,15 +139,14 @@ def choose_level(
         fits |= {name: fit_level(arm, blocks) for name, blocks in LEVELS.items()}
         if stated is not None:
             nominal = fit_level(ArmTrials(stated, state, robot, bases, noise))
-            fits = _with_lost_zero(fits, problem, stated, nominal, bases)
-    found = {name: fit for name, fit in fits.items() if fit is not None}
-    least = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
-    best = _best(
-        {name: level_fit for name, level_fit in found.items() if name in (*least, *ASKED[asked])}
-    )
+            fits = _with_shifted_zero(fits, problem, stated, nominal, bases)
+    possible = {name: fit for name, fit in fits.items() if fit is not None}
+    always = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
+    allowed = (*always, *ASKED[asked])
+    best = _best({name: fit for name, fit in possible.items() if name in allowed})
     with one_blas_thread():
-        found[best] = resized(arm, found[best])
-    return Kinematics(best, found, asked not in _ALL)
+        possible[best] = resized(arm, possible[best])
+    return Kinematics(best, possible, asked not in _AUTOMATIC)
 
 
 def with_functions(
@@ -162,16 +158,16 @@ def with_functions(
     stops: tuple[FloatArray, FloatArray, Loads],
     noise: Noise,
 ) -> Kinematics:
-    """Takes functions of the joints to a level of the geometry, where they are beyond chance.
+    """Adds functions of the joints to a level of the geometry, where they are significant.
 
     Args:
-        found: What `choose_level` gave.
+        found: The result of `choose_level`.
         problem: The observations, without errors of this arm.
-        state: Where to start.
+        state: The start.
         robot: The robot.
-        model: The arm as stated.
-        stops: (s, m) which of the robot's m places each stop is at, (m, n) its joints and its loads
-            there.
+        model: The nominal arm.
+        stops: (s, m) incidence of the problem's stops and the robot's m places; (m, n) joints and
+            loads at the latter.
         noise: The noise's levels to start from.
     """
     placed, q, loads = stops
@@ -194,52 +190,45 @@ def with_functions(
         noise = replace(noise, robots=functions.levels)
         arm = ArmTrials(problem, state, robot, bases, noise)
         fit = arm.level(without_springs(arm, functions.errors), functions.gain)
-    return replace(
-        found,
-        level=FUNCTIONS,
-        fits={**found.fits, FUNCTIONS: fit},
-        functions=functions,
-    )
+    fits = {**found.fits, FUNCTIONS: fit}
+    return replace(found, level=FUNCTIONS, fits=fits, functions=functions)
 
 
-def _with_lost_zero(
+def _with_shifted_zero(
     fits: Mapping[str, LevelFit | None],
     problem: Problem,
     stated: Problem,
     nominal: LevelFit | None,
     bases: Mapping[str, FloatArray],
 ) -> dict[str, LevelFit | None]:
-    """The levels beside the arm as it was stated, with what the zero explains in all others."""
+    """The levels beside the nominal arm, each with the gain of the shifted zero."""
     zeroed = fits[NOMINAL]
     if nominal is None or zeroed is None:
         return dict(fits)
-    gain = 2.0 * (_unlikeliness(stated, nominal) - _unlikeliness(problem, zeroed))
-    found = {
-        name: None if fit is None else replace(fit, gain=fit.gain + gain)
-        for name, fit in fits.items()
-    }
-    if found["offsets"] is None:
+    gain = 2.0 * (_neg_log_likelihood(stated, nominal) - _neg_log_likelihood(problem, zeroed))
+    with_gain = {name: fit and replace(fit, gain=fit.gain + gain) for name, fit in fits.items()}
+    if with_gain["offsets"] is None:
         errors = ArmErrors(bases["offsets"], _ZERO_SIGMA_RAD, gain, of_links=True)
-        found["offsets"] = replace(zeroed, errors={"offsets": errors}, gain=gain)
-    return found | {NOMINAL: nominal}
+        with_gain["offsets"] = replace(zeroed, errors={"offsets": errors}, gain=gain)
+    return with_gain | {NOMINAL: nominal}
 
 
-def _unlikeliness(problem: Problem, fit: LevelFit) -> float:
+def _neg_log_likelihood(problem: Problem, fit: LevelFit) -> float:
     return robot_levels(problem, fit.fit.state, starting_noise(problem), from_above=True)[1]
 
 
 def _best(fits: Mapping[str, LevelFit]) -> str:
-    """The likeliest level that predicts better than the first one, by more than chance each."""
-    # The price of all its columns is in a level's likelihood, but for that of their size. Of two
-    # levels with as many sizes, such as offsets or links, neither is the simpler one: to prefer
-    # offsets would leave links that are off by as little out of the covariance.
+    """The most likely level that predicts held-out stops better than the first one."""
+    # A level's likelihood has the penalty for its columns, except for their prior sizes. Of two
+    # levels with as many sizes, such as offsets or links, neither is simpler: preferring offsets
+    # would leave links with errors as small out of the covariance.
     best, *others = fits
-    off_mm = {name: _rms(fit.left_out, fit.has_rotation).mm for name, fit in fits.items()}
-    nominal_mm = off_mm[best]
+    held_out_mm = {name: _rms(fit.left_out, fit.has_rotation).mm for name, fit in fits.items()}
+    nominal_mm = held_out_mm[best]
     for name in others:
         more_sizes = len(fits[name].errors) > len(fits[best].errors)
         margin = SIGNIFICANT if more_sizes else 0.0
-        if off_mm[name] < nominal_mm and fits[name].gain - fits[best].gain > margin:
+        if held_out_mm[name] < nominal_mm and fits[name].gain - fits[best].gain > margin:
             best = name
     return best
 
@@ -267,12 +256,12 @@ def _rms(residuals: FloatArray, turned: Mask) -> Rms:
 
 
 def allows_functions(asked: str, stops: int) -> bool:
-    """Whether so many stops may determine functions of the joints at a level that is asked for."""
+    """Whether a level allows functions of the joints, and there are enough stops for them."""
     return asked not in ("offsets", "hand-eye") and stops >= _FEWEST_STOPS
 
 
 def check_level(asked: str) -> None:
-    """Refuses a level that is none.
+    """Refuses an unknown level.
 
     Raises:
         DataError: It is not known.
@@ -285,10 +274,8 @@ def check_level(asked: str) -> None:
 def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
     """Refuses a level that the session cannot give.
 
-    Args:
-        asked: The level.
-        can: Whether there are joint angles that belong to the robot's model and poses.
-        misread: What is wrong with those that there are, and what to do.
+    `can` is whether there are joint angles that belong to the robot's model and poses, `misread`
+    what is wrong with them, and what to do.
 
     Raises:
         DataError: There are no joint angles that belong to a known model.
@@ -303,9 +290,9 @@ def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
 
 
 def doubts(kinematics: Kinematics) -> Iterator[Finding]:
-    """Says where another level explains the views far better than the one that was asked for."""
-    chosen, likeliest = kinematics.result.chosen, _best(kinematics.fits)
-    best = replace(kinematics.result, level=likeliest).chosen
+    """Reports where another level explains the views far better than the requested one."""
+    chosen, name = kinematics.result.chosen, _best(kinematics.fits)
+    best = replace(kinematics.result, level=name).chosen
     if best.likelihood_ratio - chosen.likelihood_ratio > SIGNIFICANT:
         yield Finding(
             "level",
@@ -317,17 +304,17 @@ def doubts(kinematics: Kinematics) -> Iterator[Finding]:
 
 
 def findings(kinematics: Kinematics) -> Iterator[str]:
-    """Says what was found, for the verdict."""
+    """States the chosen level, for the verdict."""
     if kinematics.level == NOMINAL and kinematics.was_asked:
         yield (
             "The arm stays as stated: what was asked to be found of it explains the views no "
             "better than chance, or there are too few stops to show it."
         )
-    found = kinematics.result
-    if found.is_calibrated:
+    result = kinematics.result
+    if result.is_calibrated:
         yield (
-            f"The arm was calibrated along ({found.level}): stops left out are predicted to "
-            f"{figure(found.chosen.held_out_mm)} mm, with the nominal arm to "
-            f"{figure(found.nominal.held_out_mm)} mm. The transforms go with this arm: take its "
+            f"The arm was calibrated along ({result.level}): stops left out are predicted to "
+            f"{figure(result.chosen.held_out_mm)} mm, with the nominal arm to "
+            f"{figure(result.nominal.held_out_mm)} mm. The transforms go with this arm: take its "
             "poses (calibration.base_from_flange), not the controller's."
         )

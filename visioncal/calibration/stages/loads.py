@@ -1,4 +1,4 @@
-"""Whether what a session says of loads can determine anything."""
+"""Checks whether a session's loads can determine the arm's elasticity."""
 
 from collections.abc import Sequence
 
@@ -9,21 +9,15 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.robot import Loads, Robot
 
-# Stops that are nearer to one another than these stand at one pose: a change that a loaded arm may
-# make by itself [m, rad].
+# Stops that differ by less are at one pose: a loaded arm may deflect by so much [m, rad].
 _SAME_M, _SAME_RAD = 0.02, 0.02
 
 
 def check_stops(loads: Loads, views: Sequence[int], stops: Sequence[int | None]) -> None:
-    """Refuses views of one stop under different loads.
-
-    Args:
-        loads: Of m views.
-        views: Their numbers.
-        stops: The stop that each declares; None where it declares none.
+    """Refuses views of one declared stop under different loads; `stops` has None for none.
 
     Raises:
-        DataError: Naming two of them.
+        DataError: Two views of a stop differ; it names them.
     """
     rows = loads.rows
     first: dict[int, int] = {}
@@ -42,22 +36,18 @@ def check_stops(loads: Loads, views: Sequence[int], stops: Sequence[int | None])
 
 
 def check_poses(loads: Loads, poses: FloatArray) -> None:
-    """Refuses loads that change while the arm stands still.
-
-    Args:
-        loads: Of m views.
-        poses: (m, 4, 4) where the robot reports its flange.
+    """Refuses loads that change while the arm stands still at one reported flange pose (m, 4, 4).
 
     Raises:
-        DegenerateError: The load changes, and all poses are one.
+        DegenerateError: The load changes, and all poses are the same.
     """
     kg = loads.payload_kg
     force = np.linalg.norm(loads.force_n, axis=1)
     if len(poses) < 2 or (np.ptp(kg) == 0.0 and np.ptp(force) == 0.0):
         return
-    away = invert(poses[:1]) @ poses
-    shift = np.linalg.norm(away[:, :3, 3], axis=1).max()
-    if shift > _SAME_M or rotation_angle(away).max() > _SAME_RAD:
+    difference = invert(poses[:1]) @ poses
+    shift = np.linalg.norm(difference[:, :3, 3], axis=1).max()
+    if shift > _SAME_M or rotation_angle(difference).max() > _SAME_RAD:
         return
     changed = f"{kg.min():g} to {kg.max():g} kg" if np.ptp(kg) else f"0 to {force.max():g} N"
     raise DegenerateError(
@@ -69,7 +59,7 @@ def check_poses(loads: Loads, poses: FloatArray) -> None:
 
 
 def check_elastic(asked: str, robot: Robot | None, loads: Loads) -> None:
-    """Refuses to look for springs where nothing is known that bends them.
+    """Refuses to estimate joint compliance where no load on the arm is known.
 
     Raises:
         DataError: The level is asked for, masses are not known, and there is no load.

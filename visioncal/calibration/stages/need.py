@@ -1,25 +1,24 @@
-"""What a pick errs by where the views looked, and whether that is near enough.
+"""Error budget of a pick where the views looked, and the probability that it meets a need.
 
-A pick: the camera sees a thing as the views saw their target, and the robot goes to where it is.
-Where the robot arrives differs from the thing by
+A pick: the camera sees a thing as the views saw their target, and the robot goes to its position.
+The error of the robot relative to the thing has these sources:
 
     calibration   the chain from the robot's base to the camera and the lens: the errors of all
-                  unknowns together, through the same slopes that the fit has
-    board         by what the uncertainty of its size and shape did to these; the thing is another
+                  unknowns together, through the fit's Jacobian
+    board         what the uncertainty of its size and shape did to these; the thing is another
     look          the robot's noise at the look, where it carries the camera; and the focus, where
                   that changes from image to image
-    arm           errors that follow the arm's posture and were not calibrated, and errors that last
-                  from stop to stop, which are others at another time
-    pick          the noise of the flange when it goes there, and what the arm errs by in that
-                  posture, where it looked from another; a tool's length adds to it
-    left out      as far as views that were left out of the fit err by more than is predicted of
-                  them and than chance explains
+    arm           posture-dependent errors that were not calibrated, and errors that last from stop
+                  to stop, which have other values at another time
+    pick          the noise of the flange when it goes there, and the arm's error in that posture,
+                  where it looked from another; a tool's length adds to it
+    left out      the excess of held-out residuals over their prediction, beyond chance
 
-No camera finds a thing without noise; that is the task's own, and not among them. Where the arm
-errs with its posture, calibrated or not, the place is compared with where the chain as a whole puts
-it: what its first and last link do looks the same in all views, the frames of camera and target
-have taken it up, and an arm that picks does it again. Of errors that are not beyond chance, they
-alone are taken so.
+No camera finds a thing without noise; that is the task's own error, and not among them. Where the
+arm has posture-dependent errors, calibrated or not, the position is compared with the one by the
+whole chain: the errors of its first and last link are the same in all views, are absorbed by the
+frames of camera and target, and recur when the arm picks. Of errors that are not significant, only
+those of links are treated so.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,15 +45,16 @@ from visioncal.session.frames import thing_name
 
 @dataclass(frozen=True, eq=False)
 class Picks:
-    """Picks by one robot of what one camera sees.
+    """Predicted errors of picks by one robot of what one camera sees.
 
     Attributes:
         camera: The camera's frame.
         robot: The robot.
-        parts: (k, 6, 6) covariance by source, of rotation [rad] and place [m] in the robot's base,
-            at k places.
-        freedom: Degrees of freedom that the noise was estimated with.
-        distance_m: How far the camera was from the places, on average.
+        parts: (k, 6, 6) covariance by source, of rotation [rad] and position [m] in the robot's
+            base,
+            at k positions.
+        freedom: Degrees of freedom of the noise estimate.
+        distance_m: Mean distance of the positions from the camera.
     """
 
     camera: str
@@ -65,51 +65,51 @@ class Picks:
 
     @property
     def spreads(self) -> FloatArray:
-        """(k, 6, 6) of all sources together."""
+        """(k, 6, 6) total covariance."""
         return np.asarray(np.sum(list(self.parts.values()), axis=0))
 
     def probability(self, need: Need) -> float:
-        """The chance that a pick at one of the places lands within a need."""
+        """The probability that a pick at one of the positions is within a need."""
         turn_rad = np.inf if need.deg is None else float(np.deg2rad(need.deg))
         shift_m = np.inf if need.mm is None else 1e-3 * need.mm
         return chance_within(self.spreads, turn_rad, shift_m, self.freedom)
 
     def without(self, source: str) -> "Picks":
-        """Picks that do not err by one of the sources."""
+        """Picks without the error of one source."""
         parts = {name: part for name, part in self.parts.items() if name != source}
         return replace(self, parts=parts or {"none": np.zeros_like(self.parts[source])})
 
     @cached_property
     def good_for_mm(self) -> float:
-        """The least need of places alone that would be met [mm]."""
+        """The least need of position alone that would be met [mm]."""
         return 1e3 * radius_within(self.spreads, NeedLimits.probability[0], self.freedom)
 
     @cached_property
     def good_for_deg(self) -> float:
-        """The least need of directions alone that would be met [deg]."""
+        """The least need of rotation alone that would be met [deg]."""
         turned = np.roll(self.spreads, 3, axis=(1, 2))
         return float(np.rad2deg(radius_within(turned, NeedLimits.probability[0], self.freedom)))
 
     @property
     def budget_mm(self) -> dict[str, float]:
-        """Standard deviation of the place by source, and as a `total` [mm]."""
+        """Standard deviation of the position by source, and as a `total` [mm]."""
         return {name: 1e3 * value for name, value in self._budget(slice(3, 6)).items()}
 
     @property
     def budget_deg(self) -> dict[str, float]:
-        """Standard deviation of the direction by source, and as a `total` [deg]."""
+        """Standard deviation of the rotation by source, and as a `total` [deg]."""
         return {name: float(np.rad2deg(value)) for name, value in self._budget(slice(3)).items()}
 
-    def _budget(self, of: slice) -> dict[str, float]:
-        every = {**self.parts, "total": self.spreads}
-        squares = {
-            name: np.trace(array[:, of, of], axis1=1, axis2=2) for name, array in every.items()
-        }
-        # Of two sources that make up for each other, one may be under zero.
-        return {name: float(max(square.mean(), 0.0) ** 0.5) for name, square in squares.items()}
+    def _budget(self, axes: slice) -> dict[str, float]:
+        budget = {}
+        for name, covariances in {**self.parts, "total": self.spreads}.items():
+            squares = np.trace(covariances[:, axes, axes], axis1=1, axis2=2)
+            # Of two sources that compensate, one may be negative.
+            budget[name] = float(max(squares.mean(), 0.0) ** 0.5)
+        return budget
 
     def stays_within(self, need: Need | None) -> str:
-        """Within what 95 % of picks land, in the units of a need."""
+        """The limits that 95 % of picks are within, in the units of a need."""
         within = [f"{figure(self.good_for_deg)} deg"] if need and need.deg else []
         if need is None or need.mm or not within:
             within.insert(0, f"{figure(self.good_for_mm)} mm")
@@ -117,12 +117,9 @@ class Picks:
 
 
 def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) -> NeedMet | None:
-    """How likely picks land within a need; None where nothing is needed or predicted.
+    """The probability that picks are within a need; None without a need or predictions.
 
-    Args:
-        need: What the task needs.
-        picks: Those of each camera and robot.
-        whole: Whether pairs are distinguished.
+    With `whole`, it is reported for each pair of a camera and a robot, too.
     """
     if need is None or not picks:
         return None
@@ -135,20 +132,20 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
 
 @dataclass(frozen=True, eq=False)
 class PickInputs:
-    """What picks are predicted from.
+    """Input for the prediction of picks.
 
     Attributes:
         problem: The n observations of the fit.
         fit: Their fit.
-        covariance: (p, p) of the unknowns, with all that counts beside the noise.
+        covariance: (p, p) of the unknowns, all sources included.
         held_out: The observations' residuals by fits without their stops.
         middles: (3,) of each target, in its frame [m]; of others, their origin.
         freedom: Degrees of freedom of each robot's noise.
         arms: The robots' arms, at the problem's stops.
         of_boards: The problem's columns of boards' shapes.
-        moved: (3, b) how the middle of each target moves with these, by its frame [m].
+        moved: (3, b) Jacobian of each target's middle for these columns, by its frame [m].
         whole: The observations of all pairs, merged or not, that the fit was made from.
-        jitters: By which share the focal length of each camera changes from image to image.
+        jitters: Relative change of the focal length of each camera from image to image.
     """
 
     problem: Problem
@@ -165,11 +162,9 @@ class PickInputs:
 
 
 def picks_of(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
-    """Predicts picks, for each camera and each robot that parts it from what it sees.
+    """Predicts picks, for each camera and each robot between it and what it sees.
 
-    Args:
-        fitted: The fit.
-        need: Where they count; where the views looked without.
+    They are at the need's place, or where the views looked.
     """
     problem = fitted.problem
     pairs: dict[tuple[str, str], list[int]] = {}
@@ -178,15 +173,15 @@ def picks_of(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
         for step in group.path:
             if step.robot:
                 pairs.setdefault((observer, step.robot), []).extend(group.rows.tolist())
-    off = {robot: _off_by_arm(fitted, robot) for robot in {robot for _, robot in pairs}}
+    bias = {robot: _arm_bias(fitted, robot) for robot in {robot for _, robot in pairs}}
     return tuple(
-        _picks(_part(fitted, sorted(rows)), camera, robot, off[robot], need)
+        _picks(_subset(fitted, sorted(rows)), camera, robot, bias[robot], need)
         for (camera, robot), rows in pairs.items()
     )
 
 
-def _off_by_arm(fitted: PickInputs, robot: str) -> FloatArray | None:
-    """By how much (p, q) a fit is off with each error of an arm that it takes for noise."""
+def _arm_bias(fitted: PickInputs, robot: str) -> FloatArray | None:
+    """(p, q) bias of a fit for each error of an arm that it treats as noise."""
     arm = fitted.arms.get(robot)
     if arm is None or arm.model is not None or arm.errors is None or arm.errors.is_estimated:
         return None
@@ -194,8 +189,8 @@ def _off_by_arm(fitted: PickInputs, robot: str) -> FloatArray | None:
     return arm.errors.sigma * misfit_jacobian(fitted.whole, state, noise, robot, arm.errors)
 
 
-def _part(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
-    """The information of some of the observations on picks."""
+def _subset(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
+    """The input restricted to some of the observations."""
     chosen = np.isin(np.arange(len(fitted.problem)), rows)
     held = fitted.held_out
     kept = replace(held, away_m=held.away_m[chosen], away_rad=held.away_rad[chosen])
@@ -203,121 +198,122 @@ def _part(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
 
 
 def _picks(
-    fitted: PickInputs, camera: str, robot: str, off: FloatArray | None, need: Need | None
+    fitted: PickInputs, camera: str, robot: str, bias: FloatArray | None, need: Need | None
 ) -> Picks:
-    """Picks of what one camera sees by one robot, from the observations that it parts."""
+    """Picks by one robot of what one camera sees, from the observations with it between."""
     problem, state, noise = fitted.problem, fitted.fit.state, fitted.fit.noise
     seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
-    in_base = _in_base(problem, state, base)
-    middles = np.array(
-        [fitted.middles.get(name.partition("@")[0], np.zeros(3)) for name in seen.observed]
-    )
+    in_base = _base_from_targets(problem, state, base)
+    frames = (name.partition("@")[0] for name in seen.observed)
+    middles = np.array([fitted.middles.get(frame, np.zeros(3)) for frame in frames])
     carries = np.array([_is_between(problem, observer, base, robot) for observer in seen.observers])
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
-    unfitted = None if off is None else errors
-    whole = calibrated or (unfitted is not None and (unfitted.of_links or unfitted.is_significant))
+    as_noise = None if bias is None else errors
+    whole = calibrated or (as_noise is not None and (as_noise.of_links or as_noise.is_significant))
     if whole:
-        # The whole chain, in the targets' frames: the noise of its flanges is in it.
-        looking, at_m = _of_things(fitted), middles
+        # The whole chain, in the targets' frames, includes the noise of its flanges.
+        observations, at_m = _as_things(fitted), middles
     else:
-        looking, at_m = _to_base(fitted, base, in_base), apply_each(in_base, middles)
+        observations, at_m = _as_seen_by_base(fitted, base, in_base), apply_each(in_base, middles)
         if need is not None and need.at != "views":
             at_m = np.where(carries[:, None], at_m, np.array(need.at))
-    linear, covariance, parts = looking.linear(state, ideal=True), fitted.covariance, {}
-    turned, at = adjoint(in_base), problem.robots.index(robot)
-    white = again = noise.robots[at]
-    if unfitted is not None and off is not None:
-        covariance = covariance - off @ off.T
-        by_posture, in_time = _left_by_arm(fitted, robot, unfitted, off)
+    linearised, covariance, parts = observations.linear(state, ideal=True), fitted.covariance, {}
+    to_base, column = adjoint(in_base), problem.robots.index(robot)
+    level = pick_level = noise.robots[column]
+    if as_noise is not None and bias is not None:
+        covariance = covariance - bias @ bias.T
+        by_posture, in_time = _arm_covariances(fitted, robot, as_noise, bias)
         if not whole:
-            by_posture, in_time = (turned @ array @ turned.mT for array in (by_posture, in_time))
+            by_posture, in_time = (to_base @ array @ to_base.mT for array in (by_posture, in_time))
         parts["arm"] = by_posture + in_time
-        if unfitted.white is not None:
-            white, levels = unfitted.white, noise.robots.copy()
-            levels[at] = white
+        if as_noise.white is not None:
+            level, levels = as_noise.white, noise.robots.copy()
+            levels[column] = level
             noise = replace(noise, robots=levels)
-        again = np.hypot(white, _lasting(unfitted))
+        pick_level = np.hypot(level, _lasting_sigma(as_noise))
     elif errors is not None:
-        parts["arm"] = _of_arm(problem, robot, errors)
-    of_boards = _by_boards(covariance, fitted.of_boards)
-    parts["calibration"] = linear.covariance(covariance - of_boards)
-    parts["board"] = linear.covariance(of_boards)
+        parts["arm"] = _arm_covariance(problem, robot, errors)
+    of_boards = _board_part(covariance, fitted.of_boards)
+    parts["calibration"] = linearised.covariance(covariance - of_boards)
+    parts["board"] = linearised.covariance(of_boards)
+    carried = carries[:, None, None]
     if problem.is_combined:
-        # Noise of both as one counts as the robot's, where it carries the camera.
-        alone = turned @ _axes(white) @ turned.mT
-        look = carries[:, None, None] * alone
+        # Combined noise counts as the robot's, where it carries the camera.
+        look = carried * (to_base @ _noise_covariance(level) @ to_base.mT)
     else:
-        look = looking.total_covariance(linear, noise) - looking.covariance(noise)
+        look = observations.total_covariance(linearised, noise) - observations.covariance(noise)
     parts["look"] = look
-    placed = {name: _at_points(part, at_m) for name, part in parts.items()}
+    by_source = {name: _at_points(part, at_m) for name, part in parts.items()}
     at_camera = problem.measured(state)
     in_camera = apply_each(at_camera, middles)
     axes = np.swapaxes(at_camera[:, :3, :3], 1, 2)[:, :, 2]
     if not whole:
         axes = (in_base[:, :3, :3] @ axes[:, :, None])[:, :, 0]
-    # A focal length that is longer by a share shows a thing nearer by it.
-    nearer_m = fitted.jitters.get(camera, 0.0) * in_camera[:, 2, None] * axes
-    placed["look"][:, 3:, 3:] += nearer_m[:, :, None] * nearer_m[:, None]
-    # A camera that is carried looks from another posture than the robot then has; before one that
-    # stands still it is the same, and of a whole chain its noise is among the chain's already.
-    alike = 0.0 if whole else _axes(white)
-    going = np.where(carries[:, None, None], _axes(again), alike)
-    placed["pick"] = _of_flange(problem, robot, in_base, going)
-    if unfitted is not None and not unfitted.of_links:
-        placed["pick"] = placed["pick"] + carries[:, None, None] * _at_points(by_posture, at_m)
-    placed["left out"] = np.broadcast_to(_unpredicted(fitted), parts["look"].shape)
+    # A focal length that is longer by a share shows a thing nearer by the same share.
+    focus_m = fitted.jitters.get(camera, 0.0) * in_camera[:, 2, None] * axes
+    by_source["look"][:, 3:, 3:] += focus_m[:, :, None] * focus_m[:, None]
+    # A carried camera looks from another posture than the robot then has; before one that is fixed
+    # the posture is the same, and the noise of a whole chain is already in it.
+    fixed = 0.0 if whole else _noise_covariance(level)
+    pick_noise = np.where(carried, _noise_covariance(pick_level), fixed)
+    by_source["pick"] = _flange_covariance(problem, robot, in_base, pick_noise)
+    if as_noise is not None and not as_noise.of_links:
+        by_source["pick"] = by_source["pick"] + carried * _at_points(by_posture, at_m)
+    by_source["left out"] = np.broadcast_to(_excess_covariance(fitted), parts["look"].shape)
     return Picks(
         camera,
         robot,
-        {name: array for name, array in placed.items() if array.any()},
+        {name: array for name, array in by_source.items() if array.any()},
         fitted.freedom.get(robot, np.inf),
         float(np.linalg.norm(in_camera, axis=1).mean()),
     )
 
 
-def _axes(level: FloatArray) -> FloatArray:
-    """(6, 6) the covariance of a flange's noise of a level (2,), of rotation and place."""
+def _noise_covariance(level: FloatArray) -> FloatArray:
+    """(6, 6) covariance of a flange's noise, from levels (2,) of rotation and position."""
     return np.diag(np.repeat(level, 3) ** 2)
 
 
-def _of_flange(problem: Problem, robot: str, in_base: FloatArray, noise: FloatArray) -> FloatArray:
-    """(n, 6, 6) the noise of a flange at its own origin, of (n, 6, 6) by its level."""
-    # Where the noise of robot and camera is one, it is that of targets: what the flange's rotation
-    # does to them by their distance is in that of their place.
-    found = noise.copy()
+def _flange_covariance(
+    problem: Problem, robot: str, in_base: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """(n, 6, 6) noise of a flange at its own origin, from (n, 6, 6) by its level."""
+    # Combined noise of robot and camera is that of targets: its position part includes the flange's
+    # rotation times their distance.
+    covariance = noise.copy()
     if problem.is_combined:
         flange_m = problem.poses[robot][problem.observations.stops, :3, 3]
         lever_m2 = np.sum((in_base[:, :3, 3] - flange_m) ** 2, axis=1)
-        # About three axes alike, a rotation moves a point by two of its components.
-        own = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
-        found[:, 3:, 3:] = own[:, None, None] * np.eye(3)
-    return found
+        # With equal rotations about three axes, a point moves by two of their components.
+        own_m2 = np.maximum(noise[:, 3, 3] - noise[:, 0, 0] * lever_m2 * 2.0 / 3.0, 0.0)
+        covariance[:, 3:, 3:] = own_m2[:, None, None] * np.eye(3)
+    return covariance
 
 
 def _is_between(problem: Problem, observer: str, base: str, robot: str) -> bool:
     return any(step.robot == robot for step in problem.tree.path(observer, base))
 
 
-def _in_base(problem: Problem, state: State, base: str) -> FloatArray:
-    """(n, 4, 4) `base_from_target` as each observation has it."""
-    found = np.zeros((len(problem), 4, 4))
+def _base_from_targets(problem: Problem, state: State, base: str) -> FloatArray:
+    """(n, 4, 4) `base_from_target` of each observation."""
+    base_from_camera = np.zeros((len(problem), 4, 4))
     for group in problem.groups:
         observer = problem.observations.observers[int(group.rows[0])]
-        found[group.rows] = problem.between(base, observer, state, group.rows)
-    return np.asarray(found @ problem.measured(state))
+        base_from_camera[group.rows] = problem.between(base, observer, state, group.rows)
+    return np.asarray(base_from_camera @ problem.measured(state))
 
 
-def _to_base(fitted: PickInputs, base: str, in_base: FloatArray) -> Problem:
-    """The observations as if they were of the base itself, by way of what they saw."""
-    # What a lens does to the measured poses of targets then moves the base instead.
+def _as_seen_by_base(fitted: PickInputs, base: str, in_base: FloatArray) -> Problem:
+    """The observations converted to ones of the base, through what they saw."""
+    # The lens's effect on the measured poses of targets then moves the base instead.
     problem = fitted.problem
     carry, effects = adjoint(in_base), []
     for effect in problem.effects:
-        at = problem.effect_columns[effect.name]
-        of_thing = ~np.isin(np.arange(at.start, at.stop), fitted.of_boards)
-        seen = None if effect.by_sensor is None else carry @ effect.by_sensor * of_thing
-        effects.append(replace(effect, by_sensor=seen))
+        columns = problem.effect_columns[effect.name]
+        not_boards = ~np.isin(np.arange(columns.start, columns.stop), fitted.of_boards)
+        by_sensor = None if effect.by_sensor is None else carry @ effect.by_sensor * not_boards
+        effects.append(replace(effect, by_sensor=by_sensor))
     return replace(
         problem,
         observations=replace(
@@ -332,97 +328,98 @@ def _to_base(fitted: PickInputs, base: str, in_base: FloatArray) -> Problem:
     )
 
 
-def _of_things(fitted: PickInputs) -> Problem:
-    """The observations as if they were of things that stand where the boards' middles are."""
-    # A board of another size was measured at another distance, and a thing is not: all that a
-    # board's shape then moves is its middle.
+def _as_things(fitted: PickInputs) -> Problem:
+    """The observations converted to ones of things at the boards' middles."""
+    # A board of another size was measured at another distance, and a thing is not: a board's shape
+    # then only moves its middle.
     problem, effects = fitted.problem, []
-    still, frames = np.zeros((3, len(fitted.of_boards))), problem.observations.observed
-    moved = np.array([fitted.moved.get(frame.partition("@")[0], still) for frame in frames])
+    unmoved, frames = np.zeros((3, len(fitted.of_boards))), problem.observations.observed
+    jacobian = np.array([fitted.moved.get(frame.partition("@")[0], unmoved) for frame in frames])
     for effect in problem.effects:
-        at, seen = problem.effect_columns[effect.name], effect.by_sensor
-        of_boards = np.isin(np.arange(at.start, at.stop), fitted.of_boards)
-        if seen is not None and of_boards.any():
-            seen = seen.copy()
-            seen[:, :3, of_boards], seen[:, 3:, of_boards] = 0.0, -moved
-        effects.append(replace(effect, by_sensor=seen))
+        columns, by_sensor = problem.effect_columns[effect.name], effect.by_sensor
+        of_boards = np.isin(np.arange(columns.start, columns.stop), fitted.of_boards)
+        if by_sensor is not None and of_boards.any():
+            by_sensor = by_sensor.copy()
+            by_sensor[:, :3, of_boards], by_sensor[:, 3:, of_boards] = 0.0, -jacobian
+        effects.append(replace(effect, by_sensor=by_sensor))
     return replace(problem, effects=tuple(effects))
 
 
-def _by_boards(covariance: FloatArray, columns: IntArray) -> FloatArray:
-    """(p, p) what would not be of a covariance, were the boards' shapes known."""
-    among = covariance[:, columns]
-    return np.asarray(among @ np.linalg.pinv(among[columns], hermitian=True) @ among.T)
+def _board_part(covariance: FloatArray, columns: IntArray) -> FloatArray:
+    """(p, p) the part of a covariance that is due to the boards' shapes."""
+    cross = covariance[:, columns]
+    return np.asarray(cross @ np.linalg.pinv(cross[columns], hermitian=True) @ cross.T)
 
 
-def _at_points(spreads: FloatArray, points_m: FloatArray) -> FloatArray:
-    """(n, 6, 6) of rotation and of (n, 3) points, by those of their frame's twist."""
-    jacobian = np.broadcast_to(np.eye(6), spreads.shape).copy()
+def _at_points(covariances: FloatArray, points_m: FloatArray) -> FloatArray:
+    """(n, 6, 6) covariance of rotation and (n, 3) points, from that of their frame's twist."""
+    jacobian = np.broadcast_to(np.eye(6), covariances.shape).copy()
     jacobian[:, 3:, :3] = -skew(points_m)
-    return np.asarray(jacobian @ spreads @ np.swapaxes(jacobian, 1, 2))
+    return np.asarray(jacobian @ covariances @ np.swapaxes(jacobian, 1, 2))
 
 
-def _left_by_arm(
-    fitted: PickInputs, robot: str, errors: ArmErrors, off: FloatArray
+def _arm_covariances(
+    fitted: PickInputs, robot: str, errors: ArmErrors, bias: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What errors that a fit takes for noise make of each observation.
+    """Covariances from arm errors that a fit treats as noise, for each observation.
 
     Args:
         fitted: The fit.
-        robot: Whose they are.
-        errors: The errors.
-        off: (p, q) by how much the fit is off with each of them, in its own size.
+        robot: The robot.
+        errors: Its arm's errors.
+        bias: (p, q) the fit's bias for each of them, scaled by its sigma.
 
     Returns:
-        (n, 6, 6) twice: of those that follow the posture, and of those that last. These are others
-        than at the stops of the fit: as much as they have changed among these.
+        (n, 6, 6) twice: of posture-dependent errors, and of lasting ones. The latter have other
+        values than at the stops of the fit, and vary as much as among these.
     """
     problem, state = fitted.problem, fitted.fit.state
     widened = problem.with_effects([*problem.effects, errors.effect(robot)])
-    values = np.concatenate([state.values, np.zeros(off.shape[1])])
+    values = np.concatenate([state.values, np.zeros(bias.shape[1])])
     jacobian = widened.linear(replace(state, values=values), ideal=True).jacobian
     size, last = problem.size, errors.last
-    by_fit, own = jacobian[:, :, :size] @ off, errors.sigma * jacobian[:, :, size:]
-    left = by_fit[:, :, ~last] - own[:, :, ~last]
+    by_fit, own = jacobian[:, :, :size] @ bias, errors.sigma * jacobian[:, :, size:]
+    by_posture = by_fit[:, :, ~last] - own[:, :, ~last]
     changing = own[:, :, last] - own[:, :, last].mean(axis=0)
     in_time = np.concatenate([by_fit[:, :, last], changing], axis=2)
-    return left @ left.mT, in_time @ in_time.mT
+    return by_posture @ by_posture.mT, in_time @ in_time.mT
 
 
-def _lasting(errors: ArmErrors) -> FloatArray:
-    """(2,) how much errors that last change among stops, of rotation [rad] and place [m]."""
+def _lasting_sigma(errors: ArmErrors) -> FloatArray:
+    """(2,) RMS change of lasting errors among stops, of rotation [rad] and position [m]."""
     if not errors.lasting:
         return np.zeros(2)
-    stood = errors.basis.any(axis=(1, 2))
-    moved = errors.sigma * errors.basis[stood][:, :, errors.last]
-    squares = np.sum((moved - moved.mean(axis=0)) ** 2, axis=2).reshape(-1, 2, 3)
+    used = errors.basis.any(axis=(1, 2))
+    change = errors.sigma * errors.basis[used][:, :, errors.last]
+    squares = np.sum((change - change.mean(axis=0)) ** 2, axis=2).reshape(-1, 2, 3)
     return np.asarray(np.sqrt(squares.mean(axis=(0, 2))))
 
 
-def _of_arm(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
-    """(n, 6, 6) what errors that follow the posture make of a place, as a twist of the base."""
+def _arm_covariance(problem: Problem, robot: str, errors: ArmErrors) -> FloatArray:
+    """(n, 6, 6) covariance from posture-dependent errors, as a twist of the base."""
     stops = problem.observations.stops
     jacobian = errors.sigma * adjoint(problem.poses[robot][stops]) @ errors.basis[stops]
     return np.asarray(jacobian @ np.swapaxes(jacobian, 1, 2))
 
 
-def _unpredicted(fitted: PickInputs) -> FloatArray:
-    """(6, 6) by how much left-out views err more than is predicted, and than chance lets them."""
+def _excess_covariance(fitted: PickInputs) -> FloatArray:
+    """(6, 6) excess of held-out residuals over their prediction, beyond chance."""
     problem, noise = fitted.problem, fitted.fit.noise
     linear = problem.linear(fitted.fit.state, ideal=True)
     expected = linear.covariance(fitted.covariance) + problem.total_covariance(linear, noise)
-    held, found = fitted.held_out, np.zeros((6, 6))
-    for away, axes in ((held.away_rad, slice(0, 3)), (held.away_m, slice(3, 6))):
-        known = np.isfinite(away)
-        if not known.any():
+    held_out, excess = fitted.held_out, np.zeros((6, 6))
+    for residuals, axes in ((held_out.away_rad, slice(0, 3)), (held_out.away_m, slice(3, 6))):
+        measured = np.isfinite(residuals)
+        if not measured.any():
             continue
-        among = expected[known][:, axes, axes]
-        variance = np.trace(among, axis1=1, axis2=2)
-        # By how much a sum of squares varies: a view whose own pose is known badly shows little.
-        weights = 1.0 / np.sum(among**2, axis=(1, 2))
-        mean, shown = np.average([variance, away[known] ** 2], axis=1, weights=weights)
-        # About chi-square, with so many degrees (Satterthwaite 1946).
+        block = expected[measured][:, axes, axes]
+        variance = np.trace(block, axis1=1, axis2=2)
+        # Weights by the variance of a sum of squares: a view whose own pose is uncertain shows
+        # little.
+        weights = 1.0 / np.sum(block**2, axis=(1, 2))
+        mean, observed = np.average([variance, residuals[measured] ** 2], axis=1, weights=weights)
+        # About chi-square, with this many degrees of freedom (Satterthwaite 1946).
         count = mean**2 * float(weights.sum())
-        if shown > mean * chi2_limit(NeedLimits.chance, count) / count:
-            found[axes, axes] = (shown - mean) / 3.0 * np.eye(3)
-    return found
+        if observed > mean * chi2_limit(NeedLimits.chance, count) / count:
+            excess[axes, axes] = (observed - mean) / 3.0 * np.eye(3)
+    return excess

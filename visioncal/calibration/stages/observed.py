@@ -1,4 +1,4 @@
-"""What was observed in a session, by one camera and one robot or by many."""
+"""The observations of a session, by one camera and one robot or by many."""
 
 import shlex
 from collections import defaultdict
@@ -23,20 +23,19 @@ from visioncal.session import Session
 from visioncal.session.images import FolderImages
 from visioncal.session.tables import CameraTable
 
-# So many views of one reason are named.
+# Views of one reason that are listed.
 _LISTED = 40
 
 
 @dataclass(frozen=True, eq=False)
 class CameraLook:
-    """What one camera gave.
+    """Observations of one camera.
 
     Attributes:
-        table: What the session says of it.
-        corners: What was found in its images, by view; those of several boards are numbered
-            through.
+        table: The session's table of the camera.
+        corners: The corners in its images, by view; those of several boards are numbered through.
         resolution: Size of its images [px].
-        lens: Its intrinsics; None where it has no view to measure them by.
+        lens: Its intrinsics; None where no view determines them.
         pixel_px: Noise of a corner's coordinate [px].
         repeats: Why views that repeat others are not needed, by view.
     """
@@ -51,24 +50,25 @@ class CameraLook:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What was observed in a session.
+    """Observations of a session, as far as they are processed.
 
     Attributes:
-        session: What was recorded.
-        progress: Told of long work.
-        threads: How many images are worked on at a time; 0 for one a core.
-        keeps_corners: Whether what is found in them is kept beside the session.
-        cameras: What each camera with images gave, by its frame.
-        poses: The target's pose by view; several candidates until they are chosen from.
+        session: The recording.
+        progress: Reports long work.
+        threads: Number of images that are processed at a time; 0 for one per core.
+        keeps_corners: Whether detected corners are cached beside the session.
+        cameras: Observations of each camera with images, by its frame.
+        poses: The target's pose by view; several candidates until one is chosen.
         reasons: Why a view cannot be used, by view.
-        robots: What its rows report of each robot, by the name that rows give it.
-        clocks: How the clocks of cameras and robots go together, where robots' streams are used.
-        warnings: What the user should know.
-        notes: What is good to know and no reason for doubt.
+        robots: Reported poses and joints of each robot, by the name that rows give it.
+        clocks: Relations of the clocks of cameras and robots, where robots' streams are used.
+        warnings: Findings for the user.
+        notes: Remarks that are no reason for doubt.
         dense: How corners are fitted by all pixels around them; None for the template's.
         is_misread: Whether robots' poses are clearly misread, so that they determine nothing of
             lenses and boards.
-        turned: How images were turned or mirrored that say nothing of their camera's lens, by view.
+        turned: How turned or mirrored images, which determine nothing of their lens, were turned,
+            by view.
     """
 
     session: Session
@@ -88,22 +88,22 @@ class Observed:
 
     def noting(self, rejections: Iterable[Rejection], warnings: Iterable[Finding] = ()) -> Self:
         """Adds rejected views, of which the first reason counts, and warnings."""
-        reasons = {rejection.view: rejection.reason for rejection in rejections} | dict(
-            self.reasons
+        reasons = {rejection.view: rejection.reason for rejection in rejections}
+        return replace(
+            self, reasons={**reasons, **self.reasons}, warnings=(*self.warnings, *warnings)
         )
-        return replace(self, reasons=reasons, warnings=(*self.warnings, *warnings))
 
     def with_camera(self, frame: str, look: CameraLook) -> Self:
-        """Takes over what one camera gave."""
+        """Adds or replaces one camera's observations."""
         return replace(self, cameras={**self.cameras, frame: look})
 
     def with_robot(self, name: str, reported: Reported) -> Self:
-        """Takes over what is known of one robot."""
+        """Adds or replaces one robot's reports."""
         return replace(self, robots={**self.robots, name: reported})
 
     @cached_property
     def corners(self) -> Mapping[int, Corners]:
-        """What was found in the images of all cameras, by view."""
+        """The corners in the images of all cameras, by view."""
         return {
             view: view_corners
             for look in self.cameras.values()
@@ -112,11 +112,11 @@ class Observed:
 
     @cached_property
     def timed(self) -> Session:
-        """The session with what robots' streams have at the times of rows that wait for them."""
+        """The session with robot poses from streams in the rows that wait for them."""
         if not self.clocks:
             return self.session
-        found = {view.number: view for clock in self.clocks.values() for view in clock.views}
-        views = tuple(found.get(view.number, view) for view in self.session.views)
+        timed_views = {view.number: view for clock in self.clocks.values() for view in clock.views}
+        views = tuple(timed_views.get(view.number, view) for view in self.session.views)
         return replace(self.session, views=views)
 
     @cached_property
@@ -128,12 +128,12 @@ class Observed:
 
     @property
     def lenses(self) -> Mapping[str, CameraResult]:
-        """The intrinsics of each camera, by its frame, where they are known."""
+        """The known intrinsics of the cameras, by frame."""
         return {frame: look.lens for frame, look in self.cameras.items() if look.lens is not None}
 
     @property
     def scenes(self) -> Mapping[str, Scene]:
-        """What each camera whose corners have poses looks at, and with what, by its frame."""
+        """Boards and lens of each camera whose corners have poses, by its frame."""
         boards, tables = self.session.boards, {name: at.table for name, at in self.cameras.items()}
         return {
             frame: Scene(
@@ -151,12 +151,12 @@ class Observed:
 
     @property
     def reported(self) -> Reported:
-        """What rows report of the only robot."""
+        """Reported poses and joints of the only robot."""
         return next(iter(self.robots.values()), Reported({}))
 
     @property
     def base_from_flange(self) -> Mapping[int, FloatArray]:
-        """(4, 4) by view, as the only robot reported it."""
+        """(4, 4) reported poses of the only robot, by view."""
         return self.reported.base_from_flange
 
     @property
@@ -176,31 +176,31 @@ class Observed:
         return next((camera.pixel_px for camera in self.cameras.values()), None)
 
     def with_noise(self, pixel_px: float) -> Self:
-        """Takes over the noise of the corners."""
+        """Sets the noise of the corners."""
         cameras = {name: replace(look, pixel_px=pixel_px) for name, look in self.cameras.items()}
         return replace(self, cameras=cameras)
 
     @property
     def poses_of_one_board(self) -> Mapping[int, ViewPoses]:
-        """The poses of the board that most views show: those of different ones do not compare."""
+        """The poses of the board that most views show; those of others do not compare."""
         shown = [pose.board for pose in self.poses.values()]
         most = max(sorted(set(shown)), key=shown.count, default=0)
         return {view: pose for view, pose in self.poses.items() if pose.board == most}
 
     @cached_property
     def held_back(self) -> frozenset[int]:
-        """The views that the session keeps from every fit (`role = holdout`)."""
+        """The views that the session keeps out of every fit (`role = holdout`)."""
         return frozenset(view.number for view in self.session.views if view.holdout)
 
     @property
     def lost_views(self) -> tuple[str, ...]:
-        """The rejected views and those held back, grouped by their reason, in words."""
+        """The rejected and held-back views, grouped by reason, in words."""
         held = dict.fromkeys(sorted(self.held_back - self.reasons.keys()), HELD_BACK)
         return by_reason({**self.reasons, **held})
 
 
 def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
-    """Groups views by why they cannot be used, in words: the commonest reason first."""
+    """Groups views by why they cannot be used, in words: the most frequent reason first."""
     views = defaultdict(list)
     for view, reason in reasons.items():
         views[reason].append(view)
@@ -211,49 +211,49 @@ def by_reason(reasons: Mapping[int, str]) -> tuple[str, ...]:
     )
 
 
-def all_held_back(seen: Observed) -> DataError:
-    """What to raise where the session keeps every usable view from the fit."""
+def all_held_back(observed: Observed) -> DataError:
+    """The error where the session keeps every usable view out of the fit."""
     return DataError(
-        f"session {seen.session.name!r}: all views that could be used are held back (role = "
+        f"session {observed.session.name!r}: all views that could be used are held back (role = "
         "holdout), and none is left to fit.",
         next_step="Clear role in the rows that the fit may use.",
     )
 
 
-def nothing_seen(seen: Observed) -> DataError:
-    """What to raise where no view shows anything to calibrate by."""
-    if seen.corners and seen.corners.keys() <= seen.held_back:
-        return all_held_back(seen)
-    if not any(view.image or view.has_corners for view in seen.session.views):
+def nothing_seen(observed: Observed) -> DataError:
+    """The error where no view shows anything to calibrate by."""
+    if observed.corners and observed.corners.keys() <= observed.held_back:
+        return all_held_back(observed)
+    if not any(view.image or view.has_corners for view in observed.session.views):
         return DataError(
-            f"session {seen.session.name!r}: there are neither images nor measured poses.",
+            f"session {observed.session.name!r}: there are neither images nor measured poses.",
             next_step="Give the views images, rows in corners.csv, or cft_ or meas_ columns.",
         )
-    few = [view for view in seen.lost_views if "too few corners" in view]
+    few = [view for view in observed.lost_views if "too few corners" in view]
     if few:
         return DataError(
-            f"session {seen.session.name!r}: no view shows enough of the target.",
+            f"session {observed.session.name!r}: no view shows enough of the target.",
             next_step="Bring more of the board into the images; one of 4 x 4 squares or more has "
             "corners enough.",
         )
-    outside = [view for view in seen.lost_views if "lies far outside the image" in view]
-    if 2 * len(outside) > len(seen.lost_views):
+    outside = [view for view in observed.lost_views if "lies far outside the image" in view]
+    if 2 * len(outside) > len(observed.lost_views):
         return DataError(
-            f"session {seen.session.name!r}: the corners lie outside the image: resolution in "
+            f"session {observed.session.name!r}: the corners lie outside the image: resolution in "
             "[camera] is not that of the images in which they were found.",
             culprits=outside,
             next_step="In session.toml, give the resolution of these images, with the matrix that "
             "belongs to it.",
         )
     return DataError(
-        f"session {seen.session.name!r}: no view shows the target.",
+        f"session {observed.session.name!r}: no view shows the target.",
         next_step="Look at an image: is the board in it, and is it the one that the session "
-        f"declares?{_named_by(seen)}",
+        f"declares?{_identify_command(observed)}",
     )
 
 
-def _named_by(seen: Observed) -> str:
-    """The command that names the board in an image, where images are files."""
-    image = next((view.image for view in seen.session.views if view.image), "")
-    has_files = image and isinstance(seen.session.images, FolderImages)
+def _identify_command(observed: Observed) -> str:
+    """The command that identifies the board in an image, where images are files."""
+    image = next((view.image for view in observed.session.views if view.image), "")
+    has_files = image and isinstance(observed.session.images, FolderImages)
     return f" Run: visioncal target check SESSION/{shlex.quote(image)}" if has_files else ""

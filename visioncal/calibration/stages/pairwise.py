@@ -1,4 +1,4 @@
-"""What most views of one pair of frames agree on: one transform, or two that a robot parts."""
+"""Consensus transforms of one pair of frames: one, or two with a robot between."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,25 +21,24 @@ from visioncal.estimation.solve import fisher_information
 # probability (1 - 1/8)^40 = 0.5 %.
 _TRIPLES = 40
 FEWEST = 3
-# Below this scaled eigenvalue ratio the motion leaves a direction open; an edge that is known worse
-# than this [m, with rotations on a lever] is no start.
+# Below this scaled eigenvalue ratio the motion leaves a direction undetermined; an edge with a
+# larger sigma [m, with rotations on a lever] is no start.
 _NULL_RATIO, _WORST_M = 1e-8, 0.1
-# Views that agree do so to this, on average, rotations on a lever [m].
+# Largest mean distance of views that agree, rotations on a lever [m].
 AGREE_M = 0.02
-# Noise by which pairs are weighed against each other [rad, m].
-_USUAL = Noise(np.full((1, 2), 5e-4), np.zeros(0))
-# ... and so little is the camera's beside it [rad and m].
-_EXACT = 1e-6
+# Robot noise by which pairs are compared [rad, m], and the camera's, negligible beside it.
+_NOISE = Noise(np.full((1, 2), 5e-4), np.zeros(0))
+_CAMERA_SIGMA = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The poses that m views allow, padded to k.
+    """Candidate poses of m views, padded to k.
 
     Attributes:
         poses: (m, k, 4, 4) `cam_from_target`.
-        turns: (m, k) which turn of the target's own each has applied.
-        valid: (m, k) which of them there are.
+        turns: (m, k) which of the target's symmetries each has applied.
+        valid: (m, k) which are not padding.
     """
 
     poses: FloatArray
@@ -51,164 +50,146 @@ class Candidates:
 
     @staticmethod
     def of(views: Sequence[ViewPoses]) -> "Candidates":
-        """Puts those of views into one array."""
+        """Collects the candidates of views."""
         most = max(len(view.cam_from_target) for view in views)
-        every = [np.minimum(np.arange(most), len(view.cam_from_target) - 1) for view in views]
-        pairs = list(zip(views, every, strict=True))
-        return Candidates(
-            np.array([view.cam_from_target[rows] for view, rows in pairs]),
-            np.array([np.array(view.turns)[rows] for view, rows in pairs]),
-            np.array([np.arange(most) < len(view.cam_from_target) for view in views]),
-        )
+        counts = [len(view.cam_from_target) for view in views]
+        indices = [np.minimum(np.arange(most), count - 1) for count in counts]
+        padded = list(zip(views, indices, strict=True))
+        poses = np.array([view.cam_from_target[rows] for view, rows in padded])
+        turns = np.array([np.array(view.turns)[rows] for view, rows in padded])
+        return Candidates(poses, turns, np.array([np.arange(most) < count for count in counts]))
 
     def take(self, rows: IntArray) -> "Candidates":
-        """Returns those of some views."""
+        """Returns the candidates of some views."""
         return Candidates(self.poses[rows], self.turns[rows], self.valid[rows])
 
     def carried(self, before: FloatArray, after: FloatArray) -> "Candidates":
-        """Returns them with (m or 1, 4, 4) transforms before and behind."""
+        """Returns them multiplied by (m or 1, 4, 4) transforms on both sides."""
         return replace(self, poses=before[:, None] @ self.poses @ after[:, None])
 
     def distances(self, predicted: FloatArray) -> FloatArray:
         """Distances (m, k) [m] from (m or 1, 4, 4) predictions, rotations on a lever."""
         between = invert(predicted)[:, None] @ self.poses
-        away = np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
-        return np.asarray(np.where(self.valid, away, np.inf))
+        distances = np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
+        return np.asarray(np.where(self.valid, distances, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
-class Parted:
-    """Both edges of `robot * x * camera = z`, and how far (m, k) candidates are from them [m]."""
+class HandEyeEdges:
+    """Both edges of `robot * x * camera = z`, and the residuals (m, k) of the candidates [m]."""
 
     x: FloatArray
     z: FloatArray
-    away: FloatArray
+    residuals: FloatArray
 
     @property
     def picks(self) -> IntArray:
         """(m,) the nearest candidate of each view."""
-        return np.asarray(self.away.argmin(axis=1))
+        return np.asarray(self.residuals.argmin(axis=1))
 
 
-def parted(
+def solve_edges(
     robot: FloatArray,
     candidates: Candidates,
     rows: IntArray,
     picks: IntArray,
     solver: Solver = SOLVERS["park"],
-) -> Parted:
-    """Solves for both edges by one candidate each of some views.
+) -> HandEyeEdges:
+    """Solves for both edges by one candidate (`picks`) each of some views (`rows`).
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: What each view allows.
-        rows: The views to solve from.
-        picks: Their candidates.
-        solver: The closed form.
+    `robot` is (m, 4, 4), the robot's part of the chain.
     """
-    found = solver(robot[rows], candidates.poses[rows, picks])
-    return Parted(found.x, found.z, candidates.distances(invert(robot @ found.x) @ found.z))
+    edges = solver(robot[rows], candidates.poses[rows, picks])
+    return HandEyeEdges(edges.x, edges.z, candidates.distances(invert(robot @ edges.x) @ edges.z))
 
 
-def trimmed(
+def trimmed_edges(
     robot: FloatArray, candidates: Candidates, solver: Solver = SOLVERS["park"]
-) -> tuple[Mask, Parted]:
-    """Both edges by the better half of the views, whichever candidates these take.
+) -> tuple[Mask, HandEyeEdges]:
+    """Solves for both edges by the better half of the views, with any of their candidates.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: What each view allows.
-        solver: The closed form.
+    `robot` is (m, 4, 4), the robot's part of the chain.
 
     Returns:
         (m,) mask of that half, and the edges.
     """
 
-    def solve(mask: Mask, at: Parted) -> Parted:
+    def solve(mask: Mask, edges: HandEyeEdges) -> HandEyeEdges:
         rows = np.flatnonzero(mask)
-        return parted(robot, candidates, rows, at.picks[rows], solver)
+        return solve_edges(robot, candidates, rows, edges.picks[rows], solver)
 
     return trimmed_start(
-        (parted(robot, candidates, *start, solver) for start in _starts(candidates)),
-        lambda item: np.asarray(item.away.min(axis=1)),
+        (solve_edges(robot, candidates, *start, solver) for start in _starts(candidates)),
+        lambda item: np.asarray(item.residuals.min(axis=1)),
         solve,
         max(len(robot) // 2 + 1, FEWEST),
     )
 
 
 def common_transform(candidates: Candidates, turn: int = 0) -> tuple[FloatArray, float, float]:
-    """The transform that most views agree on.
+    """Finds the transform that most views agree on.
 
-    Args:
-        candidates: What each view allows.
-        turn: By which turn the target is taken to be other than the view has it that agrees best.
+    With `turn`, the target is turned by it relative to the view that agrees best.
 
     Returns:
-        (4, 4), how far these views are from it on average, and what it is known to [m].
+        (4, 4), the mean distance of these views from it, and its sigma [m].
     """
-    half, least, best = len(candidates) // 2 + 1, np.inf, (0, 0)
+    half, least_sum, best = len(candidates) // 2 + 1, np.inf, (0, 0)
     for view, pose in np.argwhere(candidates.valid & (candidates.turns == 0)).tolist():
-        away = candidates.distances(candidates.poses[view, pose][None]).min(axis=1)
-        if (sum_m := trimmed_sum(away, half)) < least:
-            least, best = sum_m, (view, pose)
+        distances = candidates.distances(candidates.poses[view, pose][None]).min(axis=1)
+        if (sum_m := trimmed_sum(distances, half)) < least_sum:
+            least_sum, best = sum_m, (view, pose)
     # Candidates come in blocks of all turns.
-    away = candidates.distances(candidates.poses[best[0], best[1] + turn][None])
-    rows = np.flatnonzero(nearest(away.min(axis=1), half))
-    picked = candidates.poses[rows, away[rows].argmin(axis=1)]
-    return mean_transform(picked), least / half, least / half / np.sqrt(half)
+    distances = candidates.distances(candidates.poses[best[0], best[1] + turn][None])
+    rows = np.flatnonzero(nearest(distances.min(axis=1), half))
+    picked = candidates.poses[rows, distances[rows].argmin(axis=1)]
+    return mean_transform(picked), least_sum / half, least_sum / half / np.sqrt(half)
 
 
 def hand_eye(
     robot: FloatArray, candidates: Candidates, mount: Mount
 ) -> tuple[tuple[FloatArray, FloatArray], tuple[float, float]] | None:
-    """Both edges of `robot * x * camera = z` by a consensus of m views.
+    """Solves for both edges of `robot * x * camera = z` by a consensus of m views.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: What each view allows of the camera's.
-        mount: Whose flange it is that errs.
+    `robot` is (m, 4, 4), the robot's part of the chain; its noise is modelled for the mount.
 
     Returns:
-        (4, 4) x and z, and what each is known to, rotations on a lever [m]; None where the motion
-        leaves a direction open, or no half of the views agrees.
+        (4, 4) x and z, and the sigma of each, rotations on a lever [m]; None where the motion
+        leaves a direction undetermined, or no half of the views agrees.
     """
-    half, found = trimmed(robot, candidates)
-    typical = float(found.away.min(axis=1)[half].mean())
+    half, edges = trimmed_edges(robot, candidates)
+    typical = float(edges.residuals.min(axis=1)[half].mean())
     if typical > AGREE_M:
         return None
-    picked = candidates.poses[half, found.picks[half]]
-    exact = np.tile(_EXACT**2 * np.eye(6), (len(picked), 1, 1))
+    picked = candidates.poses[half, edges.picks[half]]
+    exact = np.tile(_CAMERA_SIGMA**2 * np.eye(6), (len(picked), 1, 1))
     poses = robot[half] if mount == "eye-in-hand" else invert(robot[half])
     problem = chain(mount, poses, picked, exact)
-    state = State(np.stack([found.x, found.z]), np.zeros(0))
-    information = fisher_information(problem, state, _USUAL)
+    state = State(np.stack([edges.x, edges.z]), np.zeros(0))
+    information = fisher_information(problem, state, _NOISE)
     if spectrum(information).ratio < _NULL_RATIO:
         return None
     variances = np.diag(covariance_from(information)).reshape(4, 3).sum(axis=1)
     x, z = np.sqrt(variances[1::2]) + LEVER_M * np.sqrt(variances[::2])
-    # Views that agree badly determine less than their motion would.
-    worse = max(typical / _USUAL.robots[0, 1], 1.0)
-    known = worse * float(x), worse * float(z)
-    return None if max(x, z) > _WORST_M else ((found.x, found.z), known)
+    # Views that agree poorly determine less than their motion would.
+    excess = max(typical / _NOISE.robots[0, 1], 1.0)
+    sigmas = excess * float(x), excess * float(z)
+    return None if max(x, z) > _WORST_M else ((edges.x, edges.z), sigmas)
 
 
 def partial_hand_eye(
     robot: FloatArray, candidates: Candidates
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Both edges of `robot * x * camera = z` as far as the motion of m views determines them.
-
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: What each view allows of the camera's.
+    """Solves for both edges of `robot * x * camera = z` as far as the motion determines them.
 
     Returns:
-        (4, 4) x and z, and how far the better half of the views is from them on average [m].
+        (4, 4) x and z, and the mean distance of the better half of the views [m].
     """
-    found = []
+    solutions = []
     for solver in (SOLVERS["park"], lone_axis):
-        half, edges = trimmed(robot, candidates, solver)
-        found.append((float(edges.away.min(axis=1)[half].mean()), edges))
-    typical, edges = min(found, key=lambda pair: pair[0])
+        half, edges = trimmed_edges(robot, candidates, solver)
+        solutions.append((float(edges.residuals.min(axis=1)[half].mean()), edges))
+    typical, edges = min(solutions, key=lambda pair: pair[0])
     return edges.x, edges.z, typical
 
 
@@ -218,11 +199,11 @@ def _starts(candidates: Candidates) -> Iterator[tuple[IntArray, IntArray]]:
     rng = np.random.default_rng(0)
     # Views with few candidates first: they need the fewest combinations.
     counts = candidates.valid.sum(axis=1)
-    likely = 1.0 / counts**2
+    weights = 1.0 / counts**2
     for _ in range(_TRIPLES):
-        triple = rng.choice(len(candidates), FEWEST, replace=False, p=likely / likely.sum())
+        triple = rng.choice(len(candidates), FEWEST, replace=False, p=weights / weights.sum())
         options = [list(range(counts[at])) for at in triple]
-        # A turn of the target in all views alike is a change of its frame, and no other solution.
+        # A turn of the target in all views alike changes its frame and is no other solution.
         options[0] = [at for at in options[0] if candidates.turns[triple[0], at] == 0]
         for picks in product(*options):
             yield triple, np.array(picks)

@@ -1,4 +1,4 @@
-"""The pose of the target in each view, with covariance and with its rivals."""
+"""Pose of the target in each view, with covariance and rival poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,33 +21,33 @@ from visioncal.estimation.poses import PoseFit, fit_poses, planar_poses
 from visioncal.session import Session
 from visioncal.vision.targets import first_corners, numbered_positions, rotation_transforms
 
-# The mirrored pose of a planar target stays a candidate while its rms is under this many times
-# the better one's: systematic errors of lens and board can change the order up to there.
+# The mirrored pose of a planar target stays a candidate while its rms is within this ratio of the
+# better one's: systematic errors of lens and board can change the order up to there.
 _RIVAL_RATIO = 2.0
-# ... or while the difference in squared error is no surprise: 6 sigma.
+# ... or while the difference in squared error is within 6 sigma.
 _RIVAL_CHI2 = 36.0
-# The closed form's guess is refined while its rms [px] is under this many times the better
-# pose's, or about a pixel: the fit brings it down by two at most.
+# The closed form's mirrored pose is refined while its rms [px] is within this ratio of the better
+# pose's, plus about a pixel: the fit reduces it by a factor of two at most.
 _PROMISING_RATIO = 5.0
-# Rotations [rad] no further apart are one pose that was reached from both starts.
+# Smaller differences of rotation [rad] are one pose that was reached from both starts.
 _SAME_RAD = 1e-5
 _ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPoses:
-    """The poses that one view allows.
+    """Candidate poses of one view.
 
     Attributes:
         view: The view's number.
-        corners: The corners that passed the gate; None where the session gave the pose itself.
+        corners: The inlier corners; None where the session states the pose itself.
         cam_from_target: (c, 4, 4) candidates, the best by reprojection first.
         turns: (c,) which of the target's own symmetries each candidate has applied.
-        covariance: (c, 6, 6) of the candidates' right perturbations; zero where the session gave
+        covariance: (c, 6, 6) of the candidates' right perturbations; zero where the session states
             the pose itself.
-        by_shared: (c, 6, k) how each candidate moves with the unknowns that all views share, once
-            it is known which these are; k = 0 before.
-        board: Which of several targets it is.
+        by_shared: (c, 6, k) Jacobian of each candidate by the unknowns that all views share; k = 0
+            before these are known.
+        board: Index of the target.
         first: The number of the target's first corner, where several are numbered through.
     """
 
@@ -63,7 +63,7 @@ class ViewPoses:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """The poses of all views, those given up, and the noise of a corner's coordinate [px]."""
+    """Poses of all views, the rejected views, and the noise of a corner's coordinate [px]."""
 
     views: tuple[ViewPoses, ...]
     rejections: tuple[Rejection, ...]
@@ -79,16 +79,16 @@ def estimate_poses(
     """Estimates `cam_from_target` of each view.
 
     Both solutions of the planar problem are refined and kept while they cannot be distinguished,
-    and a board that looks the same after a turn gives each of them once a turn.
+    and a board with rotational symmetry has each of them in every turn.
 
     Args:
         corners: The corners by view; at least one view.
-        targets: What was seen; the corners of several are numbered through.
+        targets: The targets; the corners of several are numbered through.
         camera: The intrinsics.
-        lens_unknowns: How many intrinsics were estimated from these same corners.
+        lens_unknowns: Number of intrinsics that were estimated from these same corners.
 
     Returns:
-        The poses; views whose residual is no noise are rejected.
+        The poses; outlier views are rejected.
 
     Raises:
         DataError: The lens's distortion cannot be inverted at any view's corners.
@@ -96,18 +96,18 @@ def estimate_poses(
     positions = numbered_positions(targets)
     reasons: dict[int, str] = {}
     with one_blas_thread():
-        stack, starts = _started(CornerStack.of(corners, positions), camera, reasons)
+        stack, starts = _with_starts(CornerStack.of(corners, positions), camera, reasons)
         fit = fit_poses(stack, camera, starts[0])
         for _ in range(_ROUNDS):
-            passed = gate(stack, fit.residuals)
-            if passed.is_open:
+            gated = gate(stack, fit.residuals)
+            if gated.is_open:
                 break
-            reasons |= passed.reasons
-            stack, starts = _started(stack.keep(passed.mask), camera, reasons)
+            reasons |= gated.reasons
+            stack, starts = _with_starts(stack.keep(gated.mask), camera, reasons)
             fit = fit_poses(stack, camera, starts[0])
-        weighed = stack.weighed(fit.residuals)
-        if weighed is not stack:
-            stack, fit = weighed, fit_poses(weighed, camera, fit.cam_from_target)
+        weighted = stack.weighed(fit.residuals)
+        if weighted is not stack:
+            stack, fit = weighted, fit_poses(weighted, camera, fit.cam_from_target)
         sigma_px = stack.sigma_px(fit.residuals, 6 * len(stack.views) + lens_unknowns)
         views = _with_rivals(stack, camera, fit, starts[1], sigma_px, targets)
     return Poses(views, tuple(Rejection(*item) for item in reasons.items()), sigma_px)
@@ -116,18 +116,18 @@ def estimate_poses(
 def measure_poses(
     corners: Mapping[int, Corners], targets: Sequence[Target], camera: Camera, sigma_px: float
 ) -> tuple[ViewPoses, ...]:
-    """Poses of views that are only to be looked at: by a noise that others have set, ungated."""
+    """Poses of views that are not fitted: with a given noise, ungated."""
     if not corners:
         return ()
     with one_blas_thread():
-        stack, starts = _started(
+        stack, starts = _with_starts(
             CornerStack.of(corners, numbered_positions(targets)), camera, reasons={}
         )
         fit = fit_poses(stack, camera, starts[0])
         return _with_rivals(stack, camera, fit, starts[1], sigma_px, targets)
 
 
-def _started(
+def _with_starts(
     stack: CornerStack, camera: Camera, reasons: dict[int, str]
 ) -> tuple[CornerStack, tuple[FloatArray, FloatArray]]:
     """Closed-form starts, and the views that have them; the others' reasons are added."""
@@ -139,9 +139,8 @@ def _started(
             next_step="Check the distortion coefficients: their number, order and model.",
         )
     lost = [view for view, solved in zip(stack.views, guess.solved, strict=True) if not solved]
-    reasons |= dict.fromkeys(
-        lost, "no pose: the lens's distortion cannot be inverted where its corners are"
-    )
+    why = "no pose: the lens's distortion cannot be inverted where its corners are"
+    reasons |= dict.fromkeys(lost, why)
     first, second = guess.first[guess.solved], guess.second[guess.solved]
     return stack.keep(guess.solved[stack.view_of]), (first, second)
 
@@ -154,32 +153,32 @@ def _with_rivals(
     sigma_px: float,
     targets: Sequence[Target],
 ) -> tuple[ViewPoses, ...]:
-    """Gives each view its candidates: the planar solutions that rival, in all of its turns."""
-    best, other = _sorted(stack, fit, _mirrored(stack, camera, fit, mirrored))
+    """Collects each view's candidates: rival planar solutions, in all turns of the target."""
+    best, other = _by_residual(stack, fit, _mirrored_fit(stack, camera, fit, mirrored))
     mean_squares = [mean_square_by_view(stack, pose_fit.residuals) for pose_fit in (best, other)]
     turns_of = [rotation_transforms(target) for target in targets]
-    turned_of = [adjoint(invert(turn)) for turn in turns_of]
+    adjoints = [adjoint(invert(turn)) for turn in turns_of]
     firsts = first_corners(targets)
     boards = np.searchsorted(firsts, stack.ids[stack.starts], side="right") - 1
-    spreads = [
+    covariances_of = [
         floored_sigma_px(sigma_px) ** 2 * covariance_from(pose_fit.information)
         for pose_fit in (best, other)
     ]
-    turned_by = np.abs(best.cam_from_target - other.cam_from_target)[:, :3, :3].max(axis=(1, 2))
+    differ = np.abs(best.cam_from_target - other.cam_from_target)[:, :3, :3].max(axis=(1, 2))
     views = []
     for at, (view, board) in enumerate(zip(stack.views, boards.tolist(), strict=True)):
-        turns, turned = turns_of[board], turned_of[board]
-        rival = turned_by[at] > _SAME_RAD and _is_rival(
-            mean_squares[0][at], mean_squares[1][at], stack.counts[at], sigma_px
-        )
-        fits = (best, other) if rival else (best,)
+        turns, by_turn = turns_of[board], adjoints[board]
+        square, rival = (values[at] for values in mean_squares)
+        has_rival = differ[at] > _SAME_RAD and _is_rival(square, rival, stack.counts[at], sigma_px)
+        fits = (best, other) if has_rival else (best,)
         covariances = [
-            turned @ spread[at] @ np.swapaxes(turned, 1, 2) for spread in spreads[: len(fits)]
+            by_turn @ covariance[at] @ np.swapaxes(by_turn, 1, 2)
+            for covariance in covariances_of[: len(fits)]
         ]
         views.append(
             ViewPoses(
                 view,
-                _surviving(stack, at),
+                _inlier_corners(stack, at),
                 np.concatenate([pose_fit.cam_from_target[at] @ turns for pose_fit in fits]),
                 tuple(range(len(turns))) * len(fits),
                 np.concatenate(covariances),
@@ -192,7 +191,7 @@ def _with_rivals(
 
 
 def given_poses(session: Session) -> dict[int, ViewPoses]:
-    """Collects the poses that the session gives itself (`cft_` columns), by view."""
+    """Collects the poses that the session states itself (`cft_` columns), by view."""
     boards = {name: at for at, name in enumerate(session.boards)}
     given = ((view, view.cam_from_target()) for view in session.views)
     return {
@@ -210,20 +209,20 @@ def given_poses(session: Session) -> dict[int, ViewPoses]:
     }
 
 
-def _mirrored(stack: CornerStack, camera: Camera, fit: PoseFit, starts: FloatArray) -> PoseFit:
-    """Refines the other planar solution in the views where it may be a rival."""
-    # Elsewhere it has no minimum of its own, and a fit from there would wander to the first one:
-    # that one stands in for it.
-    raw = mean_square_by_view(stack, reproject(stack, camera, starts).residuals)
-    promising = raw < _PROMISING_RATIO**2 * mean_square_by_view(stack, fit.residuals) + 1.0
-    of_corner = promising[stack.view_of]
+def _mirrored_fit(stack: CornerStack, camera: Camera, fit: PoseFit, starts: FloatArray) -> PoseFit:
+    """Refines the mirrored planar solution in the views where it may be a rival."""
+    # Elsewhere it has no minimum of its own, and a fit from there would reach the first one, which
+    # stands in for it.
+    squares = mean_square_by_view(stack, reproject(stack, camera, starts).residuals)
+    promising = squares < _PROMISING_RATIO**2 * mean_square_by_view(stack, fit.residuals) + 1.0
+    corner_mask = promising[stack.view_of]
     if not promising.any():
         return fit
-    part = fit_poses(stack.keep(of_corner), camera, starts[promising])
+    refined = fit_poses(stack.keep(corner_mask), camera, starts[promising])
     return PoseFit(
-        _replaced(fit.cam_from_target, promising, part.cam_from_target),
-        _replaced(fit.information, promising, part.information),
-        _replaced(fit.residuals, of_corner, part.residuals),
+        _replaced(fit.cam_from_target, promising, refined.cam_from_target),
+        _replaced(fit.information, promising, refined.information),
+        _replaced(fit.residuals, corner_mask, refined.residuals),
     )
 
 
@@ -233,17 +232,17 @@ def _replaced(values: FloatArray, rows: Mask, new: FloatArray) -> FloatArray:
     return changed
 
 
-def _sorted(stack: CornerStack, first: PoseFit, second: PoseFit) -> tuple[PoseFit, PoseFit]:
-    """Exchanges the fits' views so that of each the first has the smaller residuals."""
+def _by_residual(stack: CornerStack, first: PoseFit, second: PoseFit) -> tuple[PoseFit, PoseFit]:
+    """Sorts the two fits of each view by their residuals."""
     squares = [mean_square_by_view(stack, fit.residuals) for fit in (first, second)]
     swap = squares[1] < squares[0]
-    of_corner = swap[stack.view_of]
+    corner_mask = swap[stack.view_of]
 
     def pick(a: PoseFit, b: PoseFit) -> PoseFit:
         return PoseFit(
             np.where(swap[:, None, None], b.cam_from_target, a.cam_from_target),
             np.where(swap[:, None, None], b.information, a.information),
-            np.where(of_corner[:, None], b.residuals, a.residuals),
+            np.where(corner_mask[:, None], b.residuals, a.residuals),
         )
 
     return pick(first, second), pick(second, first)
@@ -255,8 +254,8 @@ def _is_rival(best: float, other: float, corners: int, sigma_px: float) -> bool:
     return bool(other < _RIVAL_RATIO**2 * best or mahalanobis_sq < _RIVAL_CHI2)
 
 
-def _surviving(stack: CornerStack, at: int) -> Corners:
-    """The corners of a view that the gate let pass."""
+def _inlier_corners(stack: CornerStack, at: int) -> Corners:
+    """The inlier corners of a view."""
     rows = slice(stack.starts[at], stack.starts[at] + stack.counts[at])
     weights = None if stack.weights is None else stack.weights[rows]
     return Corners(

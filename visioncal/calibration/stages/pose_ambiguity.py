@@ -1,70 +1,58 @@
-"""Chooses among the poses that each view allows, by the robot's motion."""
+"""Choice among the candidate poses of each view, by the robot's motion."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.pairwise import Candidates, parted
+from visioncal.calibration.stages.pairwise import Candidates, solve_edges
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import FloatArray, IntArray, Mask, Target
 from visioncal.vision.targets import rotations
 
-# A rival that closes the chain within this many times the chosen one's distance is as likely.
+# A rival within this ratio of the chosen candidate's distance is as likely.
 CLEAR_RATIO = 3.0
 _ROUNDS = 10
 
 
-def has_rival(away: FloatArray, typical: float) -> Mask:
-    """(m,) for which views another pose is as likely as the nearest.
+def has_rival(distances: FloatArray, typical_m: float) -> Mask:
+    """(m,) whether another candidate of a view is as likely as the nearest.
 
-    A view that is far from all others with any of its poses is wrong, which is for others to say.
-
-    Args:
-        away: (m, k) distances of their poses from the prediction [m].
-        typical: Distance of a sound view's pose [m].
+    `distances` are those of (m, k) candidates from the prediction, `typical_m` that of a good
+    view's pose [m]. Views that are far with any candidate are outliers and not reported here.
     """
-    ordered = np.sort(away, axis=1)
+    ordered = np.sort(distances, axis=1)
     best, second = ordered[:, 0], ordered[:, 1:].min(axis=1, initial=np.inf)
-    near = best < CLEAR_RATIO**2 * typical
-    return np.asarray(near & (second < CLEAR_RATIO * np.maximum(best, typical)))
+    near = best < CLEAR_RATIO**2 * typical_m
+    return np.asarray(near & (second < CLEAR_RATIO * np.maximum(best, typical_m)))
 
 
 def choose_by(view: ViewPoses, predicted: FloatArray, target: Target | None) -> ViewPoses:
-    """Chooses the pose of one view that is nearest to a predicted one.
-
-    Args:
-        view: The view with its candidates.
-        predicted: (4, 4) `cam_from_target`.
-        target: What was seen, for its symmetries.
-    """
+    """Chooses the candidate of one view that is nearest to a predicted `cam_from_target` (4, 4)."""
     return chosen(view, int(Candidates.of([view]).distances(predicted[None]).argmin()), target)
 
 
-def settled(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
-    """Solves for both edges from all views, until none picks another pose than before.
+def settle_candidates(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
+    """Solves for both edges from all views and updates each view's candidate until none changes.
 
-    Args:
-        robot: (m, 4, 4) the robot's part of the chain.
-        candidates: What each view allows.
-        picks: (m,) which of these each takes at first.
+    `robot` is (m, 4, 4), the robot's part of the chain, `picks` (m,) the initial choice.
 
     Returns:
-        (m, k) how far the candidates are from what that predicts [m].
+        (m, k) distances of the candidates from the predictions [m].
     """
     rows = np.arange(len(robot))
     for _ in range(_ROUNDS):
-        found = parted(robot, candidates, rows, picks)
-        if np.array_equal(found.picks, picks):
+        edges = solve_edges(robot, candidates, rows, picks)
+        if np.array_equal(edges.picks, picks):
             break
-        picks = found.picks
-    return found.away
+        picks = edges.picks
+    return edges.residuals
 
 
 def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
-    """Leaves one pose to a view, and numbers its corners accordingly."""
+    """Reduces a view to one candidate, and renumbers its corners accordingly."""
     corners, turn = view.corners, view.turns[pick]
     if corners is not None and target is not None and turn:
-        # Turned, corner i lies where corner rotations[i] was: what was seen as that one is i.
+        # Turned, corner i is where corner rotations[i] was: what was detected as that one is i.
         renumbered = np.argsort(rotations(target)[turn])[corners.ids - view.first] + view.first
         corners = replace(corners, ids=renumbered).take(np.argsort(renumbered))
     return replace(

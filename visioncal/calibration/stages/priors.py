@@ -1,7 +1,8 @@
-"""What a session knows of a cell's frames beforehand: `[prior.A_from_B]`, and what became of it."""
+"""Priors on a cell's frames, `[prior.A_from_B]`, and whether the views contradict them."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,28 +18,28 @@ from visioncal.estimation.tree import Tree
 from visioncal.session.tables import PriorTable
 
 _COMPONENTS = ("x_m", "y_m", "z_m")
-# What was measured is contradicted by so many standard deviations.
+# A measured component is contradicted beyond this many combined sigmas.
 _CONTRADICTION = 3.0
-# A place of this sigma is overruled by any that views determine well enough to be accepted [m].
+# Prior sigma of a position that is overruled by any estimate that is accepted [m].
 _LOOSE_M = 1.0
 
 
 def _prior_of(name: str, table: PriorTable) -> FramePrior:
-    """Reads `[prior.A_from_B]`: the components that it states, and the rotation where it does."""
+    """Reads `[prior.A_from_B]`: the stated components, and the rotation if stated."""
     first, _, second = name.partition("_from_")
     values = [getattr(table, component) for component in _COMPONENTS]
     axes = tuple(axis for axis, value in enumerate(values) if value is not None)
     places = tuple(float(values[axis]) for axis in axes)
-    found = FramePrior(first, second, axes, places, table.sigma_m or 1.0)
+    prior = FramePrior(first, second, axes, places, table.sigma_m or 1.0)
     if table.quaternion_xyzw is None or table.sigma_rad is None:
-        return found
+        return prior
     rotation = Rotation.from_quat(table.quaternion_xyzw).as_matrix()
-    return replace(found, rotation=rotation, sigma_rad=table.sigma_rad)
+    return replace(prior, rotation=rotation, sigma_rad=table.sigma_rad)
 
 
 @dataclass(frozen=True)
 class Component:
-    """A measured component beside what the views alone say of it [m]."""
+    """A measured component of a prior, beside what the views alone determine of it [m]."""
 
     label: str
     axis: int
@@ -50,34 +51,34 @@ class Component:
 
     @property
     def is_redundant(self) -> bool:
-        """Whether the views would do without."""
+        """Whether the views alone determine it well enough."""
         return self.seen_sigma_m < SIGMA_LIMIT_M
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether the views say otherwise, by more than both may be off."""
+        """Whether the views contradict it significantly."""
         return self.is_redundant and self.contradiction > _CONTRADICTION
 
     @property
     def contradiction(self) -> float:
-        """How far the views alone are from it, in units of what both are known to."""
-        apart_m = abs(self.seen_m - self.stated_m)
-        return float(apart_m / np.hypot(self.sigma_m, self.seen_sigma_m))
+        """Distance of the views' value from the stated one, in combined sigmas."""
+        distance_m = abs(self.seen_m - self.stated_m)
+        return float(distance_m / np.hypot(self.sigma_m, self.seen_sigma_m))
 
     @property
     def remark(self) -> str:
-        """Says that the answer rests on it."""
-        alone = "leave it open"
+        """States that the result uses it."""
+        by_views = "leave it open"
         if self.is_redundant:
-            alone = f"determine it to {figure(1e3 * self.seen_sigma_m)} mm"
+            by_views = f"determine it to {figure(1e3 * self.seen_sigma_m)} mm"
         return (
             f"The measured {self.label} = {1e3 * self.stated_m:g} mm was used, known to "
-            f"{figure(1e3 * self.sigma_m)} mm; the views alone {alone}."
+            f"{figure(1e3 * self.sigma_m)} mm; the views alone {by_views}."
         )
 
     @property
     def doubt(self) -> str:
-        """Says that the views contradict it."""
+        """States that the views contradict it."""
         return (
             f"The measured {self.label} = {1e3 * self.stated_m:g} mm, known to "
             f"{figure(1e3 * self.sigma_m)} mm, is contradicted by the views, which alone say "
@@ -86,79 +87,60 @@ class Component:
 
 
 def components(
-    problem: Problem,
-    state: State,
-    covariance: FloatArray,
-    priors: Sequence[FramePrior],
+    problem: Problem, state: State, covariance: FloatArray, priors: Sequence[FramePrior]
 ) -> tuple[Component, ...]:
-    """The measured components of priors beside what the observations alone say of them.
-
-    Args:
-        problem: The observations in the fit.
-        state: The answer.
-        covariance: (p, p) covariance of the unknowns.
-        priors: Priors, in the problem or left out of it.
-    """
-    return tuple(
-        component
-        for prior in priors
-        for component in _components(prior, problem, state, covariance)
-    )
+    """The measured components of priors, used or not, beside the observations' estimates."""
+    by_prior = (_components(prior, problem, state, covariance) for prior in priors)
+    return tuple(chain.from_iterable(by_prior))
 
 
 def _components(
     prior: FramePrior, problem: Problem, state: State, covariance: FloatArray
 ) -> Iterator[Component]:
-    away, jacobian = problem.prior_rows(prior, state)
+    residuals, jacobian = problem.prior_rows(prior, state)
     used = {(frame_prior.name, axis) for frame_prior in problem.priors for axis in frame_prior.axes}
     sigmas = np.sqrt(np.einsum("dp,pq,dq->d", jacobian, covariance, jacobian)) * prior.sigma_m
-    # Behind those of the rotation, which no word is said of.
-    places = slice(len(away) - len(prior.axes), len(away))
-    for axis, stated, off, sigma in zip(
-        prior.axes,
-        prior.values_m,
-        (away[places] * prior.sigma_m).tolist(),
-        sigmas[places].tolist(),
-        strict=True,
-    ):
+    # The position's rows follow those of the rotation, which are not reported.
+    rows = slice(len(residuals) - len(prior.axes), len(residuals))
+    residuals_m = (residuals[rows] * prior.sigma_m).tolist()
+    columns = zip(prior.axes, prior.values_m, residuals_m, sigmas[rows].tolist(), strict=True)
+    for axis, stated_m, residual_m, sigma_m in columns:
         is_used = (prior.name, axis) in used
-        seen = _without_prior(off, sigma, prior.sigma_m) if is_used else (off, sigma)
-        label = f"{_COMPONENTS[axis]} of {prior.name}"
-        yield Component(label, axis, is_used, stated, prior.sigma_m, stated + seen[0], seen[1])
+        by_views = (
+            _without_prior(residual_m, sigma_m, prior.sigma_m) if is_used else (residual_m, sigma_m)
+        )
+        label, seen_m = f"{_COMPONENTS[axis]} of {prior.name}", stated_m + by_views[0]
+        yield Component(label, axis, is_used, stated_m, prior.sigma_m, seen_m, by_views[1])
 
 
-def _without_prior(off_m: float, sigma_m: float, prior_m: float) -> tuple[float, float]:
-    """How far the views alone are from a measured component, and to what they know it [m]."""
-    own = max(sigma_m**-2.0 - prior_m**-2.0, 0.0)
-    alone = np.inf if own == 0.0 else 1.0 / np.sqrt(own)
-    # Both together are their mean, each weighted with its information.
-    return float(off_m + off_m * (alone / prior_m) ** 2), float(alone)
+def _without_prior(residual_m: float, sigma_m: float, prior_m: float) -> tuple[float, float]:
+    """Distance of the views' own value from a measured component, and its sigma [m]."""
+    information = max(sigma_m**-2.0 - prior_m**-2.0, 0.0)
+    views_sigma_m = np.inf if information == 0.0 else 1.0 / np.sqrt(information)
+    # The estimate is the mean of views and prior, weighted by information.
+    return float(residual_m + residual_m * (views_sigma_m / prior_m) ** 2), float(views_sigma_m)
 
 
 def priors_of(tables: Mapping[str, PriorTable], tree: Tree) -> tuple[FramePrior, ...]:
-    """Reads the priors of a cell's frames.
-
-    Args:
-        tables: `[prior.A_from_B]` by its name: where frame B is in frame A.
-        tree: The frames.
+    """Reads the priors of a cell's frames: `[prior.A_from_B]` is the pose of frame B in frame A.
 
     Raises:
-        DataError: A frame is unknown, or a robot moves one of the two before the other.
+        DataError: A frame is unknown, or a robot moves one of the two relative to the other.
     """
     return tuple(_prior(name, table, tree) for name, table in tables.items())
 
 
 def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
-    found = _prior_of(name, table)
-    first, second = found.first, found.second
+    prior = _prior_of(name, table)
+    first, second = prior.first, prior.second
     label = f"session.toml: prior.{name}"
     for frame in (first, second):
         if frame not in tree.branches:
-            known = [branch for branch in tree.branches if branch != frame]
+            names = [branch for branch in tree.branches if branch != frame]
             raise DataError(
-                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(known)}.",
+                f"{label}: {frame!r} is no frame of this cell; those are {', '.join(names)}.",
                 culprits=[label],
-                next_step=did_you_mean(frame, known)
+                next_step=did_you_mean(frame, names)
                 or "Name a prior A_from_B, as [prior.flange_a_from_cam_left].",
             )
     moved_by = [step.robot for step in tree.path(first, second) if step.robot]
@@ -169,54 +151,38 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
             culprits=[label],
             next_step="State where two frames are that stand in the cell, or on one flange.",
         )
-    return found
+    return prior
 
 
 def loosened(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]:
-    """The priors with places so uncertain that the observations overrule them."""
+    """The priors with position sigmas so large that the observations overrule them."""
     return tuple(replace(prior, sigma_m=max(prior.sigma_m, _LOOSE_M)) for prior in priors)
 
 
 def without_most_contradicted(
     problem: Problem, state: State, covariance: FloatArray
 ) -> tuple[FramePrior, ...] | None:
-    """The priors without the component that the observations contradict most.
-
-    Args:
-        problem: The observations in the fit.
-        state: The answer.
-        covariance: (p, p) covariance of the unknowns.
-
-    Returns:
-        The others; None where the observations contradict none.
-    """
-    found = [
+    """The priors without the most contradicted component; None where none is contradicted."""
+    contradicted = [
         (component.contradiction, at, component.axis)
         for at, prior in enumerate(problem.priors)
         for component in components(problem, state, covariance, [prior])
         if component.is_contradicted
     ]
-    if not found:
+    if not contradicted:
         return None
-    _, worst, axis = max(found)
-    kept = [
-        prior.without(axis) if at == worst else prior for at, prior in enumerate(problem.priors)
-    ]
-    return tuple(
-        frame_prior for frame_prior in kept if frame_prior.axes or frame_prior.rotation is not None
-    )
+    _, worst, axis = max(contradicted)
+    kept = list(problem.priors)
+    kept[worst] = kept[worst].without(axis)
+    return tuple(prior for prior in kept if prior.axes or prior.rotation is not None)
 
 
 def prior_words(
     problem: Problem, state: State, covariance: FloatArray, stated: Iterable[FramePrior]
 ) -> Iterator[Finding]:
-    """Says what became of priors; what contradicts none is a note.
+    """Reports used priors as notes, and contradicted ones as findings.
 
-    Args:
-        problem: The observations in the fit, with what of priors these do not contradict.
-        state: The answer.
-        covariance: (p, p) covariance of the unknowns.
-        stated: All priors, whole.
+    `problem` has the priors that the observations do not contradict, `stated` are all, whole.
     """
     for component in components(problem, state, covariance, tuple(stated)):
         if component.is_used:

@@ -1,4 +1,4 @@
-"""Readings of a measuring instrument: places of points on the flange, or poses of a probe."""
+"""Readings of a measuring instrument: positions of points on the flange, or poses of a probe."""
 
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
@@ -19,26 +19,26 @@ from visioncal.session import Session, View
 from visioncal.session.instruments import Instrument, instrument_names, stated_instrument
 from visioncal.session.kinds import is_read, is_seen, name_of
 
-# No tracker reads so far [m].
+# Largest distance that a tracker reads [m].
 _FARTHEST_M = 160.0
-# Labels are exchanged where a stop's points lie so many times farther from where the others of
-# the stop put them than is usual, and as usual, give or take, once they are changed back.
-_OFF, _USUAL = 5.0, 2.0
-# Readings agree to no better than this [m]: exact ones would otherwise be judged by rounding.
-_LEAST_M = 1e-7
-# Points whose width is under this share of their length are as good as on a line.
+# Points are exchanged where the scatter of a stop's residuals exceeds the median by the first
+# factor, and is within the second once they are exchanged back.
+_EXCHANGED, _USUAL = 5.0, 2.0
+# Least scatter of readings [m]: exact ones would be judged by rounding errors.
+_LEAST_SCATTER_M = 1e-7
+# Points whose width is below this share of their length count as on a line.
 _LINE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What an instrument read.
+    """Readings of an instrument.
 
     Attributes:
         instrument: Its noise.
-        names: The points in the order in which they first appear; one, perhaps without a name.
+        names: The points in the order in which they first appear; a single one may have no name.
         read_m: (3,) by view, in the instrument's frame [m].
-        points: Which of the points, by view.
+        points: Index of the point, by view.
         probes: (4, 4) `instrument_from_probe` by view, where poses were read; else None.
         rejections: Rows that are of no use.
     """
@@ -57,13 +57,13 @@ class Readings:
 
     @property
     def sigma_m(self) -> float:
-        """Noise of a coordinate that was read, typically [m]."""
+        """Median noise of a coordinate [m]."""
         return float(np.median(self.instrument.sigmas_m(np.array(list(self.read_m.values())))))
 
     def places(
         self, views: Sequence[int], base_from_flange: Mapping[int, FloatArray], stops: IntArray
     ) -> Places:
-        """What was read of points in some views; the (m,) stops are numbered from 0."""
+        """The readings of points in some views; the (m,) stops are numbered from 0."""
         read = np.array([self.read_m[view] for view in views]).reshape(-1, 3)
         return Places(
             np.array([base_from_flange[view] for view in views]).reshape(-1, 4, 4),
@@ -75,7 +75,7 @@ class Readings:
 
 
 def read_instrument(session: Session) -> Readings:
-    """Collects an instrument's readings, and checks them.
+    """Collects and checks an instrument's readings.
 
     Raises:
         DataError: The instrument's noise is not known, readings are in millimetres, some have a
@@ -84,10 +84,9 @@ def read_instrument(session: Session) -> Readings:
     rows = [view for view in session.views if view.reading_m is not None]
     _check_unit(rows)
     are_poses, instrument = _are_poses(rows), _instrument(session, rows)
-    names, rejections = _names(rows, are_poses=are_poses)
-    kept = [
-        view for view in rows if view.number not in {rejection.view for rejection in rejections}
-    ]
+    names, rejected = _names(rows, are_poses=are_poses)
+    lost = {rejection.view for rejection in rejected}
+    used = [view for view in rows if view.number not in lost]
     missing = [
         Rejection(view.number, "no reading of the instrument: meas_x_m ... are empty")
         for view in session.views
@@ -96,39 +95,39 @@ def read_instrument(session: Session) -> Readings:
     return Readings(
         instrument,
         names,
-        {view.number: _read(view) for view in kept},
-        {view.number: names.index(view.point) for view in kept},
-        {view.number: _probe(view) for view in kept} if are_poses else None,
-        (*missing, *rejections),
+        {view.number: _read(view) for view in used},
+        {view.number: names.index(view.point) for view in used},
+        {view.number: _probe(view) for view in used} if are_poses else None,
+        (*missing, *rejected),
     )
 
 
 def probe_poses(session: Session, readings: Readings) -> dict[int, FloatArray]:
-    """Poses (4, 4) of what the flange carries, in the instrument's frame, by one view of each stop.
+    """Poses (4, 4) of a probe on the flange, in the instrument's frame, by one view of each stop.
 
-    They are those of the probe, or of all points together as the first such stop has them; there
-    are none of fewer than three points, or of points on a line.
+    Without a probe they are fitted to all points of a stop, relative to the first complete stop;
+    empty with fewer than three points, or with points on a line.
     """
     if readings.probes is not None:
         return dict(readings.probes)
-    station = {observation.view.number: observation.station for observation in session.observations}
+    stop_of = {observation.view.number: observation.station for observation in session.observations}
     stops: dict[Hashable, dict[int, int]] = defaultdict(dict)
     for view, point in readings.points.items():
-        stops[station[view]][point] = view
+        stops[stop_of[view]][point] = view
     numbers = range(len(readings.names))
     views = [[stop[at] for at in numbers] for stop in stops.values() if len(stop) == len(numbers)]
-    places = np.array([[readings.read_m[view] for view in group] for group in views])
+    positions = np.array([[readings.read_m[view] for view in group] for group in views])
     if len(numbers) < 3 or not views:
         return {}
-    away = places[0] - places[0].mean(axis=0)
-    sizes = np.linalg.svd(away, compute_uv=False)
+    centred = positions[0] - positions[0].mean(axis=0)
+    sizes = np.linalg.svd(centred, compute_uv=False)
     if sizes[1] < _LINE * sizes[0]:
         return {}
-    return {view[0]: align(at, places[0]) for view, at in zip(views, places, strict=True)}
+    return {view[0]: align(at, positions[0]) for view, at in zip(views, positions, strict=True)}
 
 
 def read_instruments(session: Session) -> dict[int, ViewPoses]:
-    """What all instruments of a cell read, by view; of places alone, the rotation is any.
+    """Reads all instruments of a cell, by view; for positions alone, the rotation has no meaning.
 
     Raises:
         DataError: An instrument's noise is not known, or its readings are in millimetres.
@@ -137,42 +136,41 @@ def read_instruments(session: Session) -> dict[int, ViewPoses]:
     for observation in session.observations:
         if is_read(observation.view) and not is_seen(observation.view):
             rows.setdefault(observation.seer, []).append(observation.view)
-    found = {}
-    for mine in rows.values():
-        _check_unit(mine)
-        instrument = _instrument(session, mine)
-        for view in mine:
-            found[view.number] = _sighting(view.number, _probe(view), instrument)
-    return found
+    sightings = {}
+    for of_instrument in rows.values():
+        _check_unit(of_instrument)
+        instrument = _instrument(session, of_instrument)
+        for view in of_instrument:
+            sightings[view.number] = _sighting(view.number, _probe(view), instrument)
+    return sightings
 
 
 def _sighting(view: int, probe: FloatArray, instrument: Instrument) -> ViewPoses:
-    """A probe (4, 4) as an instrument saw it."""
+    """A reading (4, 4) as a view with covariance."""
     covariance = np.zeros((6, 6))
     covariance[range(3), range(3)] = (instrument.sigma_rad or 0.0) ** 2
     covariance[range(3, 6), range(3, 6)] = instrument.sigmas_m(probe[None, :3, 3])[0] ** 2
     return ViewPoses(view, None, probe[None], (0,), covariance[None], np.zeros((1, 6, 0)))
 
 
-def exchanged_points(seen: Observed, readings: Readings) -> tuple[Rejection, ...]:
-    """Readings of one robot's points whose names are exchanged.
-
-    Args:
-        seen: What is known, with where the robot stood.
-        readings: Of places.
+def exchanged_points(observed: Observed, readings: Readings) -> tuple[Rejection, ...]:
+    """Finds readings of one robot's points whose names are exchanged.
 
     Raises:
         DataError: No view can be used.
         DegenerateError: There are too few stops.
     """
-    station = {
-        observation.view.number: observation.station for observation in seen.session.observations
+    stop_of = {
+        observation.view.number: observation.station
+        for observation in observed.session.observations
     }
-    poses = seen.base_from_flange
-    views = [index for index in readings.read_m if index in poses and index not in seen.held_back]
+    poses = observed.base_from_flange
+    views = [
+        index for index in readings.read_m if index in poses and index not in observed.held_back
+    ]
     if not views:
-        raise nothing_seen(seen)
-    stops = np.unique([station[view] for view in views], return_inverse=True)[1]
+        raise nothing_seen(observed)
+    stops = np.unique([stop_of[view] for view in views], return_inverse=True)[1]
     _check_stops(readings, stops)
     places = readings.places(views, poses, stops)
     with one_blas_thread():
@@ -186,7 +184,7 @@ def _read(view: View) -> FloatArray:
 
 
 def _probe(view: View) -> FloatArray:
-    """(4, 4) where the probe was read; of a place alone its rotation is any."""
+    """(4, 4) the probe's pose; for a position alone, with the identity as rotation."""
     pose, matrix = view.instrument_from_probe(), np.eye(4)
     if pose is not None:
         return np.asarray(pose.as_matrix())
@@ -205,23 +203,24 @@ def _instrument(session: Session, rows: Sequence[View]) -> Instrument:
             next_step="Add [instrument] with sigma_m (and sigma_per_m), or with one of these as "
             f"its name: {', '.join(instrument_names())}.",
         )
-    found = stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
-    if found.sigma_rad is None and any(row.instrument_from_probe() is not None for row in rows):
+    instrument = stated_instrument(table.name, table.sigma_m, table.sigma_per_m, table.sigma_rad)
+    has_rotations = any(row.instrument_from_probe() is not None for row in rows)
+    if instrument.sigma_rad is None and has_rotations:
         raise DataError(
             f"session.toml: rows have rotations of a probe (meas_qx ...), but how good they are "
             f"is not known of the instrument {table.name!r}.",
             culprits=["session.toml: instrument.sigma_rad"],
             next_step="State sigma_rad in [instrument], or leave the columns meas_qx ... out.",
         )
-    return found
+    return instrument
 
 
 def _check_unit(rows: Sequence[View]) -> None:
-    far = float(np.median([np.linalg.norm(_read(view)) for view in rows]))
-    if far > _FARTHEST_M:
+    distance_m = float(np.median([np.linalg.norm(_read(view)) for view in rows]))
+    if distance_m > _FARTHEST_M:
         raise DataError(
             f"views.csv: the median distance of the readings (meas_x_m, meas_y_m, meas_z_m) from "
-            f"the instrument is {far:.4g} m, and no instrument reads farther than "
+            f"the instrument is {distance_m:.4g} m, and no instrument reads farther than "
             f"{_FARTHEST_M:g} m.",
             culprits=["views.csv: meas_x_m, meas_y_m, meas_z_m"],
             next_step="It looks like millimetres: multiply these columns by 0.001.",
@@ -229,16 +228,16 @@ def _check_unit(rows: Sequence[View]) -> None:
 
 
 def _are_poses(rows: Sequence[View]) -> bool:
-    turned = [view.instrument_from_probe() is not None for view in rows]
-    if any(turned) and not all(turned):
-        without = [str(row.number) for row, there in zip(rows, turned, strict=True) if not there]
+    has_rotation = [view.instrument_from_probe() is not None for view in rows]
+    if any(has_rotation) and not all(has_rotation):
+        without = [str(row.number) for row in rows if row.instrument_from_probe() is None]
         raise DataError(
-            f"views.csv: {sum(turned)} of {len(rows)} readings have the probe's rotation "
+            f"views.csv: {sum(has_rotation)} of {len(rows)} readings have the probe's rotation "
             f"(meas_qx ...); view{'s' if len(without) > 1 else ''} {some_of(without)} have none.",
             culprits=[f"views.csv: view {name}" for name in without],
             next_step="Fill it in everywhere, or leave its columns out.",
         )
-    return all(turned)
+    return all(has_rotation)
 
 
 def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], list[Rejection]]:
@@ -264,19 +263,19 @@ def _names(rows: Sequence[View], *, are_poses: bool) -> tuple[tuple[str, ...], l
             "points are read.",
         )
     alone = {name: views[0] for name, views in by_name.items() if len(views) == 1}
-    rejections = [_alone(name, view, by_name) for name, view in alone.items()]
+    rejections = [_read_once(name, view, by_name) for name, view in alone.items()]
     if len(alone) == len(by_name):
         return tuple(by_name), []
     return tuple(name for name in by_name if name not in alone), rejections
 
 
-def _alone(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejection:
-    known = [word for word, views in others.items() if len(views) > 1]
-    hint = did_you_mean(name, known)
+def _read_once(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejection:
+    names = [word for word, views in others.items() if len(views) > 1]
+    hint = did_you_mean(name, names)
     if hint:
         raise DataError(
             f"views.csv: view {view} reads a point {name!r} that no other row names; the points "
-            f"are {some_of(known)}.",
+            f"are {some_of(names)}.",
             culprits=[f"views.csv: view {view}, point"],
             next_step=hint,
         )
@@ -284,7 +283,7 @@ def _alone(name: str, view: int, others: Mapping[str, Sequence[int]]) -> Rejecti
 
 
 def _check_stops(readings: Readings, stops: IntArray) -> None:
-    """Refuses fewer stops than determine where instrument and points are, with any to spare."""
+    """Refuses too few stops to determine the instrument and the points with redundancy."""
     count, points = len(np.unique(stops)), len(readings.names)
     needed = 4 if points == 1 else 3
     if count >= needed:
@@ -304,37 +303,41 @@ def _exchanged(
     readings: Readings, views: Sequence[int], places: Places, mounting: Mounting
 ) -> Iterator[Rejection]:
     """Finds stops at which the names of two points are exchanged."""
-    # Where the arm puts the flange wrongly, all points of a stop are off alike: what counts is how
-    # they lie to each other.
-    off = residuals(places, mounting)
+    # An error of the flange's pose moves all points of a stop alike: only their relative positions
+    # count.
+    errors = residuals(places, mounting)
     stops = [np.flatnonzero(places.stops == stop) for stop in range(places.stops.max() + 1)]
     rows_of = [rows for rows in stops if len(rows) > 1]
     if not rows_of:
         return
-    usual = max(float(np.median([_apart(off[rows]) for rows in rows_of])), _LEAST_M)
-    for rows in rows_of:
-        if _apart(off[rows]) < _OFF * usual:
+    scatter_m = [_scatter_m(errors[rows]) for rows in rows_of]
+    usual_m = max(float(np.median(scatter_m)), _LEAST_SCATTER_M)
+    for rows, before_m in zip(rows_of, scatter_m, strict=True):
+        if before_m < _EXCHANGED * usual_m:
             continue
-        for one, other in combinations(rows.tolist(), 2):
-            back = off[rows] - _change(places, mounting, rows, one, other)
-            if _apart(back) < _USUAL * usual:
-                names = [readings.names[places.points[index]] for index in (one, other)]
+        for first, second in combinations(rows.tolist(), 2):
+            restored = errors[rows] - _change(places, mounting, rows, first, second)
+            after_m = _scatter_m(restored)
+            if after_m < _USUAL * usual_m:
+                names = [readings.names[places.points[index]] for index in (first, second)]
                 words = (
                     f"the points {names[0]} and {names[1]} are exchanged at this stop: changed "
-                    f"back, its points agree to {figure(1e3 * _apart(back))} mm, not "
-                    f"{figure(1e3 * _apart(off[rows]))} mm"
+                    f"back, its points agree to {figure(1e3 * after_m)} mm, not "
+                    f"{figure(1e3 * before_m)} mm"
                 )
-                yield from (Rejection(views[index], words) for index in (one, other))
+                yield from (Rejection(views[index], words) for index in (first, second))
                 break
 
 
-def _change(places: Places, mounting: Mounting, rows: IntArray, one: int, other: int) -> FloatArray:
-    """What the residuals (r, 3) of a stop's rows lose when two rows exchange their points."""
-    step = mounting.on_flange[places.points[other]] - mounting.on_flange[places.points[one]]
-    sign = (rows == one).astype(float) - (rows == other)
-    return np.asarray(sign[:, None] * step)
+def _change(
+    places: Places, mounting: Mounting, rows: IntArray, first: int, second: int
+) -> FloatArray:
+    """Change of the residuals (r, 3) of a stop's rows when two rows exchange their points."""
+    before, after = mounting.on_flange[places.points[[first, second]]]
+    sign = (rows == first).astype(float) - (rows == second)
+    return np.asarray(sign[:, None] * (after - before))
 
 
-def _apart(off: FloatArray) -> float:
-    """Root mean square of how far (r, 3) residuals lie from their mean [m]."""
-    return float(np.sqrt(np.mean(np.sum((off - off.mean(axis=0)) ** 2, axis=1))))
+def _scatter_m(errors: FloatArray) -> float:
+    """RMS deviation of (r, 3) residuals from their mean [m]."""
+    return float(np.sqrt(np.mean(np.sum((errors - errors.mean(axis=0)) ** 2, axis=1))))

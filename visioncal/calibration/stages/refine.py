@@ -1,4 +1,4 @@
-"""Refinement: what all views share besides the edges, the lens and the board as it really is."""
+"""Joint fit of lenses, boards and frames, and the selection of the values that it frees."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -36,27 +36,27 @@ from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import covariance_of, equations_and_cost, left_out_residuals
 from visioncal.estimation.variance import likely_sigma
 
-# A board that is off by so much is beyond what is linear.
-_FAR = 2e-3
-# Robots that err by more [m] may do so because of a board that is far off: it is looked for by fits
-# with other sizes, so far apart, and taken where the robots then err by much less.
-_ROUGH_M, _TRIED, _MUCH_LESS = 1e-3, 5e-3, 0.5
-# No board is off by more.
+# Relative error of a board's size beyond the linear range.
+_NONLINEAR = 2e-3
+# Larger robot noise [m] may come from a board with a wrong size: fits with sizes that differ by
+# this step are compared, and a size is taken where it reduces the noise to less than this ratio.
+_ROUGH_M, _STEP, _NOISE_RATIO = 1e-3, 5e-3, 0.5
+# Largest relative error of a board's size.
 _FARTHEST = 0.15
 
 
 def free_of(seen: LinearisedCorners) -> LensBoardParameters:
     """Lens and boards of the only camera, and their covariance."""
-    looks, known = seen.looks, seen.known
-    ((name, problem),) = looks.problems.items()
+    cameras, prior = seen.looks, seen.known
+    ((name, problem),) = cameras.problems.items()
     return LensBoardParameters(
-        Appearance(looks.camera(name), looks.values[looks.boards]),
+        Appearance(cameras.camera(name), cameras.values[cameras.boards]),
         problem.basis,
         problem.positions,
         seen.free,
         seen.held,
-        known.information,
-        known.gradient,
+        prior.information,
+        prior.gradient,
     )
 
 
@@ -65,33 +65,29 @@ def refined(
 ) -> tuple[ConvergedFit, FramesSide]:
     """Fits lenses, boards and frames to all corners together; see `chosen`.
 
-    Once these are as the corners ask for, the residuals determine the noise of each view, and all
-    is fitted once more by it.
-
-    Args:
-        side: The frames' side.
-        looks: The corners, and lenses and boards as they are stated.
-        frames: Where the unknown frames are thought to be.
+    With these fitted, the residuals determine the noise of each view, and all is fitted once more
+    with that. `looks` has stated lenses and boards, `frames` the initial poses of unknown frames.
 
     Returns:
         The fit, and the side with the errors of its arms.
     """
     try:
         with diverging():
-            fitted, found = _refined(side, looks, frames, is_plain=False)
+            fitted, new_side = _fit_with_levels(side, looks, frames, is_plain=False)
         levels = fitted.looks.levels
-        sizes = zip(fitted.looks.problems, fitted.seen.sigmas_px, strict=True)
-        if not any(name in levels and are_beyond(levels[name], value) for name, value in sizes):
-            return _doubted(found, fitted), found
+        sigmas = zip(fitted.looks.problems, fitted.seen.sigmas_px, strict=True)
+        if not any(name in levels and are_beyond(levels[name], value) for name, value in sigmas):
+            return _with_lens_priors(new_side, fitted), new_side
     except ConvergenceError:
         pass
-    # A field of many pixels is none: poses run away with it. Lenses are then what they say.
-    plain = dict.fromkeys(looks.problems, LensLevels())
+    # A field of many pixels is wrong: poses diverge with it. The lens models are then used without
+    # fields.
+    no_levels = dict.fromkeys(looks.problems, LensLevels())
     with diverging():
-        return _refined(side, looks.with_levels(plain), frames, is_plain=True)
+        return _fit_with_levels(side, looks.with_levels(no_levels), frames, is_plain=True)
 
 
-def _refined(
+def _fit_with_levels(
     side: FramesSide,
     looks: CameraParameters,
     frames: Mapping[str, FloatArray],
@@ -99,108 +95,106 @@ def _refined(
     is_plain: bool,
 ) -> tuple[ConvergedFit, FramesSide]:
     levels = looks.levels
-    answer, side = _equally_weighed(side, looks, frames)
-    looks = answer.looks.weighed(answer.seen)
-    if any(
-        problem.stack is not answer.looks.problems[name].stack
-        for name, problem in looks.problems.items()
-    ):
-        answer = again(answer, side, answer.moving, looks)
-    elif np.array_equal(answer.moving, looks.first) and not (levels or side.has_errors):
-        return answer, side
+    fitted, side = _fit_with_own_weights(side, looks, frames)
+    looks = fitted.looks.weighed(fitted.seen)
+    stacks = {name: problem.stack for name, problem in fitted.looks.problems.items()}
+    if any(problem.stack is not stacks[name] for name, problem in looks.problems.items()):
+        fitted = again(fitted, side, fitted.moving, looks)
+    elif np.array_equal(fitted.moving, looks.first) and not (levels or side.has_errors):
+        return fitted, side
     if is_plain:
-        return answer, side
-    looks = answer.looks.with_levels(lens_levels(side, answer))
-    return again(answer, side, answer.moving, looks), side
+        return fitted, side
+    looks = fitted.looks.with_levels(lens_levels(side, fitted))
+    return again(fitted, side, fitted.moving, looks), side
 
 
-def _equally_weighed(
+def _fit_with_own_weights(
     side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
 ) -> tuple[ConvergedFit, FramesSide]:
-    """Fits all with the weights that the corners have."""
-    # Errors of an arm are sought once lenses and boards are as the corners ask for. They may have
-    # passed for another lens or board: all is then chosen once more with them free. Errors of any
-    # arm's shape decide which values are free, but are not estimated. Their size is that under the
-    # stated lenses and boards: a board that changes its size with the arm hides a part of it.
+    """Fits all with the corners' own weights."""
+    # Errors of an arm are estimated once lenses and boards are fitted. Before, they may have looked
+    # like another lens or board: the free values are then chosen once more with them free. Errors
+    # of any arm's shape decide which values are free, but are not estimated. Their sigma is that
+    # under the stated lenses and boards: a board whose size changes with the arm hides a part of
+    # it.
     stated = settle(looks, side, looks.first, frames)
     if not looks.levels:
-        levels = lens_levels(side, _sized(side, stated))
+        levels = lens_levels(side, _with_measured_sizes(side, stated))
         stated = again(stated, side, stated.moving, stated.looks.with_levels(levels))
-    answer = chosen(side, stated)
-    found = side.with_errors(answer)
-    if not any(error.is_significant for error in found.errors):
-        return answer, found
+    selected = chosen(side, stated)
+    new_side = side.with_errors(selected)
+    if not any(error.is_significant for error in new_side.errors):
+        return selected, new_side
     under_stated = side.with_errors(stated)
-    erring = (under_stated if under_stated.errors else found).freed(freely=True)
-    answer = chosen(erring, _still_asked_for(erring, stated, answer))
-    estimating = erring.freed(freely=False)
-    if all(error.is_estimated for error in erring.errors):
-        return answer, estimating
-    fitted = settle(answer.looks, estimating, answer.moving, answer.frames, before=answer.seen)
-    found = estimating.with_errors(fitted)
-    # Errors that were less than significant under the stated lenses may be it under these.
-    if [error.is_estimated for error in found.errors] != [
+    freeing = (under_stated if under_stated.errors else new_side).freed(freely=True)
+    selected = chosen(freeing, _still_significant(freeing, stated, selected))
+    estimating = freeing.freed(freely=False)
+    if all(error.is_estimated for error in freeing.errors):
+        return selected, estimating
+    fitted = settle(
+        selected.looks, estimating, selected.moving, selected.frames, before=selected.seen
+    )
+    new_side = estimating.with_errors(fitted)
+    # Errors that were not significant under the stated lenses may be so under these.
+    if [error.is_estimated for error in new_side.errors] != [
         error.is_estimated for error in estimating.errors
     ]:
-        fitted = settle(fitted.looks, found, fitted.moving, fitted.frames, before=fitted.seen)
-    return fitted, found
+        fitted = settle(fitted.looks, new_side, fitted.moving, fitted.frames, before=fitted.seen)
+    return fitted, new_side
 
 
-def _sized(side: Side, fitted: ConvergedFit) -> ConvergedFit:
-    """The fit with boards as large as the motion says, where that is far from what is stated."""
+def _with_measured_sizes(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+    """The fit with board sizes by the motion, where these differ much from the stated ones."""
     looks = fitted.looks
-    away = np.array([_measured(side, fitted, index).scale for index in looks.printed])
-    if not np.any(np.abs(away) > _FAR):
+    scales = np.array([_measured_size(side, fitted, index).scale for index in looks.printed])
+    if not np.any(np.abs(scales) > _NONLINEAR):
         return fitted
     sizes = np.concatenate([looks.scale_of(index) for index in looks.printed])
-    looks = looks.without_prior(sizes.tolist()).with_values(sizes, away)
+    looks = looks.without_prior(sizes.tolist()).with_values(sizes, scales)
     return again(fitted, side, np.union1d(fitted.moving, sizes), looks)
 
 
 def lens_levels(side: Side, fitted: ConvergedFit) -> dict[str, LensLevels]:
-    """Estimates the sizes of what lenses do beyond their models, near a fit.
+    """Estimates the sizes of deviations of lenses from their models, near a fit.
 
-    Lenses and boards are free for that, so that what they have wrong is not taken for it.
+    Lenses and boards are free for that, so that their errors do not count as such deviations.
     """
     levels = fitted.looks.levels
     if any(level.breathing for level in levels.values()):
-        # Linearised far from where there is none, that would be underrated.
-        still = {name: replace(level, breathing=0.0) for name, level in levels.items()}
-        fitted = again(fitted, side, fitted.moving, fitted.looks.with_levels(still))
+        # Linearised at a value far from zero, breathing would be underestimated.
+        no_breathing = {name: replace(level, breathing=0.0) for name, level in levels.items()}
+        fitted = again(fitted, side, fitted.moving, fitted.looks.with_levels(no_breathing))
     looks = fitted.seen.looks
-    # A size of the board is left to the motion: a wrong one would pass for breathing. So would a
+    # The board's size is left to the motion: a wrong one would look like breathing, and so would a
     # focal length.
+    doubted = {name: item for name, item in looks.problems.items() if len(item.doubted)}
     looks = looks.doubting(
-        {
-            name: (lens_prior(problem.scene), problem.doubted[:0])
-            for name, problem in looks.problems.items()
-            if len(problem.doubted)
-        }
+        {name: (lens_prior(item.scene), item.doubted[:0]) for name, item in doubted.items()}
     )
     sizes = [looks.scale_of(index) for index in looks.printed]
     unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
     seen = fitted.seen.freed(np.arange(len(looks.values)), unsized)
-    # What was measured by hand may be wrong, which is looked at later; all may hang on it.
+    # Priors may be wrong, which is tested later; without them, frames may be undetermined.
     problem = side.problem(seen)
     problem = replace(problem, priors=loosened(problem.priors))
-    first = np.append(looks.values, np.zeros(seen.by_field.shape[2]))
-    state = State(fitted.fit.state.edges, np.concatenate([first, fitted.others]))
+    values = np.append(looks.values, np.zeros(seen.by_field.shape[2]))
+    state = State(fitted.fit.state.edges, np.concatenate([values, fitted.others]))
     return {
         name: estimate_levels(seen, problem, side.rows(seen), state, fitted.fit.noise, name)
         for name in looks.problems
     }
 
 
-def _doubted(side: Side, fitted: ConvergedFit) -> ConvergedFit:
-    """Fits given lenses that were held once more, as well known as corners and motion have them.
+def _with_lens_priors(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+    """Refits with priors on given lenses that were held, whose sigmas corners and motion determine.
 
-    A lens that is given may be off by less than shows beyond chance. Where its focal length follows
-    from the motion alone, that moves a camera by many of its sigmas. The focal length and the
-    centre get a prior each, whose size is found by restricted likelihood. They move where the data
-    know them better than that, and count where they do not.
+    A given lens may have errors that are not significant. Where its focal length follows from the
+    motion alone, that moves a camera by many of its sigmas. The focal length and the centre get a
+    prior each, whose sigma is estimated by restricted likelihood (REML). They are freed where the
+    data determine them better than the prior, and count in the covariance where not.
     """
     looks, moving = fitted.looks, [fitted.moving]
-    # A board that is larger by less than it is known to looks like another focal length.
+    # A size error within the board's sigma looks like another focal length.
     scales = np.array(
         [value for board in looks.printed for value in looks.scale_of(board)], dtype=int
     )
@@ -224,131 +218,128 @@ def _doubted(side: Side, fitted: ConvergedFit) -> ConvergedFit:
         focal_px, sigma = looks.values[lens[:2]], lens_prior(problem.scene)
         step, covariance = scores.asked_for(np.append(lens[:4], scales), fitted.moving)
         step, covariance = step[:4], covariance[:4, :4]
-        # Both focal lengths have one factor: what parts them shows, and is not in doubt.
+        # Both focal lengths have one factor: their ratio is determined well, and not in doubt.
         factors = np.zeros((4, 3))
         factors[:2, 0], factors[2, 1], factors[3, 2] = focal_px, 1.0, 1.0
         information = covariance_from(covariance)
-        open_ = covariance_from(factors.T @ information @ factors)
-        asked = open_ @ (factors.T @ information @ step)
-        counting = [lens[:0]]
-        for of, places, unit in ((slice(1), slice(2), focal_px), (slice(1, 3), slice(2, 4), 1.0)):
-            known = likely_sigma(asked[of], open_[of, of])
-            if known > 0.0:
-                sigma[places] = unit * known
-                counting.append(problem.lens[places])
-            if known**2 > np.diag(open_)[of].mean():
+        factor_covariance = covariance_from(factors.T @ information @ factors)
+        factor_steps = factor_covariance @ (factors.T @ information @ step)
+        in_covariance = [lens[:0]]
+        for axes, places, unit in ((slice(1), slice(2), focal_px), (slice(1, 3), slice(2, 4), 1.0)):
+            sigma_factor = likely_sigma(factor_steps[axes], factor_covariance[axes, axes])
+            if sigma_factor > 0.0:
+                sigma[places] = unit * sigma_factor
+                in_covariance.append(problem.lens[places])
+            if sigma_factor**2 > np.diag(factor_covariance)[axes].mean():
                 moving += [lens[places], scales]
-        doubts[name] = sigma, np.concatenate(counting)
+        doubts[name] = sigma, np.concatenate(in_covariance)
     if not any(len(places) for _, places in doubts.values()):
         return fitted
-    together = np.unique(np.concatenate(moving))
-    return _contesting(side, again(fitted, side, together, looks.doubting(doubts)))
+    free = np.unique(np.concatenate(moving))
+    return _with_contested_lenses(side, again(fitted, side, free, looks.doubting(doubts)))
 
 
-def _still_asked_for(erring: Side, stated: ConvergedFit, answer: ConvergedFit) -> ConvergedFit:
-    """The fit with errors of arms free, and of what was set free before what is still asked for."""
-    # Before, noise was as large as these errors: what they had passed for is as stated again, and
-    # what really is another is clear now.
-    wide = settle(answer.looks, erring, answer.moving, answer.frames, before=answer.seen)
-    looks = answer.looks
-    freed = [looks.shape_of(index) for index in looks.printed] + [
+def _still_significant(side: Side, stated: ConvergedFit, fitted: ConvergedFit) -> ConvergedFit:
+    """The fit with arm errors and with those freed values that are still significant."""
+    # Before, these errors were part of the noise: values that had absorbed them return to the
+    # stated ones, and real deviations are clear now.
+    refit = settle(fitted.looks, side, fitted.moving, fitted.frames, before=fitted.seen)
+    looks = fitted.looks
+    groups = [looks.shape_of(index) for index in looks.printed] + [
         looks.lens_of(problem) for problem in looks.problems
     ]
     kept = [
         array
-        for array in freed
-        if np.isin(array, answer.moving).all()
+        for array in groups
+        if np.isin(array, fitted.moving).all()
         and not np.isin(array, stated.moving).any()
-        and moved_mahalanobis_sq(wide, array) > chance_limit(len(array))
+        and moved_mahalanobis_sq(refit, array) > chance_limit(len(array))
     ]
-    sizes, wide = _still_other_sizes(erring, wide)
+    sizes, refit = _significant_sizes(side, refit)
     places = np.concatenate([stated.moving, *kept, *sizes])
-    unstated = places[np.isinf(looks.prior_sigma[places])]
-    restated = stated.looks.without_prior(unstated.tolist())
-    restated = restated.with_values(places, wide.looks.values[places])
-    return settle(restated, erring, np.unique(places), answer.frames)
+    without_prior = places[np.isinf(looks.prior_sigma[places])]
+    restated = stated.looks.without_prior(without_prior.tolist())
+    restated = restated.with_values(places, refit.looks.values[places])
+    return settle(restated, side, np.unique(places), fitted.frames)
 
 
-def _still_other_sizes(erring: Side, wide: ConvergedFit) -> tuple[list[IntArray], ConvergedFit]:
-    """The scales of boards that are others than stated, and the fit with these alone free."""
-    # What all boards have in common, links of arms may have, too, and free together none is clear:
-    # the least clear one is as stated, and the rest are measured anew beside it.
-    looks = wide.looks
-    free = [index for index in looks.printed if np.isin(looks.scale_of(index), wide.moving).all()]
-    while free:
-        measured = [measured_scale(erring, wide, board) for board in free]
+def _significant_sizes(side: Side, fit: ConvergedFit) -> tuple[list[IntArray], ConvergedFit]:
+    """The board scales that still differ from the stated ones, and the fit with these free."""
+    # An error common to all boards looks like one of the arms' links, and with all free together
+    # none is significant: the least significant one is reset, and the others are measured again.
+    looks = fit.looks
+    boards = [board for board in looks.printed if np.isin(looks.scale_of(board), fit.moving).all()]
+    while boards:
+        measured = [measured_scale(side, fit, board) for board in boards]
         least = min(measured, key=lambda value: abs(value.scale) / value.sigma)
         if least.is_another:
             break
-        free.remove(least.board)
+        boards.remove(least.board)
         place = looks.scale_of(least.board)
-        held = wide.looks.with_values(place, looks.stated[place])
-        wide = again(wide, erring, np.setdiff1d(wide.moving, place), held)
-    return [looks.scale_of(index) for index in free], wide
+        restated = fit.looks.with_values(place, looks.stated[place])
+        fit = again(fit, side, np.setdiff1d(fit.moving, place), restated)
+    return [looks.scale_of(index) for index in boards], fit
 
 
-def _measured(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScale:
-    """Measures a board's size by the robots' motion, also where the fit is not linear in it."""
-    # A view's line of sight is known much better than its distance. Where views and chain disagree
-    # by millimetres, because a board is far off, their lines of sight do, too, and a size that is
-    # linear about the views' poses is held by that. The costs of fits with other sizes say more.
-    found, looks = measured_scale(side, fitted, board), fitted.looks
+def _measured_size(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScale:
+    """Measures a board's size by the robots' motion, also beyond the linear range."""
+    # A view's line of sight is determined much better than its distance. Where views and chain
+    # disagree by millimetres, because a board's size is wrong, their lines of sight do, too, and
+    # restrain a size that is linear about the views' poses. The costs of fits with other sizes do
+    # not have this bias.
+    linear, looks = measured_scale(side, fitted, board), fitted.looks
     noise, place = fitted.fit.noise, looks.scale_of(board)
-    if found.is_another or not any(robot[1] > _ROUGH_M for robot in noise.robots):
-        return found
+    if linear.is_another or not any(robot[1] > _ROUGH_M for robot in noise.robots):
+        return linear
 
-    def held(scale: float) -> ConvergedFit:
+    def refit(scale: float) -> ConvergedFit:
         value = looks.values[place] + scale
         return again(fitted, side, fitted.moving, looks.with_values(place, value))
 
-    below, here, above = (
+    below, centre, above = (
         equations_and_cost(item.problem, item.fit.state, noise)[2]
-        for item in (held(-_TRIED), fitted, held(_TRIED))
+        for item in (refit(-_STEP), fitted, refit(_STEP))
     )
-    bend = below + above - 2.0 * here
-    if bend <= 0.0:
-        return found
-    least = 0.5 * _TRIED * (below - above) / bend
-    tried = held(float(np.clip(least, -_FARTHEST, _FARTHEST)))
-    less = tried.fit.noise.robots[:, 1] < _MUCH_LESS * noise.robots[:, 1]
-    return measured_scale(side, tried, board) if less.any() else found
+    curvature = below + above - 2.0 * centre
+    if curvature <= 0.0:
+        return linear
+    least = 0.5 * _STEP * (below - above) / curvature
+    refitted = refit(float(np.clip(least, -_FARTHEST, _FARTHEST)))
+    is_reduced = refitted.fit.noise.robots[:, 1] < _NOISE_RATIO * noise.robots[:, 1]
+    return measured_scale(side, refitted, board) if is_reduced.any() else linear
 
 
 def chosen(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
-    """Sets free what the data speak for.
+    """Frees the values that the data support, beside those that are free from the start.
 
-    The boards' bends, given intrinsics together with them, and the boards' scales are set free
-    where corners and chains speak for it with more than noise can say, the frames stay determined,
-    and views that are left out do not speak against it. What is held although the corners speak
-    against it, and a scale that is held, count by their priors in the covariance.
-
-    Args:
-        side: The frames' side.
-        fitted: The fit with what is free from the start.
+    The boards' bends, given intrinsics together with them, and the boards' scales are freed where
+    corners and chains support it significantly, the frames stay determined, and held-out views are
+    not predicted worse. Held values that the corners contradict, and a held scale, count by their
+    priors in the covariance.
     """
-    answer = fitted
-    for moving in _shapes(side, fitted):
-        wider = _freed(side, moving, fitted)
-        if _is_determined(wider, fitted) and not _predicts_worse(wider, fitted):
-            answer = wider
+    best = fitted
+    for moving in _shape_sets(side, fitted):
+        freed = _fit_freed(side, moving, fitted)
+        if _is_determined(freed, fitted) and not _predicts_worse(freed, fitted):
+            best = freed
             break
-    resized = _resized(side, _contesting(side, answer))
-    if np.array_equal(resized.moving, answer.moving):
+    resized = _with_freed_scales(side, _with_contested_lenses(side, best))
+    if np.array_equal(resized.moving, best.moving):
         return resized
-    # A board of another size speaks against lenses, too.
-    return _contesting(side, resized)
+    # A board of another size may contradict lenses, too.
+    return _with_contested_lenses(side, resized)
 
 
-def _contesting(side: Side, answer: ConvergedFit) -> ConvergedFit:
-    """The fit with the uncertainty of intrinsics that are held although corners contradict them."""
-    contested = _contested(side, answer)
-    if contested == [name for name, problem in answer.looks.problems.items() if problem.contested]:
-        return answer
-    return again(answer, side, answer.moving, answer.looks.contesting(contested))
+def _with_contested_lenses(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+    """The fit with the uncertainty of held intrinsics that corners contradict."""
+    contested = _contested_cameras(side, fitted)
+    if contested == [name for name, problem in fitted.looks.problems.items() if problem.contested]:
+        return fitted
+    return again(fitted, side, fitted.moving, fitted.looks.contesting(contested))
 
 
-def _freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
-    """Fits with more values free; a confident wrong prior is worse than none."""
+def _fit_freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
+    """Fits with more values free, without priors of lenses that they contradict."""
     wider = again(fitted, side, moving)
     looks = wider.looks
     wrong = [
@@ -361,85 +352,85 @@ def _freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
     return again(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
 
 
-def _resized(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
-    """Sets the boards' scales free where the robot measures others than are stated."""
-    # One after the other: a board that is off misleads about the others, too, and about the arm's
-    # errors, beside which a size is clear or not.
-    answer, others = fitted, list[MeasuredScale]()
+def _with_freed_scales(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
+    """Frees the boards' scales where the robot measures others than are stated."""
+    # One after the other: a wrong size biases the others, too, and the arm's errors, beside which a
+    # size is tested.
+    result, sizes = fitted, list[MeasuredScale]()
     for _ in fitted.looks.printed:
-        other = _wrongly_sized(side, answer)
-        if other is None:
+        size = _most_wrong_size(side, result)
+        if size is None:
             break
-        resized = _sized_as(side, answer, other)
-        if not _is_determined(resized, answer):
+        resized = _with_scale(side, result, size)
+        if not _is_determined(resized, result):
             break
-        answer = resized
-        others.append(other)
-    if not (others and side.poses_alone):
-        return answer
-    covariance = side.covariance_by_posture(answer)
-    clear = [other for other in others if _is_clear(side, answer, other, covariance)]
-    if len(clear) < len(others):
-        answer = fitted
-        for other in clear:
-            answer = _sized_as(side, answer, other)
-    return answer
+        result = resized
+        sizes.append(size)
+    if not (sizes and side.arms_without_joints):
+        return result
+    covariance = side.covariance_with_pose_errors(result)
+    significant = [size for size in sizes if _is_clear(side, result, size, covariance)]
+    if len(significant) < len(sizes):
+        result = fitted
+        for size in significant:
+            result = _with_scale(side, result, size)
+    return result
 
 
-def _sized_as(side: FramesSide, answer: ConvergedFit, other: MeasuredScale) -> ConvergedFit:
-    """The fit with the scale of a board free, from where it was measured."""
-    place = answer.looks.scale_of(other.board)
-    looks = answer.looks.with_values(place, np.array([other.scale]))
-    if other.contradicts:
+def _with_scale(side: FramesSide, fitted: ConvergedFit, size: MeasuredScale) -> ConvergedFit:
+    """The fit with the scale of a board free, from its measured value."""
+    place = fitted.looks.scale_of(size.board)
+    looks = fitted.looks.with_values(place, np.array([size.scale]))
+    if size.contradicts:
         looks = looks.without_prior(place.tolist())
-    return again(answer, side, np.union1d(answer.moving, place), looks)
+    return again(fitted, side, np.union1d(fitted.moving, place), looks)
 
 
-def _wrongly_sized(side: FramesSide, answer: ConvergedFit) -> MeasuredScale | None:
-    """The board whose size is held and farthest from what the robot measures, if any is beyond."""
-    looks = answer.looks
-    held = [index for index in looks.printed if looks.scale_of(index)[0] not in answer.moving]
-    measured = [_measured(side, answer, board) for board in held]
-    other = [scale for scale in measured if _is_wrong(side, scale)]
-    return max(other, key=lambda value: abs(value.scale) / value.sigma, default=None)
+def _most_wrong_size(side: FramesSide, fitted: ConvergedFit) -> MeasuredScale | None:
+    """The held board scale that differs most significantly from the stated one, or None."""
+    looks = fitted.looks
+    held = [index for index in looks.printed if looks.scale_of(index)[0] not in fitted.moving]
+    measured = [_measured_size(side, fitted, board) for board in held]
+    wrong = [size for size in measured if _is_wrong(side, size)]
+    return max(wrong, key=lambda value: abs(value.scale) / value.sigma, default=None)
 
 
-def _is_wrong(side: FramesSide, scale: MeasuredScale) -> bool:
-    # An arm whose links may all be too long is hard to distinguish from a board that is too large.
-    return scale.contradicts if side.has_errors else scale.is_another
+def _is_wrong(side: FramesSide, size: MeasuredScale) -> bool:
+    # An arm whose links are all too long is hard to distinguish from a board that is too large.
+    return size.contradicts if side.has_errors else size.is_another
 
 
 def _is_clear(
-    side: FramesSide, resized: ConvergedFit, other: MeasuredScale, covariance: FloatArray
+    side: FramesSide, resized: ConvergedFit, size: MeasuredScale, covariance: FloatArray
 ) -> bool:
-    """Whether a board is still of another size beside errors of arms without joint angles.
+    """Whether a board's size is still significant beside errors of arms without joint angles.
 
-    Such errors follow the posture and pass for a size, whose sigma by white noise is a small part
-    of what it is.
+    Such errors depend on the posture and look like a size, whose sigma by white noise is far too
+    small.
     """
     looks = resized.looks
-    (place,) = looks.scale_of(other.board)
-    at = resized.columns.start + int(np.searchsorted(resized.seen.free, place))
-    # What was stated is taken away again.
-    known = looks.prior_sigma[place] ** -2.0
-    measured = 1.0 / covariance[at, at] - known
-    if measured <= 0.0:
+    (place,) = looks.scale_of(size.board)
+    column = resized.columns.start + int(np.searchsorted(resized.seen.free, place))
+    # Removes the prior's information.
+    prior_information = looks.prior_sigma[place] ** -2.0
+    information = 1.0 / covariance[column, column] - prior_information
+    if information <= 0.0:
         return False
-    scale, sigma = looks.values[place] * (1.0 + known / measured), measured**-0.5
-    beside = replace(other, scale=float(scale), sigma=max(float(sigma), other.sigma))
-    return _is_wrong(side, beside)
+    scale, sigma = looks.values[place] * (1.0 + prior_information / information), information**-0.5
+    tested = replace(size, scale=float(scale), sigma=max(float(sigma), size.sigma))
+    return _is_wrong(side, tested)
 
 
 def _is_determined(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
-    """Whether the views still determine all frames to what is accepted, errors of arms aside."""
-    after, before = _worst(wider), _worst(fitted)
+    """Whether the views still determine all frames acceptably, errors of arms aside."""
+    after, before = _largest_sigmas(wider), _largest_sigmas(fitted)
     limits = np.tile([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], len(after) // 2)
-    # What was not determined before is no fault of lens and board.
+    # Frames that were undetermined before are not due to lens and board.
     return bool(np.all((after < limits) | (before >= limits)))
 
 
-def _worst(fitted: ConvergedFit) -> FloatArray:
-    """(2 e,) the largest sigma of each unknown frame's rotation [rad] and place [m]."""
+def _largest_sigmas(fitted: ConvergedFit) -> FloatArray:
+    """(2 e,) the largest sigma of each unknown frame's rotation [rad] and position [m]."""
     looks, fit = [effect.determined for effect in fitted.problem.effects[:1]], fitted.fit
     problem = fitted.problem.with_effects(looks)
     values = fit.state.values[: sum(map(len, looks))]
@@ -448,9 +439,9 @@ def _worst(fitted: ConvergedFit) -> FloatArray:
     return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(place, place)])[-1] for place in places])
 
 
-def _contested(side: Side, answer: ConvergedFit) -> list[str]:
-    """Cameras whose intrinsics are held, and explain the corners worse than chance does."""
-    looks, moving = answer.looks, answer.moving
+def _contested_cameras(side: Side, fitted: ConvergedFit) -> list[str]:
+    """Cameras with held intrinsics that the corners contradict."""
+    looks, moving = fitted.looks, fitted.moving
     held = [
         problem for problem in looks.problems if not np.isin(looks.lens_of(problem), moving).all()
     ]
@@ -458,7 +449,7 @@ def _contested(side: Side, answer: ConvergedFit) -> list[str]:
         return []
     bent = np.union1d(moving, looks.shape)
     lenses = {name: looks.lens_of(name) for name in held}
-    scores = Scores.of(side, answer, np.concatenate([bent, *lenses.values()]))
+    scores = Scores.of(side, fitted, np.concatenate([bent, *lenses.values()]))
     least = scores.gain(bent)
     return [
         name
@@ -470,12 +461,9 @@ def _contested(side: Side, answer: ConvergedFit) -> list[str]:
 def remade(
     views: Sequence[ViewPoses], free: LensBoardParameters, sigma_px: float
 ) -> tuple[ViewPoses, ...]:
-    """Makes the poses of views anew that had no part in the fit.
+    """Recomputes the poses of views that are not in the fit, with the fitted lens and board.
 
-    Args:
-        views: The views, each with its one pose and its corners.
-        free: Lens and board.
-        sigma_px: Noise of a corner's coordinate [px].
+    Each view has its one pose and its corners; `sigma_px` is the noise of a corner's coordinate.
     """
     if not views:
         return ()
@@ -484,16 +472,16 @@ def remade(
     with one_blas_thread():
         compressed = compress(stack, free.basis, free.appearance, starts)
     return tuple(
-        _remade(view, compressed, free.columns, sigma_px, at) for at, view in enumerate(views)
+        _remade_view(view, compressed, free.columns, sigma_px, at) for at, view in enumerate(views)
     )
 
 
-def _shapes(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
-    """The bends, with given intrinsics or without, where they explain significantly more."""
-    looks, now = fitted.looks, fitted.moving
+def _shape_sets(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
+    """Sets of values to free: the bends, with given intrinsics or without, where significant."""
+    looks, moving = fitted.looks, fitted.moving
     if not looks.has_spare_corners:
         return
-    bent = np.union1d(now, looks.shape)
+    bent = np.union1d(moving, looks.shape)
     stated = {
         name: np.setdiff1d(looks.lens_of(name), bent)
         for name, problem in looks.problems.items()
@@ -506,20 +494,20 @@ def _shapes(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
         for name, lens in stated.items()
         if len(lens)
     }
-    # The one that is asked for least is done without first.
-    asked = sorted(
+    # The least significant one is dropped first.
+    significant = sorted(
         (name for name, gain in gains.items() if gain > 0.0), key=lambda index: -gains[index]
     )
-    while asked:
-        yield np.unique(np.concatenate([bent, *(stated[name] for name in asked)]))
-        asked.pop()
-    if len(bent) > len(now) and gain_bent > chance_limit(len(bent) - len(now)):
+    while significant:
+        yield np.unique(np.concatenate([bent, *(stated[name] for name in significant)]))
+        significant.pop()
+    if len(bent) > len(moving) and gain_bent > chance_limit(len(bent) - len(moving)):
         yield bent
 
 
 def _predicts_worse(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
-    """Whether views that are left out are predicted worse, in position and in rotation."""
-    # Intrinsics whose sigma is stated are free to move within that, whatever they predict.
+    """Whether held-out views are predicted worse, in position and in rotation."""
+    # Intrinsics with a stated sigma are free to move within that in any case.
     looks = wider.looks
     freed = [
         problem.scene
@@ -540,7 +528,7 @@ def _corners(views: Sequence[ViewPoses]) -> dict[int, Corners]:
     return {view.view: view.corners for view in views if view.corners is not None}
 
 
-def _remade(
+def _remade_view(
     view: ViewPoses, compressed: Compressed, columns: IntArray, sigma_px: float, at: int
 ) -> ViewPoses:
     covariance = floored_sigma_px(sigma_px) ** 2 * covariance_from(compressed.information[at])

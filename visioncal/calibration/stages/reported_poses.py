@@ -1,4 +1,4 @@
-"""Where the robot says that its flange was: poses as reported, or joints through the model."""
+"""Flange poses as the robot reports them, or by the model from its joint angles."""
 
 from collections import defaultdict
 from collections.abc import Collection, Mapping
@@ -18,29 +18,30 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.table import reported_matrices
 
-# The robot stands still while a stop's images are taken; controllers report it with some noise.
+# Largest difference of poses within a stop: the robot is standing still, but is reported with
+# noise.
 _ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
-# No arm reaches so far [m]: beside rows that are nearer, one that is a thousand times as far, to
-# within this factor, is in millimetres.
+# Beyond any arm's reach [m]: beside nearer rows, one that is a thousand times as far, to within
+# this factor, is in millimetres.
 _OUT_OF_REACH_M, _ALIKE = 20.0, 5.0
 
 
 def moved_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
-    """Poses (m, 4, 4) of what is on the flange of one model, on that of another."""
+    """Converts poses (m, 4, 4) of a thing on one model's flange to those on another's."""
     on_flange = invert(before.base_from_flange(q)) @ poses
     return np.asarray(after.base_from_flange(q) @ on_flange)
 
 
 @dataclass(frozen=True, eq=False)
 class Reported:
-    """What a robot's rows report of it.
+    """Poses and joints that a robot's rows report.
 
     Attributes:
         base_from_flange: (4, 4) by view.
         rejections: Views without a pose.
-        warnings: What does not fit together.
-        notes: What is good to know of it.
-        matched: The joints beside the poses; None without a model.
+        warnings: Contradictions.
+        notes: Remarks.
+        matched: The joints matched with the poses; None without a model.
     """
 
     base_from_flange: Mapping[int, FloatArray]
@@ -54,17 +55,17 @@ class Reported:
         """(n,) joint angles by view [rad]; None where a view with a pose lacks them."""
         if self.matched is None or not self.base_from_flange:
             return None
-        there = self.matched.joints_rad
-        known = {view: there[view] for view in self.base_from_flange if view in there}
+        joints = self.matched.joints_rad
+        known = {view: joints[view] for view in self.base_from_flange if view in joints}
         return known if len(known) == len(self.base_from_flange) else None
 
     def without(self, views: Collection[int]) -> Self:
-        """Leaves out some views."""
+        """Removes some views."""
         kept = {key: pose for key, pose in self.base_from_flange.items() if key not in views}
         return replace(self, base_from_flange=kept)
 
     def with_zero(self, zero: JointReading) -> Self:
-        """Takes a joint's zero for where it is, and the poses for those of the arm then."""
+        """Corrects a joint's zero, and the poses accordingly."""
         before, joints = self.matched, self.joints_rad
         if before is None or joints is None:
             return self
@@ -77,20 +78,13 @@ class Reported:
 
 
 def reported_poses(session: Session, robot: Robot | None) -> Reported:
-    """Collects `base_from_flange` of each view.
+    """Collects `base_from_flange` of each view, and matches joints with poses.
 
-    A reported pose comes first; where a view has joints only, the robot's model gives the pose.
-
-    Args:
-        session: The session.
-        robot: Its nominal robot, where it names a known one.
-
-    Returns:
-        The poses, and whether joints and poses belong together.
+    Reported poses are preferred; for a view with joints only, the robot's model gives the pose.
 
     Raises:
-        DataError: Joints are all there is, and they are not as many as the robot's; or rows that
-            are said to be of one stop lie apart.
+        DataError: There are only joints, and they are not as many as the robot's; or rows of one
+            declared stop have different poses.
     """
     matched = None if robot is None else match_joints(session.views, robot)
     rejections = []
@@ -114,7 +108,7 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
         else:
             poses[view.number] = matched.pose(joints)
     if not session.is_network:
-        # Of a whole cell, such rows are of a state of their own.
+        # In a whole cell, such rows are separate states.
         _check_stops(session, poses)
     remarks = ((), ()) if matched is None else (matched.warnings, matched.notes)
     return Reported(poses, tuple(rejections), *remarks, matched)
@@ -122,14 +116,14 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
 
 def _in_millimetres(poses: Mapping[int, FloatArray]) -> set[int]:
     """The views whose position is a thousand times as far as those of others."""
-    away_m = {view: float(np.linalg.norm(pose[:3, 3])) for view, pose in poses.items()}
-    near = [value for value in away_m.values() if value < _OUT_OF_REACH_M]
+    distances_m = {view: float(np.linalg.norm(pose[:3, 3])) for view, pose in poses.items()}
+    near = [value for value in distances_m.values() if value < _OUT_OF_REACH_M]
     if not near:
         return set()
     low, high = min(near) / _ALIKE, max(near) * _ALIKE
     return {
         view
-        for view, value in away_m.items()
+        for view, value in distances_m.items()
         if value >= _OUT_OF_REACH_M and low <= 1e-3 * value <= high
     }
 
@@ -146,14 +140,14 @@ def _no_pose(joints: FloatArray | None, matched: Matched | None) -> str:
 
 
 def _check_stops(session: Session, poses: Mapping[int, FloatArray]) -> None:
-    """Refuses declared stops whose rows lie apart: one pose of the robot would stand for all."""
+    """Refuses declared stops whose rows differ: one pose of the robot is used for all."""
     rows = defaultdict(list)
     for view in session.views:
         if view.stop is not None and view.number in poses:
             rows[view.stop].append(view.number)
     for stop, views in rows.items():
-        away = [pose_difference(poses[views[0]], poses[view]) for view in views]
-        mm, deg = np.max(away, axis=0)
+        differences = [pose_difference(poses[views[0]], poses[view]) for view in views]
+        mm, deg = np.max(differences, axis=0)
         if mm > _ONE_STOP_MM or deg > _ONE_STOP_DEG:
             named = ", ".join(map(str, views))
             raise DataError(

@@ -1,7 +1,8 @@
-"""Points of a rig that are not where its table has them: exchanged numbers, wrong coordinates.
+"""Detection of wrong points of a rig: exchanged numbers, wrong coordinates in its table.
 
-A pose by most of a view's points (Fischler and Bolles 1981) shows the others where they are. What
-many views place alike, and elsewhere than the table, is wrong in the table or in the numbers.
+A pose by most of a view's points (Fischler and Bolles 1981) shows where the others are. A point
+that many views place consistently, but not where the table has it, is wrong in the table or
+numbered wrongly.
 """
 
 from collections import defaultdict
@@ -24,174 +25,174 @@ from visioncal.vision.targets import first_corners
 
 T = TypeVar("T", bound=Observed)
 
-# Points of a view below which the majority says nothing; what share of them must agree, and how
-# many at least: a pose takes four, and one more to be sure of them.
+# Fewest points of a view for a majority; the share of them that must agree, and the fewest: a pose
+# takes four, and a fifth verifies it.
 _FEWEST, _MOST_AGREE, _LEAST_AGREE = 6, 0.6, 5
-# Views that must show a point, and the share of these that must place it elsewhere.
+# Fewest views of a point, and the share of these in which it must be an outlier.
 _VIEWS, _SHARE = 3, 0.8
-# A point is elsewhere beyond so many pixels, and so many times what the others deviate by: tables
-# that were measured by hand deviate by a pixel, a lens that is not quite right by as much.
-_ELSEWHERE_PX, _TIMES = 3.0, 8.0
-# ... and beyond so many times the standard deviation that its table states.
+# Outlier points deviate by more than this [px], and this many times the others' median: tables that
+# were measured by hand deviate by a pixel, and a slightly wrong lens as well. A wrong point also
+# differs from its table by this many stated sigmas.
+_OUTLIER_PX, _TIMES = 3.0, 8.0
 _SIGMAS = 6.0
 _TRIALS, _SURE = 300, 0.9999
 
 
 @dataclass(frozen=True, eq=False)
 class _RigView:
-    """One view of a rig, by the pose that most of its points agree on.
+    """One view of a rig, with the pose that most of its points agree on.
 
     Attributes:
-        at: (n,) which of the rig's points were seen.
+        at: (n,) indices of the seen points in the table.
         rays: (n, 3) rays in the camera, z = 1.
         cam_from_target: (4, 4).
-        agrees: (n,) whether a point is where the pose has it.
-        focal_px: Pixels a unit of x and y of a ray.
+        agrees: (n,) inlier points.
+        focal_px: Focal length: pixels per unit of x and y of a ray.
     """
 
-    at: IntArray
+    indices: IntArray
     rays: FloatArray
     cam_from_target: FloatArray
-    agrees: Mask
+    inliers: Mask
     focal_px: float
 
 
-def leave_out_wrong_points(seen: T) -> T:
-    """Names the points of rigs that are not where their tables have them, and leaves them out."""
-    targets = tuple(seen.session.boards.values())
+def leave_out_wrong_points(observed: T) -> T:
+    """Reports and removes points of rigs that are not where their tables have them."""
+    targets = tuple(observed.session.boards.values())
     for first, (name, target) in zip(
-        first_corners(targets).tolist(), seen.session.boards.items(), strict=True
+        first_corners(targets).tolist(), observed.session.boards.items(), strict=True
     ):
         if target.kind != "points":
             continue
-        places = _places_elsewhere(seen, target, first)
-        if not places:
+        positions = _wrong_points(observed, target, first)
+        if not positions:
             continue
-        called = name if len(targets) > 1 else target.name
-        seen = seen.noting((), (_said(target, places, called),))
-        gone = np.array([first + place for place in places])
-        for frame, look in seen.cameras.items():
+        label = name if len(targets) > 1 else target.name
+        observed = observed.noting((), (_finding(target, positions, label),))
+        wrong = np.array([first + point for point in positions])
+        for frame, look in observed.cameras.items():
             kept = {
-                view: view_corners.take(~np.isin(view_corners.ids, gone))
+                view: view_corners.take(~np.isin(view_corners.ids, wrong))
                 for view, view_corners in look.corners.items()
             }
-            seen = seen.with_camera(frame, replace(look, corners=kept))
-    return seen
+            observed = observed.with_camera(frame, replace(look, corners=kept))
+    return observed
 
 
-def _places_elsewhere(seen: Observed, target: Target, first: int) -> dict[int, FloatArray]:
-    """Where points are in the rig's frame [m], by their places in the table: those elsewhere."""
+def _wrong_points(observed: Observed, target: Target, first: int) -> dict[int, FloatArray]:
+    """Measured positions of wrong points in the rig's frame [m], by index in the table."""
     table = np.array(target.points_m)
-    looks: list[_RigView] = []
-    for look in seen.cameras.values():
+    rig_views: list[_RigView] = []
+    for look in observed.cameras.values():
         if look.lens is None:
             continue
         for view, corners in look.corners.items():
-            mine = (corners.ids >= first) & (corners.ids < first + len(table))
-            if view not in seen.reasons and view not in seen.held_back and mine.any():
-                at = corners.ids[mine] - first
-                looks += _looks(at, corners.px[mine], table, look.lens.camera)
-    return _agreed(looks, table, target.point_sigmas_m)
+            of_rig = (corners.ids >= first) & (corners.ids < first + len(table))
+            if view not in observed.reasons and view not in observed.held_back and of_rig.any():
+                indices = corners.ids[of_rig] - first
+                rig_views += _rig_views(indices, corners.px[of_rig], table, look.lens.camera)
+    return _consistent_positions(rig_views, table, target.point_sigmas_m)
 
 
-def _agreed(
-    looks: Sequence[_RigView], table: FloatArray, sigmas_m: Sequence[float]
+def _consistent_positions(
+    rig_views: Sequence[_RigView], table: FloatArray, sigmas_m: Sequence[float]
 ) -> dict[int, FloatArray]:
-    """What most views place alike, and elsewhere than the table."""
+    """Positions that most views agree on and that differ from the table."""
     by_point: dict[int, list[tuple[_RigView, int]]] = defaultdict(list)
-    for look in looks:
-        for row, point in enumerate(look.at.tolist()):
-            by_point[point].append((look, row))
-    places = {}
+    for rig_view in rig_views:
+        for row, point in enumerate(rig_view.indices.tolist()):
+            by_point[point].append((rig_view, row))
+    positions = {}
     for point, rows in sorted(by_point.items()):
-        off = [not look.agrees[row] for look, row in rows]
-        if len(rows) < _VIEWS or np.mean(off) < _SHARE:
+        is_outlier = [not rig_view.inliers[row] for rig_view, row in rows]
+        if len(rows) < _VIEWS or np.mean(is_outlier) < _SHARE:
             continue
-        place, left_px = _triangulated(rows)
-        moved = float(np.linalg.norm(place - table[point]))
-        if left_px < _ELSEWHERE_PX and moved > _SIGMAS * (sigmas_m[point] if sigmas_m else 0.0):
-            places[point] = place
-    # Where more than the rest is elsewhere, it is not known which are.
-    return places if len(places) <= (1.0 - _MOST_AGREE) * len(by_point) else {}
+        position, left_px = _triangulated(rows)
+        shift_m = float(np.linalg.norm(position - table[point]))
+        if left_px < _OUTLIER_PX and shift_m > _SIGMAS * (sigmas_m[point] if sigmas_m else 0.0):
+            positions[point] = position
+    # With more points elsewhere than not, it is unknown which are wrong.
+    return positions if len(positions) <= (1.0 - _MOST_AGREE) * len(by_point) else {}
 
 
-def _looks(at: IntArray, px: FloatArray, table: FloatArray, camera: Camera) -> Iterator[_RigView]:
-    """The view by the pose that most of its points agree on; nothing where there is none."""
+def _rig_views(
+    indices: IntArray, px: FloatArray, table: FloatArray, camera: Camera
+) -> Iterator[_RigView]:
+    """The view with the pose that most of its points agree on; empty without one."""
     plane = normalise(camera, px)
     usable = np.isfinite(plane).all(axis=1)
-    at, plane = at[usable], plane[usable]
-    points = table[at]
-    if len(at) < _FEWEST or not determines_pose(points):
+    indices, plane = indices[usable], plane[usable]
+    points = table[indices]
+    if len(indices) < _FEWEST or not determines_pose(points):
         return
     focal = float(np.mean(camera.matrix[:2]))
-    found, turn, shift, inliers = cv2.solvePnPRansac(
-        points, plane, np.eye(3), None, None, None, False, _TRIALS, _ELSEWHERE_PX / focal, _SURE,
+    is_solved, turn, shift, agreeing = cv2.solvePnPRansac(
+        points, plane, np.eye(3), None, None, None, False, _TRIALS, _OUTLIER_PX / focal, _SURE,
         flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
-    least = max(_LEAST_AGREE, int(np.ceil(_MOST_AGREE * len(at))))
-    if not found or inliers is None or len(inliers) < least:
+    least = max(_LEAST_AGREE, int(np.ceil(_MOST_AGREE * len(indices))))
+    if not is_solved or agreeing is None or len(agreeing) < least:
         return
-    agrees = np.zeros(len(at), dtype=bool)
-    agrees[inliers.ravel()] = True
-    if not determines_pose(points[agrees]):
+    inliers = np.zeros(len(indices), dtype=bool)
+    inliers[agreeing.ravel()] = True
+    if not determines_pose(points[inliers]):
         return
     for _ in range(2):
         turn, shift = cv2.solvePnPRefineLM(
-            points[agrees], plane[agrees], np.eye(3), None, turn, shift
+            points[inliers], plane[inliers], np.eye(3), None, turn, shift
         )
-        there = cv2.projectPoints(points, turn, shift, np.eye(3), None)[0][:, 0]
-        off_px = focal * np.linalg.norm(there - plane, axis=1)
-        limit = max(_ELSEWHERE_PX, _TIMES * float(np.median(off_px[agrees])))
-        agrees = np.asarray(off_px < limit)
-        if np.sum(agrees) < least:
+        predicted = cv2.projectPoints(points, turn, shift, np.eye(3), None)[0][:, 0]
+        residuals_px = focal * np.linalg.norm(predicted - plane, axis=1)
+        limit = max(_OUTLIER_PX, _TIMES * float(np.median(residuals_px[inliers])))
+        inliers = np.asarray(residuals_px < limit)
+        if np.sum(inliers) < least:
             return
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    yield _RigView(at, np.column_stack([plane, np.ones(len(at))]), pose, agrees, focal)
+    yield _RigView(indices, np.column_stack([plane, np.ones(len(indices))]), pose, inliers, focal)
 
 
 def _triangulated(rows: Sequence[tuple[_RigView, int]]) -> tuple[FloatArray, float]:
-    """Where the rays of a point meet in the rig's frame [m], and what is left of them [px]."""
+    """Intersection of a point's rays in the rig's frame [m], and the median residual [px]."""
     factors, values = [], []
-    for look, row in rows:
-        across = skew(look.rays[row])[:2]
-        factors.append(across @ look.cam_from_target[:3, :3])
-        values.append(-across @ look.cam_from_target[:3, 3])
-    place = np.linalg.lstsq(np.concatenate(factors), np.concatenate(values), rcond=None)[0]
-    left = []
-    for look, row in rows:
-        there = look.cam_from_target[:3, :3] @ place + look.cam_from_target[:3, 3]
-        left.append(look.focal_px * np.linalg.norm(there[:2] / there[2] - look.rays[row, :2]))
-    return place, float(np.median(left))
+    for rig_view, row in rows:
+        normals = skew(rig_view.rays[row])[:2]
+        factors.append(normals @ rig_view.cam_from_target[:3, :3])
+        values.append(-normals @ rig_view.cam_from_target[:3, 3])
+    position = np.linalg.lstsq(np.concatenate(factors), np.concatenate(values), rcond=None)[0]
+    residuals = []
+    for rig_view, row in rows:
+        point = rig_view.cam_from_target[:3, :3] @ position + rig_view.cam_from_target[:3, 3]
+        difference = point[:2] / point[2] - rig_view.rays[row, :2]
+        residuals.append(rig_view.focal_px * np.linalg.norm(difference))
+    return position, float(np.median(residuals))
 
 
-def _said(target: Target, places: Mapping[int, FloatArray], name: str) -> Finding:
-    """Says which points are elsewhere, and what would mend it."""
+def _finding(target: Target, positions: Mapping[int, FloatArray], name: str) -> Finding:
+    """Reports the wrong points, and the correction."""
     table, labels = np.array(target.points_m), [str(number) for number in target.point_numbers]
     measured = table.copy()
-    for point, place in places.items():
-        measured[point] = place
+    for point, position in positions.items():
+        measured[point] = position
     numbering = find_numbering(measured, table)
     reordered = set(numbering.moved.tolist()) if numbering.is_wrong else set()
-    reordered = reordered if reordered <= set(places) else set()
+    reordered = reordered if reordered <= set(positions) else set()
     parts, steps = [], []
     if reordered:
         parts.append(f"the numbers of points are not those of its table: {numbering.words(labels)}")
         steps.append("correct the numbers of these points in corners.csv or in the rig's table")
-    others = [place for place in places if place not in reordered]
+    others = [point for point in positions if point not in reordered]
     if others:
         listing = ", ".join(
             f"{labels[other]} by "
-            f"{figure(1e3 * float(np.linalg.norm(places[other] - table[other])))} mm, at "
-            f"({', '.join(f'{1e3 * x:.1f}' for x in places[other])}) mm"
+            f"{figure(1e3 * float(np.linalg.norm(positions[other] - table[other])))} mm, at "
+            f"({', '.join(f'{1e3 * x:.1f}' for x in positions[other])}) mm"
             for other in others
         )
         parts.append(f"points are elsewhere than its table has them: {listing}")
         steps.append("measure these points again, and correct the rig's table")
     words = f"target {name}: {'; '.join(parts)}, by the views' other points. They were left out."
     step = " and ".join(steps)
-    return Finding(
-        "rig_points",
-        words[0].upper() + words[1:],
-        Remedy(f"{step[0].upper()}{step[1:]}.", CALIBRATE),
-    )
+    remedy = Remedy(f"{step[0].upper()}{step[1:]}.", CALIBRATE)
+    return Finding("rig_points", words[0].upper() + words[1:], remedy)

@@ -1,4 +1,4 @@
-"""Where the robots stood: what their rows report, and whether joints belong to what is seen."""
+"""Reading of the robots' reports, and the check of their joints against the observations."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from visioncal.calibration.guess.misread import (
     JointGuess,
     guess_joints,
 )
-from visioncal.calibration.stages.joints import ARM_AS_FOUND, Matched, zero_taken
+from visioncal.calibration.stages.joints import EXPORT_ARM, Matched, zero_taken
 from visioncal.calibration.stages.motion import is_open
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
@@ -30,36 +30,31 @@ from visioncal.session.kinds import is_seen, name_of
 T = TypeVar("T", bound=Observed)
 
 
-def read_robots(seen: T) -> T:
-    """Takes up what rows report of the robots, by way of which something was observed.
+def read_robots(observed: T) -> T:
+    """Reads the reported poses and joints of the robots.
 
     Raises:
-        DataError: Joints are all there is, and they are not as many as the robot's; or rows that
-            are said to be of one stop lie apart.
+        DataError: There are only joints, and they are not as many as the robot's; or rows of one
+            declared stop have different poses.
     """
-    session, found = seen.timed, {}
+    session, reports = observed.timed, {}
     for name in session.robots:
-        document = session.robot_documents.get(name)
-        mine = tuple(
+        model_document = session.robot_documents.get(name)
+        of_robot = tuple(
             view
             for view in session.views
             if name_of(session.declaration, "robot", view) == name
-            and not (seen.clocks and is_open(view))
+            and not (observed.clocks and is_open(view))
         )
-        model = None if document is None else Robot.from_document(document)
-        reported = reported_poses(replace(session, views=mine), model)
-        found[name] = _with_stops(session, name, reported)
-        seen = seen.noting(
-            (), (warning.of(_called(session, name)) for warning in reported.warnings)
-        )
-        notes = (remark.of(_called(session, name)).words for remark in remarks(reported.notes))
-        seen = replace(seen, notes=(*seen.notes, *notes))
-    rows = [
-        observation
-        for observation in session.observations
-        if observation.view.number not in seen.spared
-    ]
-    return replace(seen, robots=found).noting(_lost(session, rows, found))
+        model = None if model_document is None else Robot.from_document(model_document)
+        reported = reported_poses(replace(session, views=of_robot), model)
+        reports[name] = _with_stops(session, name, reported)
+        label = _label(session, name)
+        observed = observed.noting((), (warning.of(label) for warning in reported.warnings))
+        notes = (remark.of(label).words for remark in remarks(reported.notes))
+        observed = replace(observed, notes=(*observed.notes, *notes))
+    rows = [row for row in session.observations if row.view.number not in observed.spared]
+    return replace(observed, robots=reports).noting(_lost_views(session, rows, reports))
 
 
 def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
@@ -67,10 +62,8 @@ def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
     poses, matched = dict(reported.base_from_flange), reported.matched
     joints = {} if matched is None else dict(matched.joints_rad)
     for observation in session.observations:
-        view, row = (
-            observation.view.number,
-            observation.robots[name].number if name in observation.robots else None,
-        )
+        view, of_stop = observation.view.number, observation.robots.get(name)
+        row = None if of_stop is None else of_stop.number
         if row in poses and view not in poses:
             poses[view] = poses[row]
             joints |= {view: joints[row]} if row in joints else {}
@@ -79,17 +72,17 @@ def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
     return replace(reported, base_from_flange=poses, matched=matched)
 
 
-def _lost(
-    session: Session, rows: Sequence[Observation], found: Mapping[str, Reported]
+def _lost_views(
+    session: Session, rows: Sequence[Observation], reports: Mapping[str, Reported]
 ) -> Iterator[Rejection]:
-    """Why where a robot stood is not known for an observation."""
+    """Rejections of observations without the pose of a robot."""
     reasons = {
-        name: {rejection.view: rejection.reason for rejection in at.rejections}
-        for name, at in found.items()
+        name: {rejection.view: rejection.reason for rejection in report.rejections}
+        for name, report in reports.items()
     }
     for row in rows:
         for name in (*row.lacks, *row.robots):
-            if row.view.number in found[name].base_from_flange:
+            if row.view.number in reports[name].base_from_flange:
                 continue
             why = reasons[name].get(row.robots.get(name, row.view).number, "")
             of = f" ({name})" if len(session.robots) > 1 else ""
@@ -98,101 +91,91 @@ def _lost(
             yield Rejection(row.view.number, f"{why}{of}")
 
 
-def _called(session: Session, robot: str) -> str:
-    """Names, of several robots, the one that findings are of."""
+def _label(session: Session, robot: str) -> str:
+    """The name of the robot that findings concern; empty with a single one."""
     return f"Robot {robot}" if len(session.robots) > 1 else ""
 
 
-def check_joints(seen: T, *, drops: bool, takes: bool) -> T:
-    """Refuses joints that only fit what the cameras see where they are read otherwise.
+def check_joints(observed: T, *, drops: bool, takes: bool) -> T:
+    """Refuses joints that only another reading makes fit the cameras' observations.
 
-    Args:
-        seen: What is known.
-        drops: Whether to leave out readings whose pose and joints contradict each other, where the
-            joints are right.
-        takes: Whether a lost zero is taken for where it is.
+    With `drops`, views are removed whose pose and joints contradict each other, where the joints
+    are right; with `takes`, a lost zero is corrected.
 
     Raises:
-        DataError: They do.
+        DataError: Joints are misread.
     """
-    for name, reported in seen.robots.items():
+    for name, reported in observed.robots.items():
         if reported.matched is not None:
-            seen = _checked(seen, name, reported, reported.matched, (drops, takes))
-    return seen
+            observed = _checked(observed, name, reported, reported.matched, (drops, takes))
+    return observed
 
 
-def _checked(seen: T, name: str, reported: Reported, matched: Matched, how: tuple[bool, bool]) -> T:
-    session, joints, (drops, takes) = seen.session, reported.joints_rad or {}, how
-    pair = next(iter(pairs_of(seen, name)), _NO_PAIR)
-    mount, poses = pair.mount, pair.poses
-    views = [pose for pose in poses if pose in joints]
-    if not views:
-        return seen
-    doubted = matched.contradicting
-    sound = [view for view in views if view not in doubted and view not in seen.held_back]
-    looks = {view: poses[view].cam_from_target[0] for view in views}
-    rows = np.array([looks[view] for view in sound])
-    q = np.array([joints[view] for view in sound]).reshape(len(sound), matched.robot.joint_count)
-    guess = _guess_seen_joints(matched.arm, q, rows, mount)
+def _checked(
+    observed: T, name: str, reported: Reported, matched: Matched, options: tuple[bool, bool]
+) -> T:
+    session, joints, (drops, takes) = observed.session, reported.joints_rad or {}, options
+    pair = next(iter(pairs_of(observed, name)), _NO_PAIR)
+    target_poses = {
+        view: poses.cam_from_target[0] for view, poses in pair.poses.items() if view in joints
+    }
+    if not target_poses:
+        return observed
+    excluded = {*matched.contradicting, *observed.held_back}
+    views = [view for view in target_poses if view not in excluded]
+    rows = np.array([target_poses[view] for view in views])
+    q = np.array([joints[view] for view in views]).reshape(len(views), matched.robot.joint_count)
+    guess = _guess_seen_joints(matched.arm, q, rows, pair.mount)
     if drops:
-        both = {
-            view: (reported.base_from_flange[view], looks[view])
-            for view in views
-            if view in doubted
+        contradicting = {
+            view: (reported.base_from_flange[view], pose)
+            for view, pose in target_poses.items()
+            if view in matched.contradicting
         }
-        lost = tuple(_contradicted_joints(matched, guess, both, mount))
+        lost = tuple(_contradicted_joints(matched, guess, contradicting, pair.mount))
         reported = reported.without({rejection.view for rejection in lost})
-        seen = seen.noting(lost).with_robot(name, reported)
+        observed = observed.noting(lost).with_robot(name, reported)
     if guess is None or not guess.stands_out:
-        return seen
+        return observed
     zero = guess.zero
     if zero is None:
-        mine = [view for view in session.views if view.number in reported.base_from_flange]
-        has_poses = any(view.base_from_flange() is not None for view in mine)
+        of_robot = [view for view in session.views if view.number in reported.base_from_flange]
+        has_poses = any(view.base_from_flange() is not None for view in of_robot)
         error = misread_joints(guess, matched.robot, has_poses=has_poses)
         raise error.within(f"robot {name}") if len(session.robots) > 1 else error
-    taken = takes and matched.zero is None
-    seen = seen.noting((), (_lost_zero(guess, zero, taken=taken).of(_called(session, name)),))
-    return seen.with_robot(name, reported.with_zero(zero)) if taken else seen
+    used = takes and matched.zero is None
+    finding = _lost_zero_finding(guess, zero, is_used=used)
+    observed = observed.noting((), (finding.of(_label(session, name)),))
+    return observed.with_robot(name, reported.with_zero(zero)) if used else observed
 
 
-def check_read_joints(seen: Observed, probes: Mapping[int, FloatArray]) -> None:
-    """Refuses joints that only fit what an instrument reads where they are read otherwise.
+def check_read_joints(observed: Observed, probes: Mapping[int, FloatArray]) -> None:
+    """Refuses joints that only another reading makes fit an instrument's readings.
 
-    A lost zero is none of these: it is found with the arm.
-
-    Args:
-        seen: What is known.
-        probes: (4, 4) `instrument_from_probe` by view; empty where points do not give them.
+    `probes` has (4, 4) `instrument_from_probe` by view; it is empty where points do not determine
+    them. A lost zero is not refused: it is estimated with the arm.
 
     Raises:
-        DataError: They do.
+        DataError: Joints are misread.
     """
-    for reported in seen.robots.values():
+    for reported in observed.robots.values():
         matched, joints = reported.matched, reported.joints_rad or {}
-        views = [probe for probe in probes if probe in joints and probe not in seen.held_back]
+        views = [probe for probe in probes if probe in joints and probe not in observed.held_back]
         if matched is None or not views:
             continue
-        q, looks = (np.array([by_view[view] for view in views]) for by_view in (joints, probes))
-        # The instrument stands still beside the robot, as a camera does.
-        guess = _guess_seen_joints(matched.arm, q, looks, "eye-to-hand")
+        q, poses = (np.array([by_view[view] for view in views]) for by_view in (joints, probes))
+        # The instrument is fixed beside the robot, as a camera may be.
+        guess = _guess_seen_joints(matched.arm, q, poses, "eye-to-hand")
         if guess is not None and guess.stands_out and guess.zero is None:
-            mine = (view for view in seen.session.views if view.number in joints)
-            has_poses = any(view.base_from_flange() is not None for view in mine)
-            by = "what the instrument reads"
-            raise misread_joints(guess, matched.robot, has_poses=has_poses, seen=by)
+            with_joints = (view for view in observed.session.views if view.number in joints)
+            has_poses = any(view.base_from_flange() is not None for view in with_joints)
+            source = "what the instrument reads"
+            raise misread_joints(guess, matched.robot, has_poses=has_poses, seen=source)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraTargetPair:
-    """What one camera sees of one target by way of one robot alone.
-
-    Attributes:
-        camera: The camera's frame.
-        target: The target's.
-        mount: Where the camera is.
-        poses: The target's pose by view.
-    """
+    """Observations of a target (poses by view) by a camera, with one robot between."""
 
     camera: str
     target: str
@@ -203,32 +186,29 @@ class CameraTargetPair:
 _NO_PAIR = CameraTargetPair("", "", "eye-in-hand", {})
 
 
-def pairs_of(seen: Observed, robot: str) -> list[CameraTargetPair]:
-    """The pairs of a camera and a target by way of one robot alone, those of most views first.
+def pairs_of(observed: Observed, robot: str) -> list[CameraTargetPair]:
+    """The pairs of a camera and a target with only this robot between, those of most views first.
 
-    Poses of different ones do not compare.
+    Poses of different pairs do not compare.
     """
     pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
-    for observation in seen.timed.observations:
+    for observation in observed.timed.observations:
         view = observation.view.number
-        if (
-            view in seen.poses
-            and is_seen(observation.view)
-            and [*observation.robots, *observation.lacks] == [robot]
-        ):
-            pairs.setdefault((observation.seer, observation.seen), {})[view] = seen.poses[view]
-    flange, found = frame_name("flange", robot), []
+        is_alone = [*observation.robots, *observation.lacks] == [robot]
+        if view in observed.poses and is_seen(observation.view) and is_alone:
+            pairs.setdefault((observation.seer, observation.seen), {})[view] = observed.poses[view]
+    flange, found_pairs = frame_name("flange", robot), []
     for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):
-        on_flange = seen.session.frames[camera] == flange
+        on_flange = observed.session.frames[camera] == flange
         mount: Mount = "eye-in-hand" if on_flange else "eye-to-hand"
-        found.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
-    return found
+        found_pairs.append(CameraTargetPair(camera, target, mount, pairs[camera, target]))
+    return found_pairs
 
 
 def _guess_seen_joints(
     robot: Robot, q: FloatArray, cam_from_target: FloatArray, mount: Mount
 ) -> JointGuess | None:
-    """Compares joint angles with what the camera sees, where there are enough views."""
+    """Searches for the right reading of joint angles, with enough views."""
     if len(q) < FEWEST_JOINT_ROWS:
         return None
     return guess_joints(robot, q, _as_flange(cam_from_target, mount), FITS_SEEN)
@@ -240,7 +220,7 @@ def _contradicted_joints(
     seen: Mapping[int, tuple[FloatArray, FloatArray]],
     mount: Mount,
 ) -> Iterator[Rejection]:
-    """Tells of the views whose pose and angles contradict each other where the angles are wrong."""
+    """Rejects the views whose pose and angles contradict each other with wrong angles."""
     for view, (pose, cam_from_target) in seen.items():
         reason = matched.contradicting[view]
         if guess is None:
@@ -248,24 +228,23 @@ def _contradicted_joints(
             continue
         model = guess.best.reading.poses(matched.joints_rad[view][None])[0]
         both = np.array([model, pose @ invert(matched.flange_from_reported)])
-        of_poses = invert(_as_flange(np.array([cam_from_target, cam_from_target]), mount))
+        flange_from_base = invert(_as_flange(np.array([cam_from_target, cam_from_target]), mount))
         fit = guess.best.fit
-        by_joints, by_pose = distances(of_poses, both, fit.lever, (fit.x, fit.z)).away
+        by_joints, by_pose = distances(flange_from_base, both, fit.lever, (fit.x, fit.z)).residuals
         if by_pose < by_joints:
             yield Rejection(view, f"{reason}, with which the camera agrees")
 
 
 def _as_flange(cam_from_target: FloatArray, mount: Mount) -> FloatArray:
     """`base_from_flange` up to the two unknown edges."""
-    # It is `cam_from_target` of a camera that does not move, and its inverse where the target does
-    # not.
+    # For a fixed camera it is `cam_from_target`, for a fixed target its inverse.
     return invert(cam_from_target) if mount == "eye-in-hand" else cam_from_target
 
 
 def misread_joints(
     guess: JointGuess, robot: Robot, *, has_poses: bool, seen: str = "what the camera sees"
 ) -> DataError:
-    """The error of a session whose angles fit what was observed in another reading only."""
+    """The error for joint angles that only another reading makes fit the observations."""
     sentence = guess.sentence(seen)
     also = " The reported poses are those of the same angles, and as wrong." if has_poses else ""
     columns = guess.best.reading.columns or range(robot.joint_count)
@@ -277,14 +256,12 @@ def misread_joints(
     )
 
 
-def _lost_zero(guess: JointGuess, zero: JointReading, *, taken: bool) -> Finding:
-    """Says which joint's zero is lost, and what becomes of it."""
+def _lost_zero_finding(guess: JointGuess, zero: JointReading, *, is_used: bool) -> Finding:
+    """Reports the joint with a lost zero, and how it is used."""
     words = (
         f"The joint angles do not belong to {zero.robot.name} as they are declared. "
         f"{guess.sentence('what the camera sees')}"
     )
-    if taken:
-        return Finding(
-            "misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, ARM_AS_FOUND)
-        )
-    return Finding("misread_joints", words, Remedy(zero.fix))
+    if not is_used:
+        return Finding("misread_joints", words, Remedy(zero.fix))
+    return Finding("misread_joints", f"{words} {zero_taken(zero)}", Remedy(zero.fix, EXPORT_ARM))

@@ -1,4 +1,4 @@
-"""The frames' side of the joint fit, of one robot and one camera or of many."""
+"""The frames' side of the joint fit: observations, arms and their effects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,16 +21,16 @@ from visioncal.estimation.solve import fit_problem, fitted_covariance, robot_lik
 
 @dataclass(frozen=True, eq=False)
 class FramesSide:
-    """What the joint fit has beside corners, lenses and boards; see `joint.Side`.
+    """Part of the joint fit beside corners, lenses and boards; see `joint.Side`.
 
     Attributes:
         observed: All n observations.
-        used: (n,) those that the fit is made from.
+        used: (n,) the inliers, which are fitted.
         views: (n,) the view of each.
-        arms: The robots' arms, and which of their errors were found.
+        arms: The robots' arms, with the errors that were found.
         effects: All effects but lenses, boards and arms.
         noise: Its levels to start from; None for those from above.
-        freely: Whether all errors that were found are free, and not those alone that are estimated.
+        freely: Whether all errors that were found are free, rather than only the estimated ones.
     """
 
     observed: Problem
@@ -53,15 +53,15 @@ class FramesSide:
 
     @property
     def has_links(self) -> bool:
-        """Whether those of an arm's own links are."""
+        """Whether errors of an arm's links are free."""
         return self.has_errors and any(error.of_links for error in self.errors)
 
     def problem(self, seen: LinearisedCorners) -> Problem:
-        """The problem of the observations that agree, repeated ones sharing an error."""
+        """The problem of the inliers, repeated ones sharing an error."""
         return replace(self.whole(seen), with_repeats=True).subset(self.used)
 
     def rows(self, seen: LinearisedCorners) -> IntArray:
-        """(n,) which of the corners' views each observation of `problem` is; see `joint.Side`."""
+        """(n,) the corners' view of each observation of `problem`, by index; see `joint.Side`."""
         return self._all_rows(seen)[self.used]
 
     def _all_rows(self, seen: LinearisedCorners) -> IntArray:
@@ -69,18 +69,18 @@ class FramesSide:
         return np.array([places.get(view, -1) for view in self.views], dtype=np.int64)
 
     def whole(self, seen: LinearisedCorners) -> Problem:
-        """The problem of all observations, with poses as lenses and boards make them."""
+        """The problem of all observations, with the poses by current lenses and boards."""
         problem, rows = self.observed, self._all_rows(seen)
-        mine, before = rows >= 0, problem.observations
-        measured, covariance = before.measured.copy(), before.covariance.copy()
-        measured[mine], covariance[mine] = seen.looks.poses[rows[mine]], seen.covariance[rows[mine]]
-        arms = effects_of(self.arms, freely=self.freely)
-        return replace(
-            problem, observations=replace(before, measured=measured, covariance=covariance)
-        ).with_effects([seen.effect(rows), *self.effects, *arms])
+        has_corners, stated = rows >= 0, problem.observations
+        measured, covariance = stated.measured.copy(), stated.covariance.copy()
+        measured[has_corners] = seen.looks.poses[rows[has_corners]]
+        covariance[has_corners] = seen.covariance[rows[has_corners]]
+        observations = replace(stated, measured=measured, covariance=covariance)
+        effects = [seen.effect(rows), *self.effects, *effects_of(self.arms, freely=self.freely)]
+        return replace(problem, observations=observations).with_effects(effects)
 
     def with_errors(self, fitted: ConvergedFit) -> Self:
-        """Looks for errors of the arms that are not free yet."""
+        """Tests for errors of the arms that are not free yet."""
         problem, fit = fitted.problem, fitted.fit
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         arms = {
@@ -92,59 +92,52 @@ class FramesSide:
         return replace(self, arms=arms)
 
     @property
-    def poses_alone(self) -> dict[str, RobotArm]:
-        """The arms whose joints are not known."""
+    def arms_without_joints(self) -> dict[str, RobotArm]:
+        """The arms without joint angles."""
         return {name: arm for name, arm in self.arms.items() if not arm.is_modelled}
 
-    def covariance_by_posture(self, fitted: ConvergedFit) -> FloatArray:
-        """(p, p) a fit's covariance, errors of arms without joint angles being what they may be.
+    def covariance_with_pose_errors(self, fitted: ConvergedFit) -> FloatArray:
+        """(p, p) covariance of a fit, with the errors of arms without joint angles.
 
-        These are taken for noise, and weighed by `find_pose_errors`.
+        These are treated as noise, with sigmas by `find_pose_errors`.
         """
-        problem, alone = fitted.problem, self.poses_alone
-        for arm in alone.values():
+        problem, arms = fitted.problem, self.arms_without_joints
+        for arm in arms.values():
             problem = arm.without_errors(problem)
         values, free = problem.start_values.copy(), len(fitted.seen.free)
         values[:free] = fitted.fit.state.values[:free]
         fit = fit_problem(problem, State(fitted.fit.state.edges, values))
-        found = fitted_covariance(problem, fit.state, fit.noise)
-        for robot in alone:
+        covariance = fitted_covariance(problem, fit.state, fit.noise)
+        for robot in arms:
             errors = find_pose_errors(problem, fit.state, fit.noise, robot)
             if errors is not None:
-                found += misfit_covariance(problem, fit.state, fit.noise, robot, errors)
-        return found
+                covariance += misfit_covariance(problem, fit.state, fit.noise, robot, errors)
+        return covariance
 
     def freed(self, *, freely: bool) -> Self:
-        """Frees all errors of the arms that were found, or those alone that are estimated."""
+        """Frees all errors of the arms that were found, or only the estimated ones."""
         return replace(self, freely=freely)
 
     def looks(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]
     ) -> CameraParameters:
-        """Corners, and lenses and boards as they are stated.
-
-        Args:
-            scenes: What each camera looks at, by its frame.
-            views: Its views, each with its one pose.
-        """
+        """The corners of scenes and views (by camera frame), with stated lenses and boards."""
         shares, problems, poses = self._shares, {}, {}
         for frame, scene in scenes.items():
             corners: dict[int, Corners] = {
                 view.view: view.corners for view in views[frame] if view.corners is not None
             }
             problems[frame] = CornerProblem.of(scene, corners, shares)
-            poses[frame] = np.array(
-                [view.cam_from_target[0] for view in views[frame] if view.view in corners]
-            )
+            with_corners = [view for view in views[frame] if view.view in corners]
+            poses[frame] = np.array([view.cam_from_target[0] for view in with_corners])
         return CameraParameters.of(problems, poses)
 
     @property
     def _shares(self) -> dict[int, float]:
-        """As how much of a view each counts for lenses and boards: those of one stop as one."""
-        seen, tree = self.observed.observations, self.observed.tree
-        pairs = list(zip(seen.observers, seen.observed, strict=True))
-        parted = {pair: any(step.robot for step in tree.path(*pair)) for pair in set(pairs)}
-        rows = zip(self.views, pairs, seen.stops.tolist(), strict=True)
-        return repeat_shares(
-            {index: (pair, stop if parted[pair] else None) for index, pair, stop in rows}
-        )
+        """Weight of each view for lenses and boards; views of one stop share one weight."""
+        observations, tree = self.observed.observations, self.observed.tree
+        pairs = list(zip(observations.observers, observations.observed, strict=True))
+        has_robot = {pair: any(step.robot for step in tree.path(*pair)) for pair in set(pairs)}
+        rows = zip(self.views, pairs, observations.stops.tolist(), strict=True)
+        repeated = {view: (pair, stop if has_robot[pair] else None) for view, pair, stop in rows}
+        return repeat_shares(repeated)

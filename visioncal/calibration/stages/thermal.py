@@ -1,6 +1,6 @@
-"""Whether temperatures explain how the views move in the course of a session.
+"""Thermal level: whether temperatures explain how the views drift during a session.
 
-They come out of its streams, or else out of columns of its views.
+Temperatures or currents are read from its streams, or else from columns of its views.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,17 +43,17 @@ from visioncal.session.streams import STAMP, Stream
 
 LEVEL = "thermal"
 NO_JOINTS = "the joint angles of every view, a known model of the robot and the joint fit"
-# Views may be so far before the first and behind the last sample [s].
+# Largest time of views before the first and after the last sample [s].
 _BEYOND_S = 300.0
-# Joints that are within this of a posture are in it [rad].
+# Largest difference of joints in one posture [rad].
 _SAME_RAD = 1e-3
-# The reported course is drawn by so many points.
-_DRAWN = 200
+# Points of the reported course.
+_COURSE_POINTS = 200
 _ADVICE = (
     "Begin with a cold robot, let it work for an hour or more, and look at the same few reference "
     "views every five to ten minutes."
 )
-# More samples than this determine warm-up no better: they are averaged in bunches.
+# More samples determine warm-up no better: they are averaged in groups.
 _MOST_SAMPLES = 8192
 _FEWEST_SAMPLES = 3
 _AMBIENT = "ambient_c"
@@ -62,14 +62,14 @@ _FORMS: Mapping[Kind, str] = {"temperatures": "temp{}_c", "currents": "current{}
 
 @dataclass(frozen=True, eq=False)
 class Heat:
-    """What heats an arm, and when it was looked at.
+    """Recorded heating of an arm, and when its views were taken.
 
     Attributes:
         session: The session that records it.
         robot: The robot's name there.
-        joints: How many joints it has.
-        views: (m,) by which view each of the m stops goes at which it was.
-        stamps_s: (m,) when that was taken [s]; NaN where that is not known.
+        joints: Number of joints.
+        views: (m,) a view of each of the arm's m stops.
+        stamps_s: (m,) when that was taken [s]; NaN where unknown.
     """
 
     session: Session
@@ -88,18 +88,18 @@ class Heat:
 
     @property
     def inputs(self) -> Inputs | None:
-        """Temperatures or currents; None where they were not recorded at all of the stops."""
+        """Temperatures or currents; None where they do not cover all of the stops."""
         return None if self.missing else self._read[0]
 
     @property
     def missing(self) -> str:
-        """What is missing, in words; empty where nothing is."""
+        """What is missing, in words; empty for nothing."""
         inputs, missing = self._read
         if inputs is None:
             return missing
-        timeless = self.views[np.isnan(self.stamps_s)].tolist()
-        if timeless:
-            return f"view {timeless[0]} has no stamp_s"
+        untimed = self.views[np.isnan(self.stamps_s)].tolist()
+        if untimed:
+            return f"view {untimed[0]} has no stamp_s"
         first_s, last_s = inputs.stamps_s[[0, -1]].tolist()
         stamps = self.stamps_s
         if stamps.min() < first_s - _BEYOND_S or stamps.max() > last_s + _BEYOND_S:
@@ -111,27 +111,23 @@ class Heat:
 
     @property
     def set_aside(self) -> str:
-        """Why what was recorded of it cannot be used; empty where it can, or none was recorded."""
+        """Why recorded inputs cannot be used; empty where they can, or none were recorded."""
         return "" if self._read[0] is None else self.missing
 
 
 def heating(heat: Heat | None, asked: str) -> Inputs | None:
-    """What heats an arm; None where that is not asked for, or the session does not determine it.
-
-    Args:
-        heat: What is known of it; None where the arm's joints are not known.
-        asked: How far the arm is to be calibrated.
+    """The inputs that heat an arm; None where not requested, or not determined by the session.
 
     Raises:
-        DataError: The level asks for it, and the session lacks what it takes.
-        DegenerateError: The level asks for it, and all views were taken about equally warm.
+        DataError: The level requires it, and the session lacks data.
+        DegenerateError: The level requires it, and all views were taken about equally warm.
     """
     if asked not in ("auto", LEVEL):
         return None
     inputs = None if heat is None else heat.inputs
     if heat is None or inputs is None:
         if asked == LEVEL:
-            raise _missing(NO_JOINTS if heat is None else heat.missing)
+            raise _missing_error(NO_JOINTS if heat is None else heat.missing)
         return None
     why = uninformative(inputs, heat.stamps_s)
     if why and asked == LEVEL:
@@ -143,7 +139,7 @@ def heating(heat: Heat | None, asked: str) -> Inputs | None:
     return None if why else inputs
 
 
-def _missing(missing: str) -> DataError:
+def _missing_error(missing: str) -> DataError:
     return DataError(
         f"level {LEVEL!r} needs to know what heats the arm: {missing}.",
         culprits=["level"],
@@ -155,14 +151,9 @@ def _missing(missing: str) -> DataError:
 def find_drift(
     problem: Problem, start: State, stops: ThermalStops, inputs: Inputs, nominal: Robot
 ) -> ThermalFit:
-    """Fits an arm's drift with the frames and, where they are off, its links.
+    """Fits an arm's drift with the frames and, where these have significant errors, its links.
 
-    Args:
-        problem: The observations, with the arm as reported.
-        start: Where to start.
-        stops: Where it was observed, and when.
-        inputs: What heats it.
-        nominal: Its model.
+    `problem` has the arm as reported, `nominal` is its model.
     """
     robot, poses = stops.robot, problem.poses[stops.robot]
     model = ArmModel.of(nominal, stops.q, poses[stops.places])
@@ -178,12 +169,12 @@ def find_drift(
 
 
 def is_found(fit: ThermalFit) -> bool:
-    """Whether drift explains the views by more than chance."""
+    """Whether drift explains the views significantly."""
     return fit.gain > SIGNIFICANT
 
 
 def findings(fit: ThermalFit) -> Iterator[str]:
-    """Says what was found, for the verdict."""
+    """States the drift, for the verdict."""
     if not is_found(fit):
         yield (
             f"The joints warmed up by {figure(float(fit.rises_k.max()))} K, and the views show no "
@@ -195,7 +186,7 @@ def findings(fit: ThermalFit) -> Iterator[str]:
         f"{figure(1e3 * fit.after_m)} mm. Its transforms are those of the arm as it was at the "
         "start; give temperatures to calibration.base_from_flange and to visioncal correct."
     )
-    # Currents determine a gain and a growth by their product alone.
+    # Currents determine only the product of a gain and a growth.
     measured = fit.model.heating.kind == "temperatures"
     counted = ("growth", "drift") if measured else ("drift",)
     names = [name for name in fit.not_determined if name.startswith(counted)]
@@ -211,12 +202,7 @@ def drift_result(
 ) -> ThermalResult:
     """A drift's coefficients and its course, as a section of a calibration.
 
-    Args:
-        fit: The drift.
-        stops: Where the arm stood, and when.
-        views: (m,) by which views these stops go.
-        problem: The observations that agree.
-        solved: Their fit.
+    `views` has a view of each stop, `problem` the inlier observations, and `solved` is their fit.
     """
     model = fit.model
     return ThermalResult(
@@ -229,8 +215,8 @@ def drift_result(
         likelihood_ratio=fit.gain,
         rises_k=tuple(fit.rises_k.tolist()),
         trained_s=float(np.ptp(stops.stamps_s)),
-        course=_course(fit, _typical(stops.q)),
-        seen=_seen(fit, stops, views, problem, solved.state),
+        course=_course(fit, _typical_posture(stops.q)),
+        seen=_observed_drift(fit, stops, views, problem, solved.state),
         views=_by_view(fit, stops, views),
     )
 
@@ -256,78 +242,75 @@ def _joints(model: ThermalModel) -> tuple[JointDrift, ...]:
 
 
 def _by_view(fit: ThermalFit, stops: ThermalStops, views: Sequence[int]) -> tuple[ViewDrift, ...]:
-    """How far the flange had drifted at (m,) views, and the largest rise of a link."""
-    moved = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
+    """Drift of the flange at (m,) views, and the largest temperature rise of a link."""
+    drift_m = np.linalg.norm(fit.motion(stops)[:, :3, 3], axis=1)
     rises = fit.model.rises(fit.links_c(stops)).max(axis=1)
-    rows = zip(views, (1e3 * moved).tolist(), rises.tolist(), strict=True)
+    rows = zip(views, (1e3 * drift_m).tolist(), rises.tolist(), strict=True)
     return tuple(ViewDrift(*row) for row in rows)
 
 
 def _course(fit: ThermalFit, q: FloatArray) -> tuple[DriftPoint, ...]:
-    """How far the flange has drifted at (n,) joint angles, and how surely that is known."""
+    """Drift of the flange at (n,) joint angles over time, with its sigma."""
     model, inputs = fit.model, fit.inputs
-    at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _DRAWN)
+    at_s = np.linspace(inputs.stamps_s[0], inputs.stamps_s[-1], _COURSE_POINTS)
     links = model.heating.links_c(inputs, at_s)
     rows = np.tile(q, (len(at_s), 1))
-    moved = np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1)
-    sigma = model.sigma_m(rows, links, model.heating.jacobian(inputs, at_s))
+    drift_m = np.linalg.norm(model.motion(rows, links)[:, :3, 3], axis=1)
+    sigma_m = model.sigma_m(rows, links, model.heating.jacobian(inputs, at_s))
     rises = model.rises(links).max(axis=1)
-    columns = (at_s, 1e3 * moved, 1e3 * sigma, rises)
+    columns = (at_s, 1e3 * drift_m, 1e3 * sigma_m, rises)
     return tuple(DriftPoint(*row) for row in np.stack(columns, axis=1).tolist())
 
 
-def _seen(
+def _observed_drift(
     fit: ThermalFit, stops: ThermalStops, views: Sequence[int], problem: Problem, state: State
 ) -> tuple[ObservedDrift, ...]:
-    """How far the stops in the typical posture see the flange to have moved, by their first view.
+    """Observed drift of the flange at the stops in the typical posture, by their first view.
 
-    What is left of a stop is taken for its flange's, and counted along the drift's direction: its
+    The residual of a stop is attributed to its flange, and projected on the drift's direction: its
     length alone would grow with noise.
     """
     problem = replace(problem, is_combined=False)
-    linear, pair = problem.linear(state), ArmPair.of(problem, state, stops.robot)
+    linearised, pair = problem.linear(state), ArmPair.of(problem, state, stops.robot)
     of, members = problem.units
     slots = (members[of[pair.rows]] == problem.robots.index(stops.robot)).argmax(axis=1)
-    where, first = np.unique(problem.observations.stops[pair.rows], return_index=True)
-    alike = np.abs(stops.q - _typical(stops.q)).max(axis=1) < _SAME_RAD
-    _, chosen, among = np.intersect1d(np.where(alike, stops.places, -1), where, return_indices=True)
+    stop_ids, first = np.unique(problem.observations.stops[pair.rows], return_index=True)
+    typical = np.abs(stops.q - _typical_posture(stops.q)).max(axis=1) < _SAME_RAD
+    places = np.where(typical, stops.places, -1)
+    _, chosen, at_stops = np.intersect1d(places, stop_ids, return_indices=True)
     if not len(chosen):
         return ()
-    rows, slots = pair.rows[first[among]], slots[first[among]]
-    errors = linear.by_errors[rows].reshape(len(rows), 6, -1, 6)[np.arange(len(rows)), :, slots]
-    # A point alone does not part a flange's rotation from its place: all counts as place.
-    turns = problem.observations.has_rotation[rows, None] | (np.arange(6) >= 3)
-    left = -(np.linalg.pinv(errors * turns[:, None]) @ linear.residuals[rows, :, None])[:, 3:, 0]
-    moved = fit.motion(stops)[chosen, :3, 3]
-    # Where it has hardly moved it has no direction: that of the farthest stop serves them all.
-    lengths = np.linalg.norm(moved, axis=1)
-    far = moved[int(np.argmax(lengths))] / max(float(lengths.max()), 1e-9)
-    seen = lengths + left @ far
+    rows, slots = pair.rows[first[at_stops]], slots[first[at_stops]]
+    errors = linearised.by_errors[rows].reshape(len(rows), 6, -1, 6)[np.arange(len(rows)), :, slots]
+    # A point alone does not separate a flange's rotation from its position: all counts as position.
+    used = problem.observations.has_rotation[rows, None] | (np.arange(6) >= 3)
+    of_flange = np.linalg.pinv(errors * used[:, None]) @ linearised.residuals[rows, :, None]
+    residual_m = -of_flange[:, 3:, 0]
+    drift_m = fit.motion(stops)[chosen, :3, 3]
+    # With hardly any drift there is no direction: that of the largest drift is used for all.
+    lengths = np.linalg.norm(drift_m, axis=1)
+    direction = drift_m[int(np.argmax(lengths))] / max(float(lengths.max()), 1e-9)
+    observed_m = lengths + residual_m @ direction
     return tuple(
         ObservedDrift(views[at], float(stops.stamps_s[at]), 1e3 * drift)
-        for at, drift in zip(chosen.tolist(), seen.tolist(), strict=True)
+        for at, drift in zip(chosen.tolist(), observed_m.tolist(), strict=True)
     )
 
 
-def _typical(q: FloatArray) -> FloatArray:
-    """(n,) the posture that most of (s, n) stops are in; of several, the one that most are near."""
-    alike = [int((np.abs(q - value).max(axis=1) < _SAME_RAD).sum()) for value in q]
-    away = np.abs(q - np.median(q, axis=0)).sum(axis=1)
-    return np.asarray(q[np.lexsort((away, -np.array(alike)))[0]])
+def _typical_posture(q: FloatArray) -> FloatArray:
+    """(n,) the most frequent posture of (s, n) stops; of several, the most central one."""
+    counts = [int((np.abs(q - value).max(axis=1) < _SAME_RAD).sum()) for value in q]
+    distance = np.abs(q - np.median(q, axis=0)).sum(axis=1)
+    return np.asarray(q[np.lexsort((distance, -np.array(counts)))[0]])
 
 
 def inputs_of(session: Session, joints: int, robot: str = "") -> tuple[Inputs | None, str]:
-    """Takes what heats an arm out of a session; temperatures come before currents.
-
-    Args:
-        session: The session.
-        joints: How many joints the arm has.
-        robot: Its name, where the session has several.
+    """Reads the inputs that heat an arm from a session; temperatures come before currents.
 
     Returns:
-        What heats it; or None, and what is missing.
+        The inputs; or None, and what is missing.
     """
-    tables = [*streams_of(session, robot).values(), _of_views(session, robot)]
+    tables = [*streams_of(session, robot).values(), _views_as_stream(session, robot)]
     for kind, form in _FORMS.items():
         names = [form.format(at + 1) for at in range(joints)]
         for table in tables:
@@ -345,10 +328,10 @@ def _inputs(kind: Kind, stamps_s: FloatArray, heat: FloatArray, tables: Sequence
             ambient = np.interp(stamps_s, at_s, air[:, 0])
             break
     heat = heat if kind == "temperatures" else heat**2
-    return _bunched(Inputs(kind, stamps_s, heat, ambient))
+    return _averaged(Inputs(kind, stamps_s, heat, ambient))
 
 
-def _bunched(inputs: Inputs) -> Inputs:
+def _averaged(inputs: Inputs) -> Inputs:
     """Averages neighbouring samples where there are more than warm-up needs."""
     count = len(inputs.stamps_s)
     size = -(-count // _MOST_SAMPLES)
@@ -364,20 +347,24 @@ def _bunched(inputs: Inputs) -> Inputs:
     )
 
 
-def _of_views(session: Session, robot: str) -> Stream:
-    """A robot's views that have a time, as a stream of their numbers."""
-    mine = [view for view in session.views if name_of(session.declaration, "robot", view) == robot]
-    rows = sorted({view.stamp_s: view.numbers for view in mine if view.stamp_s is not None}.items())
+def _views_as_stream(session: Session, robot: str) -> Stream:
+    """A robot's views with a time, as a stream of their numbers."""
+    numbers = {
+        view.stamp_s: view.numbers
+        for view in session.views
+        if view.stamp_s is not None and name_of(session.declaration, "robot", view) == robot
+    }
+    rows = sorted(numbers.items())
     names = sorted({name for _, row in rows for name in row} - {STAMP})
     values = [[stamp_s, *(row.get(name, np.nan) for name in names)] for stamp_s, row in rows]
     return Stream((STAMP, *names), np.array(values).reshape(len(rows), len(names) + 1))
 
 
 def _missing_columns(tables: Sequence[Stream], joints: int) -> str:
-    there = {name for table in tables for name in table.columns}
+    columns = {name for table in tables for name in table.columns}
     for form in _FORMS.values():
         names = [form.format(at + 1) for at in range(joints)]
-        absent = [name for name in names if name not in there]
+        absent = [name for name in names if name not in columns]
         if len(absent) < joints:
             return (
                 f"{some_of(absent)} of {names[0]} ... {names[-1]} are missing"

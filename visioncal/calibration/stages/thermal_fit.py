@@ -1,8 +1,8 @@
-"""How an arm grows and drifts, estimated jointly with the chain that its views close.
+"""Joint estimation of an arm's thermal growth and drift with the chain that its views close.
 
-The coefficients are more unknowns that all views share, beside both edges and the arm's errors: one
-closure, one fit. What is known of steel and aluminium, and of how fast arms warm up, is a prior;
-what the views do not determine stays there.
+The coefficients are further unknowns that all views share, beside both edges and the arm's errors.
+Known properties of steel, aluminium and warm-up are their prior; coefficients that the views do not
+determine stay there.
 """
 
 from collections.abc import Mapping
@@ -31,19 +31,19 @@ from visioncal.robot import Robot
 from visioncal.robot.thermal.heating import Heating, Inputs, Kind
 from visioncal.robot.thermal.model import ThermalModel
 
-# Steel grows by 12e-6 of its length for a kelvin, aluminium by 23e-6.
+# Relative growth per kelvin: 12e-6 of steel, 23e-6 of aluminium.
 _GROWTH_PER_K, _GROWTH_SIGMA_PER_K = 17.5e-6, 5.5e-6
-# A zero drifts by about a hundredth of a millimetre at a metre for a kelvin, either way.
+# A zero drifts by about a hundredth of a millimetre at one metre per kelvin, either way.
 _DRIFT_SIGMA_RAD_PER_K = 1e-5
 # Gearboxes warm up in half an hour to an hour and a half; links follow a sensor in minutes.
 _TAU_S: Mapping[Kind, float] = {"currents": 2400.0, "temperatures": 120.0}
 _TAU_SIGMA: Mapping[Kind, float] = {"currents": 0.6, "temperatures": 1.0}
-# Joints at work get warmer than the air by so much, give or take a factor [K].
+# Rise of joints at work above the air, within a factor [K].
 RISE_K, _GAIN_SIGMA = 20.0, 0.8
-# Smaller rises of all joints determine nothing: temperatures [K], and shares of the rise at rest.
+# Smaller rises of all joints determine nothing: temperatures [K], and shares of the final rise.
 LEAST_RISE_K, LEAST_SHARE = 3.0, 0.15
 # A parameter counts as determined where its sigma is at most this share of its prior's.
-_LITTLE = 0.8
+_UNDETERMINED = 0.8
 _ROUNDS, _SETTLED = 5, 1e-6
 
 
@@ -52,10 +52,10 @@ class ThermalStops:
     """A robot's stops.
 
     Attributes:
-        robot: The robot, as the problem has it.
-        places: (m,) the stops, as the problem has them.
+        robot: The robot's name in the problem.
+        places: (m,) the problem's stops.
         q: (m, n) joint angles [rad].
-        stamps_s: (m,) when they were looked at [s].
+        stamps_s: (m,) when they were observed [s].
     """
 
     robot: str
@@ -66,17 +66,16 @@ class ThermalStops:
 
 @dataclass(frozen=True, eq=False)
 class ThermalFit:
-    """What views say of an arm's drift.
+    """Estimated drift of an arm.
 
     Attributes:
         model: The arm with its coefficients and their covariance.
-        values: (p,) how far its parameters are from what was known beforehand, in units of (p,)
-            `sigmas`.
-        sigmas: To what they were known beforehand.
-        shares: (p,) sigma of each parameter as a share of its prior's.
-        gain: Twice the gain in log-likelihood over an arm that does not drift.
+        values: (p,) deviation of the parameters from their prior, in units of (p,) `sigmas`.
+        sigmas: The prior's sigmas.
+        shares: (p,) posterior over prior sigma of each parameter.
+        gain: Twice the gain in log-likelihood over an arm without drift.
         before_m: Residual of the views without drift, as a root mean square [m].
-        after_m: The same with it [m].
+        after_m: The same with drift [m].
         rises_k: (n,) range of each link's temperature over the views [K].
         inputs: What heated the arm.
     """
@@ -93,10 +92,10 @@ class ThermalFit:
 
     @property
     def not_determined(self) -> tuple[str, ...]:
-        """The parameters that stay at what was known before, by joint."""
+        """The parameters that stay at their prior, by joint."""
         names = _parameter_names(self.model)
         return tuple(
-            name for name, share in zip(names, self.shares, strict=True) if share > _LITTLE
+            name for name, share in zip(names, self.shares, strict=True) if share > _UNDETERMINED
         )
 
     def links_c(self, stops: ThermalStops) -> FloatArray:
@@ -104,18 +103,18 @@ class ThermalFit:
         return self.model.heating.links_c(self.inputs, stops.stamps_s)
 
     def motion(self, stops: ThermalStops) -> FloatArray:
-        """(m, 4, 4) how far the flange had moved at some stops, in its own frame."""
+        """(m, 4, 4) drift of the flange at some stops, in its own frame."""
         return self.model.motion(stops.q, self.links_c(stops))
 
     def effect(self, stops: ThermalStops, count: int) -> Effect:
-        """The uncertainty of the parameters, as unknowns of the chain at all of so many stops.
+        """The uncertainty of the parameters, as an effect on all `count` stops.
 
-        They stay where they were found, and count in the covariance with what was known of them
-        beforehand: what the stops determine of them the chain says itself.
+        Its values are held at zero and count in the covariance with their prior: the information of
+        the stops is in the problem itself.
         """
         free = _effect(self.model, self.values, self.sigmas, stops, self.inputs, count)
-        nothing = np.zeros(len(self.values))
-        return replace(free, values=nothing, held=nothing == 0.0)
+        zero = np.zeros(len(self.values))
+        return replace(free, values=zero, held=zero == 0.0)
 
 
 def _parameter_names(model: ThermalModel) -> tuple[str, ...]:
@@ -125,7 +124,7 @@ def _parameter_names(model: ThermalModel) -> tuple[str, ...]:
 
 
 def uninformative(inputs: Inputs, stamps_s: FloatArray) -> str:
-    """Says why views were all taken about equally warm; empty where they were not."""
+    """States why views were all taken about equally warm; empty where they were not."""
     links = _expected(inputs).links_c(inputs, stamps_s)
     rise = float(np.ptp(links, axis=0).max())
     hours = float(np.ptp(stamps_s)) / 3600.0
@@ -151,30 +150,32 @@ def fit_thermal(
     inputs: Inputs,
     nominal: Robot,
 ) -> ThermalFit:
-    """Estimates how an arm drifts, with all unknowns free.
+    """Estimates an arm's drift, with all unknowns free.
 
     Args:
-        problem: The observations, with the arm as it is without drift.
-        state: Where to start.
+        problem: The observations, with the arm without drift.
+        state: The start.
         robot: That arm, up to the frame of its poses.
-        stops: Where it stood, and when.
+        stops: Its stops, with times.
         inputs: What heats the arm.
-        nominal: The arm without what is mounted on its flange: its lengths are what grows.
+        nominal: The arm without a tool on its flange: its lengths are what grows.
     """
     warming = _WarmingUnknowns(problem, stops, inputs, _start(robot, nominal, inputs))
     with one_blas_thread():
         cold = fit_problem(problem, state)
-        found, noise = _descended(warming, _Warm(cold.state, np.zeros(warming.size)), cold.noise)
-        warm, at = warming.problem(found.values), warming.at(found)
-        gain = _unlikeliness(problem, cold.state, noise) - _unlikeliness(warm, at, noise)
-        information = fisher_information(warm, at, noise)
-        covariance = covariance_among(information, warm.counted)[-warming.size :, -warming.size :]
+        start, free = _WarmState(cold.state, np.zeros(warming.size)), slice(-warming.size, None)
+        warm, noise = _minimised(warming, start, cold.noise)
+        drifted, at = warming.problem(warm.values), warming.at(warm)
+        gain = _neg_log_likelihood(problem, cold.state, noise)
+        gain -= _neg_log_likelihood(drifted, at, noise)
+        information = fisher_information(drifted, at, noise)
+        covariance = covariance_among(information, drifted.counted)[free, free]
         before_m = _rms_m(problem, cold.state, stops.robot)
-        after_m = _rms_m(warm, at, stops.robot)
-    model, sigmas = warming.model(found.values), warming.sigmas
+        after_m = _rms_m(drifted, at, stops.robot)
+    model, sigmas = warming.model(warm.values), warming.sigmas
     return ThermalFit(
         replace(model, covariance=covariance * np.outer(sigmas, sigmas)),
-        found.values,
+        warm.values,
         sigmas,
         np.sqrt(np.diag(covariance)),
         2.0 * gain,
@@ -185,29 +186,31 @@ def fit_thermal(
     )
 
 
-def _descended(warming: "_WarmingUnknowns", state: "_Warm", noise: Noise) -> tuple["_Warm", Noise]:
-    """Minimises under the noise that the residuals show, until that stays the same."""
+def _minimised(
+    warming: "_WarmingUnknowns", state: "_WarmState", noise: Noise
+) -> tuple["_WarmState", Noise]:
+    """Minimises, and re-estimates the noise from the residuals, until that is constant."""
     for _ in range(_ROUNDS):
         state, _ = levenberg_marquardt(state, partial(warming.linearised, noise=noise), _SETTLED)
-        problem, at, last = warming.problem(state.values), warming.at(state), noise
+        problem, at, previous = warming.problem(state.values), warming.at(state), noise
         noise = estimate_noise(problem, at, noise, from_above=True)
-        if np.allclose(last.robots, noise.robots, rtol=1e-3):
+        if np.allclose(previous.robots, noise.robots, rtol=1e-3):
             break
     return state, noise
 
 
-def _unlikeliness(problem: Problem, state: State, noise: Noise) -> float:
+def _neg_log_likelihood(problem: Problem, state: State, noise: Noise) -> float:
     return robot_levels(problem, state, noise, from_above=True)[1]
 
 
 def _rms_m(problem: Problem, state: State, robot: str) -> float:
-    """How far a robot's stops place what they see from one another, as a root mean square [m]."""
+    """RMS of the position residuals of a robot's stops [m]."""
     residuals = problem.linear(state).residuals[rows_of(problem, robot)]
     return float(np.sqrt(np.mean(np.sum(residuals[:, 3:] ** 2, axis=1))))
 
 
 @dataclass(frozen=True, eq=False)
-class _Warm:
+class _WarmState:
     """The unknowns of the cold arm's problem, and the (p,) values of the drift."""
 
     state: State
@@ -216,7 +219,7 @@ class _Warm:
 
 @dataclass(frozen=True, eq=False)
 class _WarmingUnknowns:
-    """The fit's unknowns beside those of the cold arm's problem, in units of their sigmas."""
+    """The cold arm's problem, extended by the drift's parameters in units of their sigmas."""
 
     cold: Problem
     stops: ThermalStops
@@ -225,11 +228,10 @@ class _WarmingUnknowns:
 
     @property
     def sigmas(self) -> FloatArray:
-        count = self.start.joint_count
         kind = self.inputs.kind
         sizes = [_GROWTH_SIGMA_PER_K, _DRIFT_SIGMA_RAD_PER_K, _TAU_SIGMA[kind]]
         sizes += [_GAIN_SIGMA] * (kind == "currents")
-        return np.repeat(sizes, count)
+        return np.repeat(sizes, self.start.joint_count)
 
     @property
     def size(self) -> int:
@@ -244,32 +246,32 @@ class _WarmingUnknowns:
             heating=self.start.heating.changed(steps[2 * count :]),
         )
 
-    def at(self, warm: _Warm) -> State:
-        """The unknowns where the drift is linearised."""
+    def at(self, warm: _WarmState) -> State:
+        """The unknowns at the linearisation point of the drift."""
         return State(warm.state.edges, np.concatenate([warm.state.values, warm.values]))
 
-    def linearised(self, warm: _Warm, noise: Noise) -> Linearised[_Warm]:
-        """The whitened squared error with that of the priors, and the way on."""
+    def linearised(self, warm: _WarmState, noise: Noise) -> Linearised[_WarmState]:
+        """The whitened squared error with that of the priors, and the damped step."""
         problem = self.problem(warm.values)
         information, gradient, cost = equations_and_cost(problem, self.at(warm), noise)
         moving = problem.moving
-        free, slope = information[np.ix_(moving, moving)], gradient[moving]
+        free = information[np.ix_(moving, moving)]
 
-        def step(damping: float) -> _Warm:
-            by = np.zeros(problem.size)
-            by[moving] = damped_step(free, slope, damping)
-            return _Warm(warm.state.moved(by[: -self.size]), warm.values + by[-self.size :])
+        def step(damping: float) -> _WarmState:
+            change = np.zeros(problem.size)
+            change[moving] = damped_step(free, gradient[moving], damping)
+            state = warm.state.moved(change[: -self.size])
+            return _WarmState(state, warm.values + change[-self.size :])
 
         return Linearised(warm, cost + float(warm.values @ warm.values), step)
 
     def problem(self, values: FloatArray) -> Problem:
-        """The observations with the arm as warm as it was, and how it moves with the unknowns."""
+        """The observations with the drifted arm, and the effect of the parameters."""
         model, stops, poses = self.model(values), self.stops, dict(self.cold.poses)
         links = model.heating.links_c(self.inputs, stops.stamps_s)
         moved = poses[stops.robot].copy()
         moved[stops.places] = moved[stops.places] @ model.motion(stops.q, links)
-        count = len(moved)
-        effect = _effect(model, values, self.sigmas, stops, self.inputs, count)
+        effect = _effect(model, values, self.sigmas, stops, self.inputs, len(moved))
         warm = replace(self.cold, poses=poses | {stops.robot: moved})
         return warm.with_effects([*warm.effects, effect])
 
@@ -282,19 +284,19 @@ def _effect(
     inputs: Inputs,
     count: int,
 ) -> Effect:
-    """The parameters as unknowns at all of so many stops, in units of (p,) sigmas."""
+    """The parameters as an effect on all `count` stops, in units of (p,) sigmas."""
     links = model.heating.links_c(inputs, stops.stamps_s)
     heated = model.heating.jacobian(inputs, stops.stamps_s)
     basis = np.zeros((count, 6, len(values)))
     basis[stops.places] = model.basis(stops.q, links, heated) * sigmas
-    known = Knowledge(np.eye(len(values)), values)
-    nothing = np.zeros(len(values), dtype=bool)
+    prior = Knowledge(np.eye(len(values)), values)
+    held = np.zeros(len(values), dtype=bool)
     name = f"temperature of {stops.robot}"
-    return Effect(name, values, known, nothing, flange_jacobian={stops.robot: basis})
+    return Effect(name, values, prior, held, flange_jacobian={stops.robot: basis})
 
 
 def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:
-    """The arm as it is expected to drift before anything was seen."""
+    """The arm with its expected drift (the prior)."""
     count, heating = robot.joint_count, _expected(inputs)
     return ThermalModel(
         robot,
@@ -308,7 +310,7 @@ def _start(robot: Robot, nominal: Robot, inputs: Inputs) -> ThermalModel:
 
 
 def _expected(inputs: Inputs) -> Heating:
-    """How links are expected to follow what heats them."""
+    """The prior of how links follow what heats them."""
     count = inputs.signal.shape[1]
     gain = np.ones(count)
     if inputs.kind == "currents":

@@ -1,7 +1,7 @@
-"""Single images that were turned or mirrored, beside others that were not.
+"""Detection of single images that were turned or mirrored.
 
-Such an image is of another lens than the others and of a pose that the robot did not take; but its
-corners, carried back, lie where the robot and the board predict them.
+Such an image shows another lens than the others, from a pose that the robot did not take; but its
+corners, turned back, are where the robot and the board predict them.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,41 +11,36 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 
-# Corners lie where they are predicted within so many times what those of most views are off by.
-_NEAR = 5.0
-# Detectors are no better [px].
+# Corners agree with the prediction within this multiple of the typical residual.
+_AGREEMENT = 5.0
+# Least residual of a detector [px].
 _LEAST_PX = 0.05
-# Corners that lie anywhere amid the predicted ones are 0.4 of their spacing off the nearest.
+# Corners at random places among the predicted ones are 0.4 of the spacing from the nearest.
 _OF_SPACING = 0.15
 
 
 @dataclass(frozen=True)
 class ImageTurn:
-    """How an image was changed.
-
-    Attributes:
-        words: What was done to it.
-        option: Of ImageMagick, which undoes it.
-    """
+    """A rotation or reflection of an image, in words, and ImageMagick's option that undoes it."""
 
     words: str
     option: str
 
 
-_Carried = Callable[[FloatArray, int, int], FloatArray]
+_PixelMap = Callable[[FloatArray, int, int], FloatArray]
 _HALF = ImageTurn("turned by 180 deg", "-rotate 180")
 _LEFT = ImageTurn("turned by 90 deg counterclockwise", "-rotate 90")
 _RIGHT = ImageTurn("turned by 90 deg clockwise", "-rotate 270")
 _FLOPPED = ImageTurn("mirrored left to right", "-flop")
 _FLIPPED = ImageTurn("mirrored upside down", "-flip")
-# Where corners (n, 2) lie once it is undone, in images of a width and a height [px].
-_UNDONE: Mapping[ImageTurn, _Carried] = {
+# Coordinates of corners (n, 2) once it is undone, in images of a width and a height [px].
+_UNDONE: Mapping[ImageTurn, _PixelMap] = {
     _HALF: lambda px, width, height: np.array([width - 1, height - 1]) - px,
     _FLOPPED: lambda px, width, _: np.array([width - 1, 0]) + np.array([-1, 1]) * px,
     _FLIPPED: lambda px, _, height: np.array([0, height - 1]) + np.array([1, -1]) * px,
 }
 # Only square images keep their size.
-_QUARTERS: Mapping[ImageTurn, _Carried] = {
+_QUARTERS: Mapping[ImageTurn, _PixelMap] = {
     _LEFT: lambda px, _, height: np.stack([height - 1 - px[:, 1], px[:, 0]], axis=1),
     _RIGHT: lambda px, width, _: np.stack([px[:, 1], width - 1 - px[:, 0]], axis=1),
 }
@@ -54,31 +49,32 @@ _QUARTERS: Mapping[ImageTurn, _Carried] = {
 def turned_how(
     px: FloatArray, predicted_px: FloatArray, size: tuple[int, int], typical_px: float
 ) -> ImageTurn | None:
-    """Says how the image of a view that disagrees was turned or mirrored.
+    """Finds how the image of an outlier view was turned or mirrored.
 
-    Corners are compared with the nearest predicted one: a checkerboard's are numbered otherwise in
-    a mirror, and one that looks the same upside down may be numbered from either end.
+    Corners are compared with the nearest predicted one: a mirrored checkerboard is numbered
+    differently, and one that looks the same upside down may be numbered from either end.
 
     Args:
         px: (n, 2) its corners [px].
         predicted_px: (m, 2) all of the target's, as robot and board predict them [px].
         size: Width and height of the image [px].
-        typical_px: What corners of views that agree are off by (rms) [px].
+        typical_px: RMS residual of the corners of inlier views [px].
 
     Returns:
-        It; None where the corners are where they are predicted, or nothing brings them there.
+        The turn; None where the corners are as predicted, or no turn explains them.
     """
-    known = predicted_px[np.isfinite(predicted_px).all(axis=1)]
-    limit_px = min(_NEAR * max(typical_px, _LEAST_PX), _OF_SPACING * _spacing_px(known))
-    if not len(known) or _away_px(px, known) < limit_px:
+    predicted = predicted_px[np.isfinite(predicted_px).all(axis=1)]
+    limit_px = min(_AGREEMENT * max(typical_px, _LEAST_PX), _OF_SPACING * _spacing_px(predicted))
+    if not len(predicted) or _rms_px(px, predicted) < limit_px:
         return None
-    undone = {**_UNDONE, **(_QUARTERS if size[0] == size[1] else {})}
-    how = min(undone, key=lambda index: _away_px(undone[index](px, *size), known))
-    return how if _away_px(undone[how](px, *size), known) < limit_px else None
+    candidates = {**_UNDONE, **(_QUARTERS if size[0] == size[1] else {})}
+    undone = ((_rms_px(undo(px, *size), predicted), turn) for turn, undo in candidates.items())
+    rms_px, turn = min(undone, key=lambda pair: pair[0])
+    return turn if rms_px < limit_px else None
 
 
 def _spacing_px(places: FloatArray) -> float:
-    """How far places are from the nearest other one (median) [px]; infinite of one alone."""
+    """Median distance of points from their nearest neighbour [px]; infinite for one."""
     if len(places) < 2:
         return np.inf
     squares = np.sum((places[:, None] - places) ** 2, axis=2)
@@ -86,7 +82,7 @@ def _spacing_px(places: FloatArray) -> float:
     return float(np.sqrt(np.median(squares.min(axis=1))))
 
 
-def _away_px(px: FloatArray, places: FloatArray) -> float:
-    """How far points are from the nearest of some places (rms) [px]."""
+def _rms_px(px: FloatArray, places: FloatArray) -> float:
+    """RMS distance of points from the nearest of others [px]."""
     squares = np.sum((px[:, None] - places) ** 2, axis=2).min(axis=1)
     return float(np.sqrt(squares.mean()))

@@ -1,4 +1,4 @@
-"""Predicts each observation from a fit that was made without its stop."""
+"""Cross-validation: each observation is predicted by a fit without its stop."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -13,20 +13,21 @@ from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
 from visioncal.vision.camera import project
 
-# Up to here every stop is left out by itself; beyond, ten groups say the same.
+# Up to this number, every stop is held out by itself; with more, ten groups are sufficient.
 _MOST_FOLDS_OF_ONE = 30
 _FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Residuals of observations that the fit had not seen.
+    """Residuals of held-out observations.
 
     Attributes:
-        method: How they were left out, in words.
-        away_m: (n,) distance between where the observation and the fit place what it saw [m]; NaN
-            where the others do not place it.
-        away_rad: (n,) the same in rotation [rad]; NaN where places alone were read.
+        method: The method of cross-validation, in words.
+        away_m: (n,) distance between the observed and the predicted position [m]; NaN where the
+            other
+            observations do not determine it.
+        away_rad: (n,) angle between the rotations [rad]; NaN for positions alone.
         rms_px: (n,) reprojection error through the chain [px]; NaN without corners.
     """
 
@@ -42,7 +43,7 @@ def validate(
     pixels: Callable[[IntArray, State], FloatArray],
     of: str = "",
 ) -> HeldOut:
-    """Leaves stops out, one by one or in ten groups, and predicts what was observed there.
+    """Holds stops out, one by one or in ten groups, and predicts their observations.
 
     Args:
         problem: The n observations in the fit.
@@ -51,10 +52,10 @@ def validate(
         of: What is fitted, as a part of the method's words.
 
     Returns:
-        The residuals. What the others do not place has none.
+        The residuals; NaN for what the others do not determine.
     """
     stops = np.unique(problem.observations.stops, return_inverse=True)[1]
-    needs = _needs(problem)
+    needed = _needed_frames(problem)
     count = int(stops.max()) + 1
     folds = count if count <= _MOST_FOLDS_OF_ONE else _FOLDS
     # Strides, so that a group's stops are not neighbours.
@@ -63,8 +64,8 @@ def validate(
     with one_blas_thread():
         for left_out in range(folds):
             kept = fold != left_out
-            known = needs[kept].any(axis=0)
-            held = ~kept & ~(needs & ~known).any(axis=1)
+            determined = needed[kept].any(axis=0)
+            held = ~kept & ~(needed & ~determined).any(axis=1)
             if not held.any():
                 continue
             state = refit(problem.subset(kept))
@@ -75,24 +76,22 @@ def validate(
     return HeldOut(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
 
 
-def _needs(problem: Problem) -> Mask:
-    """(n, u) the unknown frames on the way of each observation."""
-    needs = np.zeros((len(problem), len(problem.unknown)), dtype=bool)
+def _needed_frames(problem: Problem) -> Mask:
+    """(n, u) the unknown frames in the path of each observation."""
+    needed = np.zeros((len(problem), len(problem.unknown)), dtype=bool)
     for group in problem.groups:
-        frames = [
-            problem.unknown[step.frame] for step in group.path if step.frame in problem.unknown
-        ]
-        needs[group.rows[:, None], frames] = True
-    return needs
+        frames = [step.frame for step in group.path if step.frame in problem.unknown]
+        needed[group.rows[:, None], [problem.unknown[frame] for frame in frames]] = True
+    return needed
 
 
 def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
-    """How far (n,) [m] and (n,) [rad] observations are from what is predicted."""
-    away_m, turned = distances(problem.measured(state), problem.predicted(state))
-    seen = problem.observations
-    # The rotation of what is only a point is a matter of choice.
-    chosen = np.isin(seen.observed, list(problem.points))
-    return away_m, np.where(seen.has_rotation & ~chosen, turned, np.nan)
+    """Residuals (n,) [m] and (n,) [rad] of observations."""
+    away_m, away_rad = distances(problem.measured(state), problem.predicted(state))
+    observations = problem.observations
+    # The rotation of a mere point is arbitrary.
+    is_point = np.isin(observations.observed, list(problem.points))
+    return away_m, np.where(observations.has_rotation & ~is_point, away_rad, np.nan)
 
 
 def chain_rms_px(
@@ -101,29 +100,29 @@ def chain_rms_px(
     cameras: Sequence[Camera | None],
     positions: FloatArray,
 ) -> FloatArray:
-    """Reprojection error of each view's corners, (m,) [px]; NaN where there are none.
+    """Reprojection error of each view's corners, (m,) [px]; NaN without corners.
 
     Args:
         seen: (m,) each view's corners.
-        poses: (m, 4, 4) `cam_from_target` as the chain predicts it.
+        poses: (m, 4, 4) `cam_from_target` by the chain.
         cameras: (m,) each view's camera, where it has corners.
         positions: (c, 3) all corners, each on its target [m].
     """
     rms = np.full(len(poses), np.nan)
-    alike = defaultdict[int, list[tuple[int, Camera, Corners]]](list)
+    by_camera = defaultdict[int, list[tuple[int, Camera, Corners]]](list)
     for at, (camera, corners) in enumerate(zip(cameras, seen, strict=True)):
         if camera is not None and corners is not None:
-            alike[id(camera)].append((at, camera, corners))
-    for views in alike.values():
+            by_camera[id(camera)].append((at, camera, corners))
+    for views in by_camera.values():
         camera, rows = views[0][1], [at for at, _, _ in views]
         counts = [len(corners.ids) for _, _, corners in views]
-        of = np.repeat(rows, counts)
+        view_of = np.repeat(rows, counts)
         points = positions[np.concatenate([corners.ids for _, _, corners in views])]
-        points = apply_each(poses[of], points)
-        away = project(camera, points) - np.concatenate([corners.px for _, _, corners in views])
-        # A corner behind the camera counts as a whole image away.
-        away = np.nan_to_num(away, nan=float(max(camera.resolution)))
-        squares = np.bincount(of, np.sum(away**2, axis=1), minlength=len(poses))
+        observed = np.concatenate([corners.px for _, _, corners in views])
+        residuals = project(camera, apply_each(poses[view_of], points)) - observed
+        # A corner behind the camera counts as a whole image width of error.
+        residuals = np.nan_to_num(residuals, nan=float(max(camera.resolution)))
+        squares = np.bincount(view_of, np.sum(residuals**2, axis=1), minlength=len(poses))
         rms[rows] = np.sqrt(squares[rows] / counts)
     return rms
 
