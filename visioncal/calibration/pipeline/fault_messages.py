@@ -1,4 +1,4 @@
-"""What is wrong with observations that disagree, and what moved, for people."""
+"""Messages on outliers and moved frames: exchanged, wrong or turned observations, by cause."""
 
 import shlex
 from collections import defaultdict
@@ -30,28 +30,26 @@ from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
 
-# A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
+# A base was pushed where at least so many stops agree on its displacement, to such a share of it.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
-# What the fit leaves uncertain grows with a step: views that a large one explains agree on it to
-# within this share of it.
+# Views that a large step explains agree on it to within this share of the step: the uncertainty
+# that the fit leaves grows with it.
 _SURELY_ALIKE = 0.05
-# A robot's pose is wrong where so many observations of its stop say so.
+# A robot's pose is wrong where at least so many observations of its stop show it.
 _FEWEST = 2
-
-
-# So many views of a fault are named, and so many stops that an observation fits.
+# Most views of a fault, and most stops that fit an observation, that are named.
 _LISTED, _NAMED = 8, 3
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 
 @dataclass(frozen=True)
 class PoseFault:
-    """What is wrong with the poses of a robot.
+    """A fault of poses or images that explains outliers.
 
     Attributes:
-        found: What it is.
+        found: The finding.
         rows: The observations that it explains.
-        short: The same as a clause, for each of these; empty where the sentences are enough.
+        short: The fault as a clause, for each of these; empty where the finding suffices.
     """
 
     found: Finding
@@ -61,11 +59,11 @@ class PoseFault:
 
 @dataclass(frozen=True)
 class Version:
-    """A frame over a part of the time.
+    """A frame during a part of the session, in which it did not move.
 
     Attributes:
         key: Its name in the problem.
-        frame: The frame that it is.
+        frame: The name of the frame.
         name: Its name in the result: the frame's own for the last.
         start: The first station of it; -1 for the first version.
     """
@@ -75,45 +73,50 @@ class Version:
     name: str
     start: int
 
+    @property
+    def is_last(self) -> bool:
+        """Whether the frame was there at the end of the session."""
+        return self.name == self.frame
+
 
 def versions(solved: Solved) -> dict[str, Version]:
     """All unknown frames over time, by their names in the problem."""
-    moves = {move.twin: move for move in solved.agreed.moves}
+    starts = {move.twin: move.stop for move in solved.agreed.moves}
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
     for key in solved.agreed.problem.unknown:
-        start = moves[key].stop if key in moves else -1
-        parts[key.partition("@")[0]].append((start, key))
+        parts[key.partition("@")[0]].append((starts.get(key, -1), key))
     found = {}
-    for frame, mine in parts.items():
-        ordered = sorted(mine)
-        for at, (start, key) in enumerate(ordered):
-            name = frame
-            if at + 1 < len(ordered):
-                name = f"{frame}_until_stop_{_stops_of(solved, key)[-1]}"
-            found[key] = Version(key, frame, name, start)
+    for frame, keys in parts.items():
+        *earlier, (start, last) = sorted(keys)
+        for before, key in earlier:
+            name = f"{frame}_until_stop_{_stops_of(solved, key)[-1]}"
+            found[key] = Version(key, frame, name, before)
+        found[last] = Version(last, frame, frame, start)
     return found
 
 
 def _stops_of(solved: Solved, key: str) -> list[int]:
-    """The stops at which a frame, as the problem knows it, is in what is used; in order of time."""
-    problem = solved.agreed.problem
-    rows = problem.observations.involves(key)
-    some = rows & solved.agreed.used
-    stations = problem.observations.stops[some if some.any() else rows]
-    return [solved.cell.stops[index] for index in np.unique(stations).tolist()]
+    """The stops of a frame's inliers, in order of time; of all its observations if it has none."""
+    observations = solved.agreed.problem.observations
+    rows = observations.involves(key)
+    used = rows & solved.agreed.used
+    stations = observations.stops[used if used.any() else rows]
+    return [solved.cell.stops[station] for station in np.unique(stations).tolist()]
 
 
 def movements(solved: Solved) -> tuple[Moved, ...]:
-    """What moved, in the order of time."""
-    found, names, edges = [], versions(solved), solved.frames
+    """The frames that moved, in the order of time."""
+    found, versions_by_key, edges = [], versions(solved), solved.frames
     for move in sorted(solved.agreed.moves, key=lambda value: value.stop):
-        after = names[move.twin]
-        earlier = [
-            name
-            for name in names.values()
-            if name.frame == after.frame and name.start < after.start
-        ]
-        before = max(earlier, key=lambda value: value.start)
+        after = versions_by_key[move.twin]
+        before = max(
+            (
+                it
+                for it in versions_by_key.values()
+                if it.frame == after.frame and it.start < after.start
+            ),
+            key=lambda value: value.start,
+        )
         mm, deg = pose_difference(edges[before.key], edges[after.key])
         rivals = tuple(dict.fromkeys(rival.partition("@")[0] for rival in move.rivals))
         found.append(
@@ -131,7 +134,7 @@ def movements(solved: Solved) -> tuple[Moved, ...]:
 
 
 def moved_found(moved: Moved) -> Finding:
-    """Says that something moved."""
+    """Finding that a frame moved."""
     what = "was bumped" if moved.frame.startswith("cam") else "moved"
     rivals = (
         f" (or {' or '.join(moved.rivals)} did: the session leaves it open)" if moved.rivals else ""
@@ -146,28 +149,27 @@ def moved_found(moved: Moved) -> Finding:
 
 
 def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
-    """Images that were turned, robots that were pushed, poses that are exchanged or wrong."""
-    out = np.flatnonzero(~solved.agreed.used)
-    if not len(out):
+    """Turned images, exchanged or wrong poses, and pushed robots that explain outliers."""
+    outliers = np.flatnonzero(~solved.agreed.used)
+    if not len(outliers):
         return ()
     turned = _turned_images(solved)
     explained = {row for fault in turned for row in fault.rows}
-    mutual = exchanged(solved.agreed.problem, _fitting(solved, out))
+    mutual = exchanged(solved.agreed.problem, _fitting(solved, outliers))
     if solved.cell.mount is not None:
         swapped = tuple(_exchanged_views(solved, mutual))
         return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
     found = _pushed_bases(solved)
     found += _exchanged(solved, mutual)
     explained |= {row for fault in found for row in fault.rows}
-    found += _exchanged_views(
-        solved, {key: by for key, by in mutual.items() if not {key, by} & explained}
-    )
+    rest = {one: other for one, other in mutual.items() if not {one, other} & explained}
+    found += _exchanged_views(solved, rest)
     explained |= {row for fault in found for row in fault.rows}
     return (*turned, *found, *_wrong_poses(solved, explained))
 
 
 def _turned_images(solved: Solved) -> list[PoseFault]:
-    """Images that agree with the others once they are turned back, by how they were turned."""
+    """Turned or mirrored images, which agree with the others once they are turned back."""
     rows, found = solved.cell.rows, []
     alike: dict[ImageTurn, list[int]] = defaultdict(list)
     for at, row in enumerate(rows):
@@ -192,13 +194,13 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
 
 
 def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
-    """Views from some view on, or before one, that one step of a frame explains."""
-    # A tool frame that is switched on in the controller moves what is on the flange, as it is
-    # reported, and another base frame what stands.
-    agreed, rows = solved.agreed, solved.cell.rows
-    problem = agreed.problem
+    """Outliers at one end of the session that one step of a frame explains."""
+    # Another active tool frame in the controller looks like a step of what is on the flange, and
+    # another base frame like one of what is fixed in the cell.
+    inliers, rows = solved.agreed, solved.cell.rows
+    problem = inliers.problem
     order = np.argsort(problem.observations.stops, kind="stable")
-    used = np.flatnonzero(agreed.used[order])
+    used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
     if len(run) < _FEWEST_STOPS or not problem.observations.has_rotation[run].all():
@@ -208,11 +210,11 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
         yield from _other_boards(solved, run, is_behind=run is after)
         return
     (frame, change), *rivals = steps
-    edge = agreed.fit.state.edges[problem.unknown[frame]]
+    edge = inliers.fit.state.edges[problem.unknown[frame]]
     when = _when(solved, run, is_behind=run is after)
     moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
     moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
-    out = np.sort(run).tolist()
+    outliers = np.sort(run).tolist()
     advice = "Fasten what moved, and calibrate the views before and after it apart."
     on_flange = problem.tree.body(frame) != problem.tree.root
     if on_flange or len(problem.robots) == 1:
@@ -226,61 +228,61 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
             f"Look which {which} frame was active in the controller, and set the same one for all "
             "views; or fasten what moved, and calibrate the views before and after it apart."
         )
-    words = f"{_views(solved, out)} were left out: {when}, as they agree, {moved}."
+    words = f"{_views(solved, outliers)} were left out: {when}, as they agree, {moved}."
     found = Finding(
         "something_moved",
         f"V{words[1:]}",
-        or_alone(advice, _numbers(solved, out)),
-        _numbers(solved, out),
+        or_alone(advice, _numbers(solved, outliers)),
+        _numbers(solved, outliers),
         mahalanobis_sq=run_evidence(len(run), len(rows)),
     )
-    yield PoseFault(found, tuple(out), f"{when}, something had moved")
+    yield PoseFault(found, tuple(outliers), f"{when}, something had moved")
 
 
 def _other_boards(solved: Solved, run: IntArray, *, is_behind: bool) -> Iterator[PoseFault]:
-    """Views at one end that a board of another size explains."""
-    agreed, out = solved.agreed, np.sort(run).tolist()
-    some = np.isin(np.arange(len(agreed.used)), run)
-    found = common_size(agreed.problem, agreed.fit, some)
-    if found is None or not found[1].all():
+    """Outliers at one end of the session that a board of another size explains."""
+    inliers, outliers = solved.agreed, np.sort(run).tolist()
+    is_in_run = np.isin(np.arange(len(inliers.used)), run)
+    size = common_size(inliers.problem, inliers.fit, is_in_run)
+    if size is None or not size[1].all():
         return
     when = _when(solved, run, is_behind=is_behind)
     words = (
-        f"{_views(solved, out)} were left out: {when}, as they agree, the target is another one, "
-        f"{figure(100.0 * abs(found[0]))} % {'larger' if found[0] > 0.0 else 'smaller'} than that "
-        "of the other views."
+        f"{_views(solved, outliers)} were left out: {when}, as they agree, the target is another "
+        f"one, {figure(100.0 * abs(size[0]))} % {'larger' if size[0] > 0.0 else 'smaller'} than "
+        "that of the other views."
     )
     step = Remedy("Measure both prints, take one of them for all views, and record again.")
-    evidence = run_evidence(len(run), len(agreed.used))
-    views = _numbers(solved, out)
-    fault = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
-    yield PoseFault(fault, tuple(out), f"{when}, the target was another one")
+    evidence = run_evidence(len(run), len(inliers.used))
+    views = _numbers(solved, outliers)
+    finding = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
+    yield PoseFault(finding, tuple(outliers), f"{when}, the target was another one")
 
 
 def _when(solved: Solved, run: IntArray, *, is_behind: bool) -> str:
-    """Since when views at one end, or until when, in the order of their stops."""
+    """When views at the end, or the beginning, of the session were taken, in words."""
     rows = solved.cell.rows
     if is_behind:
         return f"from view {rows[int(run[0])].view} on"
     last = rows[int(run[-1])].station
-    behind = min((row for row in rows if row.station > last), key=lambda row: row.station)
-    return f"before view {behind.view}"
+    following = min((row for row in rows if row.station > last), key=lambda row: row.station)
+    return f"before view {following.view}"
 
 
 def _common_steps(solved: Solved, run: IntArray) -> list[tuple[str, FloatArray]]:
-    """Frames of which one step explains some views, and the step: that scatters least first."""
-    agreed, found = solved.agreed, []
-    some = np.isin(np.arange(len(agreed.used)), run)
-    for frame in agreed.problem.unknown:
-        step = common_change(agreed.problem, agreed.fit, frame, some)
+    """Frames with a common step that explains some views, and the step; least scatter first."""
+    inliers, steps = solved.agreed, []
+    is_in_run = np.isin(np.arange(len(inliers.used)), run)
+    for frame in inliers.problem.unknown:
+        step = common_change(inliers.problem, inliers.fit, frame, is_in_run)
         if step is None:
             continue
         change, explained = step
-        asked = agreed.problem.change_of(frame, agreed.fit.state)[run]
-        scatter_m = float(np.median(distances(asked, change)[0]))
+        changes = inliers.problem.change_of(frame, inliers.fit.state)[run]
+        scatter_m = float(np.median(distances(changes, change)[0]))
         if explained.all() or scatter_m < _SURELY_ALIKE * float(np.linalg.norm(change[:3, 3])):
-            found.append((scatter_m, frame, change))
-    return [(frame, change) for _, frame, change in sorted(found, key=lambda item: item[0])]
+            steps.append((scatter_m, frame, change))
+    return [(frame, change) for _, frame, change in sorted(steps, key=lambda item: item[0])]
 
 
 def _thing(frame: str) -> str:
@@ -293,7 +295,7 @@ def _elsewhere(change: FloatArray) -> str:
 
 
 def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
-    """Pairs of views of one camera, each of which fits the pose of the other."""
+    """Pairs of views of one camera, each of which fits the other's pose."""
     rows = solved.cell.rows
     for first, second in sorted(mutual.items()):
         if first < second:
@@ -307,8 +309,8 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
                 "it.",
                 exchanging(*views),
             )
-            found = Finding(EXCHANGED, words, step, views)
-            yield PoseFault(found, (first, second))
+            finding = Finding(EXCHANGED, words, step, views)
+            yield PoseFault(finding, (first, second))
 
 
 def _numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
@@ -320,9 +322,9 @@ def _views(solved: Solved, rows: Sequence[int]) -> str:
 
 
 def _pushed_bases(solved: Solved) -> list[PoseFault]:
-    """Robots whose observations all disagree from some stop on, as one other place explains."""
-    # Such observations are left out, and the base is where it stood before: a base is no frame that
-    # may be two, because all that its robot carries hangs on it.
+    """Robots whose observations are all outliers from some stop on, as if the base had moved."""
+    # Such observations are left out, and the base stays where it was: unlike other frames, a base
+    # is not split in two when it moves, as all that its robot carries hangs on it.
     problem, used = solved.agreed.problem, solved.agreed.used
     stops, found = problem.observations.stops, []
     for robot, base in problem.tree.bases.items():
@@ -347,18 +349,18 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
 
 
 def _moved_by(solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None) -> str:
-    """By how much observations ask for a base elsewhere, in words; empty where they disagree."""
-    asked = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
+    """Mean displacement of a base by some observations, in words; empty where they disagree."""
+    changes = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
     if of is not None:
-        asked = invert(of) @ asked @ of
-    mean = mean_transform(asked)
+        changes = invert(of) @ changes @ of
+    mean = mean_transform(changes)
     shift_mm, turn_deg = pose_difference(np.eye(4), mean)
-    scatter_mm = 1e3 * float(np.median(distances(asked, mean)[0]))
+    scatter_mm = 1e3 * float(np.median(distances(changes, mean)[0]))
     return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
 
 
 def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
-    """Stops at which all that was seen by way of a robot asks for it to stand elsewhere."""
+    """Stops at which all observations through a robot agree that its pose is wrong."""
     problem, used = solved.agreed.problem, solved.agreed.used
     stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
@@ -377,32 +379,33 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
                 )
                 views = _numbers(solved, rows.tolist())
                 fix = "Correct its pose there in views.csv, or leave the stop out."
-                found = Finding("wrong_pose", words, Remedy(fix, look_at(views[0])), views)
+                finding = Finding("wrong_pose", words, Remedy(fix, look_at(views[0])), views)
                 short = f"the pose of robot {robot} at stop {solved.cell.stops[stop]} is wrong"
-                yield PoseFault(found, tuple(rows.tolist()), short)
+                yield PoseFault(finding, tuple(rows.tolist()), short)
 
 
 def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
-    """Why observations that disagree are left out, by view, with what they fit instead."""
-    agreed, rows, problem = solved.agreed, solved.cell.rows, solved.agreed.problem
-    out = np.flatnonzero(~agreed.used)
-    if not len(out):
+    """Why outliers are left out, by view, with the stops that they fit instead."""
+    inliers, rows, problem = solved.agreed, solved.cell.rows, solved.agreed.problem
+    outliers = np.flatnonzero(~inliers.used)
+    if not len(outliers):
         return {}
-    away = residuals(solved)[out]
-    counted = np.maximum(agreed.distances.directions, 1)
-    times, limit = (
-        np.sqrt(array / counted) for array in (agreed.distances.squares, agreed.distances.limit)
+    residuals_mm_deg = residuals(solved)[outliers]
+    directions = np.maximum(inliers.distances.directions, 1)
+    distance, limit = (
+        np.sqrt(array / directions)
+        for array in (inliers.distances.squares, inliers.distances.limit)
     )
-    fitting = _fitting(solved, out)
+    fitting = _fitting(solved, outliers)
     mutual = exchanged(problem, fitting)
-    robots = {row: fault.short for fault in faults if fault.short for row in fault.rows}
+    clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
     found = {}
-    for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
+    for at, (mm, deg) in zip(outliers.tolist(), residuals_mm_deg.tolist(), strict=True):
         turned = f" and {figure(deg)} deg" if problem.observations.has_rotation[at] else ""
         cause = _cause(solved, at)
-        if at in robots:
-            cause = robots[at]
+        if at in clauses:
+            cause = clauses[at]
         elif at in mutual:
             other = rows[mutual[at]]
             cause = (
@@ -413,10 +416,11 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
             stops = [str(solved.cell.stops[index]) for index in fitting[at][:_NAMED]]
             one = "stop" if len(stops) == 1 else "another stop, as"
             cause = f"its image is of {one} {', '.join(stops)}; {cause}"
-        # Little may be known of where it should be: what is far away is wrong all the same.
+        # Where the prediction is uncertain, an observation that is far away is rejected all the
+        # same.
         beyond = (
-            f"{figure(times[at])} times the noise (limit {figure(limit[at])})"
-            if times[at] > limit[at]
+            f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
+            if distance[at] > limit[at]
             else "many times as far as most"
         )
         found[rows[at].view] = (
@@ -427,7 +431,7 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
 
 
 def _called(solved: Solved, frame: str) -> str:
-    """A target or point in words."""
+    """Name of a target or point in words."""
     if solved.cell.mount is None:
         return frame.partition("@")[0]
     is_probe = frame.startswith("point") and frame not in solved.agreed.problem.points
@@ -435,7 +439,7 @@ def _called(solved: Solved, frame: str) -> str:
 
 
 def _cause(solved: Solved, at: int) -> str:
-    """What is wrong with an observation, by those of its stop and its target that agree."""
+    """Likely cause of an outlier, by the inliers of its stop and of its target."""
     rows, used, problem = solved.cell.rows, solved.agreed.used, solved.agreed.problem
     seen = np.array(problem.observations.observed)
     of_its_target = np.flatnonzero((seen == seen[at]) & used)
@@ -458,19 +462,19 @@ def _stop(solved: Solved, row: int) -> int:
 
 
 def residuals(solved: Solved) -> FloatArray:
-    """Distance (n, 2) of each observation from what is predicted [mm], [deg]."""
-    away_m, away_rad = apart(solved.agreed.problem, solved.agreed.fit.state)
-    return np.stack([1e3 * away_m, np.rad2deg(away_rad)], axis=1)
+    """Residuals (n, 2) of the observations, translation and rotation [mm], [deg]."""
+    metres, radians = apart(solved.agreed.problem, solved.agreed.fit.state)
+    return np.stack([1e3 * metres, np.rad2deg(radians)], axis=1)
 
 
-def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
-    """The other stations that observations fit; see `other_stops`."""
+def _fitting(solved: Solved, outliers: IntArray) -> dict[int, list[int]]:
+    """The other stations that outliers fit; see `other_stops`."""
     agreed = solved.agreed
     turns = {
         frame_name("target", name): rotation_transforms(target)
         for name, target in solved.cell.session.boards.items()
     }
-    return other_stops(agreed.problem, agreed.used, agreed.fit, out, agreed.moves, turns)
+    return other_stops(agreed.problem, agreed.used, agreed.fit, outliers, agreed.moves, turns)
 
 
 def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
