@@ -59,15 +59,15 @@ def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
     """
     matched = run.reported.matched
     # Misread joints say nothing about the poses.
-    chain = None
+    joint_poses = None
     if matched is None or not matched.misread:
-        chain = chain_poses(run.session, None if matched is None else matched.arm)
+        joint_poses = chain_poses(run.session, None if matched is None else matched.arm)
     if robot is None:
         poses = numbers_in(run.session, POSE)
-        robot = reported_or_chained(at_times(run) if run.clocks else poses, chain)
+        robot = reported_or_chained(at_times(run) if run.clocks else poses, joint_poses)
     is_measured, mount = bool(run.corners), run.session.mount
     for camera in seen_ways(run, robot):
-        guess = guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
+        guess = guess_reading(robot, camera, mount, chain=joint_poses, is_measured=is_measured)
         if not guess.stands_out and guess.declared.closes:
             break
     return guess
@@ -107,9 +107,13 @@ def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | No
     return poses if np.isfinite(poses).any() else None
 
 
-def reported_or_chained(read: PoseNumbers, chain: FloatArray | None) -> PoseNumbers:
+def reported_or_chained(read: PoseNumbers, joint_poses: FloatArray | None) -> PoseNumbers:
     """The robot's reported poses; those of its joints where none were reported."""
-    return read if chain is None or read.there.any() else PoseNumbers.of_poses(chain, read.places)
+    return (
+        read
+        if joint_poses is None or read.there.any()
+        else PoseNumbers.of_poses(joint_poses, read.places)
+    )
 
 
 def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
@@ -177,7 +181,7 @@ def camera_numbers(run: RunState) -> PoseNumbers:
     by_view = run.poses_of_one_board
     if not run.corners:
         numbers = numbers_in(run.session, MEASURED_CAM_POSE)
-        has_pose = np.array([[view.number in by_view] for view in run.session.views])
+        has_pose = np.array([view.number in by_view for view in run.session.views])[:, None]
         return replace(
             numbers,
             positions=np.where(has_pose, numbers.positions, np.nan),
