@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import (
-    beside_steps,
-    covariance_beside_noise,
+    covariance_from_other_sources,
     joint_offsets,
+    with_errors_beside_step,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
 from visioncal.calibration.pipeline.fault_messages import (
@@ -181,8 +181,8 @@ def answer_of(
     }
     offsets = joint_offsets(solved.arms)
     tests = misfits(part, converged, errors, offsets)
-    solved = replace(solved, arms=beside_steps(solved.arms, part, fit, tests))
-    beside = covariance_beside_noise(part, fit, solved.arms, tests, offsets, is_fit=is_fit)
+    solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, tests))
+    beside = covariance_from_other_sources(part, fit, solved.arms, tests, offsets, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
     faults, held_out, middles = pose_faults(solved), left_out(solved), middles_of(solved.cell)
     return Answer(
@@ -253,7 +253,7 @@ def _views(
             solved.cell.stops[row.station],
             *_finite_or_none(left_out_residuals[at]),
         )
-    results |= held_views(solved, observed)
+    results |= held_back_results(solved, observed)
     lost = solved.cell.reasons
     for observation in cell.session.observations:
         number = observation.view.number
@@ -330,7 +330,7 @@ def held_back(solved: Solved, observed: Observed) -> Held | None:
     return Held(tuple(rows), tuple(views), _problem(solved, observed, views))
 
 
-def held_views(solved: Solved, observed: Observed) -> dict[int, ViewResult]:
+def held_back_results(solved: Solved, observed: Observed) -> dict[int, ViewResult]:
     """Results of the held-back observations, by view: residuals from what the fit predicts."""
     held = held_back(solved, observed)
     if held is None:
@@ -356,7 +356,7 @@ def held_views(solved: Solved, observed: Observed) -> dict[int, ViewResult]:
     return results
 
 
-def held_by_both_arms(solved: Solved, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
+def held_back_by_arm(solved: Solved, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
     """Residuals of held-back views by the nominal arm with its own fit, and by the calibrated."""
     arm, held = solved.arms[robot], held_back(solved, observed)
     if held is None or arm.kinematics is None:

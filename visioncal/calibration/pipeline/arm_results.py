@@ -23,12 +23,7 @@ from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import inflation
 from visioncal.estimation.slight_steps import Slip, step_covariance, with_step
-from visioncal.estimation.solve import (
-    Solution,
-    covariance_of,
-    held_shift,
-    robot_likelihood,
-)
+from visioncal.estimation.solve import Solution, covariance_of, held_shift, robot_likelihood
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
 STEP = "what moved at once"
@@ -57,7 +52,7 @@ def joint_offsets(arms: Mapping[str, RobotArm]) -> dict[str, FloatArray]:
     return {name: jacobian for name, jacobian in jacobians.items() if jacobian is not None}
 
 
-def covariance_beside_noise(
+def covariance_from_other_sources(
     problem: Problem,
     fit: Solution,
     arms: Mapping[str, RobotArm],
@@ -88,17 +83,17 @@ def covariance_beside_noise(
     for robot, arm in arms.items():
         if arm.errors is not None and not arm.errors.is_estimated:
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
-            parts[f"arm{_of(arms, robot)}"] = errors
+            parts[f"arm{_source_suffix(arms, robot)}"] = errors
         elif arm.errors is not None:
             covariance = covariance_of(problem, fit)
-            parts[f"size of arm errors{_of(arms, robot)}"] = covariance_of_size(
+            parts[f"size of arm errors{_source_suffix(arms, robot)}"] = covariance_of_size(
                 problem, covariance, robot, arm.errors
             )
     # What the residuals show: correlated errors of stops, and a sudden step.
     for robot, test in tests.items():
         if test.alike is not None and test.alike.is_significant:
             more = inflation(problem, fit.state, fit.noise, robot, test.alike.factor)
-            parts[f"misfit{_of(arms, robot)}"] = more
+            parts[f"misfit{_source_suffix(arms, robot)}"] = more
         if test.step is not None:
             parts[STEP] = step_covariance(problem, fit, test.step, offsets)
     return parts
@@ -116,7 +111,7 @@ def _expected_levels(problem: Problem, fit: Solution, arms: Mapping[str, RobotAr
     return levels
 
 
-def _of(arms: Mapping[str, RobotArm], robot: str) -> str:
+def _source_suffix(arms: Mapping[str, RobotArm], robot: str) -> str:
     """Suffix with the robot's name for a source of uncertainty; empty for a single robot."""
     return "" if len(arms) == 1 else f" of robot {robot}"
 
@@ -138,9 +133,9 @@ def doubts_of_arms(
         return words if len(arms) == 1 else f"{words} of robot {slip.robot}"
 
     for robot, arm in arms.items():
-        findings_of_arm = _doubts(arm, tests.get(robot), level, cell, joint)
+        findings_of_arm = _findings_on(arm, tests.get(robot), level, cell, joint)
         for finding in (*findings_of_arm, *results[robot].doubts()):
-            yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_called(arms, robot))
+            yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_robot_name(arms, robot))
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:
@@ -149,15 +144,11 @@ def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound])
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
         levels = () if arm.kinematics is None else findings(arm.kinematics)
         for remark in remarks((*drifts, *levels, *results[robot].notes()), NOTE):
-            yield remark.of(_called(arms, robot)).words
+            yield remark.of(_robot_name(arms, robot)).words
 
 
-def _doubts(
-    arm: RobotArm,
-    test: ResidualTest | None,
-    level: str,
-    cell: Cell,
-    joint: Callable[[Slip], str],
+def _findings_on(
+    arm: RobotArm, test: ResidualTest | None, level: str, cell: Cell, joint: Callable[[Slip], str]
 ) -> Iterator[Finding]:
     if arm.joints_rad is None and level not in ("auto", "hand-eye"):
         yield Finding(
@@ -180,12 +171,12 @@ def _doubts(
                 yield doubt
 
 
-def _called(arms: Mapping[str, RobotArm], robot: str) -> str:
+def _robot_name(arms: Mapping[str, RobotArm], robot: str) -> str:
     """Name of the robot in a finding; empty for a single robot."""
     return "" if len(arms) == 1 else f"Robot {robot}"
 
 
-def one_by_one(
+def change_each(
     arms: Mapping[str, RobotArm],
     problem: Problem,
     fit: Solution,
@@ -229,7 +220,7 @@ def with_drifts(
             refused.append(error.within(f"robot {arm.robot}"))
             return arm
 
-    changed = one_by_one(arms, problem, fit, with_drift)
+    changed = change_each(arms, problem, fit, with_drift)
     if refused and len(refused) == len(changed):
         raise refused[0]
     return changed
@@ -257,11 +248,8 @@ def with_pose_errors(
     }
 
 
-def beside_steps(
-    arms: Mapping[str, RobotArm],
-    problem: Problem,
-    fit: Solution,
-    tests: Mapping[str, ResidualTest],
+def with_errors_beside_step(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, tests: Mapping[str, ResidualTest]
 ) -> Mapping[str, RobotArm]:
     """Estimates pose-dependent errors again beside a sudden step, which they would also explain."""
     step = next((test.step for test in tests.values() if test.step), None)

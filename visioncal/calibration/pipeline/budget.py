@@ -69,7 +69,7 @@ def _root_trace(covariance: FloatArray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class WorkAccuracy:
     """Accuracy of a point that one camera and one robot locate where their views look.
 
     Attributes:
@@ -86,7 +86,9 @@ class Work:
     spectrum: FloatArray
 
 
-def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatArray) -> Work:
+def work_accuracy(
+    solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatArray
+) -> WorkAccuracy:
     """Computes the accuracy of one camera and one robot where their views look.
 
     Args:
@@ -106,7 +108,7 @@ def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatA
     }
     limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
     values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limits, limits))
-    return Work(
+    return WorkAccuracy(
         point_cam,
         {name: 1e3 * _root_trace(covariance) for name, covariance in covariances.items()},
         1e3 * radius95(covariances["total"]),
@@ -165,7 +167,7 @@ def columns_of_boards(solved: Solved) -> IntArray:
     return np.concatenate([np.zeros(0, dtype=np.int64), *boards])
 
 
-def middles_moved(solved: Solved) -> dict[str, FloatArray]:
+def middle_jacobians(solved: Solved) -> dict[str, FloatArray]:
     """(3, b) Jacobians of targets' middles with respect to `columns_of_boards` [m], by frame."""
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.reading_hints import misreadings, reading_hint
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.running import known_at_first
+from visioncal.calibration.pipeline.running import initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cause_ranking import LEAST_RUN
@@ -87,13 +87,13 @@ def doctor(session: Session | Path | str, *, progress: Progress | None = None) -
     Raises:
         DataError: The session cannot be read.
     """
-    run = known_at_first(session, progress=progress)
+    run = initial_state(session, progress=progress)
     with one_blas_thread():
         run, error = _run_stages(run)
         findings = [*_findings(run, error)]
     if not isinstance(session, Session):
         findings = [_with_session(finding, session) for finding in findings]
-    return Checkup(run.session.name, tuple(_seen(run)), tuple(findings))
+    return Checkup(run.session.name, tuple(_contents(run)), tuple(findings))
 
 
 def to_document(checkup: Checkup) -> dict[str, object]:
@@ -310,7 +310,7 @@ def _coverage(run: RunState) -> Iterator[Finding]:
             yield Finding("coverage", words, step).of(frame if len(run.cameras) > 1 else "")
 
 
-def _seen(run: RunState) -> Iterator[str]:
+def _contents(run: RunState) -> Iterator[str]:
     """The contents of the session, in a few words each."""
     session = run.session
     yield f"{len(session.views)} views"

@@ -8,7 +8,7 @@ from typing import Unpack
 import numpy as np
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.running import Asked, Run, known_at_first, run, run_steps
+from visioncal.calibration.pipeline.running import Asked, Run, initial_state, run, run_stages
 from visioncal.calibration.stages.dense import Dense, explained
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
@@ -83,11 +83,11 @@ def calibrate(
         threads=threads,
         keep_corners=keep_corners,
     )
-    state = known_at_first(session, **asked)
+    state = initial_state(session, **asked)
     state = replace(state, session=state.session.needing(need_mm, need_deg))
     if dense:
         return run_dense(state.session, device=device, **asked).calibration
-    return result_of(run_steps(state))
+    return result_of(run_stages(state))
 
 
 @typed
@@ -123,7 +123,7 @@ def align(
         DataError: The input is wrong or shows no target.
         DegenerateError: A robot is linked to nothing, or a frame is undetermined.
     """
-    state = known_at_first(
+    state = initial_state(
         session,
         level=level,
         convention=convention,
@@ -132,7 +132,7 @@ def align(
         keep_corners=keep_corners,
     )
     with_need = state.session.needing(need_mm, need_deg)
-    return result_of(run_steps(replace(state, session=with_need, found_before=corners)))
+    return result_of(run_stages(replace(state, session=with_need, found_before=corners)))
 
 
 def _is_worse(before: Run, after: Run) -> bool:

@@ -25,12 +25,10 @@ def exchanged_names(run: RunState) -> Finding | None:
     """Finding on two cameras, or robots, of a cell whose names are exchanged.
 
     Each exchange is tested up to the initial frames of the cell; no images are searched again.
+    None where no exchange makes nearly all views agree.
 
     Args:
         run: The run of the cell, after the detection of targets.
-
-    Returns:
-        The finding; None where no exchange makes nearly all views agree.
     """
     session = run.session
     if run.mount is not None or not run.cameras:

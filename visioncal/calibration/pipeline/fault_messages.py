@@ -106,20 +106,15 @@ def _stops_of(solved: Solved, key: str) -> list[int]:
 
 def movements(solved: Solved) -> tuple[Moved, ...]:
     """The frames that moved, in the order of time."""
-    found, versions_by_key, edges = [], versions(solved), solved.frames
+    moved, versions_by_key, edges = [], versions(solved), solved.frames
     for move in sorted(solved.agreed.moves, key=lambda value: value.stop):
         after = versions_by_key[move.twin]
-        before = max(
-            (
-                it
-                for it in versions_by_key.values()
-                if it.frame == after.frame and it.start < after.start
-            ),
-            key=lambda value: value.start,
-        )
+        same_frame = (item for item in versions_by_key.values() if item.frame == after.frame)
+        earlier = [item for item in same_frame if item.start < after.start]
+        before = max(earlier, key=lambda value: value.start)
         mm, deg = pose_difference(edges[before.key], edges[after.key])
         rivals = tuple(dict.fromkeys(rival.partition("@")[0] for rival in move.rivals))
-        found.append(
+        moved.append(
             Moved(
                 after.frame,
                 before.name,
@@ -130,10 +125,10 @@ def movements(solved: Solved) -> tuple[Moved, ...]:
                 tuple(rival for rival in rivals if rival != after.frame),
             )
         )
-    return tuple(found)
+    return tuple(moved)
 
 
-def moved_found(moved: Moved) -> Finding:
+def moved_finding(moved: Moved) -> Finding:
     """Finding that a frame moved."""
     what = "was bumped" if moved.frame.startswith("cam") else "moved"
     rivals = (
@@ -155,12 +150,12 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
         return ()
     turned = _turned_images(solved)
     explained = {row for fault in turned for row in fault.rows}
-    mutual = exchanged(solved.agreed.problem, _fitting(solved, outliers))
+    mutual = exchanged(solved.agreed.problem, _fitting_stations(solved, outliers))
     if solved.cell.mount is not None:
         swapped = tuple(_exchanged_views(solved, mutual))
         return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
     found = _pushed_bases(solved)
-    found += _exchanged(solved, mutual)
+    found += _exchanged_poses(solved, mutual)
     explained |= {row for fault in found for row in fault.rows}
     rest = {one: other for one, other in mutual.items() if not {one, other} & explained}
     found += _exchanged_views(solved, rest)
@@ -177,7 +172,7 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
             alike[solved.turned[row.view]].append(at)
     images = {view.number: view.image for view in solved.cell.session.views}
     for how, mine in alike.items():
-        views = _numbers(solved, mine)
+        views = _view_numbers(solved, mine)
         named = some_of([*map(str, views)], _LISTED)
         subject = f"The image of view {named} is" if len(views) == 1 else f"Images {named} are"
         them = "it agrees" if len(views) == 1 else "they agree"
@@ -212,8 +207,9 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     (frame, change), *rivals = steps
     edge = inliers.fit.state.edges[problem.unknown[frame]]
     when = _when(solved, run, is_behind=run is after)
-    moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
-    moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
+    moved = f"the {_body(frame)} stood {_displacement_words(change)}"
+    for name, step in rivals:
+        moved += f" (or the {_body(name)} {_displacement_words(step)})"
     outliers = np.sort(run).tolist()
     advice = "Fasten what moved, and calibrate the views before and after it apart."
     on_flange = problem.tree.body(frame) != problem.tree.root
@@ -228,15 +224,11 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
             f"Look which {which} frame was active in the controller, and set the same one for all "
             "views; or fasten what moved, and calibrate the views before and after it apart."
         )
-    words = f"{_views(solved, outliers)} were left out: {when}, as they agree, {moved}."
-    found = Finding(
-        "something_moved",
-        f"V{words[1:]}",
-        or_alone(advice, _numbers(solved, outliers)),
-        _numbers(solved, outliers),
-        mahalanobis_sq=run_evidence(len(run), len(rows)),
-    )
-    yield PoseFault(found, tuple(outliers), f"{when}, something had moved")
+    words = f"{_named_views(solved, outliers)} were left out: {when}, as they agree, {moved}."
+    views, evidence = _view_numbers(solved, outliers), run_evidence(len(run), len(rows))
+    step = or_alone(advice, views)
+    finding = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
+    yield PoseFault(finding, tuple(outliers), f"{when}, something had moved")
 
 
 def _other_boards(solved: Solved, run: IntArray, *, is_behind: bool) -> Iterator[PoseFault]:
@@ -248,13 +240,13 @@ def _other_boards(solved: Solved, run: IntArray, *, is_behind: bool) -> Iterator
         return
     when = _when(solved, run, is_behind=is_behind)
     words = (
-        f"{_views(solved, outliers)} were left out: {when}, as they agree, the target is another "
-        f"one, {figure(100.0 * abs(size[0]))} % {'larger' if size[0] > 0.0 else 'smaller'} than "
-        "that of the other views."
+        f"{_named_views(solved, outliers)} were left out: {when}, as they agree, the target is "
+        f"another one, {figure(100.0 * abs(size[0]))} % "
+        f"{'larger' if size[0] > 0.0 else 'smaller'} than that of the other views."
     )
     step = Remedy("Measure both prints, take one of them for all views, and record again.")
     evidence = run_evidence(len(run), len(inliers.used))
-    views = _numbers(solved, outliers)
+    views = _view_numbers(solved, outliers)
     finding = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
     yield PoseFault(finding, tuple(outliers), f"{when}, the target was another one")
 
@@ -285,11 +277,11 @@ def _common_steps(solved: Solved, run: IntArray) -> list[tuple[str, FloatArray]]
     return [(frame, change) for _, frame, change in sorted(steps, key=lambda item: item[0])]
 
 
-def _thing(frame: str) -> str:
+def _body(frame: str) -> str:
     return frame.partition("_")[0].replace("cam", "camera")
 
 
-def _elsewhere(change: FloatArray) -> str:
+def _displacement_words(change: FloatArray) -> str:
     shift_mm, turn_deg = pose_difference(np.eye(4), change)
     return f"{mm_and_deg(shift_mm, turn_deg)} elsewhere"
 
@@ -304,21 +296,19 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
                 "each fits the pose in the other's row. They were left out."
             )
             views = (rows[first].view, rows[second].view)
-            step = Remedy(
-                "Write a copy of the session in which their images are exchanged, and calibrate "
-                "it.",
-                exchanging(*views),
+            do = (
+                "Write a copy of the session in which their images are exchanged, and calibrate it."
             )
-            finding = Finding(EXCHANGED, words, step, views)
+            finding = Finding(EXCHANGED, words, Remedy(do, exchanging(*views)), views)
             yield PoseFault(finding, (first, second))
 
 
-def _numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
+def _view_numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
     return tuple(solved.cell.rows[row].view for row in rows)
 
 
-def _views(solved: Solved, rows: Sequence[int]) -> str:
-    return f"views {some_of([*map(str, _numbers(solved, rows))], _LISTED)}"
+def _named_views(solved: Solved, rows: Sequence[int]) -> str:
+    return f"views {some_of([*map(str, _view_numbers(solved, rows))], _LISTED)}"
 
 
 def _pushed_bases(solved: Solved) -> list[PoseFault]:
@@ -334,21 +324,23 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
         after = np.flatnonzero(mine & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
             continue
-        moved = _moved_by(solved, base, after)
+        moved = _base_displacement(solved, base, after)
         as_if = f", as if {base} had been pushed by {moved}" if moved else ""
         words = (
             f"All {len(after)} views by way of {flange} from stop "
             f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
             f"{base} is where it stood before."
         )
-        views = _numbers(solved, after.tolist())
+        views = _view_numbers(solved, after.tolist())
         step = Remedy("Fasten it, and align the stops from there on alone.", look_at(views[0]))
         pushed = Finding("something_moved", words, step, views)
         found.append(PoseFault(pushed, tuple(after.tolist())))
     return found
 
 
-def _moved_by(solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None) -> str:
+def _base_displacement(
+    solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None
+) -> str:
     """Mean displacement of a base by some observations, in words; empty where they disagree."""
     changes = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
     if of is not None:
@@ -369,15 +361,15 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
             rows = np.flatnonzero(mine & (stops == stop))
             if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
                 continue
-            moved = _moved_by(solved, base, rows, problem.poses[robot][stop])
+            moved = _base_displacement(solved, base, rows, problem.poses[robot][stop])
             if moved:
                 words = (
                     f"Robot {robot} did not stand at stop {solved.cell.stops[stop]} where "
                     f"its pose says: all {len(rows)} views by way of it disagree with the others, "
                     f"as if the flange had been moved by {moved}, and were left out "
-                    f"({_views(solved, rows.tolist())})."
+                    f"({_named_views(solved, rows.tolist())})."
                 )
-                views = _numbers(solved, rows.tolist())
+                views = _view_numbers(solved, rows.tolist())
                 fix = "Correct its pose there in views.csv, or leave the stop out."
                 finding = Finding("wrong_pose", words, Remedy(fix, look_at(views[0])), views)
                 short = f"the pose of robot {robot} at stop {solved.cell.stops[stop]} is wrong"
@@ -390,13 +382,11 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
     outliers = np.flatnonzero(~inliers.used)
     if not len(outliers):
         return {}
-    residuals_mm_deg = residuals(solved)[outliers]
-    directions = np.maximum(inliers.distances.directions, 1)
-    distance, limit = (
-        np.sqrt(array / directions)
-        for array in (inliers.distances.squares, inliers.distances.limit)
-    )
-    fitting = _fitting(solved, outliers)
+    residuals_mm_deg, distances_sq = residuals(solved)[outliers], inliers.distances
+    directions = np.maximum(distances_sq.directions, 1)
+    distance = np.sqrt(distances_sq.squares / directions)
+    limit = np.sqrt(distances_sq.limit / directions)
+    fitting = _fitting_stations(solved, outliers)
     mutual = exchanged(problem, fitting)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
@@ -416,21 +406,21 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
             stops = [str(solved.cell.stops[index]) for index in fitting[at][:_NAMED]]
             one = "stop" if len(stops) == 1 else "another stop, as"
             cause = f"its image is of {one} {', '.join(stops)}; {cause}"
-        # Where the prediction is uncertain, an observation that is far away is rejected all the
-        # same.
+        # What is far away is rejected even where the prediction is uncertain.
         beyond = (
             f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
             if distance[at] > limit[at]
             else "many times as far as most"
         )
+        target = _target_words(solved, rows[at].seen)
         found[rows[at].view] = (
-            f"disagrees with {rest}: it places {_called(solved, rows[at].seen)} {figure(mm)} mm"
-            f"{turned} away, {beyond}; {cause}"
+            f"disagrees with {rest}: it places {target} {figure(mm)} mm{turned} away, {beyond}; "
+            f"{cause}"
         )
     return found
 
 
-def _called(solved: Solved, frame: str) -> str:
+def _target_words(solved: Solved, frame: str) -> str:
     """Name of a target or point in words."""
     if solved.cell.mount is None:
         return frame.partition("@")[0]
@@ -467,7 +457,7 @@ def residuals(solved: Solved) -> FloatArray:
     return np.stack([1e3 * metres, np.rad2deg(radians)], axis=1)
 
 
-def _fitting(solved: Solved, outliers: IntArray) -> dict[int, list[int]]:
+def _fitting_stations(solved: Solved, outliers: IntArray) -> dict[int, list[int]]:
     """The other stations that outliers fit; see `other_stops`."""
     agreed = solved.agreed
     turns = {
@@ -477,7 +467,7 @@ def _fitting(solved: Solved, outliers: IntArray) -> dict[int, list[int]]:
     return other_stops(agreed.problem, agreed.used, agreed.fit, outliers, agreed.moves, turns)
 
 
-def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
+def _exchanged_poses(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
     """Pairs of poses of one robot that are exchanged."""
     rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
     found = []
@@ -494,10 +484,9 @@ def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
                 first, second = (solved.cell.stops[station] for station in stations)
                 short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
                 words = (
-                    f"{short[0].upper()}{short[1:]}: {_views(solved, at_both)} were left out. Each "
-                    "pose is right at the other's stop."
+                    f"{short[0].upper()}{short[1:]}: {_named_views(solved, at_both)} were left "
+                    "out. Each pose is right at the other's stop."
                 )
-                both_views = _numbers(solved, at_both)
-                swapped = Finding(EXCHANGED, words, _EXCHANGE, both_views)
-                found.append(PoseFault(swapped, tuple(at_both), short))
+                finding = Finding(EXCHANGED, words, _EXCHANGE, _view_numbers(solved, at_both))
+                found.append(PoseFault(finding, tuple(at_both), short))
     return found

@@ -43,7 +43,7 @@ def guess_session(
         DegenerateError: Too few views have both poses, or the lens cannot be estimated.
         ConvergenceError: The intrinsics do not converge.
     """
-    return guess_seen(seen_by_camera(RunState(session, progress)), robot)
+    return guess_seen(with_camera_poses(RunState(session, progress)), robot)
 
 
 def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
@@ -64,9 +64,9 @@ def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
         joint_poses = chain_poses(run.session, None if matched is None else matched.arm)
     if robot is None:
         poses = numbers_in(run.session, POSE)
-        robot = reported_or_chained(at_times(run) if run.clocks else poses, joint_poses)
+        robot = reported_or_chained(robot_numbers(run) if run.clocks else poses, joint_poses)
     is_measured, mount = bool(run.corners), run.session.mount
-    for camera in seen_ways(run, robot):
+    for camera in camera_pose_choices(run, robot):
         guess = guess_reading(robot, camera, mount, chain=joint_poses, is_measured=is_measured)
         if not guess.stands_out and guess.declared.closes:
             break
@@ -81,7 +81,7 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
         DegenerateError: The lens cannot be estimated.
         ConvergenceError: The intrinsics do not converge.
     """
-    return camera_numbers(seen_by_camera(RunState(session, progress)))
+    return camera_numbers(with_camera_poses(RunState(session, progress)))
 
 
 def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
@@ -123,7 +123,7 @@ def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places_of(session))
 
 
-def at_times(run: RunState) -> PoseNumbers:
+def robot_numbers(run: RunState) -> PoseNumbers:
     """The robot's poses at the views, also from its stream, as numbers; NaN where it has none."""
     numbers = np.full((len(run.session.views), 7), np.nan)
     for at, view in enumerate(run.session.views):
@@ -133,7 +133,7 @@ def at_times(run: RunState) -> PoseNumbers:
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places_of(run.session))
 
 
-def seen_by_camera(run: RunState) -> RunState:
+def with_camera_poses(run: RunState) -> RunState:
     """Runs the stages that the camera's poses need, whatever the robot's poses are."""
     # The offset of a stream's clock is found by rotation angles, which no reading changes.
     names = (*_SEEING, "robot", "clock") if waits_for_clock(run.session) else _SEEING
@@ -149,7 +149,7 @@ def seen_by_camera(run: RunState) -> RunState:
     return run
 
 
-def seen_ways(run: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
+def camera_pose_choices(run: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
     """The camera's poses chosen by the declared robot poses, and then by the images alone."""
     run = replace(run, poses=run.poses_of_one_board)
     # They differ where an image allows several poses: misread robot poses would choose wrong ones.

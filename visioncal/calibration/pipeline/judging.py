@@ -9,15 +9,15 @@ import numpy as np
 
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
-from visioncal.calibration.pipeline.budget import columns_of_boards, middles_moved, middles_of
-from visioncal.calibration.pipeline.fault_messages import moved_found
-from visioncal.calibration.pipeline.lens_fields import errors_found, lens_changes
+from visioncal.calibration.pipeline.budget import columns_of_boards, middle_jacobians, middles_of
+from visioncal.calibration.pipeline.fault_messages import moved_finding
+from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
 from visioncal.calibration.pipeline.network_ties import (
-    or_measured,
+    connection_advice,
+    measuring_advice,
     robot_motion,
-    standing_tie,
+    sole_static_view,
     tilting_advice,
-    untied_words,
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
@@ -62,7 +62,7 @@ def findings_of(run: RunState) -> Findings:
     frames = solved.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
-    worst, places, warnings = _of_pair(run) if run.mount else _of_cell(run)
+    worst, places, warnings = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
     doubts = doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell)
     of_arms = [_with_alternative(doubt, run) for doubt in doubts]
     if any(warning.kind == "measured_turns" for warning in warnings):
@@ -73,7 +73,7 @@ def findings_of(run: RunState) -> Findings:
         *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
         *solved.found_of_looks(answer.covariance),
     ]
-    of_lenses = [*errors_found(answer.lenses)]
+    of_lenses = [*lens_findings(answer.lenses)]
     doubted = {finding.kind for finding in (*of_arms, *of_lenses, *of_rest)}
     if doubted & OF_CHAIN or not solved.agreed.used.all():
         of_lenses += lens_changes(solved)
@@ -91,7 +91,7 @@ def findings_of(run: RunState) -> Findings:
             *run.warnings,
             *(finding for finding in of_rest if finding.kind != NOTE),
             *warnings,
-            *_untied(run),
+            *_unconnected(run),
         ),
         (
             *run.notes,
@@ -102,17 +102,17 @@ def findings_of(run: RunState) -> Findings:
         run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
         picks_of(_pick_inputs(run), run.session.need),
-        None if run.mount else _standing_tie(solved.cell, answer.last_edges),
+        None if run.mount else _sole_static_view(solved.cell, answer.last_edges),
     )
 
 
-def _standing_tie(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | None:
+def _sole_static_view(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | None:
     """The static view that alone links the worst frame to the rest, if any."""
     worst = {
         frame: max(value.sigma / value.limit for value in _directions(cell, frame, edge))
         for frame, edge in edges.items()
     }
-    return standing_tie(cell, max(worst, key=worst.__getitem__)) if worst else None
+    return sole_static_view(cell, max(worst, key=worst.__getitem__)) if worst else None
 
 
 def _with_alternative(found: Finding, run: RunState) -> Finding:
@@ -139,32 +139,32 @@ def _pick_inputs(run: RunState) -> PickInputs:
         dict(zip(answer.problem.robots, freedom, strict=True)),
         solved.arms,
         columns_of_boards(solved),
-        middles_moved(solved),
+        middle_jacobians(solved),
         answer.problem,
         {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
     )
 
 
-def _untied(run: RunState) -> Iterator[Finding]:
+def _unconnected(run: RunState) -> Iterator[Finding]:
     for frame in run.fitted.untied:
         if run.mount is not None and frame.startswith("target"):
             words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
             yield Finding("unseen_target", words)
         else:
-            step = Remedy(untied_words(run.cell, frame))
+            step = Remedy(connection_advice(run.cell, frame))
             yield Finding("untied", f"{frame} is tied to nothing.", step)
 
 
 _Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence[Finding]]
 
 
-def _of_pair(run: RunState) -> _Parts:
+def _pair_accuracy(run: RunState) -> _Parts:
     """Worst directions, accuracy where the views look, and findings of one camera and one robot."""
     answer, work, mount = run.solved, run.work, run.session.mount
     budget = _in_words(work.budget_mm)
     place = PointAccuracy("Where the views look, a point", budget, work.radius95_mm)
     worst = directions(answer.problem, answer.state, answer.covariance, mount)
-    return worst, [place], [*_of_measured(run)]
+    return worst, [place], [*_measured_pose_findings(run)]
 
 
 def _in_words(budget_mm: Mapping[str, float]) -> dict[str, float]:
@@ -173,7 +173,7 @@ def _in_words(budget_mm: Mapping[str, float]) -> dict[str, float]:
     return {f"{source.replace('_', ' ')}{of}{frame}": mm for (source, of, frame), mm in parts}
 
 
-def _of_measured(run: RunState) -> Iterator[Finding]:
+def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
     """Findings on measured poses whose scale or rotations differ from the robot's."""
     views = [
         index for index in run.base_from_flange if index in run.poses and index not in run.reasons
@@ -196,7 +196,7 @@ def _of_measured(run: RunState) -> Iterator[Finding]:
         yield found
 
 
-def _of_cell(run: RunState) -> _Parts:
+def _cell_accuracy(run: RunState) -> _Parts:
     """Worst directions, accuracy of the frames, and moved frames of a whole cell."""
     answer, cell, budget = run.solved, run.fitted.cell, run.solved.budget_mm
     absorbing = {*_absorbing(run)}
@@ -208,7 +208,7 @@ def _of_cell(run: RunState) -> _Parts:
             PointAccuracy(frame, _in_words(budget[frame]), 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
-        [moved_found(move) for move in answer.moved],
+        [moved_finding(move) for move in answer.moved],
     )
 
 
@@ -382,7 +382,7 @@ def check_answer(run: RunState) -> None:
     is_tilted = not any(tilting_advice(cell, base) for base in part.tree.bases.values())
 
     def static_view(frame: str) -> StandingTie | None:
-        return standing_tie(cell, frame) if is_tilted else None
+        return sole_static_view(cell, frame) if is_tilted else None
 
     def motion(frame: str) -> str:
         if not part.through(frame).any() and (count := int(outliers.through(frame).sum())):
@@ -398,8 +398,8 @@ def check_answer(run: RunState) -> None:
             between = [name for name in flanges if part.through(name)[part.through(frame)].any()]
             measured = ""
             if between and "offset along" in culprit:
-                measured = or_measured(cell, between[0])
-            return f"{_more(cell, frame)} {measured}".rstrip()
+                measured = measuring_advice(cell, between[0])
+            return f"{_frame_advice(cell, frame)} {measured}".rstrip()
         return (
             "Look whether the board that ties it has the stated size, and whether images and poses "
             "belong together."
@@ -430,7 +430,7 @@ def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
     return [direction for direction in found if edge.oriented or not direction.is_rotation]
 
 
-def _more(cell: Cell, frame: str) -> str:
+def _frame_advice(cell: Cell, frame: str) -> str:
     """Advice on what would determine a frame better."""
     frame = frame.partition("@")[0]
     rows = [row for row in cell.rows if frame in (row.seer, row.seen)]
@@ -456,11 +456,11 @@ def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
     worst = max(_directions(cell, name, edge), key=lambda value: value.sigma / value.limit)
     return (
         f"The weakest link is {name}: sigma {mm_and_deg(edge.sigma_mm, edge.sigma_deg)}, most of "
-        f"it in {worst.words}. {_resting(cell, name)}"
+        f"it in {worst.words}. {_determining_views(cell, name)}"
     )
 
 
-def _resting(cell: Cell, frame: str) -> str:
+def _determining_views(cell: Cell, frame: str) -> str:
     rows = [row for row in cell.rows if frame in cell.tree.above(row.seer)]
     rows += [row for row in cell.rows if frame in cell.tree.above(row.seen)]
     counts = Counter(f"{row.seer} of {row.seen}" for row in rows)

@@ -101,7 +101,7 @@ def lens_field_of(
     if (coefficients := seen.compressed[which].coefficients) is not None:
         # Coefficients depend on lens and boards, and on those directions of themselves that also
         # move the poses, which are unknowns of the fit.
-        is_free, beyond = np.isin(places, seen.free), _columns_beyond(solved, which)
+        is_free, beyond = np.isin(places, seen.free), _lens_error_columns(solved, which)
         shared = solved.columns_of(places[is_free])
         jacobian = np.zeros((len(coefficients.mean), len(covariance)))
         jacobian[:, shared] = coefficients.slope[:, is_free]
@@ -131,7 +131,7 @@ def lens_field_of(
     )
 
 
-def _columns_beyond(solved: Solved, which: int) -> IntArray:
+def _lens_error_columns(solved: Solved, which: int) -> IntArray:
     """The problem's columns of one lens's errors beyond its model."""
     seen = solved.seen
     sizes = [] if seen is None else [compressed.by_field.shape[2] for compressed in seen.compressed]
@@ -203,7 +203,7 @@ def _step_words(step: LensStep) -> str:
     return " and ".join(parts) or "its focal length and principal point are others"
 
 
-def errors_found(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
+def lens_findings(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
     """Findings on significant lens errors."""
     for name, lens in lenses.items():
         of = "The lens" if len(lenses) == 1 else f"The lens of {name}"

@@ -19,7 +19,7 @@ from visioncal.estimation.observability import (
 )
 
 
-def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
+def refuse_unconnected_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
     """Refuses a cell with a robot that is not connected to the rest.
 
     Args:
@@ -44,7 +44,7 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
     untied = [base for base in bases if base in lost] or [
         item for item in lost if not branches[item].robot
     ]
-    advice = [untied_words(cell, base) for base in bases]
+    advice = [connection_advice(cell, base) for base in bases]
     robots = "this robot" if len(bases) == 1 else "these robots"
     why = f"no observation links {robots} to the rest of the cell"
     parts = []
@@ -70,13 +70,8 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
     )
 
 
-def or_measured(cell: Cell, flange: str) -> str:
-    """Advice to measure an offset that is undetermined if the arm cannot tilt; empty for none.
-
-    Args:
-        cell: The cell.
-        flange: The flange of the arm.
-    """
+def measuring_advice(cell: Cell, flange: str) -> str:
+    """Advice to measure an offset that is undetermined if the arm cannot tilt; empty for none."""
     ends = (end for row in cell.rows for end in (row.seer, row.seen))
     carried = next((end for end in ends if cell.tree.body(end) == flange), "")
     if not carried:
@@ -105,7 +100,7 @@ def tilting_advice(cell: Cell, base: str) -> str:
         f"add {FEWEST_VIEWS} or more stops in which {flange} is tilted by 20 to 40 degrees about "
         "different axes, not only about one."
     )
-    measured = or_measured(cell, flange) if _undetermined(cell, base) else ""
+    measured = measuring_advice(cell, flange) if _undetermined(cell, base) else ""
     return f"{words} {measured}".rstrip()
 
 
@@ -135,17 +130,10 @@ def _stations(cell: Cell, base: str) -> IntArray:
     return np.array(sorted(stations), dtype=np.int64)
 
 
-def standing_tie(cell: Cell, frame: str) -> StandingTie | None:
+def sole_static_view(cell: Cell, frame: str) -> StandingTie | None:
     """The view of a fixed board by a fixed camera that alone connects a frame to the rest.
 
-    However often it is repeated, it counts as one view.
-
-    Args:
-        cell: The cell.
-        frame: The most uncertain frame.
-
-    Returns:
-        That view, and advice; None where the frame is connected otherwise.
+    It counts as one view, however often it is repeated. None where other views connect the frame.
     """
     tree = cell.tree
     moving = [row for row in cell.rows if any(step.robot for step in tree.path(row.seer, row.seen))]
@@ -167,7 +155,7 @@ def standing_tie(cell: Cell, frame: str) -> StandingTie | None:
     )
 
 
-def untied_words(cell: Cell, frame: str) -> str:
+def connection_advice(cell: Cell, frame: str) -> str:
     """Advice on observations that would connect a frame to the rest, in a sentence."""
     tree = cell.tree
     carried = [name for name in tree.branches if frame in tree.above(name)]

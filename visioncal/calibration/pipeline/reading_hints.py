@@ -10,14 +10,14 @@ from visioncal.calibration.guess.changed_rows import changed_rows
 from visioncal.calibration.guess.given import FEWEST_ROWS, Recording, closes
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
-    at_times,
     camera_numbers,
+    camera_pose_choices,
     chain_poses,
     guess_seen,
     numbers_in,
     places_of,
-    seen_by_camera,
-    seen_ways,
+    robot_numbers,
+    with_camera_poses,
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import stages_before
@@ -91,15 +91,12 @@ _BESIDE_JOINTS = Remedy(
 
 
 def reading_hint(run: RunState) -> Finding | None:
-    """Finding on the reading of the poses that explains a failed calibration.
+    """Finding on the reading of the poses that explains a failed calibration; None for none.
 
     Args:
         run: The run, after the stage `pnp`.
-
-    Returns:
-        The finding, with the command that applies the reading; None where none stands out.
     """
-    hint = _unrecorded(run) or _changed_midway(run)
+    hint = _constant_rotations(run) or _changed_midway(run)
     if hint is not None:
         return hint
     try:
@@ -110,8 +107,8 @@ def reading_hint(run: RunState) -> Finding | None:
     if not guess.stands_out:
         if guess.declared.closes:
             return None
-        contradicted = _poses_beside_joints(run, guess.declared)
-        return contradicted or _one_position(run) or _other_unit(run) or _unpaired(run)
+        contradicted = _poses_contradicting_joints(run, guess.declared)
+        return contradicted or _constant_positions(run) or _other_unit(run) or _unpaired(run)
     best, views = guess.best, run.session.views
     is_mirrored = best.hypothesis.robot.signs == "mirror"
     swap = best.hypothesis.swap if len(best.differences) == 1 else ()
@@ -144,12 +141,12 @@ def session_is_mirrored(session: Session) -> bool:
     Raises:
         VisioncalError: The camera's poses cannot be found.
     """
-    return _corners_are_mirrored(seen_by_camera(RunState(session)))
+    return _corners_are_mirrored(with_camera_poses(RunState(session)))
 
 
-def _unrecorded(run: RunState) -> Finding | None:
+def _constant_rotations(run: RunState) -> Finding | None:
     """Finding that the robot's rotations were not recorded: they are constant, the camera's not."""
-    robot, camera = at_times(run), camera_numbers(run)
+    robot, camera = robot_numbers(run), camera_numbers(run)
     both = robot.there & camera.there
     if both.sum() < FEWEST_ROWS:
         return None
@@ -196,9 +193,9 @@ def _changed_midway(run: RunState) -> Finding | None:
     return Finding(_MISREAD, words, Remedy(step, CALIBRATE), views)
 
 
-def _one_position(run: RunState) -> Finding | None:
+def _constant_positions(run: RunState) -> Finding | None:
     """Finding that the robot's positions are constant, where that does not fit the camera."""
-    robot = at_times(run)
+    robot = robot_numbers(run)
     positions = robot.poses()[robot.there, :3, 3]
     is_one = len(positions) >= FEWEST_ROWS and np.ptp(positions, axis=0).max() < _STILL_M
     words = (
@@ -217,7 +214,7 @@ def _other_unit(run: RunState) -> Finding | None:
 def _unpaired(run: RunState) -> Finding | None:
     """Finding that rows do not belong to their images: shuffled rows fit about as well."""
     # Robot and camera rotate by the same angle between two views, whatever the unknown frames.
-    robot, camera = at_times(run), camera_numbers(run)
+    robot, camera = robot_numbers(run), camera_numbers(run)
     both = robot.there & camera.there
     if both.sum() < _FEWEST_SHUFFLED:
         return None
@@ -250,7 +247,7 @@ def _pairwise_angles(poses: FloatArray) -> FloatArray:
     return rotation_angle(invert(poses)[:, None] @ poses)
 
 
-def _poses_beside_joints(run: RunState, declared: Candidate) -> Finding | None:
+def _poses_contradicting_joints(run: RunState, declared: Candidate) -> Finding | None:
     """Finding that the reported poses are wrong where the joint angles fit the camera."""
     session = run.session
     if session.robot_document is None or not numbers_in(session, POSE).there.any():
@@ -262,7 +259,7 @@ def _poses_beside_joints(run: RunState, declared: Candidate) -> Finding | None:
     if chain is None or (matched.joints_rad and not matched.contradicting):
         return None
     robot = PoseNumbers.of_poses(chain, places_of(session))
-    for camera in seen_ways(run, robot):
+    for camera in camera_pose_choices(run, robot):
         by_joints = guess_reading(
             robot, camera, session.mount, is_measured=bool(run.corners)
         ).declared
@@ -354,11 +351,11 @@ def _closes(run: RunState, robot: str, pair: CameraTargetPair) -> bool:
 def _recording(run: RunState) -> Recording:
     """The poses of robot and camera as declared, those of the camera the best by each image."""
     return Recording(
-        at_times(run), camera_numbers(run), run.session.mount, is_measured=bool(run.corners)
+        robot_numbers(run), camera_numbers(run), run.session.mount, is_measured=bool(run.corners)
     )
 
 
-def is_suspect(run: RunState) -> bool:
+def may_be_misread(run: RunState) -> bool:
     """Whether a finished calibration may be of misread poses."""
     verdict, findings = run.verdict, run.findings
     if verdict is None or findings is None or verdict.status == "good":

@@ -10,10 +10,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.pipeline.answer import held_by_both_arms
+from visioncal.calibration.pipeline.answer import held_back_by_arm
 from visioncal.calibration.pipeline.judging import weakest_link
 from visioncal.calibration.pipeline.lens_fields import lens_field_of
-from visioncal.calibration.pipeline.network_ties import untied_words
+from visioncal.calibration.pipeline.network_ties import connection_advice
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.solved import within
 from visioncal.calibration.stages.arms import RobotArm
@@ -101,10 +101,10 @@ def result_of(run: RunState) -> Calibration:
         cell=cell,
         need=need_met(findings.need, findings.picks, whole=cell is not None),
     )
-    return found if cell is not None else _of_pair(found, run, names)
+    return found if cell is not None else _complete_pair(found, run, names)
 
 
-def _of_pair(found: Calibration, run: RunState, names: Mapping[str, str]) -> Calibration:
+def _complete_pair(found: Calibration, run: RunState, names: Mapping[str, str]) -> Calibration:
     """Completes the calibration of one camera and one robot, which have no names."""
     # A single target without a name has one section.
     is_unnamed = not run.session.targets
@@ -175,7 +175,7 @@ def _arm(run: RunState) -> ArmSections:
     sections = arm_sections(run, arm.robot)
     if sections.arm is None or arm.model is None:
         return sections
-    held = held_by_both_arms(run.fitted, run, arm.robot)
+    held = held_back_by_arm(run.fitted, run, arm.robot)
     return replace(sections, arm=replace(sections.arm, holdout=held))
 
 
@@ -348,7 +348,7 @@ def cell_of(run: RunState) -> CellResult:
         },
         noise=answer.sigmas,
         moved=answer.moved,
-        untied=tuple(Untied(name, untied_words(cell, name)) for name in solved.untied),
+        untied=tuple(Untied(name, connection_advice(cell, name)) for name in solved.untied),
         weakest=weakest_link(solved.cell, answer.last_edges),
         details=CellDetails(
             {pair.words: clock.result() for pair, clock in answer.clocks(run).items()}
@@ -455,9 +455,12 @@ def fit_section(run: RunState) -> CellJointFit:
     columns = [*range(edges), *solved.columns_of(seen.free).tolist(), *of_arms]
     return CellJointFit(
         cameras={
-            thing_name(name, "camera"): _among(seen.free, at) for name, at in looks.lenses.items()
+            thing_name(name, "camera"): _relative_indices(seen.free, at)
+            for name, at in looks.lenses.items()
         },
-        targets={name: _among(seen.free, shape) for name, shape in _shapes(run).items()},
+        targets={
+            name: _relative_indices(seen.free, shape) for name, shape in _shape_slices(run).items()
+        },
         arms=arms,
         covariance=covariance[np.ix_(columns, columns)],
     )
@@ -484,16 +487,20 @@ def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResul
         return boards, rigs
     all_sigmas = np.zeros(len(looks.values))
     all_sigmas[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
-    shapes = zip(_shapes(run).items(), run.session.boards.items(), looks.corners, strict=True)
+    shapes = zip(_shape_slices(run).items(), run.session.boards.items(), looks.corners, strict=True)
     for (name, shape), (plate, target), corners in shapes:
         if frame_name("target", plate) not in solved.part.tree.branches:
             continue
-        values, sigmas, free = looks.values[shape], all_sigmas[shape], _among(seen.free, shape)
+        values, sigmas, free = (
+            looks.values[shape],
+            all_sigmas[shape],
+            _relative_indices(seen.free, shape),
+        )
         if target.kind != "points":
             boards[name] = BoardResult(
                 shape=dict(zip(BOARD_NAMES, values.tolist(), strict=True)),
                 sigma={BOARD_NAMES[at]: float(sigmas[at]) for at in free},
-                estimated=tuple(BOARD_NAMES[at] for at in _among(seen.moving, shape)),
+                estimated=tuple(BOARD_NAMES[at] for at in _relative_indices(seen.moving, shape)),
                 bend_mm=1e3 * float(np.ptp(corners[:, 2])),
             )
         elif free:
@@ -501,7 +508,7 @@ def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResul
     return boards, rigs
 
 
-def _shapes(run: RunState) -> dict[str, slice]:
+def _shape_slices(run: RunState) -> dict[str, slice]:
     """The slice of each target's shape in the values of lenses and boards, by name."""
     looks = run.fitted.looks
     if looks is None:
@@ -511,6 +518,6 @@ def _shapes(run: RunState) -> dict[str, slice]:
     return dict(zip(names, shape_slices(targets, looks.boards.start), strict=True))
 
 
-def _among(indices: IntArray, part: slice) -> tuple[int, ...]:
+def _relative_indices(indices: IntArray, part: slice) -> tuple[int, ...]:
     """Those of ascending indices that lie in a slice, relative to its start."""
     return tuple(int(value) for value in within(indices, part) - part.start)

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import TypeVar
 
 from visioncal.calibration.pipeline.answer import Answer
-from visioncal.calibration.pipeline.budget import Work, work_of
+from visioncal.calibration.pipeline.budget import WorkAccuracy, work_accuracy
 from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
@@ -26,6 +26,8 @@ _T = TypeVar("_T")
 @dataclass(frozen=True, eq=False)
 class RunState(Observed):
     """State of a run between two stages; None for results of stages still to come.
+
+    The properties `cell`, `fitted` and `solved` raise a RuntimeError before their stage has run.
 
     Attributes:
         solver: The requested solver, for one robot and one camera.
@@ -66,35 +68,23 @@ class RunState(Observed):
 
     @property
     def cell(self) -> Cell:
-        """The cell as the session states it.
-
-        Raises:
-            RuntimeError: A stage uses it before it was read.
-        """
+        """The cell as the session states it."""
         return _there(self.read, "the cell")
 
     @property
     def fitted(self) -> Solved:
-        """The fit of the cell.
-
-        Raises:
-            RuntimeError: A stage uses it before it was made.
-        """
+        """The fit of the cell."""
         return _there(self.fit, "the fit")
 
     @property
     def solved(self) -> Answer:
-        """The fit with its covariance and diagnosis.
-
-        Raises:
-            RuntimeError: A stage uses it before it was made.
-        """
+        """The fit with its covariance and diagnosis."""
         return _there(self.answer, "the answer")
 
     @cached_property
-    def work(self) -> Work:
+    def work(self) -> WorkAccuracy:
         """Accuracy of one camera and one robot where their views look."""
-        return work_of(self.fitted, self.solved.beside, self.solved.covariance)
+        return work_accuracy(self.fitted, self.solved.beside, self.solved.covariance)
 
     @property
     def robot_arm(self) -> RobotArm:

@@ -11,7 +11,7 @@ import numpy as np
 from visioncal.calibration.pipeline.answer import held_back
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.judging import poor_motion
-from visioncal.calibration.pipeline.reading_hints import is_suspect, misreadings, reading_hint
+from visioncal.calibration.pipeline.reading_hints import may_be_misread, misreadings, reading_hint
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
@@ -76,14 +76,14 @@ def run(
     session: Session | Path | str, *, dense: Dense | None = None, **asked: Unpack[Asked]
 ) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
-    state = run_steps(replace(known_at_first(session, **asked), dense=dense))
+    state = run_stages(replace(initial_state(session, **asked), dense=dense))
     held_out = state.solved.held_out
     residuals = zip(held_out.away_m.tolist(), held_out.rms_px.tolist(), strict=True)
     left_out = dict(zip(state.used, residuals, strict=True))
     return Run(result_of(state), view_evidence(state), state.dense, left_out)
 
 
-def known_at_first(session: Session | Path | str, **asked: Unpack[Asked]) -> RunState:
+def initial_state(session: Session | Path | str, **asked: Unpack[Asked]) -> RunState:
     """Loads the session and checks the options: the state before the first stage."""
     threads, solver = asked.get("threads"), asked.get("solver", "joint")
     level, convention = asked.get("level", "auto"), asked.get("convention")
@@ -116,7 +116,7 @@ def known_at_first(session: Session | Path | str, **asked: Unpack[Asked]) -> Run
     return state
 
 
-def run_steps(state: RunState) -> RunState:
+def run_stages(state: RunState) -> RunState:
     """Runs all stages; an error is raised with its likeliest cause where that is known."""
     progress = state.progress
     located: RunState | None = None
@@ -141,8 +141,7 @@ def run_steps(state: RunState) -> RunState:
                         raise
                     raise because(error, hint) from error
                 raise _with_hint(error.with_culprits(lost), located, hint) from error
-            # The stage `joints` itself reports misread joints, which would mislead the search for
-            # misread poses: it is made after that stage.
+            # Misread poses are searched after misread joints were reported, which would mislead.
             if stage.name == "joints":
                 located = state
                 hint = next(misreadings(state), None)
@@ -163,7 +162,7 @@ def _with_hint(
         return type(error)(hint.words, next_step=str(hint.do))
     robot, next_step = located.robot, error.next_step
     if robot is not None and not robot.can_tilt:
-        next_step = of_arm_that_cannot_tilt(next_step)
+        next_step = without_tilting(next_step)
     elif located.scenes:
         (next_step,) = with_proposal([next_step], modelled=robot is not None)
     return type(error)(error.message, culprits=error.culprits, next_step=next_step)
@@ -182,13 +181,11 @@ def _with_other_board(state: RunState) -> RunState:
 
 def _with_reading(state: RunState, located: RunState | None, hint: Finding | None) -> RunState:
     """Adds to a poor verdict the misreading of the poses that explains it, if any."""
-    if state.verdict is None or located is None or not is_suspect(state):
+    if state.verdict is None or located is None or not may_be_misread(state):
         return state
     if hint is None and state.mount is not None:
         hint = reading_hint(located)
-    if hint is None:
-        return state
-    return replace(state, verdict=with_misread(state.verdict, hint))
+    return state if hint is None else replace(state, verdict=with_misread(state.verdict, hint))
 
 
 def view_evidence(state: RunState) -> tuple[ViewEvidence, ...]:
@@ -203,7 +200,7 @@ def view_evidence(state: RunState) -> tuple[ViewEvidence, ...]:
         for row, view, (measured, predicted) in zip(cell_rows, views, poses, strict=True):
             px = None
             if view.corners is not None:
-                px = _predicted(state, row.seer, predicted, view.corners)
+                px = _predicted_px(state, row.seer, predicted, view.corners)
             evidence[row.view] = ViewEvidence(row.view, view.corners, px, None, measured)
     rows = {observation.view.number: observation for observation in state.timed.observations}
     return tuple(
@@ -222,7 +219,7 @@ def _evidence(
             state.corners.get(view) if poses is None else poses.corners,
             cam_from_target=None if poses is None else poses.cam_from_target[0],
         )
-    corners = None if evidence.corners is None else _own_numbers(state, evidence.corners)
+    corners = None if evidence.corners is None else _board_numbers(state, evidence.corners)
     return replace(evidence, corners=corners, base_from_flange=_flange(state, view, observation))
 
 
@@ -235,7 +232,7 @@ def _flange(state: RunState, view: int, observation: Observation | None) -> Floa
     return state.base_from_flange.get(view)
 
 
-def _own_numbers(state: RunState, corners: Corners) -> Corners:
+def _board_numbers(state: RunState, corners: Corners) -> Corners:
     """Renumbers a view's corners from the first of its own board."""
     if len(state.session.boards) < 2 or not len(corners.ids):
         return corners
@@ -243,14 +240,13 @@ def _own_numbers(state: RunState, corners: Corners) -> Corners:
     return replace(corners, ids=corners.ids - int(starts[starts <= corners.ids[0]][-1]))
 
 
-def _predicted(
+def _predicted_px(
     state: RunState, seer: str, cam_from_target: FloatArray, corners: Corners
 ) -> FloatArray | None:
     looks = state.fitted.looks
     if looks is None or seer not in looks.problems:
         return None
-    positions = looks.points[corners.ids]
-    return predict_corners(looks.camera(seer), cam_from_target, positions)
+    return predict_corners(looks.camera(seer), cam_from_target, looks.points[corners.ids])
 
 
 def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...]:
@@ -267,7 +263,7 @@ def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...
     return tuple(sentences)
 
 
-def of_arm_that_cannot_tilt(advice: str) -> str:
+def without_tilting(advice: str) -> str:
     """Replaces advice to tilt by that to measure the offset, where the advice names one."""
     words = r"This arm cannot tilt: \1, as z_m and sigma_m in session.toml."
     return _OR_MEASURED.sub(words, advice)

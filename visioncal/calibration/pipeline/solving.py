@@ -7,14 +7,14 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import (
     arms_of,
+    change_each,
     joint_offsets,
-    one_by_one,
     with_drifts,
     with_errors,
     with_pose_errors,
 )
 from visioncal.calibration.pipeline.solved import Solved
-from visioncal.calibration.pipeline.starting import Start, sensors_of, started
+from visioncal.calibration.pipeline.starting import Start, find_start, sensors_of
 from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clocks import clock_effects
@@ -57,7 +57,7 @@ _ROUNDS, _CONVERGED_RAD = 4, 1e-7
 # Where the fit diverges, boards whose size is off by a larger share start at the estimated size.
 _FAR_SIZE = 5e-3
 # A focal length with a larger relative sigma by the corners needs an arm that tilts.
-_OPEN_FOCAL = 0.02
+_UNDETERMINED_FOCAL = 0.02
 # Prior sigma of targets' sizes in the search for inliers, as a share: prints are scaled to fit a
 # page.
 _SIZE_SIGMA = 0.03
@@ -86,11 +86,11 @@ def solve(
         check_asked(level, can=can)
     if solver != "joint":
         cell, level = replace(cell, priors=()), "hand-eye"
-    start = started(cell, observed)
+    start = find_start(cell, observed)
     if start.cell.mount is not None and start.cell.priors and not observed.is_misread:
-        _refuse_open_lens(observed, start.problem, start.cell.mount)
+        _refuse_undetermined_lens(observed, start.problem, start.cell.mount)
     try:
-        solved = _fitted(start, observed, arms, level)
+        solved = _fit(start, observed, arms, level)
     except (VisioncalError, np.linalg.LinAlgError):
         # Along an undetermined direction the fit of lens and frames diverges.
         if start.cell.mount is not None and not observed.is_misread:
@@ -100,7 +100,7 @@ def solve(
     return solved if solver == "joint" else _by_closed_form(solved, solver)
 
 
-def _fitted(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> Solved:
+def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> Solved:
     """Alternates between inliers, lenses and boards, and arms."""
     cell, poses = start.cell, start.poses
     sizes: Mapping[str, float] = {}
@@ -112,24 +112,24 @@ def _fitted(start: Start, observed: Observed, arms: Mapping[str, RobotArm], leve
     initial = Solved(
         cell, inliers, None, poses, start.untied, arms, level, clock_errors, observed.turned
     )
-    solved = _agreeing_looks(initial, observed, sizes)
+    solved = _fit_with_inliers(initial, observed, sizes)
     if turned := {} if observed.is_misread else _turned_images(solved):
         # Their corners would be explained by a lens that changes from view to view.
         observed = replace(observed, turned=turned)
-        solved = _agreeing_looks(replace(initial, turned=turned), observed, sizes)
+        solved = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
     solved = replace(solved, arms=with_drifts(solved.arms, solved.part, solved.agreed.fit, level))
     if any(arm.drift is not None for arm in solved.arms.values()):
-        solved = _agreeing_looks(solved, observed, sizes)
-    solved = replace(solved, agreed=levelled(cell, poses, solved.agreed))
+        solved = _fit_with_inliers(solved, observed, sizes)
+    solved = replace(solved, agreed=with_camera_levels(cell, poses, solved.agreed))
     # Misread poses determine neither the arm nor which views are outliers.
-    solved = solved if observed.is_misread else _alternating(solved, observed)
+    solved = solved if observed.is_misread else _calibrate_arms(solved, observed)
     if level != "hand-eye" and not observed.is_misread:
         solved = _with_functions(solved)
     solved = replace(solved, agreed=with_repeats(solved.agreed))
     return replace(solved, arms=with_pose_errors(solved.arms, solved.part, solved.agreed.fit))
 
 
-def _refuse_open_lens(observed: Observed, problem: Problem, mount: Mount) -> None:
+def _refuse_undetermined_lens(observed: Observed, problem: Problem, mount: Mount) -> None:
     """Refuses a lens that neither corners nor turns about one axis with priors determine."""
     poses = problem.poses[problem.robots[0]]
     # Images of a sweep have no pose before its clock is known.
@@ -139,7 +139,7 @@ def _refuse_open_lens(observed: Observed, problem: Problem, mount: Mount) -> Non
         if look.lens is None or look.lens.covariance is None:
             continue
         sigmas = np.sqrt(np.diag(look.lens.covariance)[:2]) / look.lens.camera.matrix[:2]
-        if (focal := float(sigmas.max())) > _OPEN_FOCAL:
+        if (focal := float(sigmas.max())) > _UNDETERMINED_FOCAL:
             raise DegenerateError(
                 f"{words} Such motion does not determine the lens, of which the corners leave the "
                 f"focal length open to {100.0 * focal:.1f} %.",
@@ -163,19 +163,21 @@ def _without_misreported(inliers: Agreed, arms: Mapping[str, RobotArm], before: 
     return replace(inliers, used=used).refitted()
 
 
-def _alternating(solved: Solved, observed: Observed) -> Solved:
+def _calibrate_arms(solved: Solved, observed: Observed) -> Solved:
     """Alternates between calibrating the arms and updating the inliers until neither changes."""
     for iteration in range(_ROUNDS + 1):
         if solved.asked != "hand-eye":
-            arms = _levels(solved)
+            arms = _choose_levels(solved)
             erring = [name for name, arm in arms.items() if arm.frees_errors()]
             clock_errors = clock_effects(solved.cell, observed.clocks, erring)
-            solved = _at_rest(replace(solved, arms=arms, late=clock_errors))
+            solved = _converge_arms(replace(solved, arms=arms, late=clock_errors))
         before = solved.agreed
         if iteration == _ROUNDS:  # The arms are calibrated with the last inliers.
             break
-        inliers = _without_misreported(settled(solved.cell, before), solved.arms, before.used)
-        solved = _at_rest(replace(solved, agreed=inliers))
+        inliers = _without_misreported(
+            updated_inliers(solved.cell, before), solved.arms, before.used
+        )
+        solved = _converge_arms(replace(solved, agreed=inliers))
         # Other inliers, or other moved frames, may allow another calibration level.
         same_frames = before.problem.unknown.keys() == inliers.problem.unknown.keys()
         if same_frames and np.array_equal(before.used, inliers.used):
@@ -193,13 +195,13 @@ def _by_closed_form(solved: Solved, solver: str) -> Solved:
     return replace(solved, agreed=replace(inliers, fit=Solution(state, noise)), solver=solver)
 
 
-def _agreeing_looks(start: Solved, observed: Observed, sizes: Mapping[str, float]) -> Solved:
+def _fit_with_inliers(start: Solved, observed: Observed, sizes: Mapping[str, float]) -> Solved:
     """Fits lenses, boards and frames, and updates the inliers until they do not change."""
     # In a whole cell the inliers are updated at the end, once the arms are calibrated: a frame
     # that moved must not be taken for outliers.
     solved, levels = start, dict[str, LensLevels]()
     for _ in range(_ROUNDS):
-        solved = _with_looks(replace(solved, arms=start.arms), observed, levels, sizes)
+        solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, levels, sizes)
         levels = {} if solved.seen is None else dict(solved.seen.looks.levels)
         if solved.cell.mount is None or observed.is_misread:
             break
@@ -212,12 +214,8 @@ def _agreeing_looks(start: Solved, observed: Observed, sizes: Mapping[str, float
 
 def _turned_images(solved: Solved) -> dict[int, ImageTurn]:
     """How images of outliers were turned or mirrored, by view."""
-    inliers, looks, state, problem = (
-        solved.agreed,
-        solved.looks,
-        solved.agreed.fit.state,
-        solved.agreed.problem,
-    )
+    inliers, looks = solved.agreed, solved.looks
+    problem, state = inliers.problem, inliers.fit.state
     if looks is None or inliers.used.all():
         return {}
     typical_px = float(np.nanmedian(solved.chain_px(np.flatnonzero(inliers.used), state)))
@@ -234,7 +232,7 @@ def _turned_images(solved: Solved) -> dict[int, ImageTurn]:
     return turns
 
 
-def _with_looks(
+def _fit_lenses_and_frames(
     solved: Solved, observed: Observed, levels: Mapping[str, LensLevels], sizes: Mapping[str, float]
 ) -> Solved:
     """Fits lenses, boards and frames, with posture-dependent errors of the arms and their drift."""
@@ -265,15 +263,15 @@ def _with_looks(
     return replace(solved, agreed=_with_effects(solved.agreed, effects)) if effects else solved
 
 
-def _levels(solved: Solved) -> dict[str, RobotArm]:
+def _choose_levels(solved: Solved) -> dict[str, RobotArm]:
     """Chooses the calibration level of each arm."""
     fit = solved.agreed.fit
     views = [solved.cell.rows[index].view for index in np.flatnonzero(solved.agreed.used)]
 
-    def with_level(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
-        return arm.with_level(stated, start, solved.asked, views, fit.noise)
+    def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
+        return arm.with_level(nominal, start, solved.asked, views, fit.noise)
 
-    return one_by_one(solved.arms, solved.part, fit, with_level)
+    return change_each(solved.arms, solved.part, fit, with_level)
 
 
 def _with_functions(solved: Solved) -> Solved:
@@ -282,21 +280,21 @@ def _with_functions(solved: Solved) -> Solved:
     # also explain much of a slipped joint: where the slip explains more, they are left out.
     part, fit = solved.part, solved.agreed.fit
 
-    def with_functions(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
-        extended = arm.with_functions(stated, start, solved.asked, fit.noise)
+    def with_functions(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
+        extended = arm.with_functions(nominal, start, solved.asked, fit.noise)
         if not extended.gain_of_functions:
             return extended
         slip = slipped_joint(part, fit, joint_offsets({arm.robot: arm}))
         slips = slip and log_gain(part, fit, slip.mahalanobis_sq) > extended.gain_of_functions
         return arm if slips else extended
 
-    arms = one_by_one(solved.arms, part, fit, with_functions)
+    arms = change_each(solved.arms, part, fit, with_functions)
     if all(arms[name] is arm for name, arm in solved.arms.items()):
         return solved
-    return _at_rest(replace(solved, arms=arms))
+    return _converge_arms(replace(solved, arms=arms))
 
 
-def _at_rest(solved: Solved) -> Solved:
+def _converge_arms(solved: Solved) -> Solved:
     """Fits and relinearises the calibrated arms in turn until they converge."""
     is_modelled = any(arm.model is not None for arm in solved.arms.values())
     for iteration in range(_ROUNDS if is_modelled else 0):
@@ -306,9 +304,7 @@ def _at_rest(solved: Solved) -> Solved:
             solved = replace(solved, agreed=_with_effects(solved.agreed, effects))
         else:
             side, corners = solved.side, solved.seen
-            fitted = settle_looks(
-                corners.looks, side, corners.moving, solved.frames, before=corners
-            )
+            fitted = settle_looks(corners.looks, side, corners.moving, solved.frames, None, corners)
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
                 looks = fitted.looks.with_levels(lens_levels(side, fitted))
                 fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)
@@ -339,12 +335,7 @@ def _with_effects(inliers: Agreed, effects: Sequence[Effect]) -> Agreed:
 
 
 def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, Agreed]:
-    """Inliers of a pair of robot and camera before lens, board and arm are fitted.
-
-    Args:
-        cell: A cell of one robot and one camera.
-        observed: What was observed in it.
-        mount: Where the camera is.
+    """Inliers of one robot and one camera before lens, board and arm are fitted.
 
     Returns:
         The cell, its rows in the order of the fit, and the inliers.
@@ -352,7 +343,7 @@ def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, A
     Raises:
         DegenerateError: The geometry of the motion alone does not determine the result.
     """
-    start = started(cell, observed)
+    start = find_start(cell, observed)
     check_observability(start.problem, start.state, starting_noise(start.problem), mount)
     return start.cell, find_inliers(start)[0]
 
@@ -364,8 +355,8 @@ def find_inliers(start: Start) -> tuple[Agreed, Mapping[str, float]]:
         The inliers, and a rough relative size error of each printed target of a whole cell.
     """
     cell, problem, state = start.cell, start.problem, start.state
-    movable, observations = _movable(cell, problem), problem.observations
-    if printed := _printed(observations) if movable else []:
+    movable, observations = _movable_frames(cell, problem), problem.observations
+    if printed := _printed_targets(observations) if movable else []:
         # Otherwise all observations of a board of another size would be outliers.
         problem = problem.with_effects([target_sizes(problem, printed, _SIZE_SIGMA)])
         state = State(state.edges, problem.start_values)
@@ -381,16 +372,16 @@ def find_inliers(start: Start) -> tuple[Agreed, Mapping[str, float]]:
     return inliers, dict(zip(printed, sizes, strict=True))
 
 
-def settled(cell: Cell, inliers: Agreed) -> Agreed:
+def updated_inliers(cell: Cell, inliers: Agreed) -> Agreed:
     """Refits inliers and priors until neither set changes."""
     if cell.priors:
         loose = replace(inliers.problem, priors=loosened(cell.priors))
-        inliers = settle(replace(inliers, problem=loose), _movable(cell, loose))
+        inliers = settle(replace(inliers, problem=loose), _movable_frames(cell, loose))
         inliers = _with_priors(cell, inliers)
-    return settle(inliers, _movable(cell, inliers.problem))
+    return settle(inliers, _movable_frames(cell, inliers.problem))
 
 
-def levelled(cell: Cell, poses: Sequence[ViewPoses], inliers: Agreed) -> Agreed:
+def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: Agreed) -> Agreed:
     """Estimates the noise level of cameras, too, now that outliers are removed."""
     # Corners of one image may have a common error, as those of small squares do: poses then
     # scatter by more than the corners indicate, but never by less. Where one camera sees one robot
@@ -421,7 +412,7 @@ def with_repeats(inliers: Agreed) -> Agreed:
     return replace(inliers, problem=replace(inliers.problem, with_repeats=True)).refitted()
 
 
-def _printed(observations: Observations) -> list[str]:
+def _printed_targets(observations: Observations) -> list[str]:
     """Targets whose corners were seen: other poses have no known covariance."""
     pairs = zip(observations.observed, observations.sensors.tolist(), strict=True)
     return list(dict.fromkeys(target for target, sensor in pairs if sensor < 0))
@@ -441,7 +432,7 @@ def _with_priors(cell: Cell, inliers: Agreed) -> Agreed:
         problem = replace(problem, priors=kept)
 
 
-def _movable(cell: Cell, problem: Problem) -> tuple[str, ...]:
+def _movable_frames(cell: Cell, problem: Problem) -> tuple[str, ...]:
     """Frames that may have moved during the session: all unknown ones but bases."""
     # One camera that sees one robot move cannot distinguish what slipped from a wrong pose.
     if cell.mount is not None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.network_ties import ambiguous_error, untied_robots
+from visioncal.calibration.pipeline.network_ties import ambiguous_error, refuse_unconnected_robots
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.observed import Observed, nothing_seen
@@ -56,14 +56,14 @@ def _with_poses(cell: Cell, observed: Observed) -> Cell:
     return cell
 
 
-def started(cell: Cell, observed: Observed) -> Start:
+def find_start(cell: Cell, observed: Observed) -> Start:
     """Initialises all frames, and chooses each view's pose by them.
 
     Raises:
         DataError: No observation gave a pose.
         DegenerateError: A robot is linked to nothing, or a frame may be in two places.
     """
-    cell, lost = _tied_part(_with_poses(cell, observed))
+    cell, lost = _connected_part(_with_poses(cell, observed))
     views = [observed.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
     if cell.mount is not None:
@@ -72,11 +72,11 @@ def started(cell: Cell, observed: Observed) -> Start:
     initial = init_frames(problem, views, targets_of(cell))
     tied, chosen = initial.tied, {view.view: view for view in initial.views}
     if tied.untied:
-        untied_robots(cell, tied.untied, seen=True)
+        refuse_unconnected_robots(cell, tied.untied, seen=True)
         cell = _without_frames(cell, tied.untied)
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
-    cell, unlinked = _tied_part(
+    cell, unlinked = _connected_part(
         cell.without({rejection.view: rejection.reason for rejection in initial.rejections})
     )
     poses = tuple(chosen[row.view] for row in cell.rows)
@@ -91,7 +91,7 @@ def agreeing_views(cell: Cell, observed: Observed) -> frozenset[int]:
         DataError: Nothing was seen.
         DegenerateError: A robot is linked to nothing, or a frame may be in two places.
     """
-    start = started(cell, observed)
+    start = find_start(cell, observed)
     residual = invert(start.problem.predicted(start.state)) @ start.problem.observations.measured
     distance = np.linalg.norm(residual[:, :3, 3], axis=1) + LEVER_M * rotation_angle(residual)
     is_near = (distance < AGREE_M).tolist()
@@ -158,11 +158,11 @@ def _is_sensed(seer: str, view: ViewPoses) -> bool:
     return seer.startswith("instrument") or not view.covariance.any()
 
 
-def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
+def _connected_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
     """The part of a cell that observations connect, and the frames outside."""
     tied = cell.tied()
     unlinked = tuple(branch for branch in cell.tree.branches if branch not in tied)
-    untied_robots(cell, unlinked)
+    refuse_unconnected_robots(cell, unlinked)
     branches = cell.tree.branches
     return _without_frames(cell, unlinked), tuple(
         name for name in unlinked if not branches[name].robot

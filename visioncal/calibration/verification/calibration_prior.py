@@ -132,7 +132,7 @@ class CalibrationPrior:
         """Degrees of freedom of the estimated noise, limited."""
         return min(self.calibration.noise_dof, _MOST_FREEDOM)
 
-    def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "CalibrationPrior":
+    def with_board_at(self, z: FloatArray, sigmas: FloatArray) -> "CalibrationPrior":
         """Replaces the pose of a single board.
 
         Args:

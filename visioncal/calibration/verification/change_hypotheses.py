@@ -29,7 +29,7 @@ CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
 _FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
 # Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
 _OTHER_SIZE_PER_M = 10.0
-_KNOCK = np.repeat([TURN_PER_M, 1.0], 3)
+_MOTION_UNITS = np.repeat([TURN_PER_M, 1.0], 3)
 
 
 def causes_of(
@@ -44,7 +44,7 @@ def causes_of(
     """
     # The camera's edge: a twist on its right, transformed to the target's side.
     moved = adjoint(invert(predicted.problem.observations.measured))
-    camera = _cause(CAMERA, predicted, _KNOCK, by_sensor=moved)
+    camera = _cause(CAMERA, predicted, _MOTION_UNITS, by_sensor=moved)
     boards = () if board_placed_anew else tuple(_boards(predicted, prior))
     sizes = tuple(_sizes(predicted, prior))
     return (
@@ -52,12 +52,12 @@ def causes_of(
         *boards,
         *sizes,
         *(
-            _jointly(REPLACED, moved, replace(size, units=np.array([_OTHER_SIZE_PER_M])))
+            _simultaneous(REPLACED, moved, replace(size, units=np.array([_OTHER_SIZE_PER_M])))
             for moved, size in zip(boards, sizes, strict=False)
         ),
         # Camera and board together fit any two stops.
         *(
-            _jointly(BOTH, camera, board)
+            _simultaneous(BOTH, camera, board)
             for board in boards
             if len(prior.boards) == 1 and len(predicted.problem) >= FEWEST_VIEWS
         ),
@@ -83,10 +83,12 @@ def _boards(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Caus
             np.where(of_board[:, None, None], -np.eye(6), 0.0),
             changes[of_board].mean(axis=0),
         )
-        yield _cause(f"{BOARD} {names[board]}".strip(), predicted, _KNOCK, by_sensor, start=start)
+        yield _cause(
+            f"{BOARD} {names[board]}".strip(), predicted, _MOTION_UNITS, by_sensor, start=start
+        )
 
 
-def _jointly(kind: str, first: Cause, second: Cause) -> Cause:
+def _simultaneous(kind: str, first: Cause, second: Cause) -> Cause:
     """Two simultaneous changes."""
     # If both camera and board moved, only the arm is left of the calibration; a board of another
     # size at another place is another board.
@@ -163,7 +165,7 @@ def _views(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause
         yield _cause(
             f"{VIEW} {predicted.views[first][0]}",
             predicted,
-            _KNOCK,
+            _MOTION_UNITS,
             by_sensor,
             start=changes[first],
         )

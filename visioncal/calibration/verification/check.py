@@ -18,7 +18,7 @@ from visioncal.calibration.verification.change_hypotheses import (
 )
 from visioncal.calibration.verification.prediction import (
     PredictedStops,
-    asked_of_boards,
+    board_changes,
     predict_stops,
 )
 from visioncal.core.arguments import typed
@@ -158,7 +158,7 @@ def check(
                 "that moved is named. Or verify with views of the boards that stayed.",
             )
         change = mean_transform(predicted.away(prior))
-        prior = prior.placed_anew(prior.state.edges[1] @ change, _ANYWHERE)
+        prior = prior.with_board_at(prior.state.edges[1] @ change, _ANYWHERE)
     belief = Belief(
         prior.state,
         prior.covariance,
@@ -185,7 +185,7 @@ def check(
     if named:
         cause = causes[order[0]]
         corrected = undone(predicted.problem, cause, suspects[0].explained.values)
-        remaining = log(asked_of_boards(corrected, with_change(belief.state, cause)))
+        remaining = log(board_changes(corrected, with_change(belief.state, cause)))
     return Check(
         prior.calibration,
         predicted,

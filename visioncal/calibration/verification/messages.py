@@ -273,7 +273,7 @@ def _changed(check: Check, suspect: Suspect) -> str:
         return f"{_capital('; '.join(f'the {name} {move.words}' for name, move in moved.items()))}."
     return (
         f"{_capital(suspect.name)} alone contradicts the calibration, by "
-        f"{_short(moved[suspect.name])}; the other stops agree with it."
+        f"{_size_words(moved[suspect.name])}; the other stops agree with it."
     )
 
 
@@ -304,7 +304,7 @@ def thing(check: Check, suspect: Suspect) -> str:
         return f"the robot scatters about {explained.noise_factor:.0f} times as much as it did"
     if kind in (CAMERA, BOARD, BOTH):
         moved = motions(check, suspect)
-        return listed([f"the {name} moved by {_short(move)}" for name, move in moved.items()])
+        return listed([f"the {name} moved by {_size_words(move)}" for name, move in moved.items()])
     return f"{suspect.name} alone being wrong"
 
 
@@ -321,10 +321,12 @@ def _other_board(check: Check, suspect: Suspect) -> str:
     )
     if kind == SIZE:
         return words
-    return f"{words}; its middle lies {_short(motions(check, suspect)[suspect.name])} elsewhere"
+    return (
+        f"{words}; its middle lies {_size_words(motions(check, suspect)[suspect.name])} elsewhere"
+    )
 
 
-def _short(moved: MeasuredMove) -> str:
+def _size_words(moved: MeasuredMove) -> str:
     return mm_and_deg(moved.mm, moved.deg)
 
 
@@ -431,11 +433,7 @@ def listed_suspects(check: Check) -> tuple[Suspect, ...]:
 
 
 def _change(check: Check, suspect: Suspect) -> dict[str, Any]:
-    return {
-        "cause": suspect.name,
-        "probability": suspect.probability,
-        **described(check, suspect),
-    }
+    return {"cause": suspect.name, "probability": suspect.probability, **described(check, suspect)}
 
 
 def _trigger(outcome: Outcome) -> dict[str, Any]:

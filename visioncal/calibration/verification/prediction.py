@@ -72,7 +72,7 @@ class PredictedStops:
 
     def away(self, prior: CalibrationPrior) -> FloatArray:
         """(m, 4, 4) change of its board's edge, on the right, by each observation."""
-        return asked_of_boards(self.problem, prior.state)
+        return board_changes(self.problem, prior.state)
 
     @property
     def from_corners(self) -> bool:
@@ -114,7 +114,7 @@ def known_before(
     """
     calibration = prior.calibration
     check_mount(session, calibration)
-    session = _with_its_targets(session, prior)
+    session = _with_calibrated_targets(session, prior)
     document, robot = session.robot_document, calibration.robot
     if robot is not None and document is not None:
         check_robot(session, Robot.from_document(document), robot)
@@ -138,13 +138,13 @@ def seen_by(run: RunState, prior: CalibrationPrior) -> PredictedStops:
             )
         check_resolution(run.session, calibration, look.resolution)
         lens = CameraResult(calibration.camera.camera, estimated=False)
-        corrected = _straightened(look.corners, calibration.camera, {})
+        corrected = _in_lens_model(look.corners, calibration.camera, {})
         run = run.with_camera(frame, replace(look, lens=lens, corners=corrected))
-    run = _breathed(run, detected, calibration.camera)
+    run = _without_breathing(run, detected, calibration.camera)
     # Of a sweep the slower views are used, where the error of the clock offset is below the
     # robot's.
     run = replace(_STAGES["clock"](_STAGES["pnp"](run)), clocks={})
-    observed = _posed(_with_arm(ObservedPoses.of(run), prior), prior)
+    observed = _with_poses(_with_arm(ObservedPoses.of(run), prior), prior)
     problem, used = observed.problem(observed.used), np.array(observed.used)
     merged = problem.of_one_stop
     return PredictedStops(
@@ -155,7 +155,7 @@ def seen_by(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     )
 
 
-def _breathed(
+def _without_breathing(
     run: RunState, detected: Mapping[str, CameraLook], lens: CameraResult | None
 ) -> RunState:
     """Corrects corners for focus breathing, to the calibration's mean distance."""
@@ -170,12 +170,12 @@ def _breathed(
         stack = CornerStack.of(shown, numbered_positions(targets))
         poses = np.array([rough_poses[view].cam_from_target[0] for view in stack.views])
         depths = dict(zip(stack.views, depths_m(stack, poses).tolist(), strict=True))
-        corrected = _straightened(look.corners, lens, depths)
+        corrected = _in_lens_model(look.corners, lens, depths)
         run = run.with_camera(frame, replace(run.cameras[frame], corners=corrected))
     return run
 
 
-def _straightened(
+def _in_lens_model(
     corners: Mapping[int, Corners], lens: CameraResult, depths: Mapping[int, float]
 ) -> dict[int, Corners]:
     """Corrects corners, by view, for the lens's errors beyond its model."""
@@ -185,7 +185,7 @@ def _straightened(
     }
 
 
-def asked_of_boards(problem: Problem, state: State) -> FloatArray:
+def board_changes(problem: Problem, state: State) -> FloatArray:
     """(m, 4, 4) change of its board's edge, on the right, that each observation requires."""
     changes, observed = np.zeros((len(problem), 4, 4)), np.array(problem.observations.observed)
     for board in set(problem.observations.observed):
@@ -210,7 +210,7 @@ def _with_arm(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses
     return observed
 
 
-def _posed(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
+def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
     """Chooses each view's pose by the calibration, and recomputes it with its lens and boards."""
     mount, targets = observed.session.mount, tuple(prior.targets.values())
     x, *placed = prior.state.edges
@@ -263,7 +263,7 @@ def _noise_px(observed: ObservedPoses) -> float:
     return stack.sigma_px(residuals, 6 * len(corners))
 
 
-def _with_its_targets(session: Session, prior: CalibrationPrior) -> Session:
+def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Session:
     """Replaces the session's targets by the calibration's, by their names."""
     # A session's only target has no name: of several calibrated ones, it is that with an equal
     # print.
@@ -274,7 +274,9 @@ def _with_its_targets(session: Session, prior: CalibrationPrior) -> Session:
         return session
     name = ""
     if "" in shown:
-        alike = [name for name, target in calibrated.items() if not _differing(target, shown[""])]
+        alike = [
+            name for name, target in calibrated.items() if not _print_differences(target, shown[""])
+        ]
         name = alike[0] if len(alike) == 1 else ""
     if not name:
         _check_targets(session, prior)
@@ -292,7 +294,7 @@ def _with_its_targets(session: Session, prior: CalibrationPrior) -> Session:
     return replace(session, target=None, targets=calibrated, views=views)
 
 
-def _differing(ours: Target, theirs: Target) -> list[str]:
+def _print_differences(ours: Target, theirs: Target) -> list[str]:
     """The fields in which two targets are printed differently."""
     first, second = target_document(ours), target_document(theirs)
     return [
@@ -324,7 +326,7 @@ def _check_targets(session: Session, prior: CalibrationPrior) -> None:
                 else "Name the targets as in the calibration's session.",
             )
         ours, theirs = target_document(calibrated), target_document(target)
-        for field in _differing(calibrated, target):
+        for field in _print_differences(calibrated, target):
             raise DataError(
                 f"session {session.name!r}: target {name or target.name!r} has {field} = "
                 f"{shorten(theirs.get(field))}, and the calibration was made with "
@@ -350,15 +352,15 @@ def check_robot(session: Session, stated: Robot, calibrated: Robot) -> None:
             next_step="Name the calibration of this robot.",
         )
     q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, calibrated.joint_count))
-    # Motions are compared, as the calibrated robot's base may be moved to the frame of the poses.
+    # Motions are compared: the calibrated base may have been moved to the frame of the poses.
     ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
     between = [invert(array[0]) @ array for array in (ours, theirs)]
     off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
     if off[0] > _ONE_ROBOT_MM or off[1] > _ONE_ROBOT_DEG:
         raise DataError(
             f"session {session.name!r} names robot {stated.name}, whose flange is up to "
-            f"{off[0]:.3g} mm and {figure(off[1])} deg off from the calibrated {calibrated.name}'s: "
-            "it is another robot, or another tip.",
+            f"{off[0]:.3g} mm and {figure(off[1])} deg off from the calibrated "
+            f"{calibrated.name}'s: it is another robot, or another tip.",
             culprits=culprit,
             next_step="Name the robot and tip as in the calibration's session.",
         )
