@@ -1,6 +1,6 @@
 """Calibrates a session of one camera and robot or of a whole cell; also with dense corners."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -208,7 +208,18 @@ def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked])
             name: CornerResiduals(mm=rms.mm, px=rms.px)
             for name, rms in zip(("template", "dense"), residuals, strict=True)
         },
-        images=tuple(_images(fitted.dense)),
+        images=tuple(
+            ImageBlur(
+                view=view,
+                sigma_px=fit.blur.sigma_px,
+                disc_px=fit.blur.disc_px,
+                motion_px=fit.blur.length_px,
+                motion_deg=fit.blur.direction_deg,
+                tone=fit.tone,
+                pixel_noise=fit.noise,
+            )
+            for view, fit in fitted.dense.fits.items()
+        ),
     )
     notes = [_words(*residuals, kept=kept), *fitted.dense.notes()]
     chosen = fitted if kept else plain
@@ -217,19 +228,6 @@ def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked])
         evidence = explained(session, chosen.evidence, fitted.dense, camera)
         chosen = replace(chosen, evidence=evidence)
     return _noting(chosen, result, notes)
-
-
-def _images(dense: Dense) -> Iterator[ImageBlur]:
-    for view, fit in dense.fits.items():
-        yield ImageBlur(
-            view=view,
-            sigma_px=fit.blur.sigma_px,
-            disc_px=fit.blur.disc_px,
-            motion_px=fit.blur.length_px,
-            motion_deg=fit.blur.direction_deg,
-            tone=fit.tone,
-            pixel_noise=fit.noise,
-        )
 
 
 def _noting(fitted: Run, result: DenseResult | None, notes: list[str]) -> Run:

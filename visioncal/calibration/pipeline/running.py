@@ -191,16 +191,17 @@ def _with_reading(state: RunState, located: RunState | None, hint: Finding | Non
 def view_evidence(state: RunState) -> tuple[ViewEvidence, ...]:
     """Collects the evidence of each view: corners, predictions, poses."""
     solved, fit_state = state.fitted, state.solved.state
-    held = held_back(solved, state)
+    held, looks = held_back(solved, state), solved.looks
     problems = [(solved.cell.rows, solved.poses, solved.agreed.problem)]
     problems += [] if held is None else [(held.rows, held.views, held.problem)]
     evidence = dict[int, ViewEvidence]()
     for cell_rows, views, problem in problems:
         poses = zip(problem.measured(fit_state), problem.predicted(fit_state), strict=True)
         for row, view, (measured, predicted) in zip(cell_rows, views, poses, strict=True):
-            px = None
-            if view.corners is not None:
-                px = _predicted_px(state, row.seer, predicted, view.corners)
+            corners, px = view.corners, None
+            if corners is not None and looks is not None and row.seer in looks.problems:
+                camera = looks.camera(row.seer)
+                px = predict_corners(camera, predicted, looks.points[corners.ids])
             evidence[row.view] = ViewEvidence(row.view, view.corners, px, None, measured)
     rows = {observation.view.number: observation for observation in state.timed.observations}
     return tuple(
@@ -238,15 +239,6 @@ def _board_numbers(state: RunState, corners: Corners) -> Corners:
         return corners
     starts = first_corners(tuple(state.session.boards.values()))
     return replace(corners, ids=corners.ids - int(starts[starts <= corners.ids[0]][-1]))
-
-
-def _predicted_px(
-    state: RunState, seer: str, cam_from_target: FloatArray, corners: Corners
-) -> FloatArray | None:
-    looks = state.fitted.looks
-    if looks is None or seer not in looks.problems:
-        return None
-    return predict_corners(looks.camera(seer), cam_from_target, looks.points[corners.ids])
 
 
 def with_proposal(sentences: Sequence[str], *, modelled: bool) -> tuple[str, ...]:

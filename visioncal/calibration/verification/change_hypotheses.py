@@ -47,6 +47,7 @@ def causes_of(
     camera = _cause(CAMERA, predicted, _MOTION_UNITS, by_sensor=moved)
     boards = () if board_placed_anew else tuple(_boards(predicted, prior))
     sizes = tuple(_sizes(predicted, prior))
+    noise = (replace(_cause(NOISE, predicted, np.zeros(0)), noise_factors=_FACTORS),)
     return (
         camera,
         *boards,
@@ -62,7 +63,7 @@ def causes_of(
             if len(prior.boards) == 1 and len(predicted.problem) >= FEWEST_VIEWS
         ),
         *_joints(predicted, prior),
-        *_noise(predicted),
+        *(noise if predicted.stops > 1 else ()),
         *_views(predicted, prior),
     )
 
@@ -143,12 +144,6 @@ def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
     twists = np.zeros((len(placements), 6))
     twists[:, 3:] = np.einsum("nji,nj->ni", placements[:, :3, :3], placements[:, :3, 3])
     return np.asarray(robot.placement_jacobian(q) @ twists.reshape(-1))
-
-
-def _noise(predicted: PredictedStops) -> Iterator[Cause]:
-    """Larger noise of the robot, which takes two stops or more."""
-    if predicted.stops > 1:
-        yield replace(_cause(NOISE, predicted, np.zeros(0)), noise_factors=_FACTORS)
 
 
 def _views(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:

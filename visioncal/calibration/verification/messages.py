@@ -99,14 +99,8 @@ class MeasuredMove:
         """The significant parts of the motion, in words."""
         shift = f"by {figure(self.mm)} mm (sigma {figure(self.sigma_mm)}) along {self.along}"
         turn = f"by {figure(self.deg)} deg (sigma {figure(self.sigma_deg)}) about {self.about}"
-        parts = [
-            text
-            for text, value, sigma in (
-                (f"moved {shift}", self.mm, self.sigma_mm),
-                (f"turned {turn}", self.deg, self.sigma_deg),
-            )
-            if value > _MENTIONED * sigma
-        ]
+        parts = [f"moved {shift}"] * (self.mm > _MENTIONED * self.sigma_mm)
+        parts += [f"turned {turn}"] * (self.deg > _MENTIONED * self.sigma_deg)
         return " and ".join(parts) or f"moved {shift}"
 
 
