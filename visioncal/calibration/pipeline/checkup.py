@@ -219,19 +219,16 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
     except VisioncalError as error:
         yield _refused("motion", error)
         return
-    outliers = [
-        row.view for row, used in zip(cell.rows, inliers.used.tolist(), strict=True) if not used
-    ]
+    outliers = [cell.rows[at].view for at in np.flatnonzero(~inliers.used).tolist()]
     named = some_of([*map(str, outliers)])
     if _is_run(cell, inliers.used):
+        do = "Calibrate: the verdict says what it is, where one change explains it."
         yield Finding(
             "something_moved",
             f"Views {named} disagree with the others, and follow each other: from view "
             f"{outliers[0]} to view {outliers[-1]}, something stood elsewhere or was set up "
             "otherwise.",
-            Remedy(
-                "Calibrate: the verdict says what it is, where one change explains it.", CALIBRATE
-            ),
+            Remedy(do, CALIBRATE),
             tuple(outliers),
         )
     elif outliers:
@@ -249,14 +246,12 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
         )
     used, (enough, _) = int(inliers.used.sum()), CalibrationLimits().stops
     if used < enough:
+        do = f"Add {enough - used} views or more, tilted by 20 to 40 degrees about different axes."
         yield Finding(
             "few_stops",
             f"Only {used} views can be used; {enough} or more give a result something to be "
             "checked with.",
-            Remedy(
-                f"Add {enough - used} views or more, tilted by 20 to 40 degrees about different "
-                "axes."
-            ),
+            Remedy(do),
         )
     rad, metres = inliers.fit.noise.robots[0].tolist()
     if 1e3 * metres > _MOST_MM:

@@ -35,9 +35,8 @@ def exchanged_names(run: RunState) -> Finding | None:
         return None
     seen = run.corners.keys() | session.corners.keys() | given_poses(session).keys()
     usable = seen - run.held_back
-    rows = [
-        row for row in session.observations if row.view.number in usable and not row.view.is_of_lens
-    ]
+    observations = (row for row in session.observations if row.view.number in usable)
+    rows = [row for row in observations if not row.view.is_of_lens]
     before = _agreeing(run)
     kinds: tuple[tuple[Kind, list[str]], ...] = (
         ("camera", [*session.cameras]),

@@ -47,11 +47,7 @@ def guess_session(
 
 
 def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
-    """Does what `guess_session` does, once the camera's poses are known.
-
-    Args:
-        run: The run, with the camera's poses and all their alternatives.
-        robot: The robot's numbers; those of the session where None.
+    """Does what `guess_session` does, once the camera's poses are known, with all alternatives.
 
     Raises:
         DataError: There is nothing to read.

@@ -175,9 +175,8 @@ def _in_words(budget_mm: Mapping[str, float]) -> dict[str, float]:
 
 def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
     """Findings on measured poses whose scale or rotations differ from the robot's."""
-    views = [
-        index for index in run.base_from_flange if index in run.poses and index not in run.reasons
-    ]
+    usable = run.poses.keys() - run.reasons.keys()
+    views = [view for view in run.base_from_flange if view in usable]
     if run.cameras or run.mount == "instrument" or not views:
         return
     poses = np.array([run.base_from_flange[view] for view in views])
@@ -187,11 +186,9 @@ def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
     (edge,) = (edge for name, edge in run.solved.last_edges.items() if name.startswith("cam"))
     if (found := distance_scale(parent, seen, edge.matrix)) is not None:
         yield found
-    from_seer = edge.matrix @ seen
-    if run.mount == "eye-in-hand":
-        found = measured_turns(poses, from_seer)
-    else:
-        found = measured_turns(np.eye(4), parent @ from_seer)
+    target = edge.matrix @ seen
+    in_hand = run.mount == "eye-in-hand"
+    found = measured_turns(poses, target) if in_hand else measured_turns(np.eye(4), parent @ target)
     if found is not None:
         yield found
 

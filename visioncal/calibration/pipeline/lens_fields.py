@@ -221,7 +221,7 @@ def lens_findings(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
                 up_to_mm=1e3 * lens.field_px / lens.focal_px * lens.distance_m,
             )
         if max(breathing, jitter) > SIGNIFICANT:
-            share = 100.0 * lens.noise_px
+            share, change = 100.0 * lens.noise_px, max(lens.levels.breathing, lens.levels.jitter)
             how = []
             if breathing > SIGNIFICANT:
                 how += [f"by {figure(share * lens.levels.breathing)} % where the distance doubles"]
@@ -232,8 +232,5 @@ def lens_findings(lenses: Mapping[str, LensErrors]) -> Iterator[Finding]:
                 f"{of} changes its focal length {' and '.join(how)}. The result counts it.",
                 Remedy("Fix the focus (no autofocus), or work at one distance."),
                 mahalanobis_sq=max(breathing, jitter),
-                up_to_mm=10.0
-                * share
-                * max(lens.levels.breathing, lens.levels.jitter)
-                * lens.distance_m,
+                up_to_mm=10.0 * share * change * lens.distance_m,
             )

@@ -11,7 +11,7 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import remade
-from visioncal.core.types import Corners, FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.parts import ROBOT
@@ -101,15 +101,11 @@ class ObservedPoses(Observed):
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
             covariance,
             stops=self.stops_of(views),
-            targets=self.targets(views),
+            targets=tuple(self.frame_of(pose.board) for pose in poses),
             order=[self.frame_of(board) for board in self.boards],
             # Shared values are relative to the given ones.
             effects=[replace(effect, values=np.zeros(len(effect))) for effect in effects],
         )
-
-    def targets(self, views: Sequence[int]) -> tuple[str, ...]:
-        """(m,) the frame of the target that each view shows."""
-        return tuple(self.frame_of(self.poses[view].board) for view in views)
 
     def frame_of(self, board: int) -> str:
         """The frame of one of the session's boards."""
@@ -119,23 +115,13 @@ class ObservedPoses(Observed):
 
     def framed(self, edges: FloatArray) -> dict[str, FloatArray]:
         """Names (1 + b, 4, 4) edges of the camera and the problem's boards by their frames."""
-        frames = (self.camera_frame, *map(self.frame_of, self.boards))
-        return dict(zip(frames, edges, strict=True))
-
-    @property
-    def camera_frame(self) -> str:
-        """The frame of the camera, or of the instrument."""
-        return edge_names(self.session.mount)[0].partition("_from_")[2]
+        camera = edge_names(self.session.mount)[0].partition("_from_")[2]
+        return dict(zip((camera, *map(self.frame_of, self.boards)), edges, strict=True))
 
     def first_of_stops(self, views: Sequence[int]) -> list[int]:
         """(s,) the first view of each stop."""
         first = np.unique(self.stops_of(views), return_index=True)[1]
         return [views[index] for index in first.tolist()]
-
-    @property
-    def stops(self) -> IntArray:
-        """(m,) stop of the robot at each used view; see `stops_of`."""
-        return self.stops_of(self.used)
 
     def stops_of(self, views: Sequence[int]) -> IntArray:
         """(m,) stop of the robot at each view, numbered from 0.
@@ -154,7 +140,3 @@ class ObservedPoses(Observed):
         return {
             observation.view.number: observation.station for observation in self.timed.observations
         }
-
-    def seen(self, views: Sequence[int]) -> list[Corners | None]:
-        """The corners from which the poses of some views were computed."""
-        return [self.poses[view].corners for view in views]

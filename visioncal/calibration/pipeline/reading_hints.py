@@ -91,11 +91,7 @@ _BESIDE_JOINTS = Remedy(
 
 
 def reading_hint(run: RunState) -> Finding | None:
-    """Finding on the reading of the poses that explains a failed calibration; None for none.
-
-    Args:
-        run: The run, after the stage `pnp`.
-    """
+    """Finding on the reading of the poses that closes the chain, if any; after the stage `pnp`."""
     hint = _constant_rotations(run) or _changed_midway(run)
     if hint is not None:
         return hint
@@ -226,11 +222,8 @@ def _unpaired(run: RunState) -> Finding | None:
         difference = by_robot[order[first], order[second]] - by_camera[first, second]
         return float(np.mean(np.abs(difference) < np.deg2rad(_ALIKE_DEG)))
 
-    rng, share, count = (
-        np.random.default_rng(0),
-        share_alike(np.arange(len(by_robot))),
-        len(by_robot),
-    )
+    rng, count = np.random.default_rng(0), len(by_robot)
+    share = share_alike(np.arange(count))
     by_chance = float(np.mean([share_alike(rng.permutation(count)) for _ in range(_SHUFFLES)]))
     if share > by_chance + _PAIRS_IN_PLACE or by_chance > _MOST_BY_CHANCE:
         return None
@@ -260,24 +253,19 @@ def _poses_contradicting_joints(run: RunState, declared: Candidate) -> Finding |
         return None
     robot = PoseNumbers.of_poses(chain, places_of(session))
     for camera in camera_pose_choices(run, robot):
-        by_joints = guess_reading(
-            robot, camera, session.mount, is_measured=bool(run.corners)
-        ).declared
-        if by_joints.closes:
+        guess = guess_reading(robot, camera, session.mount, is_measured=bool(run.corners))
+        if guess.declared.closes:
             words = (
                 f"The reported poses are wrong: with them the chain closes to {declared.figures} "
-                f"only, with the joint angles and the robot's model to {by_joints.figures}."
+                "only, with the joint angles and the robot's model to "
+                f"{guess.declared.figures}."
             )
             return Finding(_MISREAD, words, _BESIDE_JOINTS)
     return None
 
 
 def misreadings(run: RunState) -> Iterator[Finding]:
-    """Findings on readings that explain why chains do not close as declared.
-
-    Args:
-        run: The run, after the stage `pnp`.
-    """
+    """Findings on misread poses, where chains do not close as declared; after the stage `pnp`."""
     if run.mount is None:
         yield from _misreadings_in_cell(run)
     elif not closes(_recording(run)) and (hint := reading_hint(run)) is not None:

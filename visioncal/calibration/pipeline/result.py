@@ -175,8 +175,8 @@ def _arm(run: RunState) -> ArmSections:
     sections = arm_sections(run, arm.robot)
     if sections.arm is None or arm.model is None:
         return sections
-    held = held_back_by_arm(run.fitted, run, arm.robot)
-    return replace(sections, arm=replace(sections.arm, holdout=held))
+    views = held_back_by_arm(run.fitted, run, arm.robot)
+    return replace(sections, arm=replace(sections.arm, holdout=views))
 
 
 def _instrument(readings: Readings) -> InstrumentResult:
@@ -216,12 +216,8 @@ def _uncertainty(run: RunState) -> UncertaintyResult:
 
 def _noise(run: RunState) -> dict[str, float]:
     """Standard deviations per axis, of corners and flange, or of both together without corners."""
-    noise = {
-        name: value
-        for sigmas in run.solved.sigmas.values()
-        for name, value in sigmas.items()
-        if name == "pixel_px"
-    }
+    px = [sigmas["pixel_px"] for sigmas in run.solved.sigmas.values() if "pixel_px" in sigmas]
+    noise = {"pixel_px": px[-1]} if px else {}
     if not noise and run.pixel_px is not None:
         noise["pixel_px"] = run.pixel_px
     if run.readings is not None:
@@ -269,13 +265,12 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
     model, errors = arm.model, arm.errors
     if errors is None or not errors.of_links:
         return None
-    count = errors.basis.shape[2]
     # Errors that are not estimated are zero. Estimates of a model are the change from its
     # linearisation point, which its arm contains.
     problem, name = run.solved.problem, f"arm of {arm.robot}"
     start = problem.start({frame: np.eye(4) for frame in problem.unknown})
     values = problem.values_of(name, run.solved.state) - problem.values_of(name, start)
-    values = values if errors.is_estimated else np.zeros(count)
+    values = values if errors.is_estimated else np.zeros(errors.basis.shape[2])
     if model is None:
         return FittedArm(of="links", values=values)
     # Errors that are not part of its geometry depend on the loads of a stop.
@@ -301,9 +296,8 @@ def _covariance(run: RunState) -> FloatArray:
     own = written @ answer.covariance @ written.T
     if arm.errors is None or arm.errors.is_estimated or not arm.errors.of_links:
         return own
-    jacobian = written @ misfit_jacobian(
-        answer.problem, answer.state, answer.noise, arm.robot, arm.errors
-    )
+    problem, state, noise = answer.problem, answer.state, answer.noise
+    jacobian = written @ misfit_jacobian(problem, state, noise, arm.robot, arm.errors)
     size, variance = jacobian.shape[1], arm.errors.sigma**2
     # The fit deviates by its Jacobian times the errors; the truth deviates from it the other way.
     cross = -variance * jacobian

@@ -171,19 +171,16 @@ def _connected_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
 
 def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
     tree = cell.tree.without(frames)
+    kept = tree.branches.keys()
     reasons = {
         row.view: f"nothing ties {row.seer if row.seer in frames else row.seen} "
         "to the rest of the cell"
         for row in cell.rows
-        if row.seer not in tree.branches or row.seen not in tree.branches
+        if not {row.seer, row.seen} <= kept
     }
     robots = set(tree.robots)
     poses = {name: pose for name, pose in cell.poses.items() if name in robots}
-    priors = tuple(
-        prior
-        for prior in cell.priors
-        if prior.first in tree.branches and prior.second in tree.branches
-    )
+    priors = tuple(prior for prior in cell.priors if {prior.first, prior.second} <= kept)
     return replace(cell.without(reasons), tree=tree, poses=poses, priors=priors)
 
 

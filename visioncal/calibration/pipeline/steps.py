@@ -72,12 +72,12 @@ def _not_used(run: RunState) -> Iterator[Finding]:
         return
     names = pair_edges(session)
     for edge in session.declaration.prior:
-        is_known = edge in names or session.declaration.has_names
-        if is_known and run.solver == "joint":
-            continue
-        reason = f"what is unknown of this session is {' and '.join(names)}"
         if run.solver != "joint":
             reason = f"the closed form {run.solver} cannot"
+        elif edge not in names and not session.declaration.has_names:
+            reason = f"what is unknown of this session is {' and '.join(names)}"
+        else:
+            continue
         yield Finding("unused", f"[prior.{edge}] was not used: {reason}.")
     readings = sum(view.reading_m is not None for view in session.views)
     if readings and session.mount != "instrument":
@@ -121,10 +121,9 @@ def _reported(run: RunState) -> RunState:
     if not run.base_from_flange:
         warnings = run.session.warnings
         of_model = [warning for warning in warnings if warning.startswith(_OF_MODEL)]
+        message = f"session {run.session.name!r}: no view has a pose of the robot."
         raise DataError(
-            " ".join(
-                [*of_model, f"session {run.session.name!r}: no view has a pose of the robot."]
-            ),
+            " ".join([*of_model, message]),
             culprits=run.lost_views,
             next_step=_without_times(run.session)
             or (_MODEL_STEP if of_model else " ".join(warnings))
@@ -149,11 +148,8 @@ def _readings(run: RunState) -> RunState:
                     next_step="Leave --solver out.",
                 )
             run = run.noting(exchanged_points(run, readings))
-    poses = {
-        view: instrument
-        for view, instrument in read_instruments(run.session).items()
-        if view not in run.reasons
-    }
+    read = read_instruments(run.session).items()
+    poses = {view: pose for view, pose in read if view not in run.reasons}
     return replace(run, poses={**run.poses, **poses})
 
 

@@ -129,7 +129,7 @@ class CalibrationPrior:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of the estimated noise, limited."""
+        """Degrees of freedom of the estimated noise; limited, as more make no difference."""
         return min(self.calibration.noise_dof, _MOST_FREEDOM)
 
     def with_board_at(self, z: FloatArray, sigmas: FloatArray) -> "CalibrationPrior":

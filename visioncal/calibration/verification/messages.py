@@ -315,9 +315,8 @@ def _other_board(check: Check, suspect: Suspect) -> str:
     )
     if kind == SIZE:
         return words
-    return (
-        f"{words}; its middle lies {_size_words(motions(check, suspect)[suspect.name])} elsewhere"
-    )
+    moved = motions(check, suspect)[suspect.name]
+    return f"{words}; its middle lies {_size_words(moved)} elsewhere"
 
 
 def _size_words(moved: MeasuredMove) -> str:

@@ -252,7 +252,7 @@ def _with_errors(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPo
 
 def _noise_px(observed: ObservedPoses) -> float:
     """Noise of a corner's coordinate around the poses, by calibrated lens and boards [px]."""
-    pairs = zip(observed.used, observed.seen(observed.used), strict=True)
+    pairs = ((view, observed.poses[view].corners) for view in observed.used)
     corners = {view: found for view, found in pairs if found}
     free = observed.free
     if free is None or not corners:
