@@ -168,7 +168,7 @@ def answer_of(
 
     Args:
         cell: The cell as it was read.
-        observed: What was observed in it.
+        observed: The observations in it.
         solved: The fit of its connected part.
         convention: Joint table convention of calibrated arms' parameters.
     """

@@ -208,8 +208,8 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     edge = inliers.fit.state.edges[problem.unknown[frame]]
     when = _when(solved, run, is_behind=run is after)
     moved = f"the {_body(frame)} stood {_displacement_words(change)}"
-    for name, step in rivals:
-        moved += f" (or the {_body(name)} {_displacement_words(step)})"
+    for rival, rival_change in rivals:
+        moved += f" (or the {_body(rival)} {_displacement_words(rival_change)})"
     outliers = np.sort(run).tolist()
     advice = "Fasten what moved, and calibrate the views before and after it apart."
     on_flange = problem.tree.body(frame) != problem.tree.root

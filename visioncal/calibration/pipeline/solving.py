@@ -70,7 +70,7 @@ def solve(
 
     Args:
         cell: The cell.
-        observed: What was observed in it.
+        observed: The observations in it.
         level: The calibration level of the arms; see `stages.kinematics.check_level`.
         solver: `joint`, or a closed form for the edges of one robot and one camera.
 
