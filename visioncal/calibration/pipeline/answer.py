@@ -339,10 +339,10 @@ def held_back_results(solved: Solved, observed: Observed) -> dict[int, ViewResul
     away_m, away_rad = apart(problem, state)
     if solved.cell.mount is not None:
         fitted = set(solved.part.observations.observed)
-        known = np.array([name in fitted for name in problem.observations.observed])
-        from_mean = scatter(problem.subset(known), solved.part, state)
-        away_m[known] = from_mean[0]
-        away_rad[known] = np.where(np.isnan(away_rad[known]), np.nan, from_mean[1])
+        is_fitted = np.array([name in fitted for name in problem.observations.observed])
+        from_mean = scatter(problem.subset(is_fitted), solved.part, state)
+        away_m[is_fitted] = from_mean[0]
+        away_rad[is_fitted] = np.where(np.isnan(away_rad[is_fitted]), np.nan, from_mean[1])
     rms_px = solved.pixels(held.rows, held.views, problem.predicted(state), state)
     figures = np.stack([1e3 * away_m, np.rad2deg(away_rad), rms_px], axis=1)
     results = {}

@@ -46,16 +46,16 @@ def exchanged_names(run: RunState) -> Finding | None:
         for pair in combinations(names, 2):
             frames = {frame_name(kind, name) for name in pair}
             # For robots, the views whose chains they are part of.
-            mine = {
+            affected = {
                 row.view.number
                 for row in rows
                 if (row.seer in frames if kind == "camera" else {*pair} & {*row.robots, *row.lacks})
             }
-            if len(mine) < _FEWEST or len(mine & before) > _HARDLY_ANY * len(mine):
+            if len(affected) < _FEWEST or len(affected & before) > _HARDLY_ANY * len(affected):
                 continue
-            after = _agreeing(_with_exchanged(run, kind, pair)) & mine
-            if len(after) >= _NEARLY_ALL * len(mine):
-                return _finding(kind, pair, (len(after), len(mine), len(mine & before)))
+            after = _agreeing(_with_exchanged(run, kind, pair)) & affected
+            if len(after) >= _NEARLY_ALL * len(affected):
+                return _finding(kind, pair, (len(after), len(affected), len(affected & before)))
     return None
 
 

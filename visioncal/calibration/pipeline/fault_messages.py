@@ -85,14 +85,14 @@ def versions(solved: Solved) -> dict[str, Version]:
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
     for key in solved.agreed.problem.unknown:
         parts[key.partition("@")[0]].append((starts.get(key, -1), key))
-    found = {}
+    versions_by_key = {}
     for frame, keys in parts.items():
         *earlier, (start, last) = sorted(keys)
         for before, key in earlier:
             name = f"{frame}_until_stop_{_stops_of(solved, key)[-1]}"
-            found[key] = Version(key, frame, name, before)
-        found[last] = Version(last, frame, frame, start)
-    return found
+            versions_by_key[key] = Version(key, frame, name, before)
+        versions_by_key[last] = Version(last, frame, frame, start)
+    return versions_by_key
 
 
 def _stops_of(solved: Solved, key: str) -> list[int]:
@@ -154,25 +154,25 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     if solved.cell.mount is not None:
         swapped = tuple(_exchanged_views(solved, mutual))
         return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
-    found = _pushed_bases(solved)
-    found += _exchanged_poses(solved, mutual)
-    explained |= {row for fault in found for row in fault.rows}
+    faults = _pushed_bases(solved)
+    faults += _exchanged_poses(solved, mutual)
+    explained |= {row for fault in faults for row in fault.rows}
     rest = {one: other for one, other in mutual.items() if not {one, other} & explained}
-    found += _exchanged_views(solved, rest)
-    explained |= {row for fault in found for row in fault.rows}
-    return (*turned, *found, *_wrong_poses(solved, explained))
+    faults += _exchanged_views(solved, rest)
+    explained |= {row for fault in faults for row in fault.rows}
+    return (*turned, *faults, *_wrong_poses(solved, explained))
 
 
 def _turned_images(solved: Solved) -> list[PoseFault]:
     """Turned or mirrored images, which agree with the others once they are turned back."""
-    rows, found = solved.cell.rows, []
-    alike: dict[ImageTurn, list[int]] = defaultdict(list)
+    rows, faults = solved.cell.rows, []
+    rows_by_turn: dict[ImageTurn, list[int]] = defaultdict(list)
     for at, row in enumerate(rows):
         if row.view in solved.turned and not solved.agreed.used[at]:
-            alike[solved.turned[row.view]].append(at)
+            rows_by_turn[solved.turned[row.view]].append(at)
     images = {view.number: view.image for view in solved.cell.session.views}
-    for how, mine in alike.items():
-        views = _view_numbers(solved, mine)
+    for how, turned_rows in rows_by_turn.items():
+        views = _view_numbers(solved, turned_rows)
         named = some_of([*map(str, views)], _LISTED)
         subject = f"The image of view {named} is" if len(views) == 1 else f"Images {named} are"
         them = "it agrees" if len(views) == 1 else "they agree"
@@ -184,8 +184,8 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
             turn = f"mogrify {how.option} {files}"
             step = Remedy("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
         fault = Finding("turned_images", words, step, views)
-        found.append(PoseFault(fault, tuple(mine), f"its image is {how.words}"))
-    return found
+        faults.append(PoseFault(fault, tuple(turned_rows), f"its image is {how.words}"))
+    return faults
 
 
 def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
@@ -316,12 +316,12 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
     # Such observations are left out, and the base stays where it was: unlike other frames, a base
     # is not split in two when it moves, as all that its robot carries hangs on it.
     problem, used = solved.agreed.problem, solved.agreed.used
-    stops, found = problem.observations.stops, []
+    stops, faults = problem.observations.stops, []
     for robot, base in problem.tree.bases.items():
         flange = problem.tree.flanges[robot]
-        mine = problem.through(flange)
-        first = int(stops[mine & used].max(initial=-1)) + 1
-        after = np.flatnonzero(mine & ~used & (stops >= first))
+        by_robot = problem.through(flange)
+        first = int(stops[by_robot & used].max(initial=-1)) + 1
+        after = np.flatnonzero(by_robot & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
             continue
         moved = _base_displacement(solved, base, after)
@@ -334,8 +334,8 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
         views = _view_numbers(solved, after.tolist())
         step = Remedy("Fasten it, and align the stops from there on alone.", look_at(views[0]))
         pushed = Finding("something_moved", words, step, views)
-        found.append(PoseFault(pushed, tuple(after.tolist())))
-    return found
+        faults.append(PoseFault(pushed, tuple(after.tolist())))
+    return faults
 
 
 def _base_displacement(
@@ -356,9 +356,9 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
     problem, used = solved.agreed.problem, solved.agreed.used
     stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
-        mine = problem.through(problem.tree.flanges[robot])
-        for stop in np.unique(stops[mine & ~used]).tolist():
-            rows = np.flatnonzero(mine & (stops == stop))
+        by_robot = problem.through(problem.tree.flanges[robot])
+        for stop in np.unique(stops[by_robot & ~used]).tolist():
+            rows = np.flatnonzero(by_robot & (stops == stop))
             if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
                 continue
             moved = _base_displacement(solved, base, rows, problem.poses[robot][stop])
@@ -390,7 +390,7 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
     mutual = exchanged(problem, fitting)
     clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
-    found = {}
+    reasons_by_view = {}
     for at, (mm, deg) in zip(outliers.tolist(), residuals_mm_deg.tolist(), strict=True):
         turned = f" and {figure(deg)} deg" if problem.observations.has_rotation[at] else ""
         cause = _cause(solved, at)
@@ -413,11 +413,11 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
             else "many times as far as most"
         )
         target = _target_words(solved, rows[at].seen)
-        found[rows[at].view] = (
+        reasons_by_view[rows[at].view] = (
             f"disagrees with {rest}: it places {target} {figure(mm)} mm{turned} away, {beyond}; "
             f"{cause}"
         )
-    return found
+    return reasons_by_view
 
 
 def _target_words(solved: Solved, frame: str) -> str:
@@ -470,16 +470,16 @@ def _fitting_stations(solved: Solved, outliers: IntArray) -> dict[int, list[int]
 def _exchanged_poses(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
     """Pairs of poses of one robot that are exchanged."""
     rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
-    found = []
+    faults = []
     for robot in problem.robots:
-        mine = np.flatnonzero(problem.through(problem.tree.flanges[robot])).tolist()
+        by_robot = np.flatnonzero(problem.through(problem.tree.flanges[robot])).tolist()
         pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
-        for at in mine:
+        for at in by_robot:
             if at in mutual:
                 both = sorted((rows[at].station, rows[mutual[at]].station))
                 pairs[both[0], both[1]].append(at)
         for stations, members in pairs.items():
-            at_both = [at for at in mine if rows[at].station in stations]
+            at_both = [at for at in by_robot if rows[at].station in stations]
             if len(members) >= 2 * _FEWEST and not used[at_both].any():
                 first, second = (solved.cell.stops[station] for station in stations)
                 short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
@@ -488,5 +488,5 @@ def _exchanged_poses(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFaul
                     "out. Each pose is right at the other's stop."
                 )
                 finding = Finding(EXCHANGED, words, _EXCHANGE, _view_numbers(solved, at_both))
-                found.append(PoseFault(finding, tuple(at_both), short))
-    return found
+                faults.append(PoseFault(finding, tuple(at_both), short))
+    return faults

@@ -115,15 +115,15 @@ def _sole_static_view(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | No
     return sole_static_view(cell, max(worst, key=worst.__getitem__)) if worst else None
 
 
-def _with_alternative(found: Finding, run: RunState) -> Finding:
+def _with_alternative(finding: Finding, run: RunState) -> Finding:
     """Adds to a frame of one camera and robot that moved what cannot be distinguished from that."""
     steps = [test.step for test in run.solved.misfits.values() if isinstance(test.step, Move)]
-    if found.kind != MOVED_FRAME or run.mount is None or not steps:
-        return found
+    if finding.kind != MOVED_FRAME or run.mount is None or not steps:
+        return finding
     tree = run.fitted.cell.tree
     on_flange = tree.body(steps[0].frame) != tree.root
     same = "Another tool frame in the controller" if on_flange else "A robot's base that was pushed"
-    return replace(found, words=f"{found.words} {same} would look the same.")
+    return replace(finding, words=f"{finding.words} {same} would look the same.")
 
 
 def _pick_inputs(run: RunState) -> PickInputs:
@@ -184,13 +184,15 @@ def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
     parent = poses if run.mount == "eye-in-hand" else invert(poses)
     # The camera may have a name.
     (edge,) = (edge for name, edge in run.solved.last_edges.items() if name.startswith("cam"))
-    if (found := distance_scale(parent, seen, edge.matrix)) is not None:
-        yield found
+    if (finding := distance_scale(parent, seen, edge.matrix)) is not None:
+        yield finding
     target = edge.matrix @ seen
     in_hand = run.mount == "eye-in-hand"
-    found = measured_turns(poses, target) if in_hand else measured_turns(np.eye(4), parent @ target)
-    if found is not None:
-        yield found
+    finding = (
+        measured_turns(poses, target) if in_hand else measured_turns(np.eye(4), parent @ target)
+    )
+    if finding is not None:
+        yield finding
 
 
 def _cell_accuracy(run: RunState) -> _Parts:
@@ -245,16 +247,16 @@ def _pairs(
         by_pair.setdefault(("", "") if alone else (view.seer, view.seen), []).append(view)
     return [
         JudgedPair(
-            mine,
+            pair_views,
             [
                 Rejection(view.view, view.reason)
-                for view in mine
+                for view in pair_views
                 if _is_outlier(view) and view.view not in explained
             ],
             f"{seer} of {seen}" if len(by_pair) > 1 else "",
-            *_weighted_rms(answer, mine),
+            *_weighted_rms(answer, pair_views),
         )
-        for (seer, seen), mine in by_pair.items()
+        for (seer, seen), pair_views in by_pair.items()
     ]
 
 
@@ -265,10 +267,10 @@ def _weighted_rms(answer: Answer, views: Sequence[ViewResult]) -> tuple[Rms, Rms
     # uncertain says nothing of the others.
     used, held_out, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
     pairs = {(view.seer, view.seen) for view in views}
-    mine = np.array([pair in pairs for pair in zip(used.observers, used.observed, strict=True)])
+    of_pairs = np.array([pair in pairs for pair in zip(used.observers, used.observed, strict=True)])
 
     def rms(block: slice, residuals: FloatArray, doubt: float) -> FloatArray | None:
-        finite = mine & np.isfinite(residuals)
+        finite = of_pairs & np.isfinite(residuals)
         if not finite.any():
             return None
         noise = np.trace(used.covariance[finite, block, block], axis1=1, axis2=2)
@@ -303,18 +305,18 @@ def _sensors(
     not_needed = run.spared.keys() | run.held_back
     sensors = []
     for seer in seers:
-        mine = [view for view in views if view.seer == seer]
-        unused = (view for view in mine if not view.used and view.view not in not_needed)
+        seer_views = [view for view in views if view.seer == seer]
+        unused = (view for view in seer_views if not view.used and view.view not in not_needed)
         lost = [Rejection(view.view, view.reason) for view in unused]
         levels = noise.get(seer, {})
         sensors.append(
             Sensor(
-                sum(view.used for view in mine),
+                sum(view.used for view in seer_views),
                 lost,
-                [view.view for view in mine if _is_outlier(view)],
+                [view.view for view in seer_views if _is_outlier(view)],
                 residual_px.get(seer, levels.get("pixel_px")),
                 levels.get("level", 1.0),
-                sum(view.view in run.spared for view in mine),
+                sum(view.view in run.spared for view in seer_views),
                 seer if len(seers) > 1 else "",
             )
         )

@@ -83,7 +83,7 @@ def result_of(run: RunState) -> Calibration:
     was_left_out = np.isfinite(answer.held_out.away_m).any()
     method = answer.held_out.method if was_left_out else ""
     boards, rigs = shapes_of(run)
-    found = Calibration(
+    calibration = Calibration(
         session_name=session.name,
         session_sha256=session.digest(),
         created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -101,15 +101,17 @@ def result_of(run: RunState) -> Calibration:
         cell=cell,
         need=need_met(findings.need, findings.picks, whole=cell is not None),
     )
-    return found if cell is not None else _complete_pair(found, run, names)
+    return calibration if cell is not None else _complete_pair(calibration, run, names)
 
 
-def _complete_pair(found: Calibration, run: RunState, names: Mapping[str, str]) -> Calibration:
+def _complete_pair(
+    calibration: Calibration, run: RunState, names: Mapping[str, str]
+) -> Calibration:
     """Completes the calibration of one camera and one robot, which have no names."""
     # A single target without a name has one section.
     is_unnamed = not run.session.targets
     return replace(
-        found,
+        calibration,
         solvers=_solvers(run, names),
         noise=_noise(run),
         views=_views(run),
@@ -119,10 +121,10 @@ def _complete_pair(found: Calibration, run: RunState, names: Mapping[str, str]) 
         clock=next((clocked.clock.result() for clocked in run.clocks.values()), None),
         instrument=None if run.readings is None else _instrument(run.readings),
         points=tuple(_points(run)),
-        board=next(iter(found.boards.values()), None) if is_unnamed else None,
-        boards={} if is_unnamed else found.boards,
-        rig=next(iter(found.rigs.values()), None) if is_unnamed else None,
-        rigs={} if is_unnamed else found.rigs,
+        board=next(iter(calibration.boards.values()), None) if is_unnamed else None,
+        boards={} if is_unnamed else calibration.boards,
+        rig=next(iter(calibration.rigs.values()), None) if is_unnamed else None,
+        rigs={} if is_unnamed else calibration.rigs,
         uncertainty=_uncertainty(run),
         conditions=_conditions_of(run),
         joint_fit=_joint_fit_of(run),
@@ -239,8 +241,8 @@ def _joint_fit_of(run: RunState) -> JointFit | None:
     if run.mount == "instrument":
         return None
     boards, seen = run.session.boards, run.fitted.seen
-    placed = run.solved.problem.unknown
-    names = [board for board in boards if len(boards) < 2 or frame_name("target", board) in placed]
+    unknown = run.solved.problem.unknown
+    names = [board for board in boards if len(boards) < 2 or frame_name("target", board) in unknown]
     return JointFit(
         targets={name: target_document(board) for name, board in boards.items()},
         boards=tuple(names) or ("",),

@@ -108,14 +108,14 @@ class CalibrationPrior:
 
         An uncertain level is raised to half the upper bound of its 95 % interval.
         """
-        stated, known = self.calibration.noise, self.calibration.uncertainty
+        stated, uncertainty = self.calibration.noise, self.calibration.uncertainty
         of = "robot" if from_corners else "combined"
         if f"{of}_rotation_deg" not in stated:
             # Poses of another origin than the calibration's have its total residuals.
             rms = self.calibration.rms
             deg, mm = (rms.deg or 0.0) / np.sqrt(3), rms.mm / np.sqrt(3)
             return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
-        intervals = {} if known is None else known.noise_95
+        intervals = {} if uncertainty is None else uncertainty.noise_95
         deg, mm = (
             max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1])
             for name in (f"{of}_rotation_deg", f"{of}_translation_mm")

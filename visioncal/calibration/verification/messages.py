@@ -373,7 +373,11 @@ def to_document(
         triggers: Evaluation of the policy's triggers.
         verdict: Its verdict, with the paths of the run; that of `verdict_of` where None.
     """
-    calibration, known, verdict = check.calibration, check.seen.known, verdict or verdict_of(check)
+    calibration, observed, verdict = (
+        check.calibration,
+        check.seen.known,
+        verdict or verdict_of(check),
+    )
     return {
         "schema": SCHEMA,
         "passed": check.passed,
@@ -382,7 +386,7 @@ def to_document(
             "sha256": calibration.session_sha256,
             "created": calibration.created,
         },
-        "session": {"name": known.session.name, "sha256": known.session.digest()},
+        "session": {"name": observed.session.name, "sha256": observed.session.digest()},
         "sentences": list(verdict.reasons),
         "next": [vars(step) for step in verdict.next_steps],
         "changes": [_change(check, suspect) for suspect in check.named],
@@ -411,7 +415,7 @@ def to_document(
             for views, away, left in zip(check.seen.views, check.away, check.left, strict=True)
         ],
         "not_used": [
-            {"view": view, "reason": reason} for view, reason in sorted(known.reasons.items())
+            {"view": view, "reason": reason} for view, reason in sorted(observed.reasons.items())
         ],
         "warnings": list(check.seen.warnings),
         "recalibrate": any(trigger.state == "fired" for trigger in triggers),

@@ -180,8 +180,8 @@ def _in_lens_model(
 ) -> dict[int, Corners]:
     """Corrects corners, by view, for the lens's errors beyond its model."""
     return {
-        view: replace(found, px=lens.in_model(found.px, depths.get(view)))
-        for view, found in corners.items()
+        view: replace(detected, px=lens.in_model(detected.px, depths.get(view)))
+        for view, detected in corners.items()
     }
 
 
@@ -189,8 +189,8 @@ def board_changes(problem: Problem, state: State) -> FloatArray:
     """(m, 4, 4) change of its board's edge, on the right, that each observation requires."""
     changes, observed = np.zeros((len(problem), 4, 4)), np.array(problem.observations.observed)
     for board in set(problem.observations.observed):
-        mine = observed == board
-        changes[mine] = problem.change_of(board, state)[mine]
+        of_board = observed == board
+        changes[of_board] = problem.change_of(board, state)[of_board]
     return changes
 
 
@@ -213,7 +213,7 @@ def _with_arm(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses
 def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
     """Chooses each view's pose by the calibration, and recomputes it with its lens and boards."""
     mount, targets = observed.session.mount, tuple(prior.targets.values())
-    x, *placed = prior.state.edges
+    x, *boards = prior.state.edges
     order = {board: at for at, board in enumerate(prior.boards)}
     views, chosen = [], []
     for view in (view.number for view in observed.session.views):
@@ -223,7 +223,7 @@ def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPos
         if view not in observed.base_from_flange or view in observed.reasons:
             continue
         robot = robot_part(observed.arm_at([view]).poses, mount)[0]
-        predicted = invert(robot @ x) @ placed[order[poses.board]]
+        predicted = invert(robot @ x) @ boards[order[poses.board]]
         views.append(view)
         chosen.append(choose_by(poses, predicted, targets[poses.board] if targets else None))
     if not views:
@@ -253,7 +253,7 @@ def _with_errors(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPo
 def _noise_px(observed: ObservedPoses) -> float:
     """Noise of a corner's coordinate around the poses, by calibrated lens and boards [px]."""
     pairs = ((view, observed.poses[view].corners) for view in observed.used)
-    corners = {view: found for view, found in pairs if found}
+    corners = {view: detected for view, detected in pairs if detected}
     free = observed.free
     if free is None or not corners:
         return observed.pixel_px or 0.0
