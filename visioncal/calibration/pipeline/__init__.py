@@ -1,4 +1,4 @@
-"""The way of the data: from a session, step by step, to a calibration of one pair or a cell."""
+"""The calibration pipeline: from a session, stage by stage, to a calibration."""
 
 from visioncal.calibration.pipeline.entry import align, calibrate, run_dense
 from visioncal.calibration.pipeline.running import Run, run

@@ -1,4 +1,4 @@
-"""The answer: a fit with its covariance, and what speaks for and against it; held-back views."""
+"""Examination of a fit: covariance, diagnosis, left-out residuals, held-back views."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import (
-    beside_steps,
-    covariance_beside_noise,
+    covariance_from_other_sources,
     joint_offsets,
+    with_errors_beside_step,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
 from visioncal.calibration.pipeline.fault_messages import (
@@ -50,20 +50,20 @@ from visioncal.results.arm import UnseenView
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """A fit with its covariance, and what speaks for and against it.
+    """A fit with its covariance and diagnosis.
 
     Attributes:
         solved: The fit.
-        problem: The observations in it.
-        covariance: (p, p) of its unknowns, with all that counts beside noise.
-        beside: (p, p) what that is, by its source.
-        lenses: What lenses do beyond their models, by camera.
-        misfits: What the residuals of each robot's stops show beyond noise.
-        arms: What the stops determine of the arms, by robot.
+        problem: The problem of its inliers.
+        covariance: (p, p) of its unknowns, from noise and all other sources.
+        beside: (p, p) covariances from sources other than noise, by source.
+        lenses: Lens errors beyond the camera models, by camera.
+        misfits: Tests of the residuals of each robot's stops.
+        arms: Results on the arms, by robot.
         held_out: Residuals of observations that were left out of the fit in turn.
-        moved: What moved, in the order of time.
-        faults: What wrong poses of robots explain.
-        views: What became of each observation.
+        moved: Frames that moved, in the order of time.
+        faults: Wrong poses and images that explain outliers.
+        views: Result of each observation.
         sigmas: Estimated standard deviations, by frame or robot and by name.
     """
 
@@ -82,17 +82,17 @@ class Answer:
 
     @property
     def fit(self) -> Solution:
-        """The unknowns and the noise."""
+        """Estimated unknowns and noise."""
         return self.solved.agreed.fit
 
     @property
     def state(self) -> State:
-        """The unknowns."""
+        """Estimated unknowns."""
         return self.fit.state
 
     @property
     def noise(self) -> Noise:
-        """The levels of robots and sensors."""
+        """Noise levels of robots and sensors."""
         return self.fit.noise
 
     @cached_property
@@ -102,124 +102,112 @@ class Answer:
 
     @cached_property
     def edges(self) -> dict[str, Edge]:
-        """The estimated transforms by the frames that they place, as the result names these."""
-        found, edges = {}, self.state.edges
-        for key, at in self.problem.unknown.items():
-            block = self.covariance[6 * at : 6 * at + 6, 6 * at : 6 * at + 6]
-            found[self.versions[key].name] = Edge(edges[at], block)
-        return found
+        """The estimated transforms, by the result's names of their child frames."""
+        transforms, edges = {}, self.state.edges
+        for key, index in self.problem.unknown.items():
+            block = self.covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
+            transforms[self.versions[key].name] = Edge(edges[index], block)
+        return transforms
 
     @property
     def last_edges(self) -> dict[str, Edge]:
-        """The edges of frames at their last places."""
-        named = self.versions.values()
-        return {
-            version.frame: self.edges[version.frame]
-            for version in named
-            if version.name == version.frame
-        }
+        """The estimated transforms at the end of the session, by frame."""
+        last = (version.frame for version in self.versions.values() if version.is_last)
+        return {frame: self.edges[frame] for frame in last}
 
-    def clocks(self, looked: Observed) -> dict[ClockPair, ClockOffset]:
-        """The clocks as the fit has them, where it estimates them."""
+    def clocks(self, observed: Observed) -> dict[ClockPair, ClockOffset]:
+        """Clock offsets, from the fit where it estimates them."""
         return {
-            pair: self._fitted_clock(pair, clock.clock) for pair, clock in looked.clocks.items()
+            pair: self._fitted_clock(pair, clocked.clock)
+            for pair, clocked in observed.clocks.items()
         }
 
     def _fitted_clock(self, pair: ClockPair, clock: ClockOffset) -> ClockOffset:
-        found = self._fitted_time(pair.effect)
-        if found is None:
+        correction = self._fitted_time(pair.effect)
+        if correction is None:
             return clock
-        late_s, sigma_s = found
+        shift_s, sigma_s = correction
         return replace(
             clock,
-            camera_minus_robot_s=clock.camera_minus_robot_s + late_s,
+            camera_minus_robot_s=clock.camera_minus_robot_s + shift_s,
             sigma_s=sigma_s,
             delays=tuple(self._fitted_delay(pair, delay) for delay in clock.delays),
         )
 
     def _fitted_delay(self, pair: ClockPair, delay: FoundDelay) -> FoundDelay:
-        found = self._fitted_time(pair.delay(delay.of))
-        if found is None:
+        correction = self._fitted_time(pair.delay(delay.of))
+        if correction is None:
             return delay
-        late_s, sigma_s = found
-        return replace(delay, time_s=delay.time_s + late_s, sigma_s=sigma_s)
+        shift_s, sigma_s = correction
+        return replace(delay, time_s=delay.time_s + shift_s, sigma_s=sigma_s)
 
     def _fitted_time(self, effect: str) -> tuple[float, float] | None:
-        """By how much a time is later in the fit, and its sigma [s]; None where it is not in it."""
+        """Estimated correction of a time, and its sigma [s]; None where the fit has none."""
         columns = self.problem.effect_columns.get(effect)
         if columns is None:
             return None
-        (late_s,) = self.problem.values_of(effect, self.state)
-        return float(late_s), float(np.sqrt(self.covariance[columns.start, columns.start]))
+        (shift_s,) = self.problem.values_of(effect, self.state)
+        return float(shift_s), float(np.sqrt(self.covariance[columns.start, columns.start]))
 
     @cached_property
     def budget_mm(self) -> dict[str, dict[str, float]]:
-        """Sigmas of each frame's place in its parent, by the frame and by source [mm]."""
-        found = budget_mm(self.solved, self.beside)
-        return {self.versions[key].name: sigmas for key, sigmas in found.items()}
+        """Standard deviations of each frame's position in its parent, by source [mm]."""
+        budget = budget_mm(self.solved, self.beside)
+        return {self.versions[key].name: sigmas for key, sigmas in budget.items()}
 
     @cached_property
     def intervals(self) -> FloatArray:
-        """(r, 2, 2) 95 % intervals of the robots' noise; see `noise_intervals`."""
+        """(r, 2, 2) 95 % intervals of the robots' noise; see `estimation.intervals`."""
         return noise_intervals(self.problem, self.state, self.noise)
 
 
 def answer_of(
-    cell: Cell, looked: Observed, solved: Solved, convention: Convention | None
+    cell: Cell, observed: Observed, solved: Solved, convention: Convention | None
 ) -> Answer:
     """Examines a fit.
 
     Args:
         cell: The cell as it was read.
-        looked: What was observed in it.
-        solved: The fit of what of it is tied.
-        convention: Of the joint table in which calibrated arms' numbers are given.
+        observed: The observations in it.
+        solved: The fit of its connected part.
+        convention: Joint table convention of calibrated arms' parameters.
     """
     part, fit = solved.part, solved.agreed.fit
-    # A closed form is not at rest, and that would pass for a misfit.
-    at_rest = fit if solved.solver == "joint" else fit_problem(part, fit.state)
-    arms = {
+    # A closed form is no minimum, which would pass for a misfit.
+    is_fit = solved.solver == "joint"
+    converged = fit if is_fit else fit_problem(part, fit.state)
+    errors = {
         name: arm.errors for name, arm in solved.arms.items() if not arm.is_modelled and arm.errors
     }
     offsets = joint_offsets(solved.arms)
-    found = misfits(part, at_rest, arms, offsets)
-    is_fit = solved.solver == "joint"
-    solved = replace(solved, arms=beside_steps(solved.arms, part, fit, found))
-    beside = covariance_beside_noise(part, fit, solved.arms, found, offsets, is_fit=is_fit)
+    tests = misfits(part, converged, errors, offsets)
+    solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, tests))
+    beside = covariance_from_other_sources(part, fit, solved.arms, tests, offsets, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
-    faults, held_out = pose_faults(solved), left_out(solved)
+    faults, held_out, middles = pose_faults(solved), left_out(solved), middles_of(solved.cell)
     return Answer(
         solved,
         part,
         covariance,
         beside,
         lens_errors(solved),
-        found,
-        _arms_found(solved, covariance, convention),
+        tests,
+        {
+            name: arm.found(part, fit, covariance, middles, convention)
+            for name, arm in solved.arms.items()
+        },
         held_out,
         movements(solved),
         faults,
-        _views(looked, cell, solved, held_out, faults),
+        _views(observed, cell, solved, held_out, faults),
         _sigmas(solved),
     )
 
 
-def _arms_found(
-    solved: Solved, covariance: FloatArray, convention: Convention | None
-) -> dict[str, ArmFound]:
-    """What the stops determine of the arms, by robot."""
-    agreed, middles = solved.agreed, middles_of(solved.cell)
-    part = solved.part
-    return {
-        name: arm.found(part, agreed.fit, covariance, middles, convention)
-        for name, arm in solved.arms.items()
-    }
-
-
 def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
-    """Estimated standard deviations: of robots by name, of cameras and instruments by frame."""
+    """Estimated standard deviations of robots by name, and of cameras and instruments by frame."""
     fit, problem = solved.agreed.fit, solved.agreed.problem
-    found = {
+    results = {
         robot: {
             "translation_mm": 1e3 * float(sigma_m),
             "rotation_deg": float(np.rad2deg(sigma_rad)),
@@ -228,31 +216,31 @@ def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
     }
     if solved.seen is not None:
         pairs = zip(solved.seen.looks.problems, solved.seen.sigmas_px, strict=True)
-        found |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
+        results |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
     sensors = dict.fromkeys(
         (*sensors_of(solved.cell, solved.poses), *(row.seer for row in solved.cell.rows))
     )
     for frame, level in zip(sensors, fit.noise.sensors.tolist(), strict=False):
-        found[frame] = {**found.get(frame, {}), "level": level}
-    return found
+        results[frame] = {**results.get(frame, {}), "level": level}
+    return results
 
 
 def _views(
-    looked: Observed, cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
+    observed: Observed, cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
 ) -> tuple[ViewResult, ...]:
-    """What became of each observation, in the order of the session's rows."""
+    """Result of each observation, in the order of the session's rows."""
     rows, used = solved.cell.rows, solved.agreed.used
-    away, why = _away(solved), reasons(solved, faults)
+    residuals_mm_deg, why = _residuals(solved), reasons(solved, faults)
     rms_px = solved.chain_px(np.arange(len(rows)), solved.agreed.fit.state)
-    unseen = np.full((len(rows), 3), np.nan)
-    unseen[used] = np.stack(
+    left_out_residuals = np.full((len(rows), 3), np.nan)
+    left_out_residuals[used] = np.stack(
         [1e3 * held_out.away_m, np.rad2deg(held_out.away_rad), held_out.rms_px], axis=1
     )
-    found = {}
+    results = {}
     for at, row in enumerate(rows):
-        mm, deg, px = _known(np.append(away[at], rms_px[at]))
+        mm, deg, px = _finite_or_none(np.append(residuals_mm_deg[at], rms_px[at]))
         corners = solved.poses[at].corners
-        found[row.view] = ViewResult(
+        results[row.view] = ViewResult(
             row.view,
             bool(used[at]),
             why.get(row.view, ""),
@@ -263,55 +251,51 @@ def _views(
             row.seer,
             row.seen,
             solved.cell.stops[row.station],
-            *_known(unseen[at]),
+            *_finite_or_none(left_out_residuals[at]),
         )
-    found |= held_views(solved, looked)
+    results |= held_back_results(solved, observed)
     lost = solved.cell.reasons
     for observation in cell.session.observations:
         number = observation.view.number
-        if number not in found and not observation.view.is_of_lens:
+        if number not in results and not observation.view.is_of_lens:
             stop = (
                 cell.stops[observation.station] if observation.station < len(cell.stops) else number
             )
-            why_not = lost.get(number, "")
-            found[number] = ViewResult(
+            results[number] = ViewResult(
                 number,
                 used=False,
-                reason=why_not,
+                reason=lost.get(number, ""),
                 seer=observation.seer,
                 seen=observation.seen,
                 stop=stop,
             )
-    return tuple(
-        found[index] for index in (view.number for view in cell.session.views) if index in found
-    )
+    return tuple(results[view.number] for view in cell.session.views if view.number in results)
 
 
-def _known(figures: FloatArray) -> list[float | None]:
-    """Figures, None in the place of those that are not known."""
+def _finite_or_none(figures: FloatArray) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in figures.tolist()]
 
 
-def _away(solved: Solved) -> FloatArray:
+def _residuals(solved: Solved) -> FloatArray:
     """(n, 2) residuals of the observations [mm], [deg]."""
-    # Of one camera and one robot it is how far each places its target from where those that are
-    # used do on average; of a whole cell, how far it is from what the rest predicts.
+    # Of one camera and one robot it is the distance of the target, as each view places it, from its
+    # mean over the inliers; of a whole cell, from what the rest predicts.
     if solved.cell.mount is None:
         return residuals(solved)
     problem = solved.agreed.problem
     away_m, away_rad = scatter(problem, solved.part, solved.agreed.fit.state)
-    turned = problem.observations.has_rotation
-    return np.stack([1e3 * away_m, np.where(turned, np.rad2deg(away_rad), np.nan)], axis=1)
+    oriented = problem.observations.has_rotation
+    return np.stack([1e3 * away_m, np.where(oriented, np.rad2deg(away_rad), np.nan)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """The observations that are held back, as the lenses and boards of the fit have them.
+    """The held-back observations, at the lenses and boards of the fit.
 
     Attributes:
         rows: The h observations.
         views: Their poses.
-        problem: What they measured, with the unknowns of the fit.
+        problem: Their problem, with the unknowns of the fit.
     """
 
     rows: tuple[ObservationRow, ...]
@@ -319,15 +303,19 @@ class Held:
     problem: Problem
 
 
-def held_back(solved: Solved, looked: Observed) -> Held | None:
-    """What is held back and can be compared with the fit; None for nothing."""
-    cell, state, placed = solved.cell, solved.agreed.fit.state, solved.cell.tree.branches.keys()
-    rows = [row for row in cell.held if row.view in looked.poses and {row.seer, row.seen} <= placed]
+def held_back(solved: Solved, observed: Observed) -> Held | None:
+    """Held-back observations that can be compared with the fit; None for none."""
+    cell, state, frames = solved.cell, solved.agreed.fit.state, solved.cell.tree.branches.keys()
+    rows = [
+        row for row in cell.held if row.view in observed.poses and {row.seer, row.seen} <= frames
+    ]
     if not rows:
         return None
     solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
-    views = [looked.poses[row.view] for row in rows]
-    predicted = _problem(solved, looked, [chosen(view, 0, None) for view in views]).predicted(state)
+    views = [observed.poses[row.view] for row in rows]
+    predicted = _problem(solved, observed, [chosen(view, 0, None) for view in views]).predicted(
+        state
+    )
     targets = targets_of(cell)
     views = [
         choose_by(view, pose, targets.get(row.seen))
@@ -339,55 +327,55 @@ def held_back(solved: Solved, looked: Observed) -> Held | None:
             stack, camera = CornerStack.of({view.view: view.corners}, looks.points), row.seer
             poses = fit_poses(stack, looks.camera(camera), view.cam_from_target).cam_from_target
             views[at] = replace(view, cam_from_target=poses)
-    return Held(tuple(rows), tuple(views), _problem(solved, looked, views))
+    return Held(tuple(rows), tuple(views), _problem(solved, observed, views))
 
 
-def held_views(solved: Solved, looked: Observed) -> dict[int, ViewResult]:
-    """How far such observations are from what the rest of the cell predicts, by view."""
-    held = held_back(solved, looked)
+def held_back_results(solved: Solved, observed: Observed) -> dict[int, ViewResult]:
+    """Results of the held-back observations, by view: residuals from what the fit predicts."""
+    held = held_back(solved, observed)
     if held is None:
         return {}
     state, problem = solved.agreed.fit.state, held.problem
     away_m, away_rad = apart(problem, state)
     if solved.cell.mount is not None:
-        among = set(solved.part.observations.observed)
-        known = np.array([name in among for name in problem.observations.observed])
-        from_mean = scatter(problem.subset(known), solved.part, state)
-        away_m[known] = from_mean[0]
-        away_rad[known] = np.where(np.isnan(away_rad[known]), np.nan, from_mean[1])
+        fitted = set(solved.part.observations.observed)
+        is_fitted = np.array([name in fitted for name in problem.observations.observed])
+        from_mean = scatter(problem.subset(is_fitted), solved.part, state)
+        away_m[is_fitted] = from_mean[0]
+        away_rad[is_fitted] = np.where(np.isnan(away_rad[is_fitted]), np.nan, from_mean[1])
     rms_px = solved.pixels(held.rows, held.views, problem.predicted(state), state)
     figures = np.stack([1e3 * away_m, np.rad2deg(away_rad), rms_px], axis=1)
-    found = {}
-    for row, seen, each in zip(held.rows, held.views, figures, strict=True):
-        mm, deg, px = _known(each)
+    results = {}
+    for row, view, residual in zip(held.rows, held.views, figures, strict=True):
+        mm, deg, px = _finite_or_none(residual)
         stop = solved.cell.stops[row.station]
-        count = None if seen.corners is None else len(seen.corners.ids)
-        found[row.view] = ViewResult(
+        count = None if view.corners is None else len(view.corners.ids)
+        results[row.view] = ViewResult(
             row.view, False, HELD_BACK, count, px, mm, deg, row.seer, row.seen, stop
         )
-    return found
+    return results
 
 
-def held_by_both_arms(solved: Solved, looked: Observed, robot: str) -> tuple[UnseenView, ...]:
-    """How far what is held back is off by a robot's nominal arm with its own fit, and by ours."""
-    arm, held = solved.arms[robot], held_back(solved, looked)
+def held_back_by_arm(solved: Solved, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
+    """Residuals of held-back views by the nominal arm with its own fit, and by the calibrated."""
+    arm, held = solved.arms[robot], held_back(solved, observed)
     if held is None or arm.kinematics is None:
         return ()
-    stated = arm.without_errors(held.problem)
-    stated = arm.stated(stated) or stated
-    was, now = (
-        np.stack(apart(problem, _in(problem, state))[::-1], axis=1)
+    nominal = arm.without_errors(held.problem)
+    nominal = arm.stated(nominal) or nominal
+    before, after = (
+        np.stack(apart(problem, _state_in(problem, state))[::-1], axis=1)
         for problem, state in (
-            (stated, arm.kinematics.nominal.fit.state),
+            (nominal, arm.kinematics.nominal.fit.state),
             (held.problem, solved.agreed.fit.state),
         )
     )
     views = [row.view for row in held.rows]
-    return unseen_views(views, was, now, np.isfinite(now[:, 0]))
+    return unseen_views(views, before, after, np.isfinite(after[:, 0]))
 
 
-def _in(problem: Problem, state: State) -> State:
-    """The state of an earlier fit, of other random coefficients of lenses: these move nothing."""
+def _state_in(problem: Problem, state: State) -> State:
+    """Fits an earlier state to a problem with other random lens coefficients, which are zero."""
     if not problem.effects:
         return state
     first = problem.effects[0]
@@ -396,17 +384,19 @@ def _in(problem: Problem, state: State) -> State:
     return State(state.edges, np.concatenate([*values, state.values[len(state.values) - behind :]]))
 
 
-def _problem(solved: Solved, looked: Observed, views: Sequence[ViewPoses]) -> Problem:
+def _problem(solved: Solved, observed: Observed, views: Sequence[ViewPoses]) -> Problem:
     """The problem of a cell's rows, with the unknowns of the fit."""
     fitted = solved.agreed.problem
     problem = replace(problem_of(solved.cell, views), tree=fitted.tree, poses=fitted.poses)
-    seen, none = problem.observations, np.zeros(len(problem), dtype=bool)
+    observations, none = problem.observations, np.zeros(len(problem), dtype=bool)
     for move in solved.agreed.moves:
-        seen = seen.renamed(move.frame, move.twin, seen.stops >= move.stop)
-    late = {effect.name: effect for effect in clock_effects(solved.cell, looked.clocks)}
+        later = observations.stops >= move.stop
+        observations = observations.renamed(move.frame, move.twin, later)
+    clock_errors = {effect.name: effect for effect in clock_effects(solved.cell, observed.clocks)}
     effects = [
-        late.get(effect.name)
+        clock_errors.get(effect.name)
         or replace(effect, by_sensor=None, concerned=None if effect.concerned is None else none)
         for effect in fitted.effects
     ]
-    return replace(problem, observations=seen, points=fitted.points).with_effects(effects)
+    problem = replace(problem, observations=observations, points=fitted.points)
+    return problem.with_effects(effects)

@@ -1,4 +1,4 @@
-"""The robots' arms of a whole cell: read from its session, calibrated with its frames, worded."""
+"""The robots' arms of a cell: reading, calibration one by one, covariance, findings."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -23,20 +23,15 @@ from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.residual_tests import inflation
 from visioncal.estimation.slight_steps import Slip, step_covariance, with_step
-from visioncal.estimation.solve import (
-    Solution,
-    covariance_of,
-    held_shift,
-    robot_likelihood,
-)
+from visioncal.estimation.solve import Solution, covariance_of, held_shift, robot_likelihood
 
-# What moved at once, as a source of uncertainty.
+# Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
 STEP = "what moved at once"
 
 
 def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
-    """Reads the arms of a cell, as they are stated."""
-    found, session = {}, cell.session
+    """Reads the nominal arms of a cell."""
+    arms, session = {}, cell.session
     for name, robot in robots.items():
         key = robot_key(name)
         if key in cell.poses:
@@ -45,94 +40,90 @@ def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
                 for observation in session.observations
                 if name in observation.robots
             }
-            stood = np.flatnonzero(np.isfinite(cell.poses[key][:, 0, 0])).tolist()
-            views = [rows[index] for index in stood]
-            found[key] = RobotArm.of(key, cell.poses[key], views, robot.matched, (session, name))
-    return found
+            stations = np.flatnonzero(np.isfinite(cell.poses[key][:, 0, 0])).tolist()
+            views = [rows[station] for station in stations]
+            arms[key] = RobotArm.of(key, cell.poses[key], views, robot.matched, (session, name))
+    return arms
 
 
 def joint_offsets(arms: Mapping[str, RobotArm]) -> dict[str, FloatArray]:
-    """(s, 6, n) how flanges move with the offsets of their joints, of arms that are modelled."""
-    found = {name: arm.joint_offsets for name, arm in arms.items()}
-    return {name: array for name, array in found.items() if array is not None}
+    """(s, 6, n) Jacobians of flanges with respect to joint offsets, of arms with a model."""
+    jacobians = {name: arm.joint_offsets for name, arm in arms.items()}
+    return {name: jacobian for name, jacobian in jacobians.items() if jacobian is not None}
 
 
-def covariance_beside_noise(
+def covariance_from_other_sources(
     problem: Problem,
     fit: Solution,
     arms: Mapping[str, RobotArm],
-    found: Mapping[str, ResidualTest],
+    tests: Mapping[str, ResidualTest],
     offsets: Mapping[str, FloatArray],
     *,
     is_fit: bool = True,
 ) -> dict[str, FloatArray]:
-    """Covariances (p, p) that a fit has of what is no noise, by their source.
+    """Covariances (p, p) of a fit from sources other than noise, by source.
 
     Args:
-        problem: The observations that agree.
+        problem: The inliers.
         fit: Their fit.
-        arms: The arms; errors that are no unknowns count, and how well the size of others is known.
-        found: What their residuals show.
-        offsets: How flanges move with the offsets of their joints; see `joint_offsets`.
-        is_fit: Whether it is at rest: a closed form is pulled by more than what is held.
+        arms: The arms. Errors that are not estimated count, and of others the uncertainty of their
+            size.
+        tests: Tests of the residuals, by robot.
+        offsets: Jacobians of flanges with respect to joint offsets; see `joint_offsets`.
+        is_fit: Whether it minimises the problem; a closed form is not biased by held values alone.
     """
     parts: dict[str, FloatArray] = {}
     if len(problem.units[1]):
-        levels = expected_levels(problem, fit.state, fit.noise)
-        for robot, arm in arms.items():
-            # Where an arm errs by what is no unknown, the noise is what stays beside that, and not
-            # the most likely one of a fit without these errors.
-            if arm.errors is not None and arm.errors.is_significant and not arm.errors.is_estimated:
-                at = problem.robots.index(robot)
-                levels[at] = fit.noise.robots[at]
-        more = covariance_of(problem, replace(fit, noise=replace(fit.noise, robots=levels)))
-        parts["noise_level"] = more - covariance_of(problem, fit)
+        noise = replace(fit.noise, robots=_expected_levels(problem, fit, arms))
+        raised = covariance_of(problem, replace(fit, noise=noise))
+        parts["noise_level"] = raised - covariance_of(problem, fit)
     shift = held_shift(problem, fit) * float(is_fit)
     if shift.any():
         parts["held_values"] = np.outer(shift, shift)
     for robot, arm in arms.items():
         if arm.errors is not None and not arm.errors.is_estimated:
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
-            parts[f"arm{_of(arms, robot)}"] = errors
+            parts[f"arm{_source_suffix(arms, robot)}"] = errors
         elif arm.errors is not None:
             covariance = covariance_of(problem, fit)
-            parts[f"size of arm errors{_of(arms, robot)}"] = covariance_of_size(
+            parts[f"size of arm errors{_source_suffix(arms, robot)}"] = covariance_of_size(
                 problem, covariance, robot, arm.errors
             )
-    return parts | _beyond_noise(problem, fit, arms, found, offsets)
-
-
-def _beyond_noise(
-    problem: Problem,
-    fit: Solution,
-    arms: Mapping[str, RobotArm],
-    found: Mapping[str, ResidualTest],
-    offsets: Mapping[str, FloatArray],
-) -> dict[str, FloatArray]:
-    """Covariances (p, p) by what residuals show: stops that err alike, and what moved at once."""
-    parts: dict[str, FloatArray] = {}
-    for robot, test in found.items():
+    # What the residuals show: correlated errors of stops, and a sudden step.
+    for robot, test in tests.items():
         if test.alike is not None and test.alike.is_significant:
             more = inflation(problem, fit.state, fit.noise, robot, test.alike.factor)
-            parts[f"misfit{_of(arms, robot)}"] = more
+            parts[f"misfit{_source_suffix(arms, robot)}"] = more
         if test.step is not None:
             parts[STEP] = step_covariance(problem, fit, test.step, offsets)
     return parts
 
 
-def _of(arms: Mapping[str, RobotArm], robot: str) -> str:
-    """Names, of several robots, the one that a source is of."""
+def _expected_levels(problem: Problem, fit: Solution, arms: Mapping[str, RobotArm]) -> FloatArray:
+    """Expected noise levels of the robots."""
+    levels = expected_levels(problem, fit.state, fit.noise)
+    for robot, arm in arms.items():
+        # Where an arm has errors that are not estimated, the noise is what remains beside them, not
+        # the expected level of a fit without them.
+        if arm.errors is not None and arm.errors.is_significant and not arm.errors.is_estimated:
+            at = problem.robots.index(robot)
+            levels[at] = fit.noise.robots[at]
+    return levels
+
+
+def _source_suffix(arms: Mapping[str, RobotArm], robot: str) -> str:
+    """Suffix with the robot's name for a source of uncertainty; empty for a single robot."""
     return "" if len(arms) == 1 else f" of robot {robot}"
 
 
 def doubts_of_arms(
     arms: Mapping[str, RobotArm],
-    found: Mapping[str, ResidualTest],
+    tests: Mapping[str, ResidualTest],
     results: Mapping[str, ArmFound],
-    asked: str,
+    level: str,
     cell: Cell,
 ) -> Iterator[Finding]:
-    """Finds what speaks against the robots."""
+    """Findings against the robots' arms."""
 
     def joint(slip: Slip) -> str:
         matched = arms[slip.robot].matched
@@ -142,41 +133,37 @@ def doubts_of_arms(
         return words if len(arms) == 1 else f"{words} of robot {slip.robot}"
 
     for robot, arm in arms.items():
-        mine = _doubts(arm, found.get(robot), asked, cell, joint)
-        for finding in (*mine, *results[robot].doubts()):
-            yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_called(arms, robot))
+        findings_of_arm = _findings_on(arm, tests.get(robot), level, cell, joint)
+        for finding in (*findings_of_arm, *results[robot].doubts()):
+            yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_robot_name(arms, robot))
 
 
 def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:
-    """Words what was found of the arms and is no reason for doubt."""
+    """Notes on the arms that are no reason for doubt."""
     for robot, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
-        chosen = () if arm.kinematics is None else findings(arm.kinematics)
-        for remark in remarks((*drifts, *chosen, *results[robot].notes()), NOTE):
-            yield remark.of(_called(arms, robot)).words
+        levels = () if arm.kinematics is None else findings(arm.kinematics)
+        for remark in remarks((*drifts, *levels, *results[robot].notes()), NOTE):
+            yield remark.of(_robot_name(arms, robot)).words
 
 
-def _doubts(
-    arm: RobotArm,
-    found: ResidualTest | None,
-    asked: str,
-    cell: Cell,
-    joint: Callable[[Slip], str],
+def _findings_on(
+    arm: RobotArm, test: ResidualTest | None, level: str, cell: Cell, joint: Callable[[Slip], str]
 ) -> Iterator[Finding]:
-    if arm.joints_rad is None and asked not in ("auto", "hand-eye"):
+    if arm.joints_rad is None and level not in ("auto", "hand-eye"):
         yield Finding(
             "level",
             "It stays as it reports itself: its errors take joint angles and a known model.",
         )
-    elif arm.thermal is None and asked == thermal.LEVEL:
+    elif arm.thermal is None and level == thermal.LEVEL:
         words = "No data show how it drifts with its temperature: that stays in its noise."
         yield Finding("level", words)
     if arm.kinematics is not None:
         yield from doubts(arm.kinematics)
-    if found is not None:
+    if test is not None:
         calibrated = arm.model is not None
         aside = "" if arm.heat is None else arm.heat.set_aside
-        for doubt in diagnose.doubts(found, arm.errors, cell, joint, calibrated=calibrated):
+        for doubt in diagnose.doubts(test, arm.errors, cell, joint, calibrated=calibrated):
             if doubt.kind == "moved_slowly" and aside:
                 words = f"Whether the arm drifts with its temperature was not looked for: {aside}."
                 yield replace(doubt, words=f"{doubt.words} {words}")
@@ -184,65 +171,65 @@ def _doubts(
                 yield doubt
 
 
-def _called(arms: Mapping[str, RobotArm], robot: str) -> str:
-    """Names, of several robots, the one that a finding is of."""
+def _robot_name(arms: Mapping[str, RobotArm], robot: str) -> str:
+    """Name of the robot in a finding; empty for a single robot."""
     return "" if len(arms) == 1 else f"Robot {robot}"
 
 
-def one_by_one(
+def change_each(
     arms: Mapping[str, RobotArm],
     problem: Problem,
     fit: Solution,
     change: Callable[[RobotArm, Problem, State], RobotArm],
 ) -> dict[str, RobotArm]:
-    """Changes one arm after the other, beside the errors of the others.
+    """Changes one arm after the other, with the errors of the others in the problem.
 
     Args:
         arms: The arms.
         problem: The observations, with the errors of all arms.
         fit: Their fit.
-        change: Makes of an arm, of the observations with that arm as it is stated, and of where
-            their unknowns begin, the changed arm.
+        change: Computes the changed arm from the arm, the problem with that arm nominal, and the
+            initial state of that problem.
     """
-    found = dict(arms)
+    changed = dict(arms)
     values = {effect: problem.values_of(effect.name, fit.state) for effect in problem.effects}
     for name, arm in arms.items():
-        stated = arm.without_errors(problem)
-        start = [values.get(effect, effect.values) for effect in stated.effects]
+        nominal = arm.without_errors(problem)
+        start = [values.get(effect, effect.values) for effect in nominal.effects]
         state = State(fit.state.edges, np.concatenate([np.zeros(0), *start]))
-        found[name] = change(arm, stated, state)
-        problem = found[name].put_into(problem)
-    return found
+        changed[name] = change(arm, nominal, state)
+        problem = changed[name].put_into(problem)
+    return changed
 
 
 def with_drifts(
-    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, asked: str
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, level: str
 ) -> dict[str, RobotArm]:
-    """Looks for drift with temperature, one arm after the other, beside the errors of the others.
+    """Estimates drift with temperature, one arm after the other.
 
     Raises:
-        DataError: It is asked for, and no arm has what it takes.
-        DegenerateError: Likewise, and all was observed about equally warm.
+        DataError: Drift is requested, and no arm has the data that it needs.
+        DegenerateError: Drift is requested, and the temperature hardly varied.
     """
     refused = []
 
-    def with_drift(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
+    def with_drift(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
         try:
-            return arm.with_drift(stated, start, asked)
+            return arm.with_drift(nominal, start, level)
         except (DataError, DegenerateError) as error:
             refused.append(error.within(f"robot {arm.robot}"))
             return arm
 
-    found = one_by_one(arms, problem, fit, with_drift)
-    if refused and len(refused) == len(found):
+    changed = change_each(arms, problem, fit, with_drift)
+    if refused and len(refused) == len(changed):
         raise refused[0]
-    return found
+    return changed
 
 
 def with_errors(
     arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
 ) -> dict[str, RobotArm]:
-    """Looks for errors of each arm that follow its posture, the others being as stated."""
+    """Estimates posture-dependent errors of each arm, the other arms being nominal."""
     likelihood = robot_likelihood(problem, fit.state, fit.noise)
     return {
         name: arm.with_errors(likelihood, problem.robots.index(name)) for name, arm in arms.items()
@@ -252,7 +239,7 @@ def with_errors(
 def with_pose_errors(
     arms: Mapping[str, RobotArm], problem: Problem, fit: Solution
 ) -> dict[str, RobotArm]:
-    """Weighs what arms do wrong of which the joints are not known."""
+    """Estimates pose-dependent errors of arms without joint angles."""
     return {
         name: arm
         if arm.is_modelled
@@ -261,17 +248,11 @@ def with_pose_errors(
     }
 
 
-def beside_steps(
-    arms: Mapping[str, RobotArm],
-    problem: Problem,
-    fit: Solution,
-    found: Mapping[str, ResidualTest],
+def with_errors_beside_step(
+    arms: Mapping[str, RobotArm], problem: Problem, fit: Solution, tests: Mapping[str, ResidualTest]
 ) -> Mapping[str, RobotArm]:
-    """Weighs these errors beside what moved or changed at once, which counts by itself.
-
-    Processes over time and postures would explain a step, too.
-    """
-    step = next((test.step for test in found.values() if test.step), None)
+    """Estimates pose-dependent errors again beside a sudden step, which they would also explain."""
+    step = next((test.step for test in tests.values() if test.step), None)
     if step is None or isinstance(step, Slip) or all(arm.is_modelled for arm in arms.values()):
         return arms
     return with_pose_errors(arms, *with_step(problem, fit, step))

@@ -1,4 +1,4 @@
-"""Observations of a whole cell that no fit has seen, and what its uncertainty is made of."""
+"""Left-out residuals of a fit, and its uncertainty budget by source."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ from visioncal.vision.targets import corner_positions
 
 
 def left_out(solved: Solved) -> HeldOut:
-    """Residuals of the used observations, each by a fit without its stop."""
+    """Residuals of the inliers, each by a fit without its stop."""
     fit, used, mount = solved.agreed.fit, np.flatnonzero(solved.agreed.used), solved.cell.mount
 
-    def again(part: Problem) -> State:
+    def refit(part: Problem) -> State:
         if solved.solver == "joint" or mount is None:
             return solve_problem(part, fit.state, fit.noise, is_near=True)[0]
         return closed_form_state(part, solved.solver, fit.state, mount)
@@ -35,7 +35,7 @@ def left_out(solved: Solved) -> HeldOut:
         return solved.chain_px(used[rows], state)
 
     of = {None: "", "instrument": ", of the whole fit"}.get(mount, ", of the hand-eye fit")
-    return validate(solved.part, again, pixels, of)
+    return validate(solved.part, refit, pixels, of)
 
 
 def _covariances_of_edges(
@@ -51,31 +51,33 @@ def _covariances_of_edges(
 
 
 def budget_mm(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
-    """Sigmas of each unknown frame's place in its parent, by source and as a `total` [mm]."""
+    """Standard deviations of unknown frames' positions in their parents, by source, in all [mm]."""
     parts, part = _covariances_of_edges(solved, beside), solved.part
-    found: dict[str, dict[str, float]] = {}
+    budget: dict[str, dict[str, float]] = {}
     for key in part.unknown:
-        at = part.edge_columns(key).start
-        place = slice(at + 3, at + 6)
-        found[key] = {name: 1e3 * _root_trace(own[place, place]) for name, own in parts.items()}
-    return found
+        first = part.edge_columns(key).start + 3
+        budget[key] = {
+            name: 1e3 * _root_trace(covariance[first : first + 3, first : first + 3])
+            for name, covariance in parts.items()
+        }
+    return budget
 
 
 def _root_trace(covariance: FloatArray) -> float:
-    """Root of the trace: of two sources that make up for each other, one may be under zero."""
+    # Of two sources that compensate each other, one may have a negative trace.
     return float(max(np.trace(covariance), 0.0) ** 0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
-    """How well one camera and one robot place what they look at.
+class WorkAccuracy:
+    """Accuracy of a point that one camera and one robot locate where their views look.
 
     Attributes:
-        point_cam: (3,) the target's middle in the camera's frame, as views see it on average [m].
-        budget_mm: Standard deviation of such a point's place, by source and as a `total` [mm].
-        radius95_mm: The place is right to within this in 95 % of cases [mm].
+        point_cam: (3,) the target's middle in the camera's frame, mean over the views [m].
+        budget_mm: Standard deviation of that point's position, by source and as a `total` [mm].
+        radius95_mm: 95 % error radius of its position [mm].
         spectrum: (12,) standard deviations along the principal directions of both edges, ascending,
-            in units of the largest that are accepted (5 mm, 0.5 deg).
+            in units of the largest accepted ones (5 mm, 0.5 deg).
     """
 
     point_cam: FloatArray
@@ -84,34 +86,38 @@ class Work:
     spectrum: FloatArray
 
 
-def work_of(solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatArray) -> Work:
-    """Looks at the uncertainty of one camera and one robot where its views looked.
+def work_accuracy(
+    solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatArray
+) -> WorkAccuracy:
+    """Computes the accuracy of one camera and one robot where their views look.
 
     Args:
         solved: The fit.
-        beside: (p, p) what counts beside its noise, by source.
-        covariance: (p, p) of its unknowns, with all that.
+        beside: (p, p) covariances from sources other than noise, by source.
+        covariance: (p, p) of its unknowns, from all sources.
     """
     part, state = solved.part, solved.agreed.fit.state
     middles = middles_of(solved.cell)
-    middle = np.array([middles.get(name, np.zeros(3)) for name in part.observations.observed])
-    point = apply_each(part.measured(state), middle).mean(axis=0)
-    at_work = {
-        name: point_covariance(state.edges[0], edge[:6, :6], point)
+    target_points = np.array(
+        [middles.get(name, np.zeros(3)) for name in part.observations.observed]
+    )
+    point_cam = apply_each(part.measured(state), target_points).mean(axis=0)
+    covariances = {
+        name: point_covariance(state.edges[0], edge[:6, :6], point_cam)
         for name, edge in _covariances_of_edges(solved, beside).items()
     }
-    limit = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
-    values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limit, limit))
-    return Work(
-        point,
-        {name: 1e3 * _root_trace(array) for name, array in at_work.items()},
-        1e3 * radius95(at_work["total"]),
+    limits = np.tile(np.repeat([SIGMA_LIMIT_RAD, SIGMA_LIMIT_M], 3), 2)
+    values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limits, limits))
+    return WorkAccuracy(
+        point_cam,
+        {name: 1e3 * _root_trace(covariance) for name, covariance in covariances.items()},
+        1e3 * radius95(covariances["total"]),
         np.sqrt(np.maximum(values, 0.0)),
     )
 
 
 def middles_of(cell: Cell) -> dict[str, FloatArray]:
-    """(3,) the middle of each printed target by its frame, in that [m]."""
+    """(3,) middle of each printed target in its frame [m], by frame."""
     return {
         frame_name("target", name): corner_positions(plate).mean(axis=0)
         for name, plate in cell.session.plates.items()
@@ -119,15 +125,18 @@ def middles_of(cell: Cell) -> dict[str, FloatArray]:
 
 
 def _sources(solved: Solved) -> Sources:
-    """What makes the result uncertain, by camera, robot and board; without names where alone."""
+    """Sources of uncertainty by camera, robot and board; without names for a single pair."""
     problem, is_pair = solved.agreed.problem, solved.cell.mount is not None
     of_corners = () if solved.looks is None else tuple(solved.looks.problems)
     columns: dict[str, IntArray] = {}
     for name, column in problem.effect_columns.items():
         if name != LENSES:
-            called = _of_effect(name) if is_pair else name
-            columns[called] = np.append(
-                columns.get(called, np.zeros(0, np.int64)), np.arange(column.start, column.stop)
+            source = name
+            if is_pair:
+                source = name.partition(" of ")[0]
+                source = source if source in ("temperature", "arm") else "clock"
+            columns[source] = np.append(
+                columns.get(source, np.zeros(0, np.int64)), np.arange(column.start, column.stop)
             )
     if len(solved.field_columns):
         columns["lens_field"] = solved.field_columns
@@ -135,8 +144,10 @@ def _sources(solved: Solved) -> Sources:
         kind = "instrument" if solved.cell.mount == "instrument" else "pixels"
         robot = "poses" if problem.is_combined else "robot"
         sensors = dict.fromkeys(problem.observations.observers, kind)
-        return Sources(sensors, dict.fromkeys(problem.robots, robot), columns | _looks(solved))
-    # One that moved is one sensor all the same.
+        return Sources(
+            sensors, dict.fromkeys(problem.robots, robot), columns | _appearance_columns(solved)
+        )
+    # A sensor that moved remains one sensor.
     seers = {observer: observer.partition("@")[0] for observer in problem.observations.observers}
     return Sources(
         {
@@ -144,54 +155,48 @@ def _sources(solved: Solved) -> Sources:
             for key, frame in seers.items()
         },
         {robot: f"robot {robot}" for robot in problem.robots},
-        columns | _looks(solved),
+        columns | _appearance_columns(solved),
     )
 
 
-def _of_effect(name: str) -> str:
-    """What the uncertainty of an effect is of, by its name."""
-    kind = name.partition(" of ")[0]
-    return {"temperature": "temperature", "arm": "arm"}.get(kind, "clock")
-
-
 def columns_of_boards(solved: Solved) -> IntArray:
-    """The problem's columns of boards' shapes, as far as they are free."""
-    found = (look for name, look in _looks(solved).items() if name.startswith("board"))
-    return np.concatenate([np.zeros(0, dtype=np.int64), *found])
+    """The problem's columns of the free values of boards' shapes."""
+    boards = (
+        columns for name, columns in _appearance_columns(solved).items() if name.startswith("board")
+    )
+    return np.concatenate([np.zeros(0, dtype=np.int64), *boards])
 
 
-def middles_moved(solved: Solved) -> dict[str, FloatArray]:
-    """(3, b) how the middle of each target moves with `columns_of_boards`, by its frame [m]."""
+def middle_jacobians(solved: Solved) -> dict[str, FloatArray]:
+    """(3, b) Jacobians of targets' middles with respect to `columns_of_boards` [m], by frame."""
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:
         return {}
-    plates, at = solved.cell.session.plates, looks.boards
-    free = within(seen.free, at)
-    found = {}
-    for (name, target), mine in zip(
-        plates.items(), shape_slices(tuple(plates.values()), at.start), strict=True
-    ):
-        by_shape = np.zeros((3, at.stop))
-        by_shape[:, mine] = shape_basis(target).mean(axis=0)
-        found[frame_name("target", name)] = by_shape[:, free]
-    return found
+    plates, boards = solved.cell.session.plates, looks.boards
+    free, jacobians = within(seen.free, boards), {}
+    slices = shape_slices(tuple(plates.values()), boards.start)
+    for (name, target), values in zip(plates.items(), slices, strict=True):
+        jacobian = np.zeros((3, boards.stop))
+        jacobian[:, values] = shape_basis(target).mean(axis=0)
+        jacobians[frame_name("target", name)] = jacobian[:, free]
+    return jacobians
 
 
-def _looks(solved: Solved) -> dict[str, IntArray]:
-    """Columns of each lens and each board, as far as they are free."""
+def _appearance_columns(solved: Solved) -> dict[str, IntArray]:
+    """The problem's columns of the free values of each lens and board."""
     seen, looks = solved.seen, solved.looks
     if seen is None or looks is None:
         return {}
-    boards, alone = solved.cell.session.boards, solved.cell.mount is not None
-    places = {
-        "intrinsics" if alone else f"intrinsics of {name}": lens
+    boards, is_pair = solved.cell.session.boards, solved.cell.mount is not None
+    slices = {
+        "intrinsics" if is_pair else f"intrinsics of {name}": lens
         for name, lens in looks.lenses.items()
     }
-    if alone:
-        places["board"] = looks.boards
+    if is_pair:
+        slices["board"] = looks.boards
         boards = {}
-    slices = shape_slices(tuple(boards.values()), looks.boards.start)
-    for name, item in zip(boards, slices, strict=True):
-        places[f"board {name}".strip()] = item
-    free = {name: within(seen.free, place) for name, place in places.items()}
-    return {name: solved.columns_of(array) for name, array in free.items() if len(array)}
+    board_slices = shape_slices(tuple(boards.values()), looks.boards.start)
+    for name, values in zip(boards, board_slices, strict=True):
+        slices[f"board {name}".strip()] = values
+    free = {name: within(seen.free, values) for name, values in slices.items()}
+    return {name: solved.columns_of(indices) for name, indices in free.items() if len(indices)}

@@ -1,6 +1,6 @@
-"""What is wrong with a session before anything is solved, and what to type: `visioncal doctor`."""
+"""Checks a session for mistakes before anything is solved, for `visioncal doctor`."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.reading_hints import misreadings, reading_hint
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.running import known_at_first
+from visioncal.calibration.pipeline.running import initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cause_ranking import LEAST_RUN
@@ -29,26 +29,27 @@ from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Remedy, with_pat
 from visioncal.session import Session
 from visioncal.vision.finders.board import hidden_corners
 
-# A lens is estimated by corners all over the image: so many of these parts of it need some.
+# The image is divided into this many parts per axis; the estimation of a lens needs corners in at
+# least this many of all parts.
 _PARTS, _LEAST_PARTS = 4, 7
-# So many images that show where a row should be, without it, are no chance.
+# Fewest images with room for a board's row, but without it, that show that the row does not exist.
 _LEAST_WITHOUT = 3
-# A lens's centre is nearer to the middle of its images than this share of it.
+# Largest distance of the principal point from the middle of the image, as a share of the half size.
 _OFF_CENTRE = 0.15
 # Noise of corners beyond which a lens is in doubt [px], and of the flange [mm].
 _MOST_PX, _MOST_MM = CalibrationLimits().pixel_px[0], 1.0
-# What is allowed, and no mistake.
+# Kinds of warnings that are no fault of the session.
 _NO_FAULT = ("unused",)
 
 
 @dataclass(frozen=True)
 class Checkup:
-    """What is wrong with a session.
+    """Result of checking a session.
 
     Attributes:
-        session: Its name.
-        seen: What is there, in a few words each.
-        findings: What is wrong, the likeliest cause first, each with what to do.
+        session: The session's name.
+        seen: Its contents, in a few words each.
+        findings: Its faults, the likeliest cause first, each with a remedy.
     """
 
     session: str
@@ -61,9 +62,9 @@ class Checkup:
         return not self.findings
 
     def _repr_html_(self) -> str:
-        says = [finding.reason for finding in self.findings] or ["Nothing is wrong."]
+        reasons = [finding.reason for finding in self.findings] or ["Nothing is wrong."]
         seen = {"seen": "; ".join(self.seen)}
-        return html_card(self.session, seen, "good" if self.is_sound else "check", says)
+        return html_card(self.session, seen, "good" if self.is_sound else "check", reasons)
 
     def __repr__(self) -> str:
         lines = [f"{self.session}: {'; '.join(self.seen)}."]
@@ -73,30 +74,30 @@ class Checkup:
 
 @typed
 def doctor(session: Session | Path | str, *, progress: Progress | None = None) -> Checkup:
-    """Looks for what is wrong with a session, in seconds: nothing is fitted to the chain.
+    """Checks a session for mistakes, in seconds: no chain is fitted.
 
     Args:
         session: A session, or the path of its folder or recording.
-        progress: Told of long work.
+        progress: Called with the progress of long work.
 
     Returns:
-        What is wrong, the likeliest cause first; commands have the session's path where one is
+        The faults, the likeliest cause first; commands contain the session's path where one is
         given.
 
     Raises:
-        DataError: It cannot be read.
+        DataError: The session cannot be read.
     """
-    known = known_at_first(session, progress=progress)
+    run = initial_state(session, progress=progress)
     with one_blas_thread():
-        known, error = _looked(known)
-        found = [*_findings(known, error)]
+        run, error = _run_stages(run)
+        findings = [*_findings(run, error)]
     if not isinstance(session, Session):
-        found = [_of(finding, session) for finding in found]
-    return Checkup(known.session.name, tuple(_seen(known)), tuple(found))
+        findings = [_with_session(finding, session) for finding in findings]
+    return Checkup(run.session.name, tuple(_contents(run)), tuple(findings))
 
 
 def to_document(checkup: Checkup) -> dict[str, object]:
-    """Writes what was found as the content of a JSON document."""
+    """Converts a checkup to a JSON document."""
     findings = []
     for finding in checkup.findings:
         step = {"do": finding.do.words, "command": finding.do.command} if finding.do else {}
@@ -110,66 +111,67 @@ def to_document(checkup: Checkup) -> dict[str, object]:
     return {"session": checkup.session, "seen": list(checkup.seen), "findings": findings}
 
 
-def _of(found: Finding, session: Path | str) -> Finding:
-    if found.do is None:
-        return found
-    words, command = (with_paths(text, session) for text in (found.do.words, found.do.command))
-    return replace(found, do=Remedy(words, command))
+def _with_session(finding: Finding, session: Path | str) -> Finding:
+    """Fills the session's path into a finding's remedy."""
+    if finding.do is None:
+        return finding
+    words, command = (with_paths(text, session) for text in (finding.do.words, finding.do.command))
+    return replace(finding, do=Remedy(words, command))
 
 
-def _looked(known: RunState) -> tuple[RunState, VisioncalError | None]:
-    """Takes a session through the steps before the fit, as far as they go."""
+def _run_stages(run: RunState) -> tuple[RunState, VisioncalError | None]:
+    """Runs the stages before the fit up to the first error."""
     stages = stages_before("solve")
     for at, stage in enumerate(stages):
-        if known.progress is not None:
-            known.progress(stage.name, at, len(stages))
+        if run.progress is not None:
+            run.progress(stage.name, at, len(stages))
         try:
-            known = stage.run(known)
+            run = stage.run(run)
         except VisioncalError as error:
-            return known, error
-    return known, None
+            return run, error
+    return run, None
 
 
-def _findings(known: RunState, error: VisioncalError | None) -> Iterator[Finding]:
-    cause = unseen_cause(known) if error is not None or known.reasons else None
+def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
+    cause = unseen_cause(run) if error is not None or run.reasons else None
     if cause is not None:
         yield cause
-    hint = reading_hint(known) if error is None and known.mount is not None else None
+    hint = reading_hint(run) if error is None and run.mount is not None else None
     if hint is not None:
         yield hint
-    if known.mount is None:
-        readings = [*misreadings(known)] if error is None else []
-        names = None if readings else exchanged_names(known)
+    if run.mount is None:
+        readings = [*misreadings(run)] if error is None else []
+        names = None if readings else exchanged_names(run)
         yield from readings if names is None else [names]
     if error is not None and cause is None:
         yield _refused("refused", error)
-    said = () if cause is None else (cause.kind,)
-    warned = [
+    reported = () if cause is None else (cause.kind,)
+    warnings = [
         warning
-        for warning in known.warnings
-        if warning.kind not in (*_NO_FAULT, *said)
+        for warning in run.warnings
+        if warning.kind not in (*_NO_FAULT, *reported)
         and (hint is None or warning.words not in hint.words)
     ]
-    is_said = "other_lens" in {finding.kind for finding in warned}
-    lens = [] if error is not None or is_said else list(_lenses(known))
-    yield from sorted([*lens, *warned], key=lambda value: value.do is None)
+    has_lens = "other_lens" in {warning.kind for warning in warnings}
+    lens = [] if error is not None or has_lens else list(_lenses(run))
+    yield from sorted([*lens, *warnings], key=lambda value: value.do is None)
     if error is None:
-        if hint is None and known.mount is not None and not lens:
-            yield from _motion(known, known.mount)
-        yield from _lost(known)
-        yield from _coverage(known)
-    if not {MISSING, "shared_image"} & {finding.kind for finding in (*warned, cause) if finding}:
-        yield from unnamed_images(known.session)
+        if hint is None and run.mount is not None and not lens:
+            yield from _motion(run, run.mount)
+        yield from _lost(run)
+        yield from _coverage(run)
+    if not {MISSING, "shared_image"} & {finding.kind for finding in (*warnings, cause) if finding}:
+        yield from unnamed_images(run.session)
 
 
 def _refused(kind: str, error: VisioncalError) -> Finding:
     return Finding(kind, error.message, Remedy(error.next_step) if error.next_step else None)
 
 
-def _lenses(known: RunState) -> Iterator[Finding]:
-    """Lenses that are stated and not those of the images."""
+def _lenses(run: RunState) -> Iterator[Finding]:
+    """Findings on stated lenses that do not fit the images."""
     step = Remedy("In session.toml, delete matrix and distortion, so that they are estimated.")
-    for frame, look in known.cameras.items():
+    for frame, look in run.cameras.items():
         stated = look.table.stated
         if stated is None:
             continue
@@ -182,7 +184,7 @@ def _lenses(known: RunState) -> Iterator[Finding]:
                 f"The stated matrix is of images of another size: its centre is at ({x:.0f}, "
                 f"{y:.0f}) px, and the middle of these is at ({middle[0]:.0f}, {middle[1]:.0f}) px."
             )
-            words, mend = _resized(known, look, stated) or (words, mend)
+            words, mend = _resized(run, look, stated) or (words, mend)
         elif (noise_px := _measured_px(look)) > _MOST_PX:
             words = (
                 f"Corners deviate by {figure(noise_px)} px from any pose of a flat board "
@@ -190,72 +192,68 @@ def _lenses(known: RunState) -> Iterator[Finding]:
                 "board is not flat."
             )
         if words:
-            yield Finding("lens", words, mend).of(frame if len(known.cameras) > 1 else "")
+            yield Finding("lens", words, mend).of(frame if len(run.cameras) > 1 else "")
 
 
-def _resized(known: RunState, look: CameraLook, stated: Camera) -> tuple[str, Remedy] | None:
-    """How much larger the images of a stated matrix are, by a lens of these images."""
-    targets, model = tuple(known.session.boards.values()), look.table.model
+def _resized(run: RunState, look: CameraLook, stated: Camera) -> tuple[str, Remedy] | None:
+    """Message and remedy on a stated matrix of other images, by estimating the lens."""
+    targets, model = tuple(run.session.boards.values()), look.table.model
     try:
-        found = estimate_intrinsics(look.corners, targets, stated.resolution, model)
+        estimated = estimate_intrinsics(look.corners, targets, stated.resolution, model)
     except VisioncalError:
         return None
-    words, do = other_images(stated, found.camera.matrix)
+    words, do = other_images(stated, estimated.camera.matrix)
     return (words, Remedy(do)) if words else None
 
 
 def _measured_px(look: CameraLook) -> float:
-    """Noise of a corner's coordinate [px]; zero where it is not measured, but stated."""
-    stated = {view_corners.stated_px for view_corners in look.corners.values()}
+    """Measured noise of a corner's coordinate [px]; zero where it is only stated."""
+    stated = {corners.stated_px for corners in look.corners.values()}
     return 0.0 if look.pixel_px is None or look.pixel_px in stated else look.pixel_px
 
 
-def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
-    """Motion that is too poor, and views that disagree."""
+def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
+    """Findings on too poor motion, and on outliers."""
     try:
-        cell, agreed = first_inliers(read_cell(known), known, mount)
+        cell, inliers = first_inliers(read_cell(run), run, mount)
     except VisioncalError as error:
         yield _refused("motion", error)
         return
-    out = [row.view for row, used in zip(cell.rows, agreed.used.tolist(), strict=True) if not used]
-    if _is_run(cell, agreed.used):
+    outliers = [cell.rows[at].view for at in np.flatnonzero(~inliers.used).tolist()]
+    named = some_of([*map(str, outliers)])
+    if _is_run(cell, inliers.used):
+        do = "Calibrate: the verdict says what it is, where one change explains it."
         yield Finding(
             "something_moved",
-            f"Views {some_of([*map(str, out)])} disagree with the others, and follow each other: "
-            f"from view {out[0]} to view {out[-1]}, something stood elsewhere or was set up "
+            f"Views {named} disagree with the others, and follow each other: from view "
+            f"{outliers[0]} to view {outliers[-1]}, something stood elsewhere or was set up "
             "otherwise.",
-            Remedy(
-                "Calibrate: the verdict says what it is, where one change explains it.", CALIBRATE
-            ),
-            tuple(out),
+            Remedy(do, CALIBRATE),
+            tuple(outliers),
         )
-    elif out:
-        one = len(out) == 1
-        rows = ", ".join(map(str, out))
+    elif outliers:
+        one, rows = len(outliers) == 1, ", ".join(map(str, outliers))
         yield Finding(
             "wrong_views",
-            f"{'View' if one else 'Views'} {some_of([*map(str, out)])} "
-            f"{'disagrees' if one else 'disagree'} with the others: {'its' if one else 'their'} "
-            "pose or image is wrong, or something moved.",
+            f"{'View' if one else 'Views'} {named} {'disagrees' if one else 'disagree'} with the "
+            f"others: {'its' if one else 'their'} pose or image is wrong, or something moved.",
             Remedy(
                 f"Look at {'its image and pose' if one else 'their images and poses'}: repeat "
                 f"{'it' if one else 'them'}, or in views.csv, delete the row{'' if one else 's'} "
                 f"of view {rows}."
             ),
-            tuple(out),
+            tuple(outliers),
         )
-    used, (enough, _) = int(agreed.used.sum()), CalibrationLimits().stops
+    used, (enough, _) = int(inliers.used.sum()), CalibrationLimits().stops
     if used < enough:
+        do = f"Add {enough - used} views or more, tilted by 20 to 40 degrees about different axes."
         yield Finding(
             "few_stops",
             f"Only {used} views can be used; {enough} or more give a result something to be "
             "checked with.",
-            Remedy(
-                f"Add {enough - used} views or more, tilted by 20 to 40 degrees about different "
-                "axes."
-            ),
+            Remedy(do),
         )
-    rad, metres = agreed.fit.noise.robots[0].tolist()
+    rad, metres = inliers.fit.noise.robots[0].tolist()
     if 1e3 * metres > _MOST_MM:
         yield Finding(
             "scatter",
@@ -267,36 +265,34 @@ def _motion(known: RunState, mount: Mount) -> Iterator[Finding]:
 
 
 def _is_run(cell: Cell, used: Mask) -> bool:
-    """Whether the views that are left out are all at one end of the session, and not a few."""
+    """Whether the outliers are all at one end of the session, and not too few."""
     order = np.argsort([row.station for row in cell.rows], kind="stable")
     ends = np.count_nonzero(used[order][1:] != used[order][:-1])
     return bool(ends == 1 and np.sum(~used) >= LEAST_RUN)
 
 
-def _lost(known: RunState) -> Iterator[Finding]:
-    """Views that cannot be used, but for those whose images are missing: that was said."""
-    absent = {view for found in known.warnings for view in found.views}
-    reasons: Mapping[int, str] = {
-        view: why for view, why in known.reasons.items() if view not in absent
-    }
-    is_read = known.mount is not None and known.robots
-    posed = known.base_from_flange.keys() if is_read else reasons.keys()
+def _lost(run: RunState) -> Iterator[Finding]:
+    """Findings on views that cannot be used, except those that warnings name already."""
+    reported = {view for warning in run.warnings for view in warning.views}
+    reasons = {view: why for view, why in run.reasons.items() if view not in reported}
+    is_read = run.mount is not None and run.robots
+    posed = run.base_from_flange.keys() if is_read else reasons.keys()
     of_rows = {view: why for view, why in reasons.items() if view not in posed}
     of_images = {view: why for view, why in reasons.items() if view in posed}
-    for some, do in (
+    for lost, do in (
         (of_rows, "In views.csv, correct the rows that are named, or delete them."),
         (of_images, "Look at the image, and repeat the view or take it out of views.csv."),
     ):
-        for words in by_reason(some):
+        for words in by_reason(lost):
             yield Finding("lost_views", f"{words[0].upper()}{words[1:]}.", Remedy(do))
 
 
-def _coverage(known: RunState) -> Iterator[Finding]:
-    """Cameras whose lens is to be estimated, and whose corners fill little of the image."""
-    for frame, look in known.cameras.items():
+def _coverage(run: RunState) -> Iterator[Finding]:
+    """Findings on cameras whose lens is to be estimated from corners in too little of the image."""
+    for frame, look in run.cameras.items():
         if look.resolution is None or look.table.stated is not None or not look.corners:
             continue
-        px = np.concatenate([view_corners.px for view_corners in look.corners.values()])
+        px = np.concatenate([corners.px for corners in look.corners.values()])
         part = np.floor(_PARTS * px / np.array(look.resolution)).clip(0, _PARTS - 1)
         filled = len(np.unique(part @ [_PARTS, 1]))
         if filled < _LEAST_PARTS:
@@ -306,53 +302,45 @@ def _coverage(known: RunState) -> Iterator[Finding]:
                 f"{_LEAST_PARTS} parts and more."
             )
             step = Remedy("Add views with the board near the image's edges and corners, or nearer.")
-            yield Finding("coverage", words, step).of(frame if len(known.cameras) > 1 else "")
+            yield Finding("coverage", words, step).of(frame if len(run.cameras) > 1 else "")
 
 
-def _seen(known: RunState) -> Iterator[str]:
-    session = known.session
+def _contents(run: RunState) -> Iterator[str]:
+    """The contents of the session, in a few words each."""
+    session = run.session
     yield f"{len(session.views)} views"
     images = [view.image for view in session.views if view.image]
     if images:
         there = sum(session.images.exists(image) for image in images)
         yield f"{there} of {len(images)} images"
-    for look in known.cameras.values():
-        blur = [
-            view_corners.blur_px
-            for view_corners in look.corners.values()
-            if view_corners.blur_px > 0.0
-        ]
+    for look in run.cameras.values():
+        blur = [corners.blur_px for corners in look.corners.values() if corners.blur_px > 0.0]
         size = "" if look.resolution is None else " of {} x {} px".format(*look.resolution)
         edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
         yield f"the board in {len(look.corners)} {'images' if images else 'views'}{size}{edges}"
         yield from _unseen_rows(session, look)
-    for robot, reported in known.robots.items():
-        # Rows of one stop share them.
+    for robot, reported in run.robots.items():
+        # Rows of one stop share a pose.
         if poses := {pose.tobytes() for pose in reported.base_from_flange.values()}:
-            whose = f"robot {robot}" if len(known.robots) > 1 else "the robot"
+            whose = f"robot {robot}" if len(run.robots) > 1 else "the robot"
             yield f"{len(poses)} poses of {whose}"
     if session.streams:
         yield f"streams {some_of(list(session.streams))}"
 
 
 def _unseen_rows(session: Session, look: CameraLook) -> Iterator[str]:
-    """Says which last rows of a ChArUco board are in no image, though there is room for them."""
-    # With fewer rows its markers are numbered alike: nothing else shows that too many are declared.
+    """Last rows of a ChArUco board that are in no image, though there is room for them."""
+    # A board with fewer rows has the same marker numbers: nothing else shows that too many rows are
+    # declared.
     target = session.target
     if target is None or session.targets or target.kind != "charuco" or look.resolution is None:
         return
-    across, rows = target.columns - 1, target.rows - 1
-    seen = max(
-        (int(view_corners.ids.max()) // across + 1 for view_corners in look.corners.values()),
-        default=rows,
-    )
-    last, shape = np.arange(seen * across, rows * across), look.resolution[::-1]
-    # The board's place is known well by most of the corners that there may be.
-    clear = [
-        view_corners
-        for view_corners in look.corners.values()
-        if 2 * len(view_corners.ids) > seen * across
-    ]
+    columns, rows = target.columns - 1, target.rows - 1
+    numbers = [int(corners.ids.max()) // columns + 1 for corners in look.corners.values()]
+    seen = max(numbers, default=rows)
+    last, shape = np.arange(seen * columns, rows * columns), look.resolution[::-1]
+    # With most of its corners seen, the board's place in the image is known well.
+    clear = (item for item in look.corners.values() if 2 * len(item.ids) > seen * columns)
     without = [
         corners for corners in clear if np.isin(last, hidden_corners(corners, shape, target)).all()
     ]
@@ -364,5 +352,5 @@ def _unseen_rows(session: Session, look: CameraLook) -> Iterator[str]:
 
 
 def next_command(checkup: Checkup, session: Path | str) -> str:
-    """What to type where nothing is wrong."""
+    """The command to calibrate a sound session; empty for another."""
     return "" if checkup.findings else with_paths(CALIBRATE, session, "out")

@@ -1,4 +1,4 @@
-"""Cameras, or robots, whose names are exchanged in all rows of a whole cell."""
+"""Detects two cameras, or two robots, of a cell whose names are exchanged in all rows."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -14,34 +14,30 @@ from visioncal.session import Session, View, frame_name
 from visioncal.session.document import Kind
 from visioncal.session.kinds import name_of
 
-# Nothing else makes nearly all views agree of which hardly any did.
+# Shares of agreeing views: with the names exchanged at least the first, as recorded at most the
+# second.
 _NEARLY_ALL, _HARDLY_ANY = 0.9, 0.3
-# Fewer views agree by chance.
+# Fewer views may agree by chance.
 _FEWEST = 8
 
 
-def exchanged_names(known: RunState) -> Finding | None:
-    """Says of which two cameras, or robots, of a cell the views are exchanged.
+def exchanged_names(run: RunState) -> Finding | None:
+    """Finding on two cameras, or robots, of a cell whose names are exchanged.
 
-    Each exchange is followed to the first consensus of all frames; no images are searched.
+    Each exchange is tested up to the initial frames of the cell; no images are searched again.
+    None where no exchange makes nearly all views agree.
 
     Args:
-        known: What is known of the cell, once its images were searched.
-
-    Returns:
-        It; None where no exchange makes nearly all views agree.
+        run: The run of the cell, after the detection of targets.
     """
-    session = known.session
-    if known.mount is not None or not known.cameras:
+    session = run.session
+    if run.mount is not None or not run.cameras:
         return None
-    seen = known.corners.keys() | session.corners.keys() | given_poses(session).keys()
-    there = seen - known.held_back
-    rows = [
-        observation
-        for observation in session.observations
-        if observation.view.number in there and not observation.view.is_of_lens
-    ]
-    before = _agreeing(known)
+    seen = run.corners.keys() | session.corners.keys() | given_poses(session).keys()
+    usable = seen - run.held_back
+    observations = (row for row in session.observations if row.view.number in usable)
+    rows = [row for row in observations if not row.view.is_of_lens]
+    before = _agreeing(run)
     kinds: tuple[tuple[Kind, list[str]], ...] = (
         ("camera", [*session.cameras]),
         ("robot", [*session.robots]),
@@ -49,17 +45,17 @@ def exchanged_names(known: RunState) -> Finding | None:
     for kind, names in kinds:
         for pair in combinations(names, 2):
             frames = {frame_name(kind, name) for name in pair}
-            # Of robots, what was seen by way of them.
-            mine = {
+            # For robots, the views whose chains they are part of.
+            affected = {
                 row.view.number
                 for row in rows
                 if (row.seer in frames if kind == "camera" else {*pair} & {*row.robots, *row.lacks})
             }
-            if len(mine) < _FEWEST or len(mine & before) > _HARDLY_ANY * len(mine):
+            if len(affected) < _FEWEST or len(affected & before) > _HARDLY_ANY * len(affected):
                 continue
-            after = _agreeing(_looked(known, kind, pair)) & mine
-            if len(after) >= _NEARLY_ALL * len(mine):
-                return _finding(kind, pair, (len(after), len(mine), len(mine & before)))
+            after = _agreeing(_with_exchanged(run, kind, pair)) & affected
+            if len(after) >= _NEARLY_ALL * len(affected):
+                return _finding(kind, pair, (len(after), len(affected), len(affected & before)))
     return None
 
 
@@ -80,43 +76,46 @@ def _finding(kind: Kind, pair: tuple[str, str], counts: tuple[int, int, int]) ->
     )
 
 
-def _looked(known: RunState, kind: Kind, pair: tuple[str, str]) -> RunState | None:
-    """What is known before the fit with two names exchanged; None where that cannot be."""
-    session = _renamed(known.session, kind, pair)
-    looks = dict(known.cameras)
-    # Corners of a table are taken up anew: those outside of the other camera's image were left out.
+def _with_exchanged(run: RunState, kind: Kind, pair: tuple[str, str]) -> RunState | None:
+    """The run before the fit with two names exchanged; None where a stage fails."""
+    session = _renamed(run.session, kind, pair)
+    looks = dict(run.cameras)
+    # Corners from images are reused. Those of a table are read again, as those outside of the other
+    # camera's image were dropped.
     is_kept = any(view.image for view in session.views)
     if kind == "camera" and is_kept:
         for name, other in (pair, pair[::-1]):
-            look = known.cameras.get(frame_name(kind, other))
+            look = run.cameras.get(frame_name(kind, other))
             if look is None:
                 return None
             looks[frame_name(kind, name)] = replace(
                 look, table=session.cameras[name], lens=None, pixel_px=None
             )
-    state = RunState(session, None, known.threads, level=known.level)
+    state = RunState(session, None, run.threads, level=run.level)
     try:
         for stage in stages_before("joints"):
-            is_known = stage.name == "detect" and is_kept
-            state = replace(state, cameras=looks) if is_known else stage.run(state)
+            is_done = stage.name == "detect" and is_kept
+            state = replace(state, cameras=looks) if is_done else stage.run(state)
     except VisioncalError:
         return None
     return state
 
 
 def _renamed(session: Session, kind: Kind, pair: tuple[str, str]) -> Session:
-    other = {pair[0]: pair[1], pair[1]: pair[0]}
+    exchanged = {pair[0]: pair[1], pair[1]: pair[0]}
 
     def renamed(view: View) -> View:
         name = name_of(session.declaration, kind, view)
-        return replace(view, text={**view.text, kind: other[name]}) if name in other else view
+        return (
+            replace(view, text={**view.text, kind: exchanged[name]}) if name in exchanged else view
+        )
 
     return replace(session, views=tuple(map(renamed, session.views)))
 
 
-def _agreeing(known: RunState | None) -> frozenset[int]:
-    """The views that agree in the first consensus of the frames; none where there is none."""
+def _agreeing(run: RunState | None) -> frozenset[int]:
+    """The views that agree with the initial frames; none where there are no such frames."""
     try:
-        return frozenset() if known is None else agreeing_views(read_cell(known), known)
+        return frozenset() if run is None else agreeing_views(read_cell(run), run)
     except VisioncalError:
         return frozenset()

@@ -1,4 +1,4 @@
-"""What is wrong with observations that disagree, and what moved, for people."""
+"""Messages on outliers and moved frames: exchanged, wrong or turned observations, by cause."""
 
 import shlex
 from collections import defaultdict
@@ -30,28 +30,26 @@ from visioncal.results import Moved
 from visioncal.session.frames import frame_name
 from visioncal.vision.targets import rotation_transforms
 
-# A robot is pushed where it is seen elsewhere at so many stops, which agree to such a share.
+# A base was pushed where at least so many stops agree on its displacement, to such a share of it.
 _FEWEST_STOPS, _ALIKE = 3, 0.5
-# What the fit leaves uncertain grows with a step: views that a large one explains agree on it to
-# within this share of it.
+# Views that a large step explains agree on it to within this share of the step: the uncertainty
+# that the fit leaves grows with it.
 _SURELY_ALIKE = 0.05
-# A robot's pose is wrong where so many observations of its stop say so.
+# A robot's pose is wrong where at least so many observations of its stop show it.
 _FEWEST = 2
-
-
-# So many views of a fault are named, and so many stops that an observation fits.
+# Most views of a fault, and most stops that fit an observation, that are named.
 _LISTED, _NAMED = 8, 3
 _EXCHANGE = Remedy("Exchange these rows in views.csv, and calibrate again.", CALIBRATE)
 
 
 @dataclass(frozen=True)
 class PoseFault:
-    """What is wrong with the poses of a robot.
+    """A fault of poses or images that explains outliers.
 
     Attributes:
-        found: What it is.
+        found: The finding.
         rows: The observations that it explains.
-        short: The same as a clause, for each of these; empty where the sentences are enough.
+        short: The fault as a clause, for each of these; empty where the finding suffices.
     """
 
     found: Finding
@@ -61,11 +59,11 @@ class PoseFault:
 
 @dataclass(frozen=True)
 class Version:
-    """A frame over a part of the time.
+    """A frame during a part of the session, in which it did not move.
 
     Attributes:
         key: Its name in the problem.
-        frame: The frame that it is.
+        frame: The name of the frame.
         name: Its name in the result: the frame's own for the last.
         start: The first station of it; -1 for the first version.
     """
@@ -75,48 +73,48 @@ class Version:
     name: str
     start: int
 
+    @property
+    def is_last(self) -> bool:
+        """Whether the frame was there at the end of the session."""
+        return self.name == self.frame
+
 
 def versions(solved: Solved) -> dict[str, Version]:
     """All unknown frames over time, by their names in the problem."""
-    moves = {move.twin: move for move in solved.agreed.moves}
+    starts = {move.twin: move.stop for move in solved.agreed.moves}
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
     for key in solved.agreed.problem.unknown:
-        start = moves[key].stop if key in moves else -1
-        parts[key.partition("@")[0]].append((start, key))
-    found = {}
-    for frame, mine in parts.items():
-        ordered = sorted(mine)
-        for at, (start, key) in enumerate(ordered):
-            name = frame
-            if at + 1 < len(ordered):
-                name = f"{frame}_until_stop_{_stops_of(solved, key)[-1]}"
-            found[key] = Version(key, frame, name, start)
-    return found
+        parts[key.partition("@")[0]].append((starts.get(key, -1), key))
+    versions_by_key = {}
+    for frame, keys in parts.items():
+        *earlier, (start, last) = sorted(keys)
+        for before, key in earlier:
+            name = f"{frame}_until_stop_{_stops_of(solved, key)[-1]}"
+            versions_by_key[key] = Version(key, frame, name, before)
+        versions_by_key[last] = Version(last, frame, frame, start)
+    return versions_by_key
 
 
 def _stops_of(solved: Solved, key: str) -> list[int]:
-    """The stops at which a frame, as the problem knows it, is in what is used; in order of time."""
-    problem = solved.agreed.problem
-    rows = problem.observations.involves(key)
-    some = rows & solved.agreed.used
-    stations = problem.observations.stops[some if some.any() else rows]
-    return [solved.cell.stops[index] for index in np.unique(stations).tolist()]
+    """The stops of a frame's inliers, in order of time; of all its observations if it has none."""
+    observations = solved.agreed.problem.observations
+    rows = observations.involves(key)
+    used = rows & solved.agreed.used
+    stations = observations.stops[used if used.any() else rows]
+    return [solved.cell.stops[station] for station in np.unique(stations).tolist()]
 
 
 def movements(solved: Solved) -> tuple[Moved, ...]:
-    """What moved, in the order of time."""
-    found, names, edges = [], versions(solved), solved.frames
+    """The frames that moved, in the order of time."""
+    moved, versions_by_key, edges = [], versions(solved), solved.frames
     for move in sorted(solved.agreed.moves, key=lambda value: value.stop):
-        after = names[move.twin]
-        earlier = [
-            name
-            for name in names.values()
-            if name.frame == after.frame and name.start < after.start
-        ]
+        after = versions_by_key[move.twin]
+        same_frame = (item for item in versions_by_key.values() if item.frame == after.frame)
+        earlier = [item for item in same_frame if item.start < after.start]
         before = max(earlier, key=lambda value: value.start)
         mm, deg = pose_difference(edges[before.key], edges[after.key])
         rivals = tuple(dict.fromkeys(rival.partition("@")[0] for rival in move.rivals))
-        found.append(
+        moved.append(
             Moved(
                 after.frame,
                 before.name,
@@ -127,11 +125,11 @@ def movements(solved: Solved) -> tuple[Moved, ...]:
                 tuple(rival for rival in rivals if rival != after.frame),
             )
         )
-    return tuple(found)
+    return tuple(moved)
 
 
-def moved_found(moved: Moved) -> Finding:
-    """Says that something moved."""
+def moved_finding(moved: Moved) -> Finding:
+    """Finding that a frame moved."""
     what = "was bumped" if moved.frame.startswith("cam") else "moved"
     rivals = (
         f" (or {' or '.join(moved.rivals)} did: the session leaves it open)" if moved.rivals else ""
@@ -146,36 +144,35 @@ def moved_found(moved: Moved) -> Finding:
 
 
 def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
-    """Images that were turned, robots that were pushed, poses that are exchanged or wrong."""
-    out = np.flatnonzero(~solved.agreed.used)
-    if not len(out):
+    """Turned images, exchanged or wrong poses, and pushed robots that explain outliers."""
+    outliers = np.flatnonzero(~solved.agreed.used)
+    if not len(outliers):
         return ()
     turned = _turned_images(solved)
     explained = {row for fault in turned for row in fault.rows}
-    mutual = exchanged(solved.agreed.problem, _fitting(solved, out))
+    mutual = exchanged(solved.agreed.problem, _fitting_stations(solved, outliers))
     if solved.cell.mount is not None:
         swapped = tuple(_exchanged_views(solved, mutual))
         return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
-    found = _pushed_bases(solved)
-    found += _exchanged(solved, mutual)
-    explained |= {row for fault in found for row in fault.rows}
-    found += _exchanged_views(
-        solved, {key: by for key, by in mutual.items() if not {key, by} & explained}
-    )
-    explained |= {row for fault in found for row in fault.rows}
-    return (*turned, *found, *_wrong_poses(solved, explained))
+    faults = _pushed_bases(solved)
+    faults += _exchanged_poses(solved, mutual)
+    explained |= {row for fault in faults for row in fault.rows}
+    rest = {one: other for one, other in mutual.items() if not {one, other} & explained}
+    faults += _exchanged_views(solved, rest)
+    explained |= {row for fault in faults for row in fault.rows}
+    return (*turned, *faults, *_wrong_poses(solved, explained))
 
 
 def _turned_images(solved: Solved) -> list[PoseFault]:
-    """Images that agree with the others once they are turned back, by how they were turned."""
-    rows, found = solved.cell.rows, []
-    alike: dict[ImageTurn, list[int]] = defaultdict(list)
+    """Turned or mirrored images, which agree with the others once they are turned back."""
+    rows, faults = solved.cell.rows, []
+    rows_by_turn: dict[ImageTurn, list[int]] = defaultdict(list)
     for at, row in enumerate(rows):
         if row.view in solved.turned and not solved.agreed.used[at]:
-            alike[solved.turned[row.view]].append(at)
+            rows_by_turn[solved.turned[row.view]].append(at)
     images = {view.number: view.image for view in solved.cell.session.views}
-    for how, mine in alike.items():
-        views = _numbers(solved, mine)
+    for how, turned_rows in rows_by_turn.items():
+        views = _view_numbers(solved, turned_rows)
         named = some_of([*map(str, views)], _LISTED)
         subject = f"The image of view {named} is" if len(views) == 1 else f"Images {named} are"
         them = "it agrees" if len(views) == 1 else "they agree"
@@ -187,18 +184,18 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
             turn = f"mogrify {how.option} {files}"
             step = Remedy("Turn the file back, and calibrate again.", f"{turn} && {CALIBRATE}")
         fault = Finding("turned_images", words, step, views)
-        found.append(PoseFault(fault, tuple(mine), f"its image is {how.words}"))
-    return found
+        faults.append(PoseFault(fault, tuple(turned_rows), f"its image is {how.words}"))
+    return faults
 
 
 def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
-    """Views from some view on, or before one, that one step of a frame explains."""
-    # A tool frame that is switched on in the controller moves what is on the flange, as it is
-    # reported, and another base frame what stands.
-    agreed, rows = solved.agreed, solved.cell.rows
-    problem = agreed.problem
+    """Outliers at one end of the session that one step of a frame explains."""
+    # Another active tool frame in the controller looks like a step of what is on the flange, and
+    # another base frame like one of what is fixed in the cell.
+    inliers, rows = solved.agreed, solved.cell.rows
+    problem = inliers.problem
     order = np.argsort(problem.observations.stops, kind="stable")
-    used = np.flatnonzero(agreed.used[order])
+    used = np.flatnonzero(inliers.used[order])
     before, after = order[: used[0]], order[used[-1] + 1 :]
     run = max(before, after, key=len)
     if len(run) < _FEWEST_STOPS or not problem.observations.has_rotation[run].all():
@@ -208,11 +205,12 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
         yield from _other_boards(solved, run, is_behind=run is after)
         return
     (frame, change), *rivals = steps
-    edge = agreed.fit.state.edges[problem.unknown[frame]]
+    edge = inliers.fit.state.edges[problem.unknown[frame]]
     when = _when(solved, run, is_behind=run is after)
-    moved = f"the {_thing(frame)} stood {_elsewhere(change)}"
-    moved += "".join(f" (or the {_thing(name)} {_elsewhere(step)})" for name, step in rivals)
-    out = np.sort(run).tolist()
+    moved = f"the {_body(frame)} stood {_displacement_words(change)}"
+    for rival, rival_change in rivals:
+        moved += f" (or the {_body(rival)} {_displacement_words(rival_change)})"
+    outliers = np.sort(run).tolist()
     advice = "Fasten what moved, and calibrate the views before and after it apart."
     on_flange = problem.tree.body(frame) != problem.tree.root
     if on_flange or len(problem.robots) == 1:
@@ -226,74 +224,70 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
             f"Look which {which} frame was active in the controller, and set the same one for all "
             "views; or fasten what moved, and calibrate the views before and after it apart."
         )
-    words = f"{_views(solved, out)} were left out: {when}, as they agree, {moved}."
-    found = Finding(
-        "something_moved",
-        f"V{words[1:]}",
-        or_alone(advice, _numbers(solved, out)),
-        _numbers(solved, out),
-        mahalanobis_sq=run_evidence(len(run), len(rows)),
-    )
-    yield PoseFault(found, tuple(out), f"{when}, something had moved")
+    words = f"{_named_views(solved, outliers)} were left out: {when}, as they agree, {moved}."
+    views, evidence = _view_numbers(solved, outliers), run_evidence(len(run), len(rows))
+    step = or_alone(advice, views)
+    finding = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
+    yield PoseFault(finding, tuple(outliers), f"{when}, something had moved")
 
 
 def _other_boards(solved: Solved, run: IntArray, *, is_behind: bool) -> Iterator[PoseFault]:
-    """Views at one end that a board of another size explains."""
-    agreed, out = solved.agreed, np.sort(run).tolist()
-    some = np.isin(np.arange(len(agreed.used)), run)
-    found = common_size(agreed.problem, agreed.fit, some)
-    if found is None or not found[1].all():
+    """Outliers at one end of the session that a board of another size explains."""
+    inliers, outliers = solved.agreed, np.sort(run).tolist()
+    is_in_run = np.isin(np.arange(len(inliers.used)), run)
+    size = common_size(inliers.problem, inliers.fit, is_in_run)
+    if size is None or not size[1].all():
         return
     when = _when(solved, run, is_behind=is_behind)
     words = (
-        f"{_views(solved, out)} were left out: {when}, as they agree, the target is another one, "
-        f"{figure(100.0 * abs(found[0]))} % {'larger' if found[0] > 0.0 else 'smaller'} than that "
-        "of the other views."
+        f"{_named_views(solved, outliers)} were left out: {when}, as they agree, the target is "
+        f"another one, {figure(100.0 * abs(size[0]))} % "
+        f"{'larger' if size[0] > 0.0 else 'smaller'} than that of the other views."
     )
     step = Remedy("Measure both prints, take one of them for all views, and record again.")
-    evidence = run_evidence(len(run), len(agreed.used))
-    views = _numbers(solved, out)
-    fault = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
-    yield PoseFault(fault, tuple(out), f"{when}, the target was another one")
+    evidence = run_evidence(len(run), len(inliers.used))
+    views = _view_numbers(solved, outliers)
+    finding = Finding("something_moved", f"V{words[1:]}", step, views, mahalanobis_sq=evidence)
+    yield PoseFault(finding, tuple(outliers), f"{when}, the target was another one")
 
 
 def _when(solved: Solved, run: IntArray, *, is_behind: bool) -> str:
-    """Since when views at one end, or until when, in the order of their stops."""
+    """When views at the end, or the beginning, of the session were taken, in words."""
     rows = solved.cell.rows
     if is_behind:
         return f"from view {rows[int(run[0])].view} on"
     last = rows[int(run[-1])].station
-    behind = min((row for row in rows if row.station > last), key=lambda row: row.station)
-    return f"before view {behind.view}"
+    following = min((row for row in rows if row.station > last), key=lambda row: row.station)
+    return f"before view {following.view}"
 
 
 def _common_steps(solved: Solved, run: IntArray) -> list[tuple[str, FloatArray]]:
-    """Frames of which one step explains some views, and the step: that scatters least first."""
-    agreed, found = solved.agreed, []
-    some = np.isin(np.arange(len(agreed.used)), run)
-    for frame in agreed.problem.unknown:
-        step = common_change(agreed.problem, agreed.fit, frame, some)
+    """Frames with a common step that explains some views, and the step; least scatter first."""
+    inliers, steps = solved.agreed, []
+    is_in_run = np.isin(np.arange(len(inliers.used)), run)
+    for frame in inliers.problem.unknown:
+        step = common_change(inliers.problem, inliers.fit, frame, is_in_run)
         if step is None:
             continue
         change, explained = step
-        asked = agreed.problem.change_of(frame, agreed.fit.state)[run]
-        scatter_m = float(np.median(distances(asked, change)[0]))
+        changes = inliers.problem.change_of(frame, inliers.fit.state)[run]
+        scatter_m = float(np.median(distances(changes, change)[0]))
         if explained.all() or scatter_m < _SURELY_ALIKE * float(np.linalg.norm(change[:3, 3])):
-            found.append((scatter_m, frame, change))
-    return [(frame, change) for _, frame, change in sorted(found, key=lambda item: item[0])]
+            steps.append((scatter_m, frame, change))
+    return [(frame, change) for _, frame, change in sorted(steps, key=lambda item: item[0])]
 
 
-def _thing(frame: str) -> str:
+def _body(frame: str) -> str:
     return frame.partition("_")[0].replace("cam", "camera")
 
 
-def _elsewhere(change: FloatArray) -> str:
+def _displacement_words(change: FloatArray) -> str:
     shift_mm, turn_deg = pose_difference(np.eye(4), change)
     return f"{mm_and_deg(shift_mm, turn_deg)} elsewhere"
 
 
 def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
-    """Pairs of views of one camera, each of which fits the pose of the other."""
+    """Pairs of views of one camera, each of which fits the other's pose."""
     rows = solved.cell.rows
     for first, second in sorted(mutual.items()):
         if first < second:
@@ -302,107 +296,106 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
                 "each fits the pose in the other's row. They were left out."
             )
             views = (rows[first].view, rows[second].view)
-            step = Remedy(
-                "Write a copy of the session in which their images are exchanged, and calibrate "
-                "it.",
-                exchanging(*views),
+            do = (
+                "Write a copy of the session in which their images are exchanged, and calibrate it."
             )
-            found = Finding(EXCHANGED, words, step, views)
-            yield PoseFault(found, (first, second))
+            finding = Finding(EXCHANGED, words, Remedy(do, exchanging(*views)), views)
+            yield PoseFault(finding, (first, second))
 
 
-def _numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
+def _view_numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
     return tuple(solved.cell.rows[row].view for row in rows)
 
 
-def _views(solved: Solved, rows: Sequence[int]) -> str:
-    return f"views {some_of([*map(str, _numbers(solved, rows))], _LISTED)}"
+def _named_views(solved: Solved, rows: Sequence[int]) -> str:
+    return f"views {some_of([*map(str, _view_numbers(solved, rows))], _LISTED)}"
 
 
 def _pushed_bases(solved: Solved) -> list[PoseFault]:
-    """Robots whose observations all disagree from some stop on, as one other place explains."""
-    # Such observations are left out, and the base is where it stood before: a base is no frame that
-    # may be two, because all that its robot carries hangs on it.
+    """Robots whose observations are all outliers from some stop on, as if the base had moved."""
+    # Such observations are left out, and the base stays where it was: unlike other frames, a base
+    # is not split in two when it moves, as all that its robot carries hangs on it.
     problem, used = solved.agreed.problem, solved.agreed.used
-    stops, found = problem.observations.stops, []
+    stops, faults = problem.observations.stops, []
     for robot, base in problem.tree.bases.items():
         flange = problem.tree.flanges[robot]
-        mine = problem.through(flange)
-        first = int(stops[mine & used].max(initial=-1)) + 1
-        after = np.flatnonzero(mine & ~used & (stops >= first))
+        by_robot = problem.through(flange)
+        first = int(stops[by_robot & used].max(initial=-1)) + 1
+        after = np.flatnonzero(by_robot & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
             continue
-        moved = _moved_by(solved, base, after)
+        moved = _base_displacement(solved, base, after)
         as_if = f", as if {base} had been pushed by {moved}" if moved else ""
         words = (
             f"All {len(after)} views by way of {flange} from stop "
             f"{solved.cell.stops[int(stops[after].min())]} on disagree with those before{as_if}: "
             f"{base} is where it stood before."
         )
-        views = _numbers(solved, after.tolist())
+        views = _view_numbers(solved, after.tolist())
         step = Remedy("Fasten it, and align the stops from there on alone.", look_at(views[0]))
         pushed = Finding("something_moved", words, step, views)
-        found.append(PoseFault(pushed, tuple(after.tolist())))
-    return found
+        faults.append(PoseFault(pushed, tuple(after.tolist())))
+    return faults
 
 
-def _moved_by(solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None) -> str:
-    """By how much observations ask for a base elsewhere, in words; empty where they disagree."""
-    asked = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
+def _base_displacement(
+    solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None
+) -> str:
+    """Mean displacement of a base by some observations, in words; empty where they disagree."""
+    changes = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
     if of is not None:
-        asked = invert(of) @ asked @ of
-    mean = mean_transform(asked)
+        changes = invert(of) @ changes @ of
+    mean = mean_transform(changes)
     shift_mm, turn_deg = pose_difference(np.eye(4), mean)
-    scatter_mm = 1e3 * float(np.median(distances(asked, mean)[0]))
+    scatter_mm = 1e3 * float(np.median(distances(changes, mean)[0]))
     return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
 
 
 def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
-    """Stops at which all that was seen by way of a robot asks for it to stand elsewhere."""
+    """Stops at which all observations through a robot agree that its pose is wrong."""
     problem, used = solved.agreed.problem, solved.agreed.used
     stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
-        mine = problem.through(problem.tree.flanges[robot])
-        for stop in np.unique(stops[mine & ~used]).tolist():
-            rows = np.flatnonzero(mine & (stops == stop))
+        by_robot = problem.through(problem.tree.flanges[robot])
+        for stop in np.unique(stops[by_robot & ~used]).tolist():
+            rows = np.flatnonzero(by_robot & (stops == stop))
             if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
                 continue
-            moved = _moved_by(solved, base, rows, problem.poses[robot][stop])
+            moved = _base_displacement(solved, base, rows, problem.poses[robot][stop])
             if moved:
                 words = (
                     f"Robot {robot} did not stand at stop {solved.cell.stops[stop]} where "
                     f"its pose says: all {len(rows)} views by way of it disagree with the others, "
                     f"as if the flange had been moved by {moved}, and were left out "
-                    f"({_views(solved, rows.tolist())})."
+                    f"({_named_views(solved, rows.tolist())})."
                 )
-                views = _numbers(solved, rows.tolist())
+                views = _view_numbers(solved, rows.tolist())
                 fix = "Correct its pose there in views.csv, or leave the stop out."
-                found = Finding("wrong_pose", words, Remedy(fix, look_at(views[0])), views)
+                finding = Finding("wrong_pose", words, Remedy(fix, look_at(views[0])), views)
                 short = f"the pose of robot {robot} at stop {solved.cell.stops[stop]} is wrong"
-                yield PoseFault(found, tuple(rows.tolist()), short)
+                yield PoseFault(finding, tuple(rows.tolist()), short)
 
 
 def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
-    """Why observations that disagree are left out, by view, with what they fit instead."""
-    agreed, rows, problem = solved.agreed, solved.cell.rows, solved.agreed.problem
-    out = np.flatnonzero(~agreed.used)
-    if not len(out):
+    """Why outliers are left out, by view, with the stops that they fit instead."""
+    inliers, rows, problem = solved.agreed, solved.cell.rows, solved.agreed.problem
+    outliers = np.flatnonzero(~inliers.used)
+    if not len(outliers):
         return {}
-    away = residuals(solved)[out]
-    counted = np.maximum(agreed.distances.directions, 1)
-    times, limit = (
-        np.sqrt(array / counted) for array in (agreed.distances.squares, agreed.distances.limit)
-    )
-    fitting = _fitting(solved, out)
+    residuals_mm_deg, distances_sq = residuals(solved)[outliers], inliers.distances
+    directions = np.maximum(distances_sq.directions, 1)
+    distance = np.sqrt(distances_sq.squares / directions)
+    limit = np.sqrt(distances_sq.limit / directions)
+    fitting = _fitting_stations(solved, outliers)
     mutual = exchanged(problem, fitting)
-    robots = {row: fault.short for fault in faults if fault.short for row in fault.rows}
+    clauses = {row: fault.short for fault in faults if fault.short for row in fault.rows}
     rest = "the rest of the cell" if solved.cell.mount is None else "the other views"
-    found = {}
-    for at, (mm, deg) in zip(out.tolist(), away.tolist(), strict=True):
+    reasons_by_view = {}
+    for at, (mm, deg) in zip(outliers.tolist(), residuals_mm_deg.tolist(), strict=True):
         turned = f" and {figure(deg)} deg" if problem.observations.has_rotation[at] else ""
         cause = _cause(solved, at)
-        if at in robots:
-            cause = robots[at]
+        if at in clauses:
+            cause = clauses[at]
         elif at in mutual:
             other = rows[mutual[at]]
             cause = (
@@ -413,21 +406,22 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
             stops = [str(solved.cell.stops[index]) for index in fitting[at][:_NAMED]]
             one = "stop" if len(stops) == 1 else "another stop, as"
             cause = f"its image is of {one} {', '.join(stops)}; {cause}"
-        # Little may be known of where it should be: what is far away is wrong all the same.
+        # What is far away is rejected even where the prediction is uncertain.
         beyond = (
-            f"{figure(times[at])} times the noise (limit {figure(limit[at])})"
-            if times[at] > limit[at]
+            f"{figure(distance[at])} times the noise (limit {figure(limit[at])})"
+            if distance[at] > limit[at]
             else "many times as far as most"
         )
-        found[rows[at].view] = (
-            f"disagrees with {rest}: it places {_called(solved, rows[at].seen)} {figure(mm)} mm"
-            f"{turned} away, {beyond}; {cause}"
+        target = _target_words(solved, rows[at].seen)
+        reasons_by_view[rows[at].view] = (
+            f"disagrees with {rest}: it places {target} {figure(mm)} mm{turned} away, {beyond}; "
+            f"{cause}"
         )
-    return found
+    return reasons_by_view
 
 
-def _called(solved: Solved, frame: str) -> str:
-    """A target or point in words."""
+def _target_words(solved: Solved, frame: str) -> str:
+    """Name of a target or point in words."""
     if solved.cell.mount is None:
         return frame.partition("@")[0]
     is_probe = frame.startswith("point") and frame not in solved.agreed.problem.points
@@ -435,7 +429,7 @@ def _called(solved: Solved, frame: str) -> str:
 
 
 def _cause(solved: Solved, at: int) -> str:
-    """What is wrong with an observation, by those of its stop and its target that agree."""
+    """Likely cause of an outlier, by the inliers of its stop and of its target."""
     rows, used, problem = solved.cell.rows, solved.agreed.used, solved.agreed.problem
     seen = np.array(problem.observations.observed)
     of_its_target = np.flatnonzero((seen == seen[at]) & used)
@@ -458,42 +452,41 @@ def _stop(solved: Solved, row: int) -> int:
 
 
 def residuals(solved: Solved) -> FloatArray:
-    """Distance (n, 2) of each observation from what is predicted [mm], [deg]."""
-    away_m, away_rad = apart(solved.agreed.problem, solved.agreed.fit.state)
-    return np.stack([1e3 * away_m, np.rad2deg(away_rad)], axis=1)
+    """Residuals (n, 2) of the observations, translation and rotation [mm], [deg]."""
+    metres, radians = apart(solved.agreed.problem, solved.agreed.fit.state)
+    return np.stack([1e3 * metres, np.rad2deg(radians)], axis=1)
 
 
-def _fitting(solved: Solved, out: IntArray) -> dict[int, list[int]]:
-    """The other stations that observations fit; see `other_stops`."""
+def _fitting_stations(solved: Solved, outliers: IntArray) -> dict[int, list[int]]:
+    """The other stations that outliers fit; see `other_stops`."""
     agreed = solved.agreed
     turns = {
         frame_name("target", name): rotation_transforms(target)
         for name, target in solved.cell.session.boards.items()
     }
-    return other_stops(agreed.problem, agreed.used, agreed.fit, out, agreed.moves, turns)
+    return other_stops(agreed.problem, agreed.used, agreed.fit, outliers, agreed.moves, turns)
 
 
-def _exchanged(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
+def _exchanged_poses(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
     """Pairs of poses of one robot that are exchanged."""
     rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
-    found = []
+    faults = []
     for robot in problem.robots:
-        mine = np.flatnonzero(problem.through(problem.tree.flanges[robot])).tolist()
+        by_robot = np.flatnonzero(problem.through(problem.tree.flanges[robot])).tolist()
         pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
-        for at in mine:
+        for at in by_robot:
             if at in mutual:
                 both = sorted((rows[at].station, rows[mutual[at]].station))
                 pairs[both[0], both[1]].append(at)
         for stations, members in pairs.items():
-            at_both = [at for at in mine if rows[at].station in stations]
+            at_both = [at for at in by_robot if rows[at].station in stations]
             if len(members) >= 2 * _FEWEST and not used[at_both].any():
                 first, second = (solved.cell.stops[station] for station in stations)
                 short = f"the poses of robot {robot} at stops {first} and {second} are exchanged"
                 words = (
-                    f"{short[0].upper()}{short[1:]}: {_views(solved, at_both)} were left out. Each "
-                    "pose is right at the other's stop."
+                    f"{short[0].upper()}{short[1:]}: {_named_views(solved, at_both)} were left "
+                    "out. Each pose is right at the other's stop."
                 )
-                both_views = _numbers(solved, at_both)
-                swapped = Finding(EXCHANGED, words, _EXCHANGE, both_views)
-                found.append(PoseFault(swapped, tuple(at_both), short))
-    return found
+                finding = Finding(EXCHANGED, words, _EXCHANGE, _view_numbers(solved, at_both))
+                faults.append(PoseFault(finding, tuple(at_both), short))
+    return faults

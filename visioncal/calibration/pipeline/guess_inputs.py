@@ -1,4 +1,4 @@
-"""Which reading of a session's poses is right: measured from its images, without its robot."""
+"""Input of the search for misread poses: the camera's poses by images, the robot's numbers."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,7 +21,7 @@ from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.session.columns import MEASURED_CAM_POSE, POSE
 
-# What the camera's poses need; the robot has no part in it, so that it can be wrong.
+# Stages that the camera's poses need; none uses the robot, whose poses may be misread.
 _SEEING = ("detect", "intrinsics", "pnp")
 
 
@@ -32,9 +32,8 @@ def guess_session(
 
     Args:
         session: The session, with images or measured poses of the target.
-        robot: The robot's numbers as they were before the session was made of them, one row a
-            view; left out, those of the session are taken.
-        progress: Told of long work.
+        robot: The robot's original numbers, one row a view; those of the session where None.
+        progress: Called with the progress of long work.
 
     Returns:
         The readings, and whether one stands out.
@@ -42,35 +41,29 @@ def guess_session(
     Raises:
         DataError: There is nothing to read, or the target is in no view.
         DegenerateError: Too few views have both poses, or the lens cannot be estimated.
-        ConvergenceError: The intrinsics do not come to rest.
+        ConvergenceError: The intrinsics do not converge.
     """
-    return guess_seen(seen_by_camera(RunState(session, progress)), robot)
+    return guess_seen(with_camera_poses(RunState(session, progress)), robot)
 
 
-def guess_seen(seen: RunState, robot: PoseNumbers | None = None) -> Guess:
-    """Does what `guess_session` does once the camera's poses are known.
-
-    Args:
-        seen: What is known, the camera's poses with all their rivals.
-        robot: The robot's numbers; left out, those of the session are taken.
+def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
+    """Does what `guess_session` does, once the camera's poses are known, with all alternatives.
 
     Raises:
         DataError: There is nothing to read.
         DegenerateError: Too few views have both poses.
     """
-    matched = seen.reported.matched
-    # Joints that are misread say nothing about the poses.
-    chain = (
-        None
-        if matched is not None and matched.misread
-        else chain_poses(seen.session, None if matched is None else matched.arm)
-    )
+    matched = run.reported.matched
+    # Misread joints say nothing about the poses.
+    joint_poses = None
+    if matched is None or not matched.misread:
+        joint_poses = chain_poses(run.session, None if matched is None else matched.arm)
     if robot is None:
-        poses = numbers_in(seen.session, POSE)
-        robot = reported_or_chained(at_times(seen) if seen.clocks else poses, chain)
-    is_measured, mount = bool(seen.corners), seen.session.mount
-    for camera in seen_ways(seen, robot):
-        guess = guess_reading(robot, camera, mount, chain=chain, is_measured=is_measured)
+        poses = numbers_in(run.session, POSE)
+        robot = reported_or_chained(robot_numbers(run) if run.clocks else poses, joint_poses)
+    is_measured, mount = bool(run.corners), run.session.mount
+    for camera in camera_pose_choices(run, robot):
+        guess = guess_reading(robot, camera, mount, chain=joint_poses, is_measured=is_measured)
         if not guess.stands_out and guess.declared.closes:
             break
     return guess
@@ -82,9 +75,9 @@ def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNum
     Raises:
         DataError: The target is in no view.
         DegenerateError: The lens cannot be estimated.
-        ConvergenceError: The intrinsics do not come to rest.
+        ConvergenceError: The intrinsics do not converge.
     """
-    return camera_numbers(seen_by_camera(RunState(session, progress)))
+    return camera_numbers(with_camera_poses(RunState(session, progress)))
 
 
 def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | None:
@@ -110,9 +103,13 @@ def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | No
     return poses if np.isfinite(poses).any() else None
 
 
-def reported_or_chained(read: PoseNumbers, chain: FloatArray | None) -> PoseNumbers:
-    """The robot's poses as they were reported; those of its joints where none were."""
-    return read if chain is None or read.there.any() else PoseNumbers.of_poses(chain, read.places)
+def reported_or_chained(read: PoseNumbers, joint_poses: FloatArray | None) -> PoseNumbers:
+    """The robot's reported poses; those of its joints where none were reported."""
+    return (
+        read
+        if joint_poses is None or read.there.any()
+        else PoseNumbers.of_poses(joint_poses, read.places)
+    )
 
 
 def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
@@ -122,78 +119,77 @@ def numbers_in(session: Session, columns: tuple[str, ...]) -> PoseNumbers:
     return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places_of(session))
 
 
-def at_times(seen: RunState) -> PoseNumbers:
-    """The robot's numbers out of its stream, at the views' times; NaN where it has none."""
-    numbers = np.full((len(seen.session.views), 7), np.nan)
-    for at, view in enumerate(seen.session.views):
-        if view.number in seen.base_from_flange:
-            pose = RigidTransform.from_matrix(seen.base_from_flange[view.number])
+def robot_numbers(run: RunState) -> PoseNumbers:
+    """The robot's poses at the views, also from its stream, as numbers; NaN where it has none."""
+    numbers = np.full((len(run.session.views), 7), np.nan)
+    for at, view in enumerate(run.session.views):
+        if view.number in run.base_from_flange:
+            pose = RigidTransform.from_matrix(run.base_from_flange[view.number])
             numbers[at] = [*pose.translation, *pose.rotation.as_quat()]
-    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places_of(seen.session))
+    return PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places_of(run.session))
 
 
-def seen_by_camera(known: RunState) -> RunState:
-    """What is known once the camera's poses are, whatever the robot's are."""
-    # Which moment of a stream a view belongs to is found by how both turned, however they are read.
-    names = (*_SEEING, "robot", "clock") if waits_for_clock(known.session) else _SEEING
+def with_camera_poses(run: RunState) -> RunState:
+    """Runs the stages that the camera's poses need, whatever the robot's poses are."""
+    # The offset of a stream's clock is found by rotation angles, which no reading changes.
+    names = (*_SEEING, "robot", "clock") if waits_for_clock(run.session) else _SEEING
     for stage in STAGES:
         if stage.name in names:
             try:
-                known = stage.run(known)
+                run = stage.run(run)
             except VisioncalError as error:
-                cause = unseen_cause(known)
+                cause = unseen_cause(run)
                 if cause is None:
                     raise
                 raise because(error, cause) from error
-    return known
+    return run
 
 
-def seen_ways(seen: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
-    """The camera's poses as the declared robot would have them, and then by the images alone."""
-    seen = replace(seen, poses=seen.poses_of_one_board)
-    # They differ where an image allows several poses: the wrong robot would choose wrong ones.
-    if any(len(pose.cam_from_target) > 1 for pose in seen.poses.values()):
-        # Where the declared robot cannot choose, the images alone are left.
+def camera_pose_choices(run: RunState, robot: PoseNumbers) -> Iterator[PoseNumbers]:
+    """The camera's poses chosen by the declared robot poses, and then by the images alone."""
+    run = replace(run, poses=run.poses_of_one_board)
+    # They differ where an image allows several poses: misread robot poses would choose wrong ones.
+    if any(len(pose.cam_from_target) > 1 for pose in run.poses.values()):
+        # Where the declared robot poses do not allow a choice, the images alone remain.
         with suppress(VisioncalError):
-            yield camera_numbers(_chosen(seen, robot))
-    yield camera_numbers(seen)
+            yield camera_numbers(_chosen(run, robot))
+    yield camera_numbers(run)
 
 
-def _chosen(seen: RunState, robot: PoseNumbers) -> RunState:
-    """Chooses among the poses that an image allows by the declared robot."""
-    base_from_flange = dict(
-        zip((view.number for view in seen.session.views), robot.poses(), strict=True)
-    )
-    both = [pose for pose in seen.poses.values() if np.isfinite(base_from_flange[pose.view]).all()]
+def _chosen(run: RunState, robot: PoseNumbers) -> RunState:
+    """Chooses among the poses that an image allows by the declared robot poses."""
+    numbers = (view.number for view in run.session.views)
+    base_from_flange = dict(zip(numbers, robot.poses(), strict=True))
+    both = [pose for pose in run.poses.values() if np.isfinite(base_from_flange[pose.view]).all()]
     problem = chain(
-        seen.session.mount,
+        run.session.mount,
         np.array([base_from_flange[view.view] for view in both]).reshape(-1, 4, 4),
         np.array([view.cam_from_target[0] for view in both]).reshape(-1, 4, 4),
     )
-    boards = [*seen.session.boards.values()]
+    boards = [*run.session.boards.values()]
     targets = {name: boards[both[0].board] for name in problem.observations.observed if boards}
-    found = init_frames(problem, both, targets)
-    return replace(seen, poses={view.view: view for view in found.views})
+    initial = init_frames(problem, both, targets)
+    return replace(run, poses={view.view: view for view in initial.views})
 
 
-def camera_numbers(seen: RunState) -> PoseNumbers:
-    """The poses of one board, of each view the best by its image, or as the session gives them."""
-    shown_in = seen.poses_of_one_board
-    if not seen.corners:
-        numbers = numbers_in(seen.session, MEASURED_CAM_POSE)
-        shown = np.array([view.number in shown_in for view in seen.session.views])
+def camera_numbers(run: RunState) -> PoseNumbers:
+    """Poses of one board, the best of each view by its image, or as measured in the session."""
+    by_view = run.poses_of_one_board
+    if not run.corners:
+        numbers = numbers_in(run.session, MEASURED_CAM_POSE)
+        has_pose = np.array([view.number in by_view for view in run.session.views])[:, None]
         return replace(
             numbers,
-            positions=np.where(shown[:, None], numbers.positions, np.nan),
-            rotations=np.where(shown[:, None], numbers.rotations, np.nan),
+            positions=np.where(has_pose, numbers.positions, np.nan),
+            rotations=np.where(has_pose, numbers.rotations, np.nan),
         )
-    poses = np.full((len(seen.session.views), 4, 4), np.nan)
-    for at, view in enumerate(seen.session.views):
-        if view.number in shown_in:
-            poses[at] = shown_in[view.number].cam_from_target[0]
-    return PoseNumbers.of_poses(poses, places_of(seen.session))
+    poses = np.full((len(run.session.views), 4, 4), np.nan)
+    for at, view in enumerate(run.session.views):
+        if view.number in by_view:
+            poses[at] = by_view[view.number].cam_from_target[0]
+    return PoseNumbers.of_poses(poses, places_of(run.session))
 
 
 def places_of(session: Session) -> tuple[str, ...]:
-    """What messages call the rows of a session."""
+    """Names of a session's rows in messages."""
     return tuple(f"view {view.number}" for view in session.views)

@@ -1,5 +1,6 @@
-"""What a session is judged by: its cameras, robots and targets, and its weakest link."""
+"""Collects the verdict's input: results by camera, robot and target; checks observability."""
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeAlias
@@ -8,15 +9,15 @@ import numpy as np
 
 from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
-from visioncal.calibration.pipeline.budget import columns_of_boards, middles_moved, middles_of
-from visioncal.calibration.pipeline.fault_messages import moved_found
-from visioncal.calibration.pipeline.lens_fields import errors_found, lens_changes
+from visioncal.calibration.pipeline.budget import columns_of_boards, middle_jacobians, middles_of
+from visioncal.calibration.pipeline.fault_messages import moved_finding
+from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
 from visioncal.calibration.pipeline.network_ties import (
-    or_measured,
+    connection_advice,
+    measuring_advice,
     robot_motion,
-    standing_tie,
+    sole_static_view,
     tilting_advice,
-    untied_words,
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
@@ -35,7 +36,7 @@ from visioncal.calibration.stages.priors import prior_words
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
-from visioncal.core.types import FloatArray, Mount, Rejection
+from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import NOTE, Finding, Remedy
 from visioncal.estimation.arm import stops_of
 from visioncal.estimation.budget import radius95
@@ -55,33 +56,31 @@ from visioncal.estimation.tree import Tree
 from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 
 
-def findings_of(known: RunState) -> Findings:
-    """Puts together what a session is judged by."""
-    answer, solved = known.solved, known.fitted
-    tree = solved.cell.tree
-    tied = [view for view in answer.views if {view.seer, view.seen} <= tree.branches.keys()]
+def findings_of(run: RunState) -> Findings:
+    """Collects the input of the verdict."""
+    answer, solved = run.solved, run.fitted
+    frames = solved.cell.tree.branches.keys()
+    connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
-    worst, places, warnings = _of_pair(known) if known.mount else _of_cell(known)
-    of_arms = [
-        _with_alike(doubt, known)
-        for doubt in doubts_of_arms(
-            solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell
-        )
-    ]
+    worst, places, warnings = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
+    doubts = doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell)
+    of_arms = [_with_alternative(doubt, run) for doubt in doubts]
     if any(warning.kind == "measured_turns" for warning in warnings):
-        # They follow what the camera sees, and so the arm's posture, and joint angles do not help.
+        # These errors come from the camera's poses and appear to depend on the arm's posture; joint
+        # angles would not help.
         of_arms = [arm for arm in of_arms if arm.do is not NO_JOINTS]
     of_rest = [
         *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
         *solved.found_of_looks(answer.covariance),
     ]
-    of_lenses = [*errors_found(answer.lenses)]
+    of_lenses = [*lens_findings(answer.lenses)]
     doubted = {finding.kind for finding in (*of_arms, *of_lenses, *of_rest)}
     if doubted & OF_CHAIN or not solved.agreed.used.all():
         of_lenses += lens_changes(solved)
+    is_read = all(view.seer.startswith("instrument") for view in connected)
     return Findings(
-        _pairs(tied, explained, answer, alone=known.mount is not None),
-        _sensors(tied, answer.sigmas, solved.shown_px, known),
+        _pairs(connected, explained, answer, alone=run.mount is not None),
+        _sensors(connected, answer.sigmas, solved.shown_px, run),
         _arms(answer),
         worst,
         places,
@@ -89,46 +88,47 @@ def findings_of(known: RunState) -> Findings:
             *(fault.found for fault in answer.faults),
             *of_arms,
             *of_lenses,
-            *known.warnings,
+            *run.warnings,
             *(finding for finding in of_rest if finding.kind != NOTE),
             *warnings,
-            *_untied(known),
+            *_unconnected(run),
         ),
         (
-            *known.notes,
-            *_clock_words(known),
+            *run.notes,
+            *_clock_words(run),
             *notes_on_arms(solved.arms, answer.arms),
             *(finding.reason for finding in of_rest if finding.kind == NOTE),
         ),
-        known.mount or _mount(tied),
-        known.session.need,
-        picks_of(_pickable(known), known.session.need),
-        None if known.mount else _standing_tie(solved.cell, answer.last_edges),
+        run.mount or ("instrument" if is_read else "eye-to-hand"),
+        run.session.need,
+        picks_of(_pick_inputs(run), run.session.need),
+        None if run.mount else _sole_static_view(solved.cell, answer.last_edges),
     )
 
 
-def _standing_tie(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | None:
+def _sole_static_view(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | None:
+    """The static view that alone links the worst frame to the rest, if any."""
     worst = {
         frame: max(value.sigma / value.limit for value in _directions(cell, frame, edge))
         for frame, edge in edges.items()
     }
-    return standing_tie(cell, max(worst, key=worst.__getitem__)) if worst else None
+    return sole_static_view(cell, max(worst, key=worst.__getitem__)) if worst else None
 
 
-def _with_alike(found: Finding, known: RunState) -> Finding:
-    """A frame of one camera and robot that moved at once, with what would look the same."""
-    steps = [test.step for test in known.solved.misfits.values() if isinstance(test.step, Move)]
-    if found.kind != MOVED_FRAME or known.mount is None or not steps:
-        return found
-    tree = known.fitted.cell.tree
+def _with_alternative(finding: Finding, run: RunState) -> Finding:
+    """Adds to a frame of one camera and robot that moved what cannot be distinguished from that."""
+    steps = [test.step for test in run.solved.misfits.values() if isinstance(test.step, Move)]
+    if finding.kind != MOVED_FRAME or run.mount is None or not steps:
+        return finding
+    tree = run.fitted.cell.tree
     on_flange = tree.body(steps[0].frame) != tree.root
     same = "Another tool frame in the controller" if on_flange else "A robot's base that was pushed"
-    return replace(found, words=f"{found.words} {same} would look the same.")
+    return replace(finding, words=f"{finding.words} {same} would look the same.")
 
 
-def _pickable(known: RunState) -> PickInputs:
-    """What picks are predicted from."""
-    answer, solved = known.solved, known.fitted
+def _pick_inputs(run: RunState) -> PickInputs:
+    """Input of the prediction of picks."""
+    answer, solved = run.solved, run.fitted
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return PickInputs(
         answer.problem,
@@ -139,112 +139,98 @@ def _pickable(known: RunState) -> PickInputs:
         dict(zip(answer.problem.robots, freedom, strict=True)),
         solved.arms,
         columns_of_boards(solved),
-        middles_moved(solved),
+        middle_jacobians(solved),
         answer.problem,
         {name: lens.noise_px * lens.levels.jitter for name, lens in answer.lenses.items()},
     )
 
 
-def _untied(known: RunState) -> Iterator[Finding]:
-    for frame in known.fitted.untied:
-        if known.mount is not None and frame.startswith("target"):
+def _unconnected(run: RunState) -> Iterator[Finding]:
+    for frame in run.fitted.untied:
+        if run.mount is not None and frame.startswith("target"):
             words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
             yield Finding("unseen_target", words)
         else:
-            step = Remedy(untied_words(known.cell, frame))
+            step = Remedy(connection_advice(run.cell, frame))
             yield Finding("untied", f"{frame} is tied to nothing.", step)
 
 
 _Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence[Finding]]
 
 
-def _of_pair(known: RunState) -> _Parts:
-    """The worst directions and the place of work of one camera and one robot."""
-    answer, work = known.solved, known.work
+def _pair_accuracy(run: RunState) -> _Parts:
+    """Worst directions, accuracy where the views look, and findings of one camera and one robot."""
+    answer, work, mount = run.solved, run.work, run.session.mount
     budget = _in_words(work.budget_mm)
     place = PointAccuracy("Where the views look, a point", budget, work.radius95_mm)
-    mount = known.session.mount
-    found = [*_of_measured(known)]
-    return directions(answer.problem, answer.state, answer.covariance, mount), [place], found
+    worst = directions(answer.problem, answer.state, answer.covariance, mount)
+    return worst, [place], [*_measured_pose_findings(run)]
 
 
 def _in_words(budget_mm: Mapping[str, float]) -> dict[str, float]:
-    """A budget by sources in words; the names of frames, of which they are, stay."""
+    """Replaces underscores in the sources' names by spaces, but not in the frames' names."""
     parts = ((name.partition(" of "), mm) for name, mm in budget_mm.items())
     return {f"{source.replace('_', ' ')}{of}{frame}": mm for (source, of, frame), mm in parts}
 
 
-def _of_measured(known: RunState) -> Iterator[Finding]:
-    """Whether poses that another program measured have the robot's scale, and turn as it does."""
-    views = [
-        index
-        for index in known.base_from_flange
-        if index in known.poses and index not in known.reasons
-    ]
-    if known.cameras or known.mount == "instrument" or not views:
+def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
+    """Findings on measured poses whose scale or rotations differ from the robot's."""
+    usable = run.poses.keys() - run.reasons.keys()
+    views = [view for view in run.base_from_flange if view in usable]
+    if run.cameras or run.mount == "instrument" or not views:
         return
-    poses = np.array([known.base_from_flange[view] for view in views])
-    seen = np.array([known.poses[view].cam_from_target[0] for view in views])
-    parent = poses if known.mount == "eye-in-hand" else invert(poses)
-    # The one camera may have a name.
-    (edge,) = (edge for name, edge in known.solved.last_edges.items() if name.startswith("cam"))
-    if (found := distance_scale(parent, seen, edge.matrix)) is not None:
-        yield found
-    from_seer = edge.matrix @ seen
-    if known.mount == "eye-in-hand":
-        found = measured_turns(poses, from_seer)
-    else:
-        found = measured_turns(np.eye(4), parent @ from_seer)
-    if found is not None:
-        yield found
+    poses = np.array([run.base_from_flange[view] for view in views])
+    seen = np.array([run.poses[view].cam_from_target[0] for view in views])
+    parent = poses if run.mount == "eye-in-hand" else invert(poses)
+    # The camera may have a name.
+    (edge,) = (edge for name, edge in run.solved.last_edges.items() if name.startswith("cam"))
+    if (finding := distance_scale(parent, seen, edge.matrix)) is not None:
+        yield finding
+    target = edge.matrix @ seen
+    in_hand = run.mount == "eye-in-hand"
+    finding = (
+        measured_turns(poses, target) if in_hand else measured_turns(np.eye(4), parent @ target)
+    )
+    if finding is not None:
+        yield finding
 
 
-def _of_cell(known: RunState) -> _Parts:
-    """The worst directions and the frames of a whole cell, and what moved in it."""
-    answer, solved = known.solved, known.fitted
-    edges, budget = answer.last_edges, answer.budget_mm
-    taken_up = {*_taking_up(known)}
-    edges = {frame: edge for frame, edge in edges.items() if frame not in taken_up}
-    worst = [
-        direction
-        for frame, edge in edges.items()
-        for direction in _directions(solved.cell, frame, edge)
-    ]
+def _cell_accuracy(run: RunState) -> _Parts:
+    """Worst directions, accuracy of the frames, and moved frames of a whole cell."""
+    answer, cell, budget = run.solved, run.fitted.cell, run.solved.budget_mm
+    absorbing = {*_absorbing(run)}
+    edges = {frame: edge for frame, edge in answer.last_edges.items() if frame not in absorbing}
+    worst = [value for frame, edge in edges.items() for value in _directions(cell, frame, edge)]
     return (
         sorted(worst, key=lambda value: (value.is_rotation, -value.sigma)),
         [
             PointAccuracy(frame, _in_words(budget[frame]), 1e3 * radius95(edge.covariance[3:, 3:]))
             for frame, edge in edges.items()
         ],
-        [moved_found(move) for move in answer.moved],
+        [moved_finding(move) for move in answer.moved],
     )
 
 
-def _taking_up(known: RunState) -> Iterator[str]:
-    """The frames that take up what is open of a calibrated arm's first and last link.
+def _absorbing(run: RunState) -> Iterator[str]:
+    """Frames that absorb undetermined parameters of a calibrated arm's first and last link.
 
-    Its poses make up for that, so that the sigma of such a frame alone says little.
+    The arm's poses compensate that, so that the sigma of such a frame alone says little.
     """
-    answer, cell = known.solved, known.fitted.cell
+    answer, cell = run.solved, run.fitted.cell
     for robot, base in cell.tree.bases.items():
         if answer.arms[robot].numbers is None:
             continue
         bodies = {cell.tree.flanges[robot]}
-        # All that stands in the cell is placed from the reference, and turns with its arm's zero.
+        # Static frames are placed from the reference, and rotate with the zero of its arm.
         bodies |= {cell.tree.root} if base == cell.reference else set()
         yield base
         yield from (frame for frame in cell.tree.branches if cell.tree.body(frame) in bodies)
 
 
-def _mount(sights: Sequence[ViewResult]) -> Mount:
-    is_read = all(sight.seer.startswith("instrument") for sight in sights)
-    return "instrument" if is_read else "eye-to-hand"
-
-
-def _clock_words(known: RunState) -> Iterator[str]:
-    """Says what the fit makes of clocks that the motion determined."""
-    for pair, clock in known.solved.clocks(known).items():
-        if known.mount is None and clock is not known.clocks[pair].clock:
+def _clock_words(run: RunState) -> Iterator[str]:
+    """Notes on clock offsets of a whole cell that the fit estimates."""
+    for pair, clock in run.solved.clocks(run).items():
+        if run.mount is None and clock is not run.clocks[pair].clock:
             yield (
                 f"{pair.words}: the fit of the whole cell has the camera's clock "
                 f"{1e3 * clock.camera_minus_robot_s:+.2f} ms ahead (sigma "
@@ -253,107 +239,104 @@ def _clock_words(known: RunState) -> Iterator[str]:
 
 
 def _pairs(
-    sights: Sequence[ViewResult], explained: Collection[int], answer: Answer, *, alone: bool
+    views: Sequence[ViewResult], explained: Collection[int], answer: Answer, *, alone: bool
 ) -> list[JudgedPair]:
-    """What each camera saw of each target; of one camera and one robot, all that there is."""
-    rows: dict[tuple[str, str], list[ViewResult]] = {}
-    for sight in sights:
-        rows.setdefault(("", "") if alone else (sight.seer, sight.seen), []).append(sight)
+    """Results by camera and target; all in one for one camera and one robot."""
+    by_pair: dict[tuple[str, str], list[ViewResult]] = {}
+    for view in views:
+        by_pair.setdefault(("", "") if alone else (view.seer, view.seen), []).append(view)
     return [
         JudgedPair(
-            mine,
+            pair_views,
             [
                 Rejection(view.view, view.reason)
-                for view in mine
-                if _disagrees(view) and view.view not in explained
+                for view in pair_views
+                if _is_outlier(view) and view.view not in explained
             ],
-            f"{seer} of {seen}" if len(rows) > 1 else "",
-            *_weighed(answer, mine),
+            f"{seer} of {seen}" if len(by_pair) > 1 else "",
+            *_weighted_rms(answer, pair_views),
         )
-        for (seer, seen), mine in rows.items()
+        for (seer, seen), pair_views in by_pair.items()
     ]
 
 
-def _weighed(answer: Answer, sights: Sequence[ViewResult]) -> tuple[Rms, Rms]:
-    """What a sensor's noise makes of some sights, and by how much they are away when left out."""
-    # A square varies as its mean does, so that views weigh by the inverse square of what is
-    # expected of each where doubt begins: one whose own pose is known badly says nothing of the
-    # others.
-    used, held, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
-    seen = {(sight.seer, sight.seen) for sight in sights}
-    mine = np.array([pair in seen for pair in zip(used.observers, used.observed, strict=True)])
+def _weighted_rms(answer: Answer, views: Sequence[ViewResult]) -> tuple[Rms, Rms]:
+    """Weighted rms of the sensor's noise in the poses of some views, and of left-out residuals."""
+    # The variance of a square is proportional to the square of its mean, so that views are weighted
+    # by the inverse square of the expected residual at the limit of doubt: a view whose own pose is
+    # uncertain says nothing of the others.
+    used, held_out, limits = answer.problem.observations, answer.held_out, CalibrationLimits()
+    pairs = {(view.seer, view.seen) for view in views}
+    of_pairs = np.array([pair in pairs for pair in zip(used.observers, used.observed, strict=True)])
 
-    def rms(block: slice, away: FloatArray, doubt: float) -> FloatArray | None:
-        known = mine & np.isfinite(away)
-        if not known.any():
+    def rms(block: slice, residuals: FloatArray, doubt: float) -> FloatArray | None:
+        finite = of_pairs & np.isfinite(residuals)
+        if not finite.any():
             return None
-        noise = np.trace(used.covariance[known, block, block], axis1=1, axis2=2)
+        noise = np.trace(used.covariance[finite, block, block], axis1=1, axis2=2)
         weights = (noise + doubt**2) ** -2.0
-        squares = np.stack([noise, away[known] ** 2], axis=1)
+        squares = np.stack([noise, residuals[finite] ** 2], axis=1)
         return np.sqrt(np.average(squares, axis=0, weights=weights))
 
-    turned = rms(slice(3), held.away_rad, float(np.deg2rad(limits.scatter_deg[0])))
-    shifted = rms(slice(3, 6), held.away_m, 1e-3 * limits.scatter_mm[0])
-    noise, away = (
+    rad = rms(slice(3), held_out.away_rad, float(np.deg2rad(limits.scatter_deg[0])))
+    metres = rms(slice(3, 6), held_out.away_m, 1e-3 * limits.scatter_mm[0])
+    noise, residual = (
         Rms(
-            0.0 if shifted is None else 1e3 * float(shifted[at]),
-            None if turned is None else float(np.rad2deg(turned[at])),
+            0.0 if metres is None else 1e3 * float(metres[at]),
+            None if rad is None else float(np.rad2deg(rad[at])),
         )
         for at in (0, 1)
     )
-    return noise, away
+    return noise, residual
 
 
-def _disagrees(view: ViewResult) -> bool:
-    """Whether an observation was left out although its chain could be closed."""
+def _is_outlier(view: ViewResult) -> bool:
+    """Whether an observation was rejected although its chain can be closed."""
     return not view.used and view.residual_mm is not None and view.reason != HELD_BACK
 
 
 def _sensors(
-    sights: Sequence[ViewResult],
+    views: Sequence[ViewResult],
     noise: Mapping[str, Mapping[str, float]],
-    shown_px: Mapping[str, float],
-    known: RunState,
+    residual_px: Mapping[str, float],
+    run: RunState,
 ) -> list[Sensor]:
-    seers = dict.fromkeys(sight.seer for sight in sights)
-    set_aside = known.spared.keys() | known.held_back
-    found = []
+    seers = dict.fromkeys(view.seer for view in views)
+    not_needed = run.spared.keys() | run.held_back
+    sensors = []
     for seer in seers:
-        mine = [sight for sight in sights if sight.seer == seer]
-        lost = [
-            Rejection(view.view, view.reason)
-            for view in mine
-            if not view.used and view.view not in set_aside
-        ]
+        seer_views = [view for view in views if view.seer == seer]
+        unused = (view for view in seer_views if not view.used and view.view not in not_needed)
+        lost = [Rejection(view.view, view.reason) for view in unused]
         levels = noise.get(seer, {})
-        found.append(
+        sensors.append(
             Sensor(
-                sum(view.used for view in mine),
+                sum(view.used for view in seer_views),
                 lost,
-                [view.view for view in mine if _disagrees(view)],
-                shown_px.get(seer, levels.get("pixel_px")),
+                [view.view for view in seer_views if _is_outlier(view)],
+                residual_px.get(seer, levels.get("pixel_px")),
                 levels.get("level", 1.0),
-                sum(view.view in known.spared for view in mine),
+                sum(view.view in run.spared for view in seer_views),
                 seer if len(seers) > 1 else "",
             )
         )
-    return found
+    return sensors
 
 
 def _arms(answer: Answer) -> list[JudgedArm]:
     problem, solved = answer.problem, answer.solved
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
-    found = []
+    arms = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
         noise, numbers, arm = answer.sigmas[robot], answer.arms[robot].numbers, solved.arms[robot]
-        known = not problem.is_combined
-        surely = (1e3 * float(intervals[1, 0]), float(np.rad2deg(intervals[0, 0])))
-        found.append(
+        is_known = not problem.is_combined
+        lower_bounds = (1e3 * float(intervals[1, 0]), float(np.rad2deg(intervals[0, 0])))
+        arms.append(
             JudgedArm(
                 len(stops_of(problem, robot)),
-                noise["translation_mm"] if known else None,
-                noise["rotation_deg"] if known else None,
-                surely if known else None,
+                noise["translation_mm"] if is_known else None,
+                noise["rotation_deg"] if is_known else None,
+                lower_bounds if is_known else None,
                 errs=arm.errors is not None and arm.errors.is_significant,
                 workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
                 modelled=robot in modelled,
@@ -362,58 +345,60 @@ def _arms(answer: Answer) -> list[JudgedArm]:
                 name=robot if len(problem.robots) > 1 else "",
             )
         )
-    return found
+    return arms
 
 
-def poor_motion(known: RunState) -> Finding | None:
-    """Says that a robot's poses alone leave one camera and it open; None of whole cells."""
-    if known.mount is None or len(known.base_from_flange) < 2:
+def poor_motion(run: RunState) -> Finding | None:
+    """Finding that the motion of one robot is too poor for one camera; None for a whole cell."""
+    if run.mount is None or len(run.base_from_flange) < 2:
         return None
-    poses = np.array([*known.base_from_flange.values()])
-    words, advice = too_little_motion(poses, known.mount)
+    poses = np.array([*run.base_from_flange.values()])
+    words, advice = too_little_motion(poses, run.mount)
     return Finding("weak_motion", words, Remedy(advice)) if words else None
 
 
-def check_answer(known: RunState) -> None:
-    """Refuses motion that does not determine a frame well enough for anybody.
+def check_answer(run: RunState) -> None:
+    """Refuses motion that does not determine all frames.
 
     Raises:
-        DegenerateError: A direction of a frame is not determined at all, or its predicted sigma is
-            over the limit.
+        DegenerateError: A direction of a frame is undetermined, or its predicted sigma exceeds the
+            limit.
     """
-    if known.is_misread and poor_motion(known) is None:
-        # Where poses are read wrongly, what is predicted at their fit says nothing of the motion.
+    if run.is_misread and poor_motion(run) is None:
+        # With misread poses, sigmas predicted at their fit say nothing of the motion.
         return
-    agreed, cell = known.fitted.agreed, known.fitted.cell
-    part, fit = known.fitted.part, agreed.fit
-    seen = known.fitted.seen
-    looks = seen is not None and any(scene.estimated for scene in known.scenes.values())
+    inliers, cell = run.fitted.agreed, run.fitted.cell
+    part, fit = run.fitted.part, inliers.fit
+    seen = run.fitted.seen
+    looks = seen is not None and any(scene.estimated for scene in run.scenes.values())
     pixel_px = {} if seen is None else dict(zip(seen.looks.problems, seen.sigmas_px, strict=True))
-    if known.mount is not None:
-        check_observability(part, fit.state, fit.noise, known.mount, pixel_px, looks=looks)
+    if run.mount is not None:
+        check_observability(part, fit.state, fit.noise, run.mount, pixel_px, looks=looks)
         return
     names = {name: _names(part.tree, name) for name in part.unknown}
-    lost = agreed.problem.subset(~agreed.used)
-    # A robot that was never tilted leaves more open than one standing view does.
+    outliers = inliers.problem.subset(~inliers.used)
+    # A robot that was never tilted leaves more undetermined than a static view does.
     is_tilted = not any(tilting_advice(cell, base) for base in part.tree.bases.values())
 
-    def tie_of(frame: str) -> StandingTie | None:
-        return standing_tie(cell, frame) if is_tilted else None
+    def static_view(frame: str) -> StandingTie | None:
+        return sole_static_view(cell, frame) if is_tilted else None
 
     def motion(frame: str) -> str:
-        if not part.through(frame).any() and (count := int(lost.through(frame).sum())):
+        if not part.through(frame).any() and (count := int(outliers.through(frame).sum())):
             return f"all {count} observations of it disagree with the rest of the cell"
-        tie = tie_of(frame)
-        return _motion(cell, part, frame) if tie is None else tie.words
+        view = static_view(frame)
+        return _motion(cell, part, frame) if view is None else view.words
 
     def advice(frame: str, culprit: str) -> str:
-        if (tie := tie_of(frame)) is not None:
-            return tie.advice
-        if part.through(frame).any() or not len(lost):
+        if (view := static_view(frame)) is not None:
+            return view.advice
+        if part.through(frame).any() or not len(outliers):
             flanges = part.tree.flanges.values()
-            by_way = [name for name in flanges if part.through(name)[part.through(frame)].any()]
-            measured = or_measured(cell, by_way[0]) if by_way and "offset along" in culprit else ""
-            return f"{_more(cell, frame)} {measured}".rstrip()
+            between = [name for name in flanges if part.through(name)[part.through(frame)].any()]
+            measured = ""
+            if between and "offset along" in culprit:
+                measured = measuring_advice(cell, between[0])
+            return f"{_frame_advice(cell, frame)} {measured}".rstrip()
         return (
             "Look whether the board that ties it has the stated size, and whether images and poses "
             "belong together."
@@ -424,13 +409,13 @@ def check_answer(known: RunState) -> None:
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:
-    """A frame's name in words, and that of the frame that it hangs on."""
+    """Names of a frame and of its parent in words."""
     parent = tree.branches[frame].parent
     return frame.partition("@")[0], "the cell" if parent == tree.root else parent
 
 
 def _motion(cell: Cell, part: Problem, frame: str) -> str:
-    """Says how the robots stood by way of which a frame was observed."""
+    """Describes the motion of the robots between a frame and its observers."""
     rows, words = part.through(frame), []
     for robot, base in part.tree.bases.items():
         stops = np.unique(part.observations.stops[rows & part.through(part.tree.flanges[robot])])
@@ -439,13 +424,13 @@ def _motion(cell: Cell, part: Problem, frame: str) -> str:
 
 
 def _directions(cell: Cell, frame: str, edge: Edge) -> list[Direction]:
-    """The worst directions of a frame: of its offset and, where it has one, of its rotation."""
+    """The worst directions of a frame: of its translation and, if estimated, of its rotation."""
     found = edge_directions(edge.matrix, edge.covariance, *_names(cell.tree, frame))
     return [direction for direction in found if edge.oriented or not direction.is_rotation]
 
 
-def _more(cell: Cell, frame: str) -> str:
-    """What would determine a frame better."""
+def _frame_advice(cell: Cell, frame: str) -> str:
+    """Advice on what would determine a frame better."""
     frame = frame.partition("@")[0]
     rows = [row for row in cell.rows if frame in (row.seer, row.seen)]
     others = sorted({row.seen if row.seer == frame else row.seer for row in rows})
@@ -463,23 +448,20 @@ def _more(cell: Cell, frame: str) -> str:
 
 
 def weakest_link(cell: Cell, edges: Mapping[str, Edge]) -> str:
-    """Names the link of the cell that is known worst, and what it rests on."""
+    """Names the most uncertain frame of the cell, and the observations that determine it."""
     if not edges:
         return ""
     name, edge = max(edges.items(), key=lambda pair: pair[1].sigma_mm)
     worst = max(_directions(cell, name, edge), key=lambda value: value.sigma / value.limit)
     return (
         f"The weakest link is {name}: sigma {mm_and_deg(edge.sigma_mm, edge.sigma_deg)}, most of "
-        f"it in {worst.words}. {_resting(cell, name)}"
+        f"it in {worst.words}. {_determining_views(cell, name)}"
     )
 
 
-def _resting(cell: Cell, frame: str) -> str:
+def _determining_views(cell: Cell, frame: str) -> str:
     rows = [row for row in cell.rows if frame in cell.tree.above(row.seer)]
     rows += [row for row in cell.rows if frame in cell.tree.above(row.seen)]
-    pairs: dict[str, int] = {}
-    for row in rows:
-        key = f"{row.seer} of {row.seen}"
-        pairs[key] = pairs.get(key, 0) + 1
-    least = sorted(pairs.items(), key=lambda pair: pair[1])
-    return f"It rests on {some_of([f'{count} views by {key}' for key, count in least], 4)}."
+    counts = Counter(f"{row.seer} of {row.seen}" for row in rows)
+    fewest = sorted(counts.items(), key=lambda pair: pair[1])
+    return f"It rests on {some_of([f'{count} views by {key}' for key, count in fewest], 4)}."

@@ -1,6 +1,6 @@
-"""What ties the frames of a cell together, and in words what would where nothing does."""
+"""Messages on the connectivity of a cell: unconnected frames, and observations to connect them."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,19 +19,19 @@ from visioncal.estimation.observability import (
 )
 
 
-def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
-    """Refuses a cell in which a robot is tied to nothing.
+def refuse_unconnected_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> None:
+    """Refuses a cell with a robot that is not connected to the rest.
 
     Args:
         cell: The cell.
-        lost: The frames that are tied to nothing.
-        seen: Whether there are observations that would tie them, were they enough.
+        lost: The unconnected frames.
+        seen: Whether there are observations that connect them, but too few or too poor.
 
     Raises:
-        DegenerateError: A robot's base is among the frames that are lost.
+        DegenerateError: A robot's base is among the unconnected frames.
     """
     branches = cell.tree.branches
-    # Where no row is left, the robot whose base stands for the cell is tied to nothing, too.
+    # Where no row is left, the robot of the reference base is unconnected, too.
     none_left = seen and all(row.seer in lost or row.seen in lost for row in cell.rows)
     flanges = [
         branch
@@ -44,7 +44,7 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
     untied = [base for base in bases if base in lost] or [
         item for item in lost if not branches[item].robot
     ]
-    words = [untied_words(cell, base) for base in bases]
+    advice = [connection_advice(cell, base) for base in bases]
     robots = "this robot" if len(bases) == 1 else "these robots"
     why = f"no observation links {robots} to the rest of the cell"
     parts = []
@@ -54,29 +54,24 @@ def untied_robots(cell: Cell, lost: Collection[str], *, seen: bool = False) -> N
             f"the observations that link {robots} to the rest of the cell are too few, too much "
             f"alike, or wrong (it takes 3 stops or more, turned about two axes): {'; '.join(moves)}"
         )
-        parts = [part for base in bases if base in lost and (part := _open_part(cell, base))]
+        parts = [part for base in bases if base in lost and (part := _undetermined(cell, base))]
         if parts:
             why += f", which does not determine {' and '.join(parts)}"
-        words = [
-            f"To tie {base}: {tilt}"
-            if base in lost and (tilt := tilting_advice(cell, base))
+        advice = [
+            f"To tie {base}: {tilting}"
+            if base in lost and (tilting := tilting_advice(cell, base))
             else other
-            for base, other in zip(bases, words, strict=True)
+            for base, other in zip(bases, advice, strict=True)
         ]
     raise DegenerateError(
         f"cell: nothing ties {some_of(untied)} to {cell.reference}: {why}.",
         culprits=parts or untied,
-        next_step=" ".join(words),
+        next_step=" ".join(advice),
     )
 
 
-def or_measured(cell: Cell, flange: str) -> str:
-    """A further advice for an arm that cannot tilt and leaves an offset open; empty for none.
-
-    Args:
-        cell: The cell.
-        flange: The flange of the arm, of which it is.
-    """
+def measuring_advice(cell: Cell, flange: str) -> str:
+    """Advice to measure an offset that is undetermined if the arm cannot tilt; empty for none."""
     ends = (end for row in cell.rows for end in (row.seer, row.seen))
     carried = next((end for end in ends if cell.tree.body(end) == flange), "")
     if not carried:
@@ -87,8 +82,8 @@ def or_measured(cell: Cell, flange: str) -> str:
     )
 
 
-def _open_part(cell: Cell, base: str) -> str:
-    """What the motion of the robot on a base leaves open, where it turns about one axis alone."""
+def _undetermined(cell: Cell, base: str) -> str:
+    """The undetermined offset, in words, where the robot on a base turns about one axis only."""
     stations = _stations(cell, base)
     if len(stations) < 2:
         return ""
@@ -96,7 +91,7 @@ def _open_part(cell: Cell, base: str) -> str:
 
 
 def tilting_advice(cell: Cell, base: str) -> str:
-    """Advice to tilt a robot that was observed often enough; empty where it was tilted."""
+    """Advice to tilt a robot that was observed often, but never tilted; empty otherwise."""
     stations, robot = _stations(cell, base), _robot_on(cell, base)
     if len(stations) < FEWEST_VIEWS or turns_about_two_axes(invert(cell.poses[robot][stations])):
         return ""
@@ -105,7 +100,7 @@ def tilting_advice(cell: Cell, base: str) -> str:
         f"add {FEWEST_VIEWS} or more stops in which {flange} is tilted by 20 to 40 degrees about "
         "different axes, not only about one."
     )
-    measured = or_measured(cell, flange) if _open_part(cell, base) else ""
+    measured = measuring_advice(cell, flange) if _undetermined(cell, base) else ""
     return f"{words} {measured}".rstrip()
 
 
@@ -114,7 +109,7 @@ def _robot_on(cell: Cell, base: str) -> str:
 
 
 def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
-    """Says how a robot stood at some stations, and what of it determines little."""
+    """Describes a robot's motion over some stations, and why it determines little."""
     robot = _robot_on(cell, base)
     poses, who = cell.poses[robot][stations], f"robot {robot}"
     if robot == robot_key(""):
@@ -125,35 +120,32 @@ def robot_motion(cell: Cell, base: str, stations: IntArray) -> str:
 
 
 def _stations(cell: Cell, base: str) -> IntArray:
-    """The stations at which something was observed by way of the robot on a base."""
-    found = {
+    """The stations of observations whose chains contain the robot on a base."""
+    stations = {
         row.station
         for row in cell.rows
         for step in cell.tree.path(row.seer, row.seen)
         if step.robot and cell.tree.branches[step.frame].parent == base
     }
-    return np.array(sorted(found), dtype=np.int64)
+    return np.array(sorted(stations), dtype=np.int64)
 
 
-def standing_tie(cell: Cell, frame: str) -> StandingTie | None:
-    """The one camera's view of one board, both standing still, that alone ties a frame.
+def sole_static_view(cell: Cell, frame: str) -> StandingTie | None:
+    """The view of a fixed board by a fixed camera that alone connects a frame to the rest.
 
-    However often it is repeated, it is one view.
-
-    Args:
-        cell: The cell.
-        frame: The frame that is known worst.
-
-    Returns:
-        What that is; None where the frame is tied otherwise.
+    It counts as one view, however often it is repeated. None where other views connect the frame.
     """
     tree = cell.tree
-    moved = [row for row in cell.rows if any(step.robot for step in tree.path(row.seer, row.seen))]
-    tied = replace(cell, rows=tuple(moved)).tied()
-    pairs = {(row.seer, row.seen) for row in cell.rows if (row.seer in tied) != (row.seen in tied)}
+    moving = [row for row in cell.rows if any(step.robot for step in tree.path(row.seer, row.seen))]
+    connected = replace(cell, rows=tuple(moving)).tied()
+    pairs = {
+        (row.seer, row.seen)
+        for row in cell.rows
+        if (row.seer in connected) != (row.seen in connected)
+    }
     pairs = {pair for pair in pairs if not any(step.robot for step in tree.path(*pair))}
-    flange = next((name for name in tree.flanges.values() if name in tied), "")
-    if frame in tied or len(pairs) != 1 or not flange:
+    flange = next((name for name in tree.flanges.values() if name in connected), "")
+    if frame in connected or len(pairs) != 1 or not flange:
         return None
     ((camera, board),) = pairs
     return StandingTie(
@@ -163,9 +155,10 @@ def standing_tie(cell: Cell, frame: str) -> StandingTie | None:
     )
 
 
-def untied_words(cell: Cell, frame: str) -> str:
-    """What would tie a frame to the rest, in a sentence."""
-    tree, carried = cell.tree, [*_carried(cell, frame)]
+def connection_advice(cell: Cell, frame: str) -> str:
+    """Advice on observations that would connect a frame to the rest, in a sentence."""
+    tree = cell.tree
+    carried = [name for name in tree.branches if frame in tree.above(name)]
     cameras = [name for name in carried if name.startswith("cam")]
     boards = [name for name in carried if name.startswith("target")]
     others = [name for name in cell.tied() if name not in carried]
@@ -193,15 +186,8 @@ def untied_words(cell: Cell, frame: str) -> str:
     return f"To tie {frame}: {', or '.join(ways)}."
 
 
-def _carried(cell: Cell, frame: str) -> Iterator[str]:
-    """A frame and all that hangs on it."""
-    for name in cell.tree.branches:
-        if frame in cell.tree.above(name):
-            yield name
-
-
 def ambiguous_error(cell: Cell, frames: Sequence[str]) -> DegenerateError:
-    """Words that frames are tied by boards alone that look the same when turned."""
+    """Error on frames that are connected only by boards with rotational symmetry."""
     boards = sorted({row.seen for row in cell.rows if row.seer in frames or row.seen in frames})
     return DegenerateError(
         f"cell: {some_of(frames)} may be in two places: {some_of(boards)} looks the same after "

@@ -1,4 +1,4 @@
-"""A session of one camera and one robot, seen with a lens, boards and an arm that are known."""
+"""Observations of one camera and one robot with given lens, boards and arm."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -11,7 +11,7 @@ from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.calibration.stages.refine import remade
-from visioncal.core.types import Corners, FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.chain import chain, edge_names
 from visioncal.estimation.parts import ROBOT
@@ -21,14 +21,14 @@ from visioncal.session import frame_name
 
 @dataclass(frozen=True, eq=False)
 class ObservedPoses(Observed):
-    """What was observed, and what it is seen with; nothing of that is estimated here.
+    """Observations with given lens, boards and arm, none of which is estimated here.
 
     Attributes:
-        boards: Which of the session's boards the chain holds: the one it ends at, and others.
-        frames: (4, 4) where the camera and the boards are, by the frame.
+        boards: Which of the session's boards the problem contains, the reference board first.
+        frames: (4, 4) edges of the camera and the boards, by frame.
         used: The views in the problem, in the session's order.
-        free: Lens and board, and their covariance; None without corners.
-        calibrated: The robot's arm, as far as it was calibrated; None for not at all.
+        free: Lens and boards with their free values; None without corners.
+        calibrated: The robot's calibrated arm; None for the nominal one.
     """
 
     boards: tuple[int, ...] = (0,)
@@ -38,12 +38,12 @@ class ObservedPoses(Observed):
     calibrated: RobotArm | None = None
 
     @classmethod
-    def of(cls, seen: Observed) -> Self:
-        """What was observed, not seen with anything yet."""
-        return cls(**{entry.name: getattr(seen, entry.name) for entry in fields(Observed)})
+    def of(cls, observed: Observed) -> Self:
+        """Copies the observations, with no lens, boards or arm given yet."""
+        return cls(**{entry.name: getattr(observed, entry.name) for entry in fields(Observed)})
 
     def posed(self, poses: Iterable[ViewPoses]) -> Self:
-        """Takes over poses, made anew by lens and board where their view has just one."""
+        """Takes over poses, recomputed with lens and boards where a view has a single pose."""
         given = {pose.view: pose for pose in poses}
         if self.free is not None and self.pixel_px is not None:
             single = [
@@ -56,7 +56,7 @@ class ObservedPoses(Observed):
 
     @cached_property
     def robot_arm(self) -> RobotArm:
-        """The robot's arm; its stops are all views with a pose, in their order."""
+        """The robot's arm at all views with a pose, in their order."""
         if self.calibrated is not None:
             return self.calibrated
         rows = {view.number: view for view in self.session.views}
@@ -82,12 +82,12 @@ class ObservedPoses(Observed):
         return {view: at for at, view in enumerate(self.base_from_flange)}
 
     def problem(self, views: Sequence[int]) -> Problem:
-        """What some views measured, each with its first or chosen pose."""
+        """The problem of some views, each with its first or chosen pose."""
         poses, first = [self.poses[view] for view in views], self.first_of_stops(views)
         covariance, effects = None, []
         from_corners = all(pose.corners is not None for pose in poses)
         if self.free is not None:
-            # Poses that others have measured do not move with lens and board.
+            # Measured poses do not depend on lens and boards.
             shift = np.zeros((len(poses), 6, len(self.free.columns)))
             if from_corners:
                 shift = np.array([pose.by_shared[0] for pose in poses]).reshape(shift.shape)
@@ -101,15 +101,11 @@ class ObservedPoses(Observed):
             np.array([pose.cam_from_target[0] for pose in poses]).reshape(-1, 4, 4),
             covariance,
             stops=self.stops_of(views),
-            targets=self.targets(views),
+            targets=tuple(self.frame_of(pose.board) for pose in poses),
             order=[self.frame_of(board) for board in self.boards],
-            # What is shared counts from where it is.
+            # Shared values are relative to the given ones.
             effects=[replace(effect, values=np.zeros(len(effect))) for effect in effects],
         )
-
-    def targets(self, views: Sequence[int]) -> tuple[str, ...]:
-        """(m,) the frame of the target that each view shows."""
-        return tuple(self.frame_of(self.poses[view].board) for view in views)
 
     def frame_of(self, board: int) -> str:
         """The frame of one of the session's boards."""
@@ -118,30 +114,20 @@ class ObservedPoses(Observed):
         return frame_name("target", tuple(self.session.boards)[board])
 
     def framed(self, edges: FloatArray) -> dict[str, FloatArray]:
-        """Where frames are, by (1 + b, 4, 4) edges of the camera and the chain's boards."""
-        frames = (self.camera_frame, *map(self.frame_of, self.boards))
-        return dict(zip(frames, edges, strict=True))
-
-    @property
-    def camera_frame(self) -> str:
-        """The frame of the camera, or of the instrument."""
-        return edge_names(self.session.mount)[0].partition("_from_")[2]
+        """Names (1 + b, 4, 4) edges of the camera and the problem's boards by their frames."""
+        camera = edge_names(self.session.mount)[0].partition("_from_")[2]
+        return dict(zip((camera, *map(self.frame_of, self.boards)), edges, strict=True))
 
     def first_of_stops(self, views: Sequence[int]) -> list[int]:
         """(s,) the first view of each stop."""
         first = np.unique(self.stops_of(views), return_index=True)[1]
         return [views[index] for index in first.tolist()]
 
-    @property
-    def stops(self) -> IntArray:
-        """(m,) which stop of the robot each used view was taken at; see `stops_of`."""
-        return self.stops_of(self.used)
-
     def stops_of(self, views: Sequence[int]) -> IntArray:
-        """(m,) which stop of the robot each view was taken at, numbered from 0.
+        """(m,) stop of the robot at each view, numbered from 0.
 
-        Views of one stop share the robot's error. Poses that were measured by others are not
-        distinguished apart from the robot's: of several boards, each has stops of its own then.
+        Views of one stop share the robot's error. Of measured poses, the noise is not separated
+        from the robot's: each of several boards then has stops of its own.
         """
         own = len(self.boards) > 1 and any(self.poses[view].corners is None for view in views)
         keys: dict[tuple[int, int], int] = {}
@@ -154,7 +140,3 @@ class ObservedPoses(Observed):
         return {
             observation.view.number: observation.station for observation in self.timed.observations
         }
-
-    def seen(self, views: Sequence[int]) -> list[Corners | None]:
-        """The corners of some views that their poses were made from."""
-        return [self.poses[view].corners for view in views]

@@ -1,4 +1,4 @@
-"""The fit of a whole cell, as the solver hands it on."""
+"""The fit of a cell: inliers, camera parameters and arms, with its views on the problem."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,19 +24,19 @@ from visioncal.estimation.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The fit of a whole cell.
+    """The fit of a cell.
 
     Attributes:
         cell: The cell; its rows are the observations in the fit's order.
-        agreed: The fit, what it uses, and what moved.
-        seen: What all corners say of lenses and boards; None without images.
-        poses: Each row's one pose.
-        untied: Frames that nothing ties to the rest.
+        agreed: The inliers, their fit, and the frames that moved.
+        seen: Linearised corners of lenses and boards; None without images.
+        poses: The pose chosen for each row.
+        untied: Frames that no observation links to the rest.
         arms: The robots' arms, as far as they were calibrated.
-        asked: How far that was to be.
+        asked: The requested calibration level of the arms.
         late: The errors of clocks, as effects.
-        turned: How images of views that disagree were turned or mirrored, by view.
-        solver: By which solver the edges are.
+        turned: How images of outliers were turned or mirrored, by view.
+        solver: The solver of the edges.
     """
 
     cell: Cell
@@ -52,35 +52,35 @@ class Solved:
 
     @property
     def part(self) -> Problem:
-        """The observations that the fit was made from."""
+        """The problem of the inliers."""
         return self.agreed.part
 
     @property
     def side(self) -> FramesSide:
         """The frames' side of the joint fit."""
-        problem, views = self.agreed.problem, [row.view for row in self.cell.rows]
-        used, noise = self.agreed.used, self.agreed.fit.noise
-        return FramesSide(problem, used, views, self.arms, self.late, noise)
+        agreed, views = self.agreed, [row.view for row in self.cell.rows]
+        return FramesSide(
+            agreed.problem, agreed.used, views, self.arms, self.late, agreed.fit.noise
+        )
 
     @property
     def frames(self) -> dict[str, FloatArray]:
-        """Where the unknown frames are."""
+        """Poses (4, 4) of the unknown frames in their parents."""
         return self.agreed.problem.frames(self.agreed.fit.state)
 
     def posed(self) -> Self:
-        """The same with the robots' poses by their arms."""
-        poses = {name: arm.poses for name, arm in self.arms.items()}
-        problem = self.agreed.problem
-        problem = replace(problem, poses={**problem.poses, **poses})
-        return replace(self, agreed=replace(self.agreed, problem=problem))
+        """Replaces the robots' poses by those of their arms."""
+        problem, arms = self.agreed.problem, self.arms.items()
+        poses = {**problem.poses, **{name: arm.poses for name, arm in arms}}
+        return replace(self, agreed=replace(self.agreed, problem=replace(problem, poses=poses)))
 
     def settled(self, side: FramesSide, fitted: ConvergedFit) -> Self:
-        """The same as lenses, boards and frames were fitted with a side."""
+        """Takes over a joint fit of lenses, boards and frames."""
         agreed = replace(self.agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
         return replace(self, agreed=agreed, seen=fitted.seen, arms=side.arms)
 
     def found_of_looks(self, covariance: FloatArray) -> Iterator[Finding]:
-        """Says what was found of lenses and boards; see `stages.fit_messages`."""
+        """Findings on lenses and boards; see `stages.fit_messages`."""
         if self.seen is not None:
             fitted = ConvergedFit(self.seen, self.part, self.agreed.fit)
             arms, stated = self.arms.values(), None
@@ -92,42 +92,42 @@ class Solved:
 
     @property
     def shown_px(self) -> dict[str, float]:
-        """Each camera's noise of a corner by its residuals, per axis, whatever is stated [px]."""
+        """Standard deviation of corner residuals of each camera, per axis [px]."""
         if self.seen is None:
             return {}
-        looks, found = self.seen.looks, {}
-        for (camera, corner_problem), corners in zip(
+        looks, sigmas_px = self.seen.looks, {}
+        for (camera, problem), corners in zip(
             looks.problems.items(), self.seen.compressed, strict=True
         ):
             moving = np.flatnonzero(np.isin(looks.places(camera), self.seen.moving))
-            unknowns = corner_problem.unknowns(corners, moving)
-            found[camera] = corner_problem.stack.shown_px(corners.residuals, unknowns)
-        return found
+            unknowns = problem.unknowns(corners, moving)
+            sigmas_px[camera] = problem.stack.shown_px(corners.residuals, unknowns)
+        return sigmas_px
 
     @property
     def looks(self) -> CameraParameters | None:
-        """Lenses and boards as they were found; None without images."""
+        """Estimated lenses and boards; None without images."""
         return self.looks_at(self.agreed.fit.state)
 
     def looks_at(self, state: State) -> CameraParameters | None:
-        """Lenses and boards as some state has them; None without images."""
+        """Lenses and boards at a state; None without images."""
         if self.seen is None:
             return None
         free = self.seen.free
-        found = self.agreed.problem.values_of(LENSES, state)[: len(free)]
-        return self.seen.looks.with_values(free, found)
+        values = self.agreed.problem.values_of(LENSES, state)[: len(free)]
+        return self.seen.looks.with_values(free, values)
 
     def chain_px(self, rows: IntArray, state: State) -> FloatArray:
         """Reprojection errors (m,) [px] of some observations through the chain; NaN for none.
 
         Args:
-            rows: (m,) the observations.
-            state: The unknowns of the fit, or those of another one to a part of them.
+            rows: (m,) indices of the observations.
+            state: The unknowns of this fit, or of one to a subset of the observations.
         """
         chosen = np.isin(np.arange(len(self.cell.rows)), rows)
         poses = self.agreed.problem.subset(chosen).predicted(state)
-        mine = [self.cell.rows[index] for index in rows]
-        return self.pixels(mine, [self.poses[index] for index in rows], poses, state)
+        cell_rows = [self.cell.rows[index] for index in rows]
+        return self.pixels(cell_rows, [self.poses[index] for index in rows], poses, state)
 
     def pixels(
         self,
@@ -136,7 +136,7 @@ class Solved:
         poses: FloatArray,
         state: State,
     ) -> FloatArray:
-        """Reprojection errors (m,) [px] of views whose targets are at (m, 4, 4) poses."""
+        """Reprojection errors (m,) [px] of views, given (m, 4, 4) poses of their targets."""
         looks = self.looks_at(state)
         if looks is None:
             return np.full(len(rows), np.nan)
@@ -146,21 +146,21 @@ class Solved:
 
     @property
     def lens_columns(self) -> slice:
-        """The problem's columns of lenses and boards, and of what lenses do beyond their models."""
+        """The problem's columns of lenses and boards, and of lens errors beyond their models."""
         return self.agreed.problem.effect_columns.get(LENSES, slice(0, 0))
 
     @property
     def field_columns(self) -> IntArray:
-        """The problem's columns of what lenses do beyond their models."""
-        mine, free = self.lens_columns, 0 if self.seen is None else len(self.seen.free)
-        return np.arange(mine.start + free, mine.stop)
+        """The problem's columns of lens errors beyond their models."""
+        columns, free = self.lens_columns, 0 if self.seen is None else len(self.seen.free)
+        return np.arange(columns.start + free, columns.stop)
 
-    def columns_of(self, places: IntArray) -> IntArray:
-        """The problem's columns of free values of lenses and boards, by their places."""
+    def columns_of(self, indices: IntArray) -> IntArray:
+        """The problem's columns of free values of lenses and boards, given their indices."""
         free = np.zeros(0) if self.seen is None else self.seen.free
-        return np.asarray(self.lens_columns.start + np.searchsorted(free, places))
+        return np.asarray(self.lens_columns.start + np.searchsorted(free, indices))
 
 
-def within(places: IntArray, mine: slice) -> IntArray:
-    """Those of some ascending places that lie in a slice."""
-    return np.asarray(places[(places >= mine.start) & (places < mine.stop)])
+def within(indices: IntArray, part: slice) -> IntArray:
+    """Those of ascending indices that lie in a slice."""
+    return np.asarray(indices[(indices >= part.start) & (indices < part.stop)])

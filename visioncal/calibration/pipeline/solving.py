@@ -1,4 +1,4 @@
-"""From what was seen to the fit of the whole cell: lenses, boards, frames, arms; inliers."""
+"""Solves a cell: alternates between inliers, the fit of lenses, boards and frames, and arms."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,14 +7,14 @@ import numpy as np
 
 from visioncal.calibration.pipeline.arm_results import (
     arms_of,
+    change_each,
     joint_offsets,
-    one_by_one,
     with_drifts,
     with_errors,
     with_pose_errors,
 )
 from visioncal.calibration.pipeline.solved import Solved
-from visioncal.calibration.pipeline.starting import Start, sensors_of, started
+from visioncal.calibration.pipeline.starting import Start, find_start, sensors_of
 from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clocks import clock_effects
@@ -51,94 +51,95 @@ from visioncal.estimation.solve import (
 )
 from visioncal.session.frames import frame_name
 
-# Arms are linearised anew so often, or until their errors move by less, which is far below any
-# arm's repeatability.
-_ROUNDS, _AT_REST_RAD = 4, 1e-7
-# Where all goes astray, boards that are off by more begin as they were found.
+# Arms are relinearised at most so often, or until their errors change by less, which is far below
+# any arm's repeatability.
+_ROUNDS, _CONVERGED_RAD = 4, 1e-7
+# Where the fit diverges, boards whose size is off by a larger share start at the estimated size.
 _FAR_SIZE = 5e-3
-# A focal length that corners leave open by more than this share needs an arm that tilts.
-_OPEN_FOCAL = 0.02
-
-# What targets' sizes are known to while it is sought what agrees, as a share: prints are scaled to
-# fit a page.
+# A focal length with a larger relative sigma by the corners needs an arm that tilts.
+_UNDETERMINED_FOCAL = 0.02
+# Prior sigma of targets' sizes in the search for inliers, as a share: prints are scaled to fit a
+# page.
 _SIZE_SIGMA = 0.03
 
 
 def solve(
-    cell: Cell, looked: Observed, asked: str = "auto", solver: SolverName = "joint"
+    cell: Cell, observed: Observed, level: str = "auto", solver: SolverName = "joint"
 ) -> Solved:
     """Solves a cell, of one robot and one camera or of many.
 
     Args:
         cell: The cell.
-        looked: What was observed in it.
-        asked: How far the robots' arms are to be calibrated; see `stages.kinematics.check_level`.
-        solver: `joint`, or the closed form that the edges of one robot and one camera are to be by.
+        observed: The observations in it.
+        level: The calibration level of the arms; see `stages.kinematics.check_level`.
+        solver: `joint`, or a closed form for the edges of one robot and one camera.
 
     Raises:
-        DataError: A level is asked for, and no arm has what it takes.
-        DegenerateError: A robot is tied to nothing, a frame may be in two places, or the
-            motion of one robot leaves a direction, or the lens, open.
+        DataError: No arm has the data that the requested level needs.
+        DegenerateError: A robot is linked to nothing, a frame may be in two places, or the motion
+            of one robot leaves a direction, or the lens, undetermined.
     """
-    arms: Mapping[str, RobotArm] = arms_of(cell, looked.robots)
-    check_arms(arms, asked)
+    arms: Mapping[str, RobotArm] = arms_of(cell, observed.robots)
+    check_arms(arms, level)
     if cell.mount is not None:
         can = solver == "joint" and all(arm.is_modelled for arm in arms.values())
-        check_asked(asked, can=can)
+        check_asked(level, can=can)
     if solver != "joint":
-        cell, asked = replace(cell, priors=()), "hand-eye"
-    begun = started(cell, looked)
-    if begun.cell.mount is not None and begun.cell.priors and not looked.is_misread:
-        _refuse_open_lens(looked, begun.problem, begun.cell.mount)
+        cell, level = replace(cell, priors=()), "hand-eye"
+    start = find_start(cell, observed)
+    if start.cell.mount is not None and start.cell.priors and not observed.is_misread:
+        _refuse_undetermined_lens(observed, start.problem, start.cell.mount)
     try:
-        found = _fitted(begun, looked, arms, asked)
+        solved = _fit(start, observed, arms, level)
     except (VisioncalError, np.linalg.LinAlgError):
-        # Along a direction that nothing determines, the fit of lens and frames runs away.
-        if begun.cell.mount is not None and not looked.is_misread:
-            noise = starting_noise(begun.problem)
-            refuse_open_motion(begun.problem, begun.state, noise, begun.cell.mount)
+        # Along an undetermined direction the fit of lens and frames diverges.
+        if start.cell.mount is not None and not observed.is_misread:
+            noise = starting_noise(start.problem)
+            refuse_open_motion(start.problem, start.state, noise, start.cell.mount)
         raise
-    return found if solver == "joint" else _by_closed_form(found, solver)
+    return solved if solver == "joint" else _by_closed_form(solved, solver)
 
 
-def _fitted(begun: Start, looked: Observed, arms: Mapping[str, RobotArm], asked: str) -> Solved:
-    """Alternates between what agrees, lenses and boards, and arms."""
-    cell, poses = begun.cell, begun.poses
+def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> Solved:
+    """Alternates between inliers, lenses and boards, and arms."""
+    cell, poses = start.cell, start.poses
     sizes: Mapping[str, float] = {}
-    if looked.is_misread:
-        agreed = all_as_inliers(begun.problem, begun.state)
+    if observed.is_misread:
+        inliers = all_as_inliers(start.problem, start.state)
     else:
-        agreed, sizes = find_inliers(begun)
-    late = clock_effects(cell, looked.clocks)
-    start = Solved(cell, agreed, None, poses, begun.untied, arms, asked, late, looked.turned)
-    found = _agreeing_looks(start, looked, sizes)
-    if turned := {} if looked.is_misread else _turned_images(found):
-        # Their corners would pass for a lens that changes from view to view.
-        looked = replace(looked, turned=turned)
-        found = _agreeing_looks(replace(start, turned=turned), looked, sizes)
-    found = replace(found, arms=with_drifts(found.arms, found.part, found.agreed.fit, asked))
-    if any(arm.drift is not None for arm in found.arms.values()):
-        found = _agreeing_looks(found, looked, sizes)
-    found = replace(found, agreed=levelled(cell, poses, found.agreed))
-    # Poses that are misread say nothing of the arm, nor which views are outliers.
-    found = found if looked.is_misread else _alternating(found, looked)
-    if asked != "hand-eye" and not looked.is_misread:
-        found = _with_functions(found)
-    found = replace(found, agreed=with_repeats(found.agreed))
-    return replace(found, arms=with_pose_errors(found.arms, found.part, found.agreed.fit))
+        inliers, sizes = find_inliers(start)
+    clock_errors = clock_effects(cell, observed.clocks)
+    initial = Solved(
+        cell, inliers, None, poses, start.untied, arms, level, clock_errors, observed.turned
+    )
+    solved = _fit_with_inliers(initial, observed, sizes)
+    if turned := {} if observed.is_misread else _turned_images(solved):
+        # Their corners would be explained by a lens that changes from view to view.
+        observed = replace(observed, turned=turned)
+        solved = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
+    solved = replace(solved, arms=with_drifts(solved.arms, solved.part, solved.agreed.fit, level))
+    if any(arm.drift is not None for arm in solved.arms.values()):
+        solved = _fit_with_inliers(solved, observed, sizes)
+    solved = replace(solved, agreed=with_camera_levels(cell, poses, solved.agreed))
+    # Misread poses determine neither the arm nor which views are outliers.
+    solved = solved if observed.is_misread else _calibrate_arms(solved, observed)
+    if level != "hand-eye" and not observed.is_misread:
+        solved = _with_functions(solved)
+    solved = replace(solved, agreed=with_repeats(solved.agreed))
+    return replace(solved, arms=with_pose_errors(solved.arms, solved.part, solved.agreed.fit))
 
 
-def _refuse_open_lens(looked: Observed, problem: Problem, mount: Mount) -> None:
-    """Refuses a lens that corners leave open, nor turns about one axis beside priors determine."""
+def _refuse_undetermined_lens(observed: Observed, problem: Problem, mount: Mount) -> None:
+    """Refuses a lens that neither corners nor turns about one axis with priors determine."""
     poses = problem.poses[problem.robots[0]]
-    # Images of a sweep have no pose of their own before its clock is known.
+    # Images of a sweep have no pose before its clock is known.
     poses = poses[np.isfinite(poses[:, 0, 0])]
     words, _ = too_little_motion(poses, mount) if len(poses) > 1 else ("", "")
-    for look in looked.cameras.values() if words else ():
+    for look in observed.cameras.values() if words else ():
         if look.lens is None or look.lens.covariance is None:
             continue
         sigmas = np.sqrt(np.diag(look.lens.covariance)[:2]) / look.lens.camera.matrix[:2]
-        if (focal := float(sigmas.max())) > _OPEN_FOCAL:
+        if (focal := float(sigmas.max())) > _UNDETERMINED_FOCAL:
             raise DegenerateError(
                 f"{words} Such motion does not determine the lens, of which the corners leave the "
                 f"focal length open to {100.0 * focal:.1f} %.",
@@ -148,303 +149,291 @@ def _refuse_open_lens(looked: Observed, problem: Problem, mount: Mount) -> None:
             )
 
 
-def _without_misreported(agreed: Agreed, arms: Mapping[str, RobotArm], before: Mask) -> Agreed:
-    """Leaves out what agrees with an arm's joints alone, where its reported pose is another."""
-    # A wrong report says nothing against joints and cameras, but would mislead the next fit.
-    problem, used = agreed.problem, agreed.used.copy()
+def _without_misreported(inliers: Agreed, arms: Mapping[str, RobotArm], before: Mask) -> Agreed:
+    """Removes new inliers whose reported robot pose contradicts the arm's joint angles."""
+    # They agree with joints and camera, but their reported poses would mislead the next fit.
+    problem, used = inliers.problem, inliers.used.copy()
     stops = problem.observations.stops
     for robot, arm in arms.items():
-        mine = rows_of(problem, robot)
-        sound = np.isin(np.arange(len(arm.stood)), stops[mine & before])
-        used &= before | ~mine | arm.reported_alike(sound)[stops]
-    if np.array_equal(used, agreed.used):
-        return agreed
-    return replace(agreed, used=used).refitted()
+        by_robot = rows_of(problem, robot)
+        sound = np.isin(np.arange(len(arm.stood)), stops[by_robot & before])
+        used &= before | ~by_robot | arm.reported_alike(sound)[stops]
+    if np.array_equal(used, inliers.used):
+        return inliers
+    return replace(inliers, used=used).refitted()
 
 
-def _alternating(found: Solved, looked: Observed) -> Solved:
-    """Calibrates the arms by what agrees, and sees what agrees with these, until both stay."""
-    for turn in range(_ROUNDS + 1):
-        if found.asked != "hand-eye":
-            arms = _levels(found)
+def _calibrate_arms(solved: Solved, observed: Observed) -> Solved:
+    """Alternates between calibrating the arms and updating the inliers until neither changes."""
+    for iteration in range(_ROUNDS + 1):
+        if solved.asked != "hand-eye":
+            arms = _choose_levels(solved)
             erring = [name for name, arm in arms.items() if arm.frees_errors()]
-            late = clock_effects(found.cell, looked.clocks, erring)
-            found = _at_rest(replace(found, arms=arms, late=late))
-        before = found.agreed
-        if turn == _ROUNDS:  # The arms are calibrated by what agreed last.
+            clock_errors = clock_effects(solved.cell, observed.clocks, erring)
+            solved = _converge_arms(replace(solved, arms=arms, late=clock_errors))
+        before = solved.agreed
+        if iteration == _ROUNDS:  # The arms are calibrated with the last inliers.
             break
-        agreed = _without_misreported(settled(found.cell, before), found.arms, before.used)
-        found = _at_rest(replace(found, agreed=agreed))
-        # What agrees by now, and what moved, has a say in how far the arms are calibrated.
-        if _are_alike(before, agreed):
+        inliers = _without_misreported(
+            updated_inliers(solved.cell, before), solved.arms, before.used
+        )
+        solved = _converge_arms(replace(solved, agreed=inliers))
+        # Other inliers, or other moved frames, may allow another calibration level.
+        same_frames = before.problem.unknown.keys() == inliers.problem.unknown.keys()
+        if same_frames and np.array_equal(before.used, inliers.used):
             break
-    return found
-
-
-def _are_alike(one: Agreed, other: Agreed) -> bool:
-    """Whether the same observations agree, and the same frames are unknown."""
-    alike = one.problem.unknown.keys() == other.problem.unknown.keys()
-    return alike and np.array_equal(one.used, other.used)
+    return solved
 
 
 def _by_closed_form(solved: Solved, solver: str) -> Solved:
-    """The fit with the edges of a closed form, and the noise that these leave."""
-    agreed, part = solved.agreed, solved.part
-    mount = solved.cell.mount
+    """Replaces the edges by those of a closed form, and the noise by that of its residuals."""
+    inliers, part, mount = solved.agreed, solved.part, solved.cell.mount
     if mount is None:
         raise RuntimeError("closed forms are for one robot and one camera")
-    state = closed_form_state(part, solver, agreed.fit.state, mount)
+    state = closed_form_state(part, solver, inliers.fit.state, mount)
     noise = estimate_noise(part, state, starting_noise(part), from_above=True)
-    return replace(solved, agreed=replace(agreed, fit=Solution(state, noise)), solver=solver)
+    return replace(solved, agreed=replace(inliers, fit=Solution(state, noise)), solver=solver)
 
 
-def _agreeing_looks(start: Solved, looked: Observed, sizes: Mapping[str, float]) -> Solved:
-    """Fits lenses, boards and frames, until the same observations agree under them."""
-    # In a whole cell, what moved must not be taken for a wrong view: there it is left to the end,
-    # when the arms are calibrated.
-    found, levels = start, dict[str, LensLevels]()
+def _fit_with_inliers(start: Solved, observed: Observed, sizes: Mapping[str, float]) -> Solved:
+    """Fits lenses, boards and frames, and updates the inliers until they do not change."""
+    # In a whole cell the inliers are updated at the end, once the arms are calibrated: a frame
+    # that moved must not be taken for outliers.
+    solved, levels = start, dict[str, LensLevels]()
     for _ in range(_ROUNDS):
-        found = _with_looks(replace(found, arms=start.arms), looked, levels, sizes)
-        levels = {} if found.seen is None else dict(found.seen.looks.levels)
-        if found.cell.mount is None or looked.is_misread:
+        solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, levels, sizes)
+        levels = {} if solved.seen is None else dict(solved.seen.looks.levels)
+        if solved.cell.mount is None or observed.is_misread:
             break
-        before = found.agreed.used
-        found = replace(found, agreed=settle(found.agreed))
-        if np.array_equal(before, found.agreed.used):
+        before = solved.agreed.used
+        solved = replace(solved, agreed=settle(solved.agreed))
+        if np.array_equal(before, solved.agreed.used):
             break
-    return found
+    return solved
 
 
-def _turned_images(fit: Solved) -> dict[int, ImageTurn]:
-    """How images of views that disagree were turned or mirrored, by view."""
-    agreed = fit.agreed
-    looks, state, problem = fit.looks, agreed.fit.state, agreed.problem
-    if looks is None or agreed.used.all():
+def _turned_images(solved: Solved) -> dict[int, ImageTurn]:
+    """How images of outliers were turned or mirrored, by view."""
+    inliers, looks = solved.agreed, solved.looks
+    problem, state = inliers.problem, inliers.fit.state
+    if looks is None or inliers.used.all():
         return {}
-    typical_px = float(np.nanmedian(fit.chain_px(np.flatnonzero(agreed.used), state)))
-    predicted, found = problem.predicted(state), {}
-    for at in np.flatnonzero(~agreed.used).tolist():
-        seer, view = fit.cell.rows[at].seer, fit.poses[at]
+    typical_px = float(np.nanmedian(solved.chain_px(np.flatnonzero(inliers.used), state)))
+    predicted, turns = problem.predicted(state), {}
+    for row in np.flatnonzero(~inliers.used).tolist():
+        seer, view = solved.cell.rows[row].seer, solved.poses[row]
         if view.corners is None or seer not in looks.problems:
             continue
         camera = looks.camera(seer)
-        places = predict_corners(camera, predicted[at], looks.corners[view.board])
-        how = turned_how(view.corners.px, places, camera.resolution, typical_px)
+        predicted_px = predict_corners(camera, predicted[row], looks.corners[view.board])
+        how = turned_how(view.corners.px, predicted_px, camera.resolution, typical_px)
         if how is not None:
-            found[view.view] = how
-    return found
+            turns[view.view] = how
+    return turns
 
 
-def _with_looks(
-    found: Solved, looked: Observed, levels: Mapping[str, LensLevels], sizes: Mapping[str, float]
+def _fit_lenses_and_frames(
+    solved: Solved, observed: Observed, levels: Mapping[str, LensLevels], sizes: Mapping[str, float]
 ) -> Solved:
-    """Fits lenses, boards and frames, with errors of the arms sought anew beside their drift."""
-    found = replace(
-        found, arms={name: arm.erring(None) for name, arm in found.arms.items()}
-    ).posed()
-    if looked.scenes and not found.agreed.problem.is_combined:
-        side, frames = found.side, found.frames
-        views = _views_by_camera(looked, found.poses)
-        looks = side.looks(looked.scenes, views).with_levels(levels)
-        if looked.is_misread:
-            return found.settled(side, settle_looks(looks, side, looks.first, frames))
+    """Fits lenses, boards and frames, with posture-dependent errors of the arms and their drift."""
+    solved = replace(solved, arms={name: arm.erring(None) for name, arm in solved.arms.items()})
+    solved = solved.posed()
+    if observed.scenes and not solved.agreed.problem.is_combined:
+        side, frames = solved.side, solved.frames
+        views = _views_by_camera(observed, solved.poses)
+        looks = side.looks(observed.scenes, views).with_levels(levels)
+        if observed.is_misread:
+            return solved.settled(side, settle_looks(looks, side, looks.first, frames))
         try:
             fitted, side = refined(side, looks, frames)
         except ConvergenceError:
-            names = next(iter(looked.scenes.values())).names
+            names = next(iter(observed.scenes.values())).names
             targets = [frame_name("target", name) for name in names]
-            other = {index: sizes.get(targets[index], 0.0) for index in looks.printed}
-            far = {board: size for board, size in other.items() if abs(size) > _FAR_SIZE}
+            size_errors = {index: sizes.get(targets[index], 0.0) for index in looks.printed}
+            far = {board: size for board, size in size_errors.items() if abs(size) > _FAR_SIZE}
             if not far:
                 raise
             fitted, side = refined(side, looks.with_sizes(far), frames)
-        return found.settled(side, fitted)
-    found = replace(found, seen=None)
-    if drifts := tuple(effects_of(found.arms)):
-        found = replace(found, agreed=_with_effects(found.agreed, drifts))
-    found = replace(found, arms=with_errors(found.arms, found.part, found.agreed.fit))
-    others = (*found.late, *effects_of(found.arms))
-    return replace(found, agreed=_with_effects(found.agreed, others)) if others else found
+        return solved.settled(side, fitted)
+    solved = replace(solved, seen=None)
+    if drifts := tuple(effects_of(solved.arms)):
+        solved = replace(solved, agreed=_with_effects(solved.agreed, drifts))
+    solved = replace(solved, arms=with_errors(solved.arms, solved.part, solved.agreed.fit))
+    effects = (*solved.late, *effects_of(solved.arms))
+    return replace(solved, agreed=_with_effects(solved.agreed, effects)) if effects else solved
 
 
-def _levels(found: Solved) -> dict[str, RobotArm]:
-    """Chooses how far each arm is calibrated."""
-    fit = found.agreed.fit
-    views = [found.cell.rows[index].view for index in np.flatnonzero(found.agreed.used)]
+def _choose_levels(solved: Solved) -> dict[str, RobotArm]:
+    """Chooses the calibration level of each arm."""
+    fit = solved.agreed.fit
+    views = [solved.cell.rows[index].view for index in np.flatnonzero(solved.agreed.used)]
 
-    def with_level(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
-        return arm.with_level(stated, start, found.asked, views, fit.noise)
+    def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
+        return arm.with_level(nominal, start, solved.asked, views, fit.noise)
 
-    return one_by_one(found.arms, found.part, fit, with_level)
+    return change_each(solved.arms, solved.part, fit, with_level)
 
 
-def _with_functions(found: Solved) -> Solved:
-    """Fits with functions of the joints of each arm that has any."""
-    # What agrees is known by then: their many values would make each look for outliers slow. They
-    # explain much of what a joint does that slipped: where that alone explains more, there are
-    # none.
-    part, fit = found.part, found.agreed.fit
+def _with_functions(solved: Solved) -> Solved:
+    """Fits error functions of the joints of each arm that supports them."""
+    # Their many unknowns would slow each update of the inliers down, so that they come last. They
+    # also explain much of a slipped joint: where the slip explains more, they are left out.
+    part, fit = solved.part, solved.agreed.fit
 
-    def with_functions(arm: RobotArm, stated: Problem, start: State) -> RobotArm:
-        more = arm.with_functions(stated, start, found.asked, fit.noise)
-        if not more.gain_of_functions:
-            return more
+    def with_functions(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
+        extended = arm.with_functions(nominal, start, solved.asked, fit.noise)
+        if not extended.gain_of_functions:
+            return extended
         slip = slipped_joint(part, fit, joint_offsets({arm.robot: arm}))
-        slips = slip and log_gain(part, fit, slip.mahalanobis_sq) > more.gain_of_functions
-        return arm if slips else more
+        slips = slip and log_gain(part, fit, slip.mahalanobis_sq) > extended.gain_of_functions
+        return arm if slips else extended
 
-    wider = one_by_one(found.arms, part, fit, with_functions)
-    if all(wider[name] is arm for name, arm in found.arms.items()):
-        return found
-    return _at_rest(replace(found, arms=wider))
+    arms = change_each(solved.arms, part, fit, with_functions)
+    if all(arms[name] is arm for name, arm in solved.arms.items()):
+        return solved
+    return _converge_arms(replace(solved, arms=arms))
 
 
-def _at_rest(found: Solved) -> Solved:
-    """Fits with calibrated arms that are linearised anew until they stay."""
-    is_modelled = any(arm.model is not None for arm in found.arms.values())
-    for turn in range(_ROUNDS if is_modelled else 0):
-        found = found.posed()
-        if found.seen is None:
-            others = (*found.late, *effects_of(found.arms))
-            found = replace(found, agreed=_with_effects(found.agreed, others))
+def _converge_arms(solved: Solved) -> Solved:
+    """Fits and relinearises the calibrated arms in turn until they converge."""
+    is_modelled = any(arm.model is not None for arm in solved.arms.values())
+    for iteration in range(_ROUNDS if is_modelled else 0):
+        solved = solved.posed()
+        if solved.seen is None:
+            effects = (*solved.late, *effects_of(solved.arms))
+            solved = replace(solved, agreed=_with_effects(solved.agreed, effects))
         else:
-            side, seen = found.side, found.seen
-            fitted = settle_looks(seen.looks, side, seen.moving, found.frames, before=seen)
-            if turn == 0:  # What the arm did wrong may have passed for the lens's doing.
+            side, corners = solved.side, solved.seen
+            fitted = settle_looks(corners.looks, side, corners.moving, solved.frames, None, corners)
+            if iteration == 0:  # Errors of the arm may have been attributed to the lens.
                 looks = fitted.looks.with_levels(lens_levels(side, fitted))
                 fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)
-            found = found.settled(side, fitted)
-        problem, state = found.agreed.problem, found.agreed.fit.state
-        moved = {name: arm.moved(problem, state) for name, arm in found.arms.items()}
-        found = replace(found, arms={name: arm for name, (arm, _) in moved.items()})
-        if max(step for _, step in moved.values()) < _AT_REST_RAD:
+            solved = solved.settled(side, fitted)
+        problem, state = solved.agreed.problem, solved.agreed.fit.state
+        moved = {name: arm.moved(problem, state) for name, arm in solved.arms.items()}
+        solved = replace(solved, arms={name: arm for name, (arm, _) in moved.items()})
+        if max(step for _, step in moved.values()) < _CONVERGED_RAD:
             break
-    return found
+    return solved
 
 
-def _views_by_camera(looked: Observed, views: Sequence[ViewPoses]) -> dict[str, list[ViewPoses]]:
-    """The views of each camera's images that some fit may use, each with its one pose."""
-    known = {**looked.poses, **{view.view: view for view in views}}
-    # Frames of a sweep that are not needed were taken on the move: rows of theirs are not at rest.
-    out = looked.held_back | looked.spared.keys() | looked.turned.keys()
+def _views_by_camera(observed: Observed, views: Sequence[ViewPoses]) -> dict[str, list[ViewPoses]]:
+    """The views that a fit may use of each camera's images, each with its chosen pose."""
+    poses = {**observed.poses, **{view.view: view for view in views}}
+    # Spared frames of a sweep were taken while the robot moved.
+    excluded = observed.held_back | observed.spared.keys() | observed.turned.keys()
     return {
-        frame: [known[corner] for corner in look.corners if corner in known and corner not in out]
-        for frame, look in looked.cameras.items()
+        frame: [poses[view] for view in look.corners if view in poses and view not in excluded]
+        for frame, look in observed.cameras.items()
     }
 
 
-def _with_effects(agreed: Agreed, effects: Sequence[Effect]) -> Agreed:
-    problem = agreed.problem.with_effects(effects)
-    state = State(agreed.fit.state.edges, problem.start_values)
-    return replace(agreed, problem=problem, fit=replace(agreed.fit, state=state)).refitted()
+def _with_effects(inliers: Agreed, effects: Sequence[Effect]) -> Agreed:
+    problem = inliers.problem.with_effects(effects)
+    state = State(inliers.fit.state.edges, problem.start_values)
+    return replace(inliers, problem=problem, fit=replace(inliers.fit, state=state)).refitted()
 
 
-def first_inliers(cell: Cell, looked: Observed, mount: Mount) -> tuple[Cell, Agreed]:
-    """Takes the first steps of `solve`: which views agree, before lens, board or arm are fitted.
-
-    Args:
-        cell: A cell of one robot and one camera.
-        looked: What was observed in it.
-        mount: Where the camera is.
+def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, Agreed]:
+    """Inliers of one robot and one camera before lens, board and arm are fitted.
 
     Returns:
-        The cell, its rows in the order of the fit, and what agrees.
+        The cell, its rows in the order of the fit, and the inliers.
 
     Raises:
-        DegenerateError: The motion is too poor for any answer, by its geometry alone.
+        DegenerateError: The geometry of the motion alone does not determine the result.
     """
-    start = started(cell, looked)
+    start = find_start(cell, observed)
     check_observability(start.problem, start.state, starting_noise(start.problem), mount)
     return start.cell, find_inliers(start)[0]
 
 
 def find_inliers(start: Start) -> tuple[Agreed, Mapping[str, float]]:
-    """Finds what belongs together, and what of the priors the observations do not contradict.
+    """Finds the inliers, and the priors that they do not contradict.
 
     Returns:
-        What agrees, and by which share each printed target of a whole cell is larger than stated,
-        roughly.
+        The inliers, and a rough relative size error of each printed target of a whole cell.
     """
     cell, problem, state = start.cell, start.problem, start.state
-    movable, seen = _movable(cell, problem), problem.observations
-    if printed := _printed(seen) if movable else []:
-        # All that is seen of a board of another size disagrees with the rest, and would be out.
+    movable, observations = _movable_frames(cell, problem), problem.observations
+    if printed := _printed_targets(observations) if movable else []:
+        # Otherwise all observations of a board of another size would be outliers.
         problem = problem.with_effects([target_sizes(problem, printed, _SIZE_SIGMA)])
         state = State(state.edges, problem.start_values)
     if not cell.priors:
-        agreed = agree(problem, state, movable)
+        inliers = agree(problem, state, movable)
     else:
         loose = replace(problem, priors=loosened(cell.priors))
-        agreed = _with_priors(cell, agree(loose, state, movable)).refitted()
-    # What corners say of sizes is found with the lenses.
-    edges, sizes = agreed.fit.state.edges, agreed.fit.state.values.tolist()
-    fit = replace(agreed.fit, state=State(edges, np.zeros(0)))
-    agreed = replace(agreed, problem=agreed.problem.with_effects(()), fit=fit)
-    return agreed, dict(zip(printed, sizes, strict=True))
+        inliers = _with_priors(cell, agree(loose, state, movable)).refitted()
+    # Sizes are estimated from the corners, with the lenses.
+    edges, sizes = inliers.fit.state.edges, inliers.fit.state.values.tolist()
+    fit = replace(inliers.fit, state=State(edges, np.zeros(0)))
+    inliers = replace(inliers, problem=inliers.problem.with_effects(()), fit=fit)
+    return inliers, dict(zip(printed, sizes, strict=True))
 
 
-def settled(cell: Cell, agreed: Agreed) -> Agreed:
-    """Settles what agrees, and what of the priors the observations do not contradict."""
+def updated_inliers(cell: Cell, inliers: Agreed) -> Agreed:
+    """Refits inliers and priors until neither set changes."""
     if cell.priors:
-        loose = replace(agreed.problem, priors=loosened(cell.priors))
-        agreed = settle(replace(agreed, problem=loose), _movable(cell, loose))
-        agreed = _with_priors(cell, agreed)
-    return settle(agreed, _movable(cell, agreed.problem))
+        loose = replace(inliers.problem, priors=loosened(cell.priors))
+        inliers = settle(replace(inliers, problem=loose), _movable_frames(cell, loose))
+        inliers = _with_priors(cell, inliers)
+    return settle(inliers, _movable_frames(cell, inliers.problem))
 
 
-def levelled(cell: Cell, poses: Sequence[ViewPoses], agreed: Agreed) -> Agreed:
-    """Asks for the noise level of cameras, too, now that what is wrong is out."""
-    # Corners of one image may err alike, as those of small squares do: poses then scatter by more
-    # than corners do about them, but never by less. Where one camera sees one robot once a stop,
-    # the robot's noise has taken that up.
-    is_alone = cell.mount is not None and not agreed.problem.shared_units
-    if is_alone or agreed.problem.is_combined:
-        return agreed
+def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: Agreed) -> Agreed:
+    """Estimates the noise level of cameras, too, now that outliers are removed."""
+    # Corners of one image may have a common error, as those of small squares do: poses then
+    # scatter by more than the corners indicate, but never by less. Where one camera sees one robot
+    # once a stop, that is part of the robot's noise.
+    is_alone = cell.mount is not None and not inliers.problem.shared_units
+    if is_alone or inliers.problem.is_combined:
+        return inliers
     sensors = sensors_of(cell, poses)
     frames = tuple(dict.fromkeys((*sensors, *(row.seer for row in cell.rows))))
-    places = {frame: at for at, frame in enumerate(frames)}
-    problem = agreed.problem
+    indices = {frame: at for at, frame in enumerate(frames)}
+    problem = inliers.problem
     observations = replace(
         problem.observations,
-        sensors=np.array([places[row.seer] for row in cell.rows], dtype=np.int64),
+        sensors=np.array([indices[row.seer] for row in cell.rows], dtype=np.int64),
     )
-    more = np.ones(len(frames) - len(sensors))
-    least_levels = np.concatenate([np.zeros(len(sensors)), more])
+    unit_levels = np.ones(len(frames) - len(sensors))
+    least_levels = np.concatenate([np.zeros(len(sensors)), unit_levels])
     problem = replace(problem, observations=observations, least_levels=least_levels)
-    noise = agreed.fit.noise
-    noise = replace(noise, sensors=np.concatenate([noise.sensors, more]))
-    # All that is tried with the arms begins here.
-    return replace(agreed, problem=problem, fit=replace(agreed.fit, noise=noise)).refitted()
+    noise = inliers.fit.noise
+    noise = replace(noise, sensors=np.concatenate([noise.sensors, unit_levels]))
+    # The calibration of the arms starts from this fit.
+    return replace(inliers, problem=problem, fit=replace(inliers.fit, noise=noise)).refitted()
 
 
-def with_repeats(agreed: Agreed) -> Agreed:
-    """Fits once more, repeated views of still boards by still cameras sharing an error."""
-    # What moved was looked for without it: their differences do not share it.
-    return replace(agreed, problem=replace(agreed.problem, with_repeats=True)).refitted()
+def with_repeats(inliers: Agreed) -> Agreed:
+    """Fits with a shared error of repeated views of a fixed board by a fixed camera."""
+    # Moved frames were searched without it: differences of such views do not contain it.
+    return replace(inliers, problem=replace(inliers.problem, with_repeats=True)).refitted()
 
 
-def _printed(seen: Observations) -> list[str]:
-    """The targets of which corners were seen: the covariances of others' poses are not known."""
-    pairs = zip(seen.observed, seen.sensors.tolist(), strict=True)
+def _printed_targets(observations: Observations) -> list[str]:
+    """Targets whose corners were seen: other poses have no known covariance."""
+    pairs = zip(observations.observed, observations.sensors.tolist(), strict=True)
     return list(dict.fromkeys(target for target, sensor in pairs if sensor < 0))
 
 
-def _with_priors(cell: Cell, agreed: Agreed) -> Agreed:
-    """Puts in the components of priors that the observations do not contradict."""
-    # The worst is left out first: it misleads about the rest. The noise is that of a fit with loose
-    # priors: estimated beside a wrong one, it would grow until it explains it.
-    problem, noise = replace(agreed.problem, priors=cell.priors), agreed.fit.noise
+def _with_priors(cell: Cell, inliers: Agreed) -> Agreed:
+    """Adds the components of priors that the observations do not contradict."""
+    # The most contradicted is dropped first, as it biases the rest. The noise is that of a fit with
+    # loose priors: estimated together with a wrong prior, it would grow until it explains it.
+    problem, noise = replace(inliers.problem, priors=cell.priors), inliers.fit.noise
     while True:
-        part = problem.subset(agreed.used)
-        fit = Solution(solve_problem(part, agreed.fit.state, noise)[0], noise)
+        part = problem.subset(inliers.used)
+        fit = Solution(solve_problem(part, inliers.fit.state, noise)[0], noise)
         kept = without_most_contradicted(part, fit.state, covariance_of(part, fit))
         if kept is None:
-            return replace(agreed, problem=problem, fit=fit)
+            return replace(inliers, problem=problem, fit=fit)
         problem = replace(problem, priors=kept)
 
 
-def _movable(cell: Cell, problem: Problem) -> tuple[str, ...]:
-    """What may be bumped or slip: all that is unknown but bases."""
+def _movable_frames(cell: Cell, problem: Problem) -> tuple[str, ...]:
+    """Frames that may have moved during the session: all unknown ones but bases."""
     # One camera that sees one robot move cannot distinguish what slipped from a wrong pose.
     if cell.mount is not None:
         return ()

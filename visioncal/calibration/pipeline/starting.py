@@ -1,11 +1,11 @@
-"""Where the fit of a cell starts: its problem, a start of all frames, each view with one pose."""
+"""Start of a cell's fit: its problem, initial frames, and one pose chosen for each view."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.network_ties import ambiguous_error, untied_robots
+from visioncal.calibration.pipeline.network_ties import ambiguous_error, refuse_unconnected_robots
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.observed import Observed, nothing_seen
@@ -20,20 +20,20 @@ from visioncal.estimation.parts import Observations, State
 from visioncal.estimation.problem import Problem
 from visioncal.session import frame_name
 
-# Covariance of a pose that was given without one, but for its level [rad^2, m^2].
+# Covariance, up to a level, of a pose that was given without one [rad^2, m^2].
 _NOMINAL = np.diag(np.repeat([1e-3, 5e-4], 3) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where a fit starts.
+    """Start of a fit.
 
     Attributes:
-        cell: The part of the cell that observations tie together; its rows are in the fit's order.
-        poses: Each row's one pose.
-        problem: What they measured.
-        state: Where the frames are to begin with.
-        untied: Frames that nothing ties to the rest.
+        cell: The connected part of the cell; its rows are in the fit's order.
+        poses: The pose chosen for each row.
+        problem: The problem of these.
+        state: The initial frames.
+        untied: Frames that no observation links to the rest.
     """
 
     cell: Cell
@@ -43,63 +43,59 @@ class Start:
     untied: tuple[str, ...]
 
 
-def _with_poses(cell: Cell, looked: Observed) -> Cell:
-    """The cell without the observations that gave no pose."""
+def _with_poses(cell: Cell, observed: Observed) -> Cell:
+    """Drops the observations that gave no pose."""
     missing = {
         row.view: cell.reasons.get(row.view, "nothing was found in its image")
         for row in cell.rows
-        if row.view not in looked.poses
+        if row.view not in observed.poses
     }
     cell = cell.without(missing)
     if not cell.rows:
-        raise nothing_seen(looked)
+        raise nothing_seen(observed)
     return cell
 
 
-def started(cell: Cell, looked: Observed) -> Start:
-    """Finds a start, and gives each view its one pose by it.
-
-    Args:
-        cell: The cell.
-        looked: What was observed in it.
+def find_start(cell: Cell, observed: Observed) -> Start:
+    """Initialises all frames, and chooses each view's pose by them.
 
     Raises:
         DataError: No observation gave a pose.
-        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+        DegenerateError: A robot is linked to nothing, or a frame may be in two places.
     """
-    cell, lost = _tied_part(_with_poses(cell, looked))
-    views = [looked.poses[row.view] for row in cell.rows]
+    cell, lost = _connected_part(_with_poses(cell, observed))
+    views = [observed.poses[row.view] for row in cell.rows]
     problem = problem_of(cell, views)
     if cell.mount is not None:
         refuse_too_few(problem, cell.mount, len(cell.rows))
         _refuse_few_of_each(cell)
-    placed = init_frames(problem, views, targets_of(cell))
-    tied, clear = placed.tied, {view.view: view for view in placed.views}
+    initial = init_frames(problem, views, targets_of(cell))
+    tied, chosen = initial.tied, {view.view: view for view in initial.views}
     if tied.untied:
-        untied_robots(cell, tied.untied, seen=True)
+        refuse_unconnected_robots(cell, tied.untied, seen=True)
         cell = _without_frames(cell, tied.untied)
     if tied.ambiguous:
         raise ambiguous_error(cell, tied.ambiguous)
-    cell, more = _tied_part(
-        cell.without({rejection.view: rejection.reason for rejection in placed.rejections})
+    cell, unlinked = _connected_part(
+        cell.without({rejection.view: rejection.reason for rejection in initial.rejections})
     )
-    poses = tuple(clear[row.view] for row in cell.rows)
+    poses = tuple(chosen[row.view] for row in cell.rows)
     problem = problem_of(cell, poses)
-    return Start(cell, poses, problem, problem.start(tied.edges), (*lost, *tied.untied, *more))
+    return Start(cell, poses, problem, problem.start(tied.edges), (*lost, *tied.untied, *unlinked))
 
 
-def agreeing_views(cell: Cell, looked: Observed) -> frozenset[int]:
-    """The views that the first consensus of a cell's frames predicts; nothing is fitted.
+def agreeing_views(cell: Cell, observed: Observed) -> frozenset[int]:
+    """Views that agree with the initial frames of a cell; nothing is fitted.
 
     Raises:
         DataError: Nothing was seen.
-        DegenerateError: A robot is tied to nothing, or a frame may be in two places.
+        DegenerateError: A robot is linked to nothing, or a frame may be in two places.
     """
-    start = started(cell, looked)
-    between = invert(start.problem.predicted(start.state)) @ start.problem.observations.measured
-    away = np.linalg.norm(between[:, :3, 3], axis=1) + LEVER_M * rotation_angle(between)
-    near = (away < AGREE_M).tolist()
-    return frozenset(pose.view for pose, is_near in zip(start.poses, near, strict=True) if is_near)
+    start = find_start(cell, observed)
+    residual = invert(start.problem.predicted(start.state)) @ start.problem.observations.measured
+    distance = np.linalg.norm(residual[:, :3, 3], axis=1) + LEVER_M * rotation_angle(residual)
+    is_near = (distance < AGREE_M).tolist()
+    return frozenset(pose.view for pose, agrees in zip(start.poses, is_near, strict=True) if agrees)
 
 
 def targets_of(cell: Cell) -> dict[str, Target]:
@@ -109,20 +105,20 @@ def targets_of(cell: Cell) -> dict[str, Target]:
 
 
 def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
-    """The problem of views with one pose each, lenses and boards as they are taken to be."""
-    given = np.array([not view.covariance.any() for view in views])
+    """The problem of views with one pose each, at the present lenses and boards."""
+    is_given = np.array([not view.covariance.any() for view in views])
     levels = {sensor: at for at, sensor in enumerate(sensors_of(cell, views))}
     sensors = [
         levels.get(row.seer, -1) if _is_sensed(row.seer, view) else -1
         for row, view in zip(cell.rows, views, strict=True)
     ]
     covariance = np.array([view.covariance[0] for view in views])
-    places = np.array([row.is_place for row in cell.rows], dtype=bool)
-    covariance[given] = _NOMINAL
-    turned = {row.seen for row in cell.rows if not row.is_place}
-    # What one camera measured with one robot, without a word of its noise, has that of both as one.
-    is_combined = cell.mount is not None and cell.mount != "instrument" and bool(given.any())
-    is_uneven = given & [not row.seer.startswith("instrument") for row in cell.rows]
+    is_place = np.array([row.is_place for row in cell.rows], dtype=bool)
+    covariance[is_given] = _NOMINAL
+    oriented = {row.seen for row in cell.rows if not row.is_place}
+    # Of poses without a stated noise, that of one camera and one robot is estimated as one.
+    is_combined = cell.mount is not None and cell.mount != "instrument" and bool(is_given.any())
+    is_uneven = is_given & [not row.seer.startswith("instrument") for row in cell.rows]
     if is_combined:
         is_uneven |= True
         sensors, covariance = [-1] * len(views), np.zeros((len(views), 6, 6))
@@ -136,19 +132,20 @@ def problem_of(cell: Cell, views: Sequence[ViewPoses]) -> Problem:
             np.array(sensors, dtype=np.int64),
             np.array([view.cam_from_target[0] for view in views]),
             covariance,
-            ~places,
+            ~is_place,
             is_uneven,
         ),
         priors=cell.priors,
-        points=frozenset(row.seen for row in cell.rows) - turned,
+        points=frozenset(row.seen for row in cell.rows) - oriented,
         is_combined=is_combined,
     )
 
 
 def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
-    """The frames whose observations' noise is known up to a level; other cameras come behind.
+    """Frames whose observations have a noise known up to a level, which is then estimated.
 
-    Of one camera or instrument with one robot it is the stated noise: the rest is the robot's.
+    One camera or instrument with one robot has none: its noise is the stated one, and the excess
+    is the robot's.
     """
     if cell.mount is not None:
         return ()
@@ -157,41 +154,40 @@ def sensors_of(cell: Cell, views: Sequence[ViewPoses]) -> tuple[str, ...]:
 
 
 def _is_sensed(seer: str, view: ViewPoses) -> bool:
-    """Whether an observation's noise is known up to a level: those of corners is known."""
+    """Whether an observation's noise is known up to a level only: that of corners is known."""
     return seer.startswith("instrument") or not view.covariance.any()
 
 
-def _tied_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
-    """The part of a cell that observations tie together, and the frames outside."""
+def _connected_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
+    """The part of a cell that observations connect, and the frames outside."""
     tied = cell.tied()
-    lost = tuple(branch for branch in cell.tree.branches if branch not in tied)
-    untied_robots(cell, lost)
+    unlinked = tuple(branch for branch in cell.tree.branches if branch not in tied)
+    refuse_unconnected_robots(cell, unlinked)
     branches = cell.tree.branches
-    return _without_frames(cell, lost), tuple(name for name in lost if not branches[name].robot)
+    return _without_frames(cell, unlinked), tuple(
+        name for name in unlinked if not branches[name].robot
+    )
 
 
 def _without_frames(cell: Cell, frames: Sequence[str]) -> Cell:
     tree = cell.tree.without(frames)
+    kept = tree.branches.keys()
     reasons = {
         row.view: f"nothing ties {row.seer if row.seer in frames else row.seen} "
         "to the rest of the cell"
         for row in cell.rows
-        if row.seer not in tree.branches or row.seen not in tree.branches
+        if not {row.seer, row.seen} <= kept
     }
     robots = set(tree.robots)
     poses = {name: pose for name, pose in cell.poses.items() if name in robots}
-    priors = tuple(
-        prior
-        for prior in cell.priors
-        if prior.first in tree.branches and prior.second in tree.branches
-    )
+    priors = tuple(prior for prior in cell.priors if {prior.first, prior.second} <= kept)
     return replace(cell.without(reasons), tree=tree, poses=poses, priors=priors)
 
 
 def _refuse_few_of_each(cell: Cell) -> None:
-    """Refuses several targets of which none is seen often enough to begin with."""
-    shown = [row.seen for row in cell.rows]
-    counts = {name: shown.count(name) for name in dict.fromkeys(shown)}
+    """Refuses several targets none of which is seen in enough views for a start."""
+    targets = [row.seen for row in cell.rows]
+    counts = {name: targets.count(name) for name in dict.fromkeys(targets)}
     if len(counts) > 1 and max(counts.values()) < FEWEST_VIEWS and cell.mount != "instrument":
         shares = ", ".join(f"{name.partition('_')[2]} in {count}" for name, count in counts.items())
         raise DegenerateError(

@@ -1,6 +1,6 @@
-"""The way of a session in order: one entry a step, of one camera and one robot or of a whole cell.
+"""The stages of a calibration in order, for one camera and one robot or a whole cell.
 
-A step is one file in `calibration.stages`, or a few lines here that hand it what it needs.
+A stage is one file in `calibration.stages`, or a few lines here that pass it its input.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,19 +34,19 @@ from visioncal.session import STREAMS, Session
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of the way, by the name that progress shows."""
+    """One stage, by the name that progress shows."""
 
     name: str
     run: Callable[[RunState], RunState]
 
 
-# How warnings about the robot's model begin, and how those about unknown names are told.
+# Beginning of warnings about the robot's model; phrases in warnings about unknown names.
 _OF_MODEL, _UNKNOWN_NAMES = "session.toml: robot.model:", ("is ignored", "was not read")
 _MODEL_STEP = "Correct [robot] model in session.toml, or the file that it names."
 
 
-def _read_robot(known: RunState) -> RunState:
-    session = known.session
+def _read_robot(run: RunState) -> RunState:
+    session = run.session
     if not session.views:
         what = "streams and no views" if session.streams else "no views"
         raise DataError(
@@ -55,29 +55,29 @@ def _read_robot(known: RunState) -> RunState:
             next_step="Calibration needs views.csv; streams of torques alone are for visioncal "
             "dynamics identify.",
         )
-    said = map(_suspicious, session.warnings)
-    known = known.noting((), (*pairing(session), *said, *_not_used(known)))
+    warnings = map(_suspicious, session.warnings)
+    run = run.noting((), (*pairing(session), *warnings, *_not_used(run)))
     notes = (*session.declaration.corrected, *searched_images(session))
-    known = replace(known, notes=(*known.notes, *notes))
-    if len(known.held_back) == len(session.views):
-        raise all_held_back(known)
-    # Views that have a time alone get their poses once the camera's are known.
-    return known if waits_for_clock(session) else _reported(known)
+    run = replace(run, notes=(*run.notes, *notes))
+    if len(run.held_back) == len(session.views):
+        raise all_held_back(run)
+    # Views with only a time get their poses once the camera's are known.
+    return run if waits_for_clock(session) else _reported(run)
 
 
-def _not_used(known: RunState) -> Iterator[Finding]:
-    """Says what of a session no stage can use."""
-    session = known.session
-    if known.mount is None:
+def _not_used(run: RunState) -> Iterator[Finding]:
+    """Reports declarations and columns that no stage can use."""
+    session = run.session
+    if run.mount is None:
         return
     names = pair_edges(session)
     for edge in session.declaration.prior:
-        is_used = edge in names or session.declaration.has_names
-        if is_used and known.solver == "joint":
+        if run.solver != "joint":
+            reason = f"the closed form {run.solver} cannot"
+        elif edge not in names and not session.declaration.has_names:
+            reason = f"what is unknown of this session is {' and '.join(names)}"
+        else:
             continue
-        reason = f"what is unknown of this session is {' and '.join(names)}"
-        if known.solver != "joint":
-            reason = f"the closed form {known.solver} cannot"
         yield Finding("unused", f"[prior.{edge}] was not used: {reason}.")
     readings = sum(view.reading_m is not None for view in session.views)
     if readings and session.mount != "instrument":
@@ -90,7 +90,7 @@ def _not_used(known: RunState) -> Iterator[Finding]:
 
 
 def _suspicious(warning: str) -> Finding:
-    """What is suspicious about a session; a robot that nobody knows costs its joint angles."""
+    """Turns a warning on reading the session into a finding, with a remedy where one is known."""
     if warning.startswith(_OF_MODEL):
         return Finding("misread_joints", warning, Remedy(_MODEL_STEP))
     file, _, rest = warning.partition(": ")
@@ -100,7 +100,7 @@ def _suspicious(warning: str) -> Finding:
 
 
 def _without_times(session: Session) -> str:
-    """Asks for the times of views whose poses are in a stream; empty where that is not it."""
+    """Advice to fill in times where the poses are in a stream; empty if that does not apply."""
     stream = stream_of(session, "")
     if not stream or any(view.stamp_s is not None for view in session.views):
         return ""
@@ -110,87 +110,83 @@ def _without_times(session: Session) -> str:
     )
 
 
-def _reported(known: RunState) -> RunState:
-    """Takes up what is reported of the robots."""
-    known = read_robots(known)
-    if known.mount is None:
-        return known
-    matched = known.reported.matched
+def _reported(run: RunState) -> RunState:
+    """Reads the robots' reported poses."""
+    run = read_robots(run)
+    if run.mount is None:
+        return run
+    matched = run.reported.matched
     if matched is not None and matched.misread:
-        check_asked(known.level, can=False, misread=matched.misread)
-    if not known.base_from_flange:
-        said = known.session.warnings
-        of_model = [warning for warning in said if warning.startswith(_OF_MODEL)]
+        check_asked(run.level, can=False, misread=matched.misread)
+    if not run.base_from_flange:
+        warnings = run.session.warnings
+        of_model = [warning for warning in warnings if warning.startswith(_OF_MODEL)]
+        message = f"session {run.session.name!r}: no view has a pose of the robot."
         raise DataError(
-            " ".join(
-                [*of_model, f"session {known.session.name!r}: no view has a pose of the robot."]
-            ),
-            culprits=known.lost_views,
-            next_step=_without_times(known.session)
-            or (_MODEL_STEP if of_model else " ".join(said))
+            " ".join([*of_model, message]),
+            culprits=run.lost_views,
+            next_step=_without_times(run.session)
+            or (_MODEL_STEP if of_model else " ".join(warnings))
             or "Fill in x_m to qw, or joint angles and [robot] model.",
         )
-    views = tuple(known.base_from_flange)
-    declared = {view.number: view.stop for view in known.session.views}
-    check_stops(known.loads(views), views, [declared[view] for view in views])
-    return known
+    views = tuple(run.base_from_flange)
+    declared = {view.number: view.stop for view in run.session.views}
+    check_stops(run.loads(views), views, [declared[view] for view in views])
+    return run
 
 
-def _readings(known: RunState) -> RunState:
-    """Takes up what instruments read."""
-    if known.mount == "instrument":
-        readings = read_instrument(known.session)
-        known = replace(known, readings=readings).noting(readings.rejections)
-        check_read_joints(known, probe_poses(known.session, readings))
+def _readings(run: RunState) -> RunState:
+    """Reads the instruments' readings."""
+    if run.mount == "instrument":
+        readings = read_instrument(run.session)
+        run = replace(run, readings=readings).noting(readings.rejections)
+        check_read_joints(run, probe_poses(run.session, readings))
         if not readings.are_poses:
-            if known.solver != "joint":
+            if run.solver != "joint":
                 raise DataError(
-                    f"solver {known.solver!r} needs poses, and the instrument reads places alone.",
+                    f"solver {run.solver!r} needs poses, and the instrument reads places alone.",
                     next_step="Leave --solver out.",
                 )
-            known = known.noting(exchanged_points(known, readings))
-    poses = {
-        view: instrument
-        for view, instrument in read_instruments(known.session).items()
-        if view not in known.reasons
-    }
-    return replace(known, poses={**known.poses, **poses})
+            run = run.noting(exchanged_points(run, readings))
+    read = read_instruments(run.session).items()
+    poses = {view: pose for view, pose in read if view not in run.reasons}
+    return replace(run, poses={**run.poses, **poses})
 
 
-def _clock(known: RunState) -> RunState:
-    """Gives views that have a time alone the robot's poses out of its stream."""
-    return _reported(set_clocks(known)) if waits_for_clock(known.session) else known
+def _clock(run: RunState) -> RunState:
+    """Interpolates the robot's poses in its stream for views with only a time."""
+    return _reported(set_clocks(run)) if waits_for_clock(run.session) else run
 
 
-def _joints(known: RunState) -> RunState:
-    """Refuses joints that only fit what the camera sees where they are read otherwise."""
-    drops = known.level != "hand-eye"
-    return check_joints(known, drops=drops, takes=drops and known.solver == "joint")
+def _joints(run: RunState) -> RunState:
+    """Refuses joint angles that fit the camera's poses only if they are read differently."""
+    drops = run.level != "hand-eye"
+    return check_joints(run, drops=drops, takes=drops and run.solver == "joint")
 
 
-def _solve(known: RunState) -> RunState:
-    cell = read_cell(known)
-    return replace(known, read=cell, fit=solve(cell, known, known.level, known.solver))
+def _solve(run: RunState) -> RunState:
+    cell = read_cell(run)
+    return replace(run, read=cell, fit=solve(cell, run, run.level, run.solver))
 
 
-def _examine(known: RunState) -> RunState:
-    check_answer(known)
-    answer = answer_of(known.cell, known, known.fitted, known.convention)
-    out = (view for view in answer.views if not view.used and view.view not in known.held_back)
-    known = replace(known, fit=answer.solved, answer=answer)
-    return known.noting(Rejection(view.view, view.reason) for view in out)
+def _examine(run: RunState) -> RunState:
+    check_answer(run)
+    answer = answer_of(run.cell, run, run.fitted, run.convention)
+    rejected = (view for view in answer.views if not view.used and view.view not in run.held_back)
+    run = replace(run, fit=answer.solved, answer=answer)
+    return run.noting(Rejection(view.view, view.reason) for view in rejected)
 
 
-def _judge(known: RunState) -> RunState:
-    findings = findings_of(known)
-    known = replace(known, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
-    return replace(known, findings=findings, verdict=judge(findings))
+def _judge(run: RunState) -> RunState:
+    findings = findings_of(run)
+    run = replace(run, warnings=tuple(findings.warnings), notes=tuple(findings.notes))
+    return replace(run, findings=findings, verdict=judge(findings))
 
 
 STAGES: tuple[Stage, ...] = (
     Stage("robot", _read_robot),
     Stage("readings", _readings),
-    Stage("detect", lambda known: detect_targets(known, known.found_before)),
+    Stage("detect", lambda run: detect_targets(run, run.found_before)),
     Stage("intrinsics", estimate_lenses),
     Stage("pnp", locate_targets),
     Stage("clock", _clock),
@@ -202,5 +198,5 @@ STAGES: tuple[Stage, ...] = (
 
 
 def stages_before(name: str) -> tuple[Stage, ...]:
-    """The steps that come before one."""
+    """The stages before the named one."""
     return STAGES[: [stage.name for stage in STAGES].index(name)]

@@ -1,4 +1,4 @@
-"""Whether a calibration still holds, what has changed if not, and when to calibrate again."""
+"""Verification of a calibration with new stops: test, cause of a change, recalibration triggers."""
 
 from visioncal.calibration.verification.check import Check, Suspect, verify
 from visioncal.calibration.verification.messages import to_document, verdict_of

@@ -1,4 +1,4 @@
-"""What a calibration rests on, as a later look at the same cell needs it."""
+"""The joint fit of a calibration as the prior of a later look at the same cell."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from visioncal.robot import Robot, WeightFunctions
 from visioncal.vision.camera import intrinsics
 from visioncal.vision.targets import numbered_positions, target_from_document
 
-# A scale that is known by more degrees of freedom is as good as known.
+# A noise scale with more degrees of freedom counts as known.
 _MOST_FREEDOM = 1e6
 
 ArmKind: TypeAlias = Literal["none", "model", "links", "poses"]
@@ -35,15 +35,15 @@ class CalibrationPrior:
     """The fit of a calibration: its unknowns, their covariance, and the noise.
 
     Attributes:
-        calibration: Whose.
-        targets: What was printed, by the session's names for it; that of an only one is empty.
-        boards: (b,) places among the targets, of those that were placed.
-        state: The edges of the camera and of these boards, and the k values of what all stops
-            share: lens and boards, then the arm.
+        calibration: The calibration.
+        targets: The printed targets by the session's names; that of an only one is empty.
+        boards: (b,) indices, among the targets, of those with an edge.
+        state: The edges of the camera and of these boards, and the k values that all stops share:
+            lens and boards, then the arm.
         covariance: (6 + 6 b + k, 6 + 6 b + k) of edges and values.
-        looks: (l,) which values of lens and board are among them.
-        arm: What the last of them are errors of.
-        model: The calibrated arm, where they are of its model.
+        looks: (l,) indices of the free values of lens and boards.
+        arm: Parametrisation of the arm's errors.
+        model: The calibrated arm, for errors of its model.
     """
 
     calibration: Calibration
@@ -57,10 +57,11 @@ class CalibrationPrior:
 
     @classmethod
     def of(cls, calibration: Calibration) -> "CalibrationPrior":
-        """Reads it from a calibration.
+        """Reads the prior from a calibration.
 
         Raises:
-            DataError: The calibration does not say it: an instrument made it, or an older version.
+            DataError: The calibration has none: it was made with an instrument, or by an older
+                version.
         """
         if calibration.mount == "instrument":
             raise DataError(
@@ -87,7 +88,7 @@ class CalibrationPrior:
 
     @property
     def free(self) -> LensBoardParameters | None:
-        """Lens and board as the calibration found them; None without a camera or a target."""
+        """Calibrated lens and boards with their free values; None without camera or target."""
         camera = self.calibration.camera
         if camera is None or not self.targets:
             return None
@@ -103,57 +104,57 @@ class CalibrationPrior:
         )
 
     def noise(self, *, from_corners: bool) -> Noise:
-        """The noise of one stop: of the flange, or with that of the camera's poses as one.
+        """The noise of one stop: of the flange, or of flange and measured poses combined.
 
-        A level that the calibration knows badly is taken for what its 95 % interval allows.
+        An uncertain level is raised to half the upper bound of its 95 % interval.
         """
-        stated, known = self.calibration.noise, self.calibration.uncertainty
+        stated, uncertainty = self.calibration.noise, self.calibration.uncertainty
         of = "robot" if from_corners else "combined"
         if f"{of}_rotation_deg" not in stated:
-            # Poses of another origin than the calibration's: as they scattered there in all.
+            # Poses of another origin than the calibration's have its total residuals.
             rms = self.calibration.rms
             deg, mm = (rms.deg or 0.0) / np.sqrt(3), rms.mm / np.sqrt(3)
             return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
-        intervals = {} if known is None else known.noise_95
+        intervals = {} if uncertainty is None else uncertainty.noise_95
         deg, mm = (
             max(stated[name], 0.5 * intervals.get(name, (0.0, 0.0))[1])
             for name in (f"{of}_rotation_deg", f"{of}_translation_mm")
         )
         arm = self.calibration.arm
         if arm is not None and arm.functions is not None:
-            # What functions of the joints err by at a fresh stop is as at one that was left out.
+            # Functions of the joints have the error of a left-out stop at a new stop.
             mm = max(mm, arm.chosen.held_out_mm / np.sqrt(3))
             deg = max(deg, (arm.chosen.held_out_deg or 0.0) / np.sqrt(3))
         return Noise.of_robot(float(np.deg2rad(deg)), 1e-3 * mm)
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom that the noise was estimated with, at most as many as matter."""
+        """Degrees of freedom of the estimated noise; limited, as more make no difference."""
         return min(self.calibration.noise_dof, _MOST_FREEDOM)
 
-    def placed_anew(self, z: FloatArray, sigmas: FloatArray) -> "CalibrationPrior":
-        """The same with an only board that lies somewhere else.
+    def with_board_at(self, z: FloatArray, sigmas: FloatArray) -> "CalibrationPrior":
+        """Replaces the pose of a single board.
 
         Args:
-            z: (4, 4) about where.
-            sigmas: (6,) how roughly that is known.
+            z: (4, 4) rough edge of the board.
+            sigmas: (6,) its standard deviations [rad, m].
         """
         covariance = self.covariance.copy()
         covariance[6:12], covariance[:, 6:12] = 0.0, 0.0
         covariance[6:12, 6:12] = np.diag(sigmas**2)
-        moved = replace(self.state, edges=np.stack([self.state.edges[0], z]))
-        return replace(self, state=moved, covariance=covariance)
+        state = replace(self.state, edges=np.stack([self.state.edges[0], z]))
+        return replace(self, state=state, covariance=covariance)
 
 
 def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
     names = fit.boards
     x_name, z_name = edge_names(calibration.mount)
-    placed = [calibration.edges[f"{z_name}_{name}" if name else z_name].matrix for name in names]
+    boards = [calibration.edges[f"{z_name}_{name}" if name else z_name].matrix for name in names]
     targets = {
         name: target_from_document(target, name or "target") for name, target in fit.targets.items()
     }
     values = np.zeros(0) if fit.arm is None else fit.arm.values
-    jacobian = _jacobian(np.array(placed), len(fit.looks), len(values))
+    jacobian = _jacobian(np.array(boards), len(fit.looks), len(values))
     if fit.covariance.shape != (jacobian.shape[1],) * 2:
         raise ValueError(f"covariance has the shape {fit.covariance.shape}")
     return CalibrationPrior(
@@ -161,7 +162,7 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
         targets,
         tuple(list(targets).index(name) for name in names) if targets else (0,),
         State(
-            np.stack([calibration.edges[x_name].matrix, *placed]),
+            np.stack([calibration.edges[x_name].matrix, *boards]),
             np.concatenate([np.zeros(len(fit.looks)), values]),
         ),
         jacobian @ fit.covariance @ jacobian.T,
@@ -174,64 +175,58 @@ def _read(calibration: Calibration, fit: JointFit) -> CalibrationPrior:
 def _looks(
     calibration: Calibration, fit: JointFit, targets: Mapping[str, Target]
 ) -> tuple[int, ...]:
-    """Places of the fit's free values among the lens's and then the targets'."""
-    # Files of earlier versions know nothing of a board's shear, the last of its values: what
-    # follows them lies one place farther for each board.
+    """Indices of the fit's free values among those of the lens, then of the targets."""
+    # Files of earlier versions lack a board's shear, the last of its values: indices behind it are
+    # shifted by one for each board.
     only, camera = calibration.board, calibration.camera
     boards = [*calibration.boards.values(), *([] if only is None else [only])]
     if camera is None or all("shear" in board.shape for board in boards):
         return fit.looks
-    sizes = [
-        len(intrinsics(camera.camera)),
-        *(len(board_prior(target)) for target in targets.values()),
-    ]
-    is_new = [
-        at == size - 1 and kind != "points"
-        for size, kind in zip(
-            sizes, ("points", *(target.kind for target in targets.values())), strict=True
-        )
-        for at in range(size)
-    ]
-    return tuple(np.flatnonzero(~np.array(is_new))[list(fit.looks)].tolist())
+    is_shear = [False] * len(intrinsics(camera.camera))
+    for target in targets.values():
+        is_shear += [False] * (len(board_prior(target)) - 1) + [target.kind != "points"]
+    return tuple(np.flatnonzero(~np.array(is_shear))[list(fit.looks)].tolist())
 
 
-def _jacobian(placed: FloatArray, looks: int, arm: int) -> FloatArray:
-    """How edges and values move with the unknowns as they are written.
+def _jacobian(boards: FloatArray, looks: int, arm: int) -> FloatArray:
+    """Jacobian of edges and values with respect to the unknowns as they are written.
 
-    Written are the camera's edge and the first board's, then lens and boards, then where each
-    further board lies from the first, and the arm.
+    Written are the edges of the camera and of the first board, then lens and boards, then the
+    pose of each further board relative to the first, and the arm.
 
     Args:
-        placed: (b, 4, 4) the boards' edges.
-        looks: How many values are of lens and boards.
-        arm: How many are of the arm.
+        boards: (b, 4, 4) the boards' edges.
+        looks: Number of values of lens and boards.
+        arm: Number of values of the arm.
     """
-    edges, behind = 6 + 6 * len(placed), 6 * len(placed) + 6 + looks
-    jacobian = np.zeros((edges + looks + arm, behind + arm))
+    edges = 6 + 6 * len(boards)
+    size = edges + looks + arm
+    jacobian = np.zeros((size, size))
     jacobian[:12, :12] = np.eye(12)
     jacobian[edges : edges + looks, 12 : 12 + looks] = np.eye(looks)
-    jacobian[edges + looks :, behind:] = np.eye(arm)
-    for row, carried in enumerate(adjoint(invert(placed[1:]) @ placed[0])):
+    jacobian[edges + looks :, edges + looks :] = np.eye(arm)
+    for index, transform in enumerate(adjoint(invert(boards[1:]) @ boards[0])):
         # z_k exp(d_k) = z_1 exp(d_1) exp(-d) target_1_from_target_k
-        mine, at = slice(12 + 6 * row, 18 + 6 * row), 12 + looks + 6 * row
-        jacobian[mine, 6:12], jacobian[mine, at : at + 6] = carried, -carried
+        row, column = 12 + 6 * index, 12 + looks + 6 * index
+        jacobian[row : row + 6, 6:12] = transform
+        jacobian[row : row + 6, column : column + 6] = -transform
     return jacobian
 
 
 def fitted_model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None:
-    """The arm's model at what was found, so that no errors are left to be added."""
-    # Its geometry is in the arm; what goes by the loads of a stop is in the values.
+    """The arm's model linearised at its estimate; None for errors of another kind."""
+    # The geometry is part of the arm; errors that depend on the loads of a stop are in the values.
     if fitted is None or fitted.of != "model" or arm is None:
         return None
-    reported, weights = fitted.flange_from_reported, fitted.weights
-    if reported is None or weights is None:
+    flange_from_reported, weights = fitted.flange_from_reported, fitted.weights
+    if flange_from_reported is None or weights is None:
         raise ValueError("arm.flange_from_reported or arm.weights is missing")
     mounted = np.zeros((arm.joint_count + 1, 6))
-    mounted[-1] = log(invert(reported))
+    mounted[-1] = log(invert(flange_from_reported))
     parts, shape = fitted.weight_functions, (4 * arm.joint_count, -1)
     return ArmModel(
         arm.corrected(mounted),
-        reported,
+        flange_from_reported,
         weights,
         np.zeros(len(fitted.values)) if fitted.by_stop is None else fitted.by_stop,
         1.0 if fitted.torque_nm is None else fitted.torque_nm,
@@ -241,12 +236,12 @@ def fitted_model(arm: Robot | None, fitted: FittedArm | None) -> ArmModel | None
 
 
 def _shape(calibration: Calibration, targets: Mapping[str, Target]) -> FloatArray:
-    """(s,) what the targets were found to be like; those that were not looked at are as stated."""
-    found: dict[str, BoardResult | RigResult] = {**calibration.boards, **calibration.rigs}
+    """(s,) estimated shape values of the targets; zero for those that were not estimated."""
+    shapes: dict[str, BoardResult | RigResult] = {**calibration.boards, **calibration.rigs}
     only = calibration.board or calibration.rig
     if only is not None:
-        found[""] = only
+        shapes[""] = only
     stated = {name: np.zeros(len(board_prior(target))) for name, target in targets.items()}
     return np.concatenate(
-        [array + found[name].values if name in found else array for name, array in stated.items()]
+        [zeros + shapes[name].values if name in shapes else zeros for name, zeros in stated.items()]
     )

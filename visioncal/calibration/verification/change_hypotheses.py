@@ -1,4 +1,4 @@
-"""What may have happened to a cell since it was calibrated: the causes that a check compares."""
+"""Hypotheses on what changed in a cell since its calibration, which a check compares."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,42 +25,46 @@ CAMERA, BOARD, BOTH, SIZE, REPLACED, JOINT, LENGTH, NOISE, VIEW = (
     "robot_noise",
     "view",
 )
-# What a robot's scatter may have grown by.
+# Factors by which the robot's noise may have grown.
 _FACTORS = (2.0, 4.0, 8.0, 16.0, 32.0)
-# A board that lies a millimetre elsewhere differs by a percent where it is another one.
+# Prior scale of an exchanged board: one that is displaced by 1 mm differs by 1 % in size.
 _OTHER_SIZE_PER_M = 10.0
-_KNOCK = np.repeat([TURN_PER_M, 1.0], 3)
+_MOTION_UNITS = np.repeat([TURN_PER_M, 1.0], 3)
 
 
 def causes_of(
-    seen: PredictedStops, prior_calibration: CalibrationPrior, *, board_placed_anew: bool
+    predicted: PredictedStops, prior: CalibrationPrior, *, board_placed_anew: bool
 ) -> tuple[Cause, ...]:
-    """The single causes that a check of these stops compares.
+    """The causes that a check of these stops compares.
 
     Args:
-        seen: The stops.
-        prior_calibration: What the calibration rests on.
-        board_placed_anew: Whether the board's place is nothing to be checked.
+        predicted: The stops.
+        prior: The calibration as a prior.
+        board_placed_anew: Whether the board was moved on purpose, so that its pose is not checked.
     """
-    camera = _camera(seen)
-    boards = () if board_placed_anew else tuple(_boards(seen, prior_calibration))
-    sizes = tuple(_sizes(seen, prior_calibration))
+    # The camera's edge: a twist on its right, transformed to the target's side.
+    moved = adjoint(invert(predicted.problem.observations.measured))
+    camera = _cause(CAMERA, predicted, _MOTION_UNITS, by_sensor=moved)
+    boards = () if board_placed_anew else tuple(_boards(predicted, prior))
+    sizes = tuple(_sizes(predicted, prior))
+    noise = (replace(_cause(NOISE, predicted, np.zeros(0)), noise_factors=_FACTORS),)
     return (
         camera,
         *boards,
         *sizes,
         *(
-            _jointly(REPLACED, moved, replace(size, units=np.array([_OTHER_SIZE_PER_M])))
+            _simultaneous(REPLACED, moved, replace(size, units=np.array([_OTHER_SIZE_PER_M])))
             for moved, size in zip(boards, sizes, strict=False)
         ),
+        # Camera and board together fit any two stops.
         *(
-            _jointly(BOTH, camera, board)
+            _simultaneous(BOTH, camera, board)
             for board in boards
-            if _both_possible(seen, prior_calibration)
+            if len(prior.boards) == 1 and len(predicted.problem) >= FEWEST_VIEWS
         ),
-        *_joints(seen, prior_calibration),
-        *_noise(seen),
-        *_views(seen, prior_calibration),
+        *_joints(predicted, prior),
+        *(noise if predicted.stops > 1 else ()),
+        *_views(predicted, prior),
     )
 
 
@@ -69,32 +73,26 @@ def kind_of(cause: str) -> str:
     return cause.partition(" ")[0]
 
 
-def _camera(seen: PredictedStops) -> Cause:
-    """The camera's edge: a twist on its right, seen from the target's side."""
-    moved = adjoint(invert(seen.problem.observations.measured))
-    return _cause(CAMERA, seen, _KNOCK, by_sensor=moved)
-
-
-def _boards(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
+def _boards(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
     """Each board's edge: a twist on its right."""
-    names, away = tuple(prior_calibration.targets) or ("",), log(seen.away(prior_calibration))
-    for at, board in enumerate(prior_calibration.boards):
-        mine = seen.boards == at
-        if not mine.any():
+    names, changes = tuple(prior.targets) or ("",), log(predicted.away(prior))
+    for at, board in enumerate(prior.boards):
+        of_board = predicted.boards == at
+        if not of_board.any():
             continue
-        by_sensor, start = np.where(mine[:, None, None], -np.eye(6), 0.0), away[mine].mean(axis=0)
-        yield _cause(f"{BOARD} {names[board]}".strip(), seen, _KNOCK, by_sensor, start=start)
+        by_sensor, start = (
+            np.where(of_board[:, None, None], -np.eye(6), 0.0),
+            changes[of_board].mean(axis=0),
+        )
+        yield _cause(
+            f"{BOARD} {names[board]}".strip(), predicted, _MOTION_UNITS, by_sensor, start=start
+        )
 
 
-def _both_possible(seen: PredictedStops, prior_calibration: CalibrationPrior) -> bool:
-    """Whether camera and board at once are tried: they fit any two stops."""
-    return len(prior_calibration.boards) == 1 and len(seen.problem) >= FEWEST_VIEWS
-
-
-def _jointly(kind: str, first: Cause, second: Cause) -> Cause:
-    """Two changes at once."""
-    # Of camera and board nothing is left of the old hand-eye calibration but the arm; a board of
-    # another size that lies elsewhere is another board.
+def _simultaneous(kind: str, first: Cause, second: Cause) -> Cause:
+    """Two simultaneous changes."""
+    # If both camera and board moved, only the arm is left of the calibration; a board of another
+    # size at another place is another board.
     return Cause(
         f"{kind} {second.name.partition(' ')[2]}".strip(),
         np.concatenate([first.by_sensor, second.by_sensor], axis=2),
@@ -104,84 +102,83 @@ def _jointly(kind: str, first: Cause, second: Cause) -> Cause:
     )
 
 
-def _sizes(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
-    """Each board's size, as a share: one that is larger is seen nearer by as much."""
-    if prior_calibration.calibration.mount == "instrument":
+def _sizes(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
+    """Each board's size, as a share: a larger board is seen nearer by the same share."""
+    if prior.calibration.mount == "instrument":
         return
-    names, measured = tuple(prior_calibration.targets) or ("",), seen.problem.observations.measured
+    names, measured = tuple(prior.targets) or ("",), predicted.problem.observations.measured
     nearer = np.zeros((len(measured), 6, 1))
     nearer[:, 3:, 0] = np.einsum("nji,nj->ni", measured[:, :3, :3], measured[:, :3, 3])
-    for at, board in enumerate(prior_calibration.boards):
-        if (mine := seen.boards == at).any():
-            by_sensor = np.where(mine[:, None, None], nearer, 0.0)
-            yield _cause(f"{SIZE} {names[board]}".strip(), seen, np.ones(1), by_sensor)
+    for at, board in enumerate(prior.boards):
+        if (of_board := predicted.boards == at).any():
+            by_sensor = np.where(of_board[:, None, None], nearer, 0.0)
+            yield _cause(f"{SIZE} {names[board]}".strip(), predicted, np.ones(1), by_sensor)
 
 
-def _joints(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
-    """One offset a joint, and one stretch of all lengths."""
-    model, q = _arm(seen, prior_calibration), seen.joints_rad
+def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
+    """An offset of each joint, and a common scale of all lengths."""
+    model, q = _arm(predicted, prior), predicted.joints_rad
     if model is None or q is None:
         return
     offsets, robot = model.columns("offsets", q), model.robot
     for joint in range(robot.joint_count):
         unit = 1.0 if robot.chain.prismatic[joint] else TURN_PER_M
         column = offsets[:, :, joint : joint + 1]
-        yield _cause(f"{JOINT} {joint + 1}", seen, np.array([unit]), flange_jacobian=column)
-    yield _cause(LENGTH, seen, np.ones(1), flange_jacobian=_stretch(robot, q)[:, :, None])
+        yield _cause(f"{JOINT} {joint + 1}", predicted, np.array([unit]), flange_jacobian=column)
+    yield _cause(LENGTH, predicted, np.ones(1), flange_jacobian=_stretch(robot, q)[:, :, None])
 
 
-def _arm(seen: PredictedStops, prior_calibration: CalibrationPrior) -> ArmModel | None:
-    """The arm that offsets are of; the nominal one where none was calibrated."""
-    robot, matched = prior_calibration.calibration.calibrated_robot, seen.known.reported.matched
-    if prior_calibration.model is not None or robot is None:
-        return prior_calibration.model
+def _arm(predicted: PredictedStops, prior: CalibrationPrior) -> ArmModel | None:
+    """The arm for joint offsets; the nominal one where none was calibrated."""
+    robot, matched = prior.calibration.calibrated_robot, predicted.known.reported.matched
+    if prior.model is not None or robot is None:
+        return prior.model
     reported = np.eye(4) if matched is None else matched.flange_from_reported
     return ArmModel(robot, reported, {}, np.zeros(0))
 
 
 def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
-    """(m, 6) how the flange moves when all of an arm's lengths grow by as much as they are."""
+    """(m, 6) derivative of the flange with respect to a common scale of all lengths."""
     placements = robot.chain.placements
-    # A placement's offset lies in the frame before it; its twist acts behind it.
+    # A placement's offset is in the frame before it; its twist is in the frame after it.
     twists = np.zeros((len(placements), 6))
     twists[:, 3:] = np.einsum("nji,nj->ni", placements[:, :3, :3], placements[:, :3, 3])
     return np.asarray(robot.placement_jacobian(q) @ twists.reshape(-1))
 
 
-def _noise(seen: PredictedStops) -> Iterator[Cause]:
-    """The robot's: one stop alone scatters from no other."""
-    if seen.stops > 1:
-        yield replace(_cause(NOISE, seen, np.zeros(0)), noise_factors=_FACTORS)
-
-
-def _views(seen: PredictedStops, prior_calibration: CalibrationPrior) -> Iterator[Cause]:
-    """Each stop by itself: its image belongs to another pose, or something slipped meanwhile."""
-    if seen.stops < 2:
+def _views(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
+    """Each stop alone: its image belongs to another pose, or something slipped meanwhile."""
+    if predicted.stops < 2:
         return
-    away, placed = log(seen.away(prior_calibration)), prior_calibration.state.edges[1:][seen.boards]
-    for stop in range(seen.stops):
-        mine = seen.problem.observations.stops == stop
-        first = int(np.argmax(mine))
+    changes, boards = log(predicted.away(prior)), prior.state.edges[1:][predicted.boards]
+    for stop in range(predicted.stops):
+        at_stop = predicted.problem.observations.stops == stop
+        first = int(np.argmax(at_stop))
         # All boards of a stop move together.
-        carried = adjoint(invert(placed) @ placed[first])
-        by_sensor = np.where(mine[:, None, None], -carried, 0.0)
-        yield _cause(f"{VIEW} {seen.views[first][0]}", seen, _KNOCK, by_sensor, start=away[first])
+        transform = adjoint(invert(boards) @ boards[first])
+        by_sensor = np.where(at_stop[:, None, None], -transform, 0.0)
+        yield _cause(
+            f"{VIEW} {predicted.views[first][0]}",
+            predicted,
+            _MOTION_UNITS,
+            by_sensor,
+            start=changes[first],
+        )
 
 
 def _cause(
     name: str,
-    seen: PredictedStops,
+    predicted: PredictedStops,
     units: FloatArray,
     by_sensor: FloatArray | None = None,
     flange_jacobian: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> Cause:
-    still = np.zeros((len(seen.problem), 6, len(units)))
-    resting = np.zeros((seen.stops, 6, len(units)))
+    size = len(units)
     return Cause(
         name,
-        still if by_sensor is None else by_sensor,
-        resting if flange_jacobian is None else flange_jacobian,
+        np.zeros((len(predicted.problem), 6, size)) if by_sensor is None else by_sensor,
+        np.zeros((predicted.stops, 6, size)) if flange_jacobian is None else flange_jacobian,
         units,
-        np.zeros(len(units)) if start is None else start,
+        np.zeros(size) if start is None else start,
     )

@@ -1,4 +1,4 @@
-"""Whether a calibration still holds, by a few stops, and what has changed if it does not."""
+"""Verifies a calibration with a few new stops, and ranks what may have changed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from visioncal.calibration.verification.change_hypotheses import (
 )
 from visioncal.calibration.verification.prediction import (
     PredictedStops,
-    asked_of_boards,
+    board_changes,
     predict_stops,
 )
 from visioncal.core.arguments import typed
@@ -42,7 +42,7 @@ from visioncal.session.choosing import Choice
 
 _LIMITS = CheckLimits()
 _PAIRS = (BOTH, REPLACED)
-# A board that was placed anew may lie anywhere near where it is seen [rad and m].
+# Prior sigma of a board that was moved on purpose, around where it is seen [rad, m].
 _ANYWHERE = np.repeat([1.0, 1.0], 3)
 
 
@@ -52,10 +52,9 @@ class Suspect:
 
     Attributes:
         name: `camera`, `board` (with its name where there are several), `joint 3`, `arm_length`,
-            `board_size`, `board_replaced`,
-            `robot_noise`, or `view 7`.
-        probability: Its share among all changes, given the stops.
-        explained: What the stops say under it.
+            `board_size`, `board_replaced`, `robot_noise`, or `view 7`.
+        probability: Posterior probability among all changes.
+        explained: Fit and evidence of the change.
     """
 
     name: str
@@ -65,25 +64,25 @@ class Suspect:
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What a few stops say about a calibration.
+    """Result of verifying a calibration with a few new stops.
 
     Attributes:
-        calibration: The one that was checked.
+        calibration: The calibration.
         seen: The stops.
-        prior_calibration: What the calibration rests on.
-        away: (m, 6) where each sight places its board, from where it was (rotation [rad],
-            translation [m]), in its frame.
+        prior_calibration: The calibration as a prior.
+        away: (m, 6) displacement of each board from its calibrated pose, by each observation
+            (rotation [rad], translation [m]), in the board's frame.
         left: (m, 6) the same with the likeliest change undone, where one was found.
-        log_evidence: Logarithm of how many times as likely the stops are with a change as without.
-        misfit: Squared distance of the stops from the prediction, in units of sigma.
-        freedom: What that is on average where nothing has changed.
-        p_value: How often chance makes it at least as large.
+        log_evidence: Logarithm of the likelihood ratio of any change to none.
+        misfit: Squared Mahalanobis distance of the stops from the prediction.
+        freedom: Its degrees of freedom.
+        p_value: Probability of a misfit at least as large if nothing has changed.
         suspects: All changes that were compared, the likeliest first.
-        named: Those that cannot be distinguished from the likeliest, itself the first; empty where
-            nothing has changed.
-        explained: Whether the likeliest leaves no more unexplained than noise does.
-        camera_sigma: (6,) standard deviations to which a moved camera would be seen, all about the
-            camera's axes [rad, m].
+        named: Changes that cannot be distinguished from the likeliest, which is the first; empty
+            where nothing has changed.
+        explained: Whether the likeliest change leaves no more residuals than noise.
+        camera_sigma: (6,) standard deviations of an estimated motion of the camera, about its axes
+            [rad, m].
     """
 
     calibration: Calibration
@@ -102,7 +101,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the calibration still holds as far as the stops show."""
+        """Whether the stops agree with the calibration."""
         return bool(self.log_evidence < np.log(_LIMITS.likelihood_ratio))
 
 
@@ -117,108 +116,102 @@ def verify(
     board_placed_anew: bool = False,
     progress: Progress | None = None,
 ) -> Check:
-    """Checks a calibration by a few new stops of its cell.
+    """Verifies a calibration with a few new stops of its cell; nothing is refitted.
 
-    Several threads may do so at once, as with `calibrate`.
+    Several threads may verify at once, as with `calibrate`.
 
     Args:
-        session: Five stops or more, with the same board where it was; nothing of it is fitted. It,
-            or the path of its folder or recording.
-        calibration: The one that is to hold, or the path of its folder or calibration.json.
-        camera: Which camera is meant, where session or calibration is of a whole cell.
-        robot: Which robot, likewise.
-        target: Which target, likewise.
-        board_placed_anew: Whether the board was put elsewhere meanwhile, so that its place says
-            nothing.
-        progress: Told of long work.
+        session: Five stops or more with the same board at the same place; a session, or the path
+            of its folder or recording.
+        calibration: The calibration, or the path of its folder or calibration.json.
+        camera: The camera's name, where session or calibration is of a whole cell.
+        robot: The robot's name, likewise.
+        target: The target's name, likewise.
+        board_placed_anew: Whether the board was moved on purpose, so that its pose is not checked.
+        progress: Called with the progress of long work.
 
     Raises:
-        DataError: The session is of another cell, or the calibration does not say enough.
+        DataError: The session is of another cell, or the calibration does not contain its fit.
     """
     session = session if isinstance(session, Session) else Session.load(session)
     if not isinstance(calibration, Calibration):
         calibration = Calibration.load(calibration)
     is_its_own = session.digest() == calibration.session_sha256
     session, calibration = picked(session, calibration, Choice(camera, robot, target))
-    # What the calibration has left out contradicts it now as it did then.
+    # Views of its own session that the calibration rejected are rejected here, too.
     without = {view.view: view.reason for view in calibration.views if is_its_own and not view.used}
-    prior_calibration = CalibrationPrior.of(calibration)
-    seen = predict_stops(session, prior_calibration, progress, without)
-    return check(seen, prior_calibration, board_placed_anew=board_placed_anew)
+    prior = CalibrationPrior.of(calibration)
+    predicted = predict_stops(session, prior, progress, without)
+    return check(predicted, prior, board_placed_anew=board_placed_anew)
 
 
 def check(
-    seen: PredictedStops, prior_calibration: CalibrationPrior, *, board_placed_anew: bool = False
+    predicted: PredictedStops, prior: CalibrationPrior, *, board_placed_anew: bool = False
 ) -> Check:
-    """Compares what may have changed by stops that have been looked at; see `verify`."""
+    """Compares possible changes by the evidence of predicted stops; see `verify`."""
     if board_placed_anew:
-        if len(prior_calibration.boards) > 1:
+        if len(prior.boards) > 1:
             raise DataError(
                 "verify: the calibration has several boards; where one was placed anew it is not "
                 "known which of them still stand where they were.",
                 next_step="Leave --board-moved out: each board is compared by itself, and the one "
                 "that moved is named. Or verify with views of the boards that stayed.",
             )
-        moved = mean_transform(seen.away(prior_calibration))
-        prior_calibration = prior_calibration.placed_anew(
-            prior_calibration.state.edges[1] @ moved, _ANYWHERE
-        )
+        change = mean_transform(predicted.away(prior))
+        prior = prior.with_board_at(prior.state.edges[1] @ change, _ANYWHERE)
     belief = Belief(
-        prior_calibration.state,
-        prior_calibration.covariance,
-        prior_calibration.noise(from_corners=seen.from_corners),
-        prior_calibration.freedom,
+        prior.state,
+        prior.covariance,
+        prior.noise(from_corners=predicted.from_corners),
+        prior.freedom,
     )
-    causes = causes_of(seen, prior_calibration, board_placed_anew=board_placed_anew)
+    causes = causes_of(predicted, prior, board_placed_anew=board_placed_anew)
     with one_blas_thread():
-        nothing = explain(seen.problem, belief)
-        found = [explain(seen.problem, belief, cause) for cause in causes]
-    scores = np.array([explained.likelihood for explained in found]) + np.log(_shares(causes))
+        unchanged = explain(predicted.problem, belief)
+        explanations = [explain(predicted.problem, belief, cause) for cause in causes]
+    likelihoods = np.array([explained.likelihood for explained in explanations])
+    scores = likelihoods + np.log(_prior_probabilities(causes))
     evidence = float(np.logaddexp.reduce(scores))
     order = np.argsort(-scores, kind="stable")
-    shares = np.exp(scores - evidence)
+    probabilities = np.exp(scores - evidence)
     suspects = tuple(
-        Suspect(causes[index].name, float(shares[index]), found[index]) for index in order
+        Suspect(causes[index].name, float(probabilities[index]), explanations[index])
+        for index in order
     )
-    log_evidence = evidence - nothing.likelihood
+    log_evidence = evidence - unchanged.likelihood
     named = () if log_evidence < np.log(_LIMITS.likelihood_ratio) else _not_separated(suspects)
     camera = next(suspect for suspect in suspects if suspect.name == CAMERA)
-    away = log(seen.away(prior_calibration))
-    left = _left(seen, belief, causes[order[0]], suspects[0].explained) if named else away
+    changes = remaining = log(predicted.away(prior))
+    if named:
+        cause = causes[order[0]]
+        corrected = undone(predicted.problem, cause, suspects[0].explained.values)
+        remaining = log(board_changes(corrected, with_change(belief.state, cause)))
     return Check(
-        prior_calibration.calibration,
-        seen,
-        prior_calibration,
-        away,
-        left,
+        prior.calibration,
+        predicted,
+        prior,
+        changes,
+        remaining,
         log_evidence,
-        nothing.misfit,
-        nothing.freedom,
-        float(fdtrc(nothing.freedom, prior_calibration.freedom, nothing.misfit / nothing.freedom)),
+        unchanged.misfit,
+        unchanged.freedom,
+        float(fdtrc(unchanged.freedom, prior.freedom, unchanged.misfit / unchanged.freedom)),
         suspects,
         named,
-        _is_explained(suspects[0], prior_calibration.freedom),
+        _is_explained(suspects[0], prior.freedom),
         np.sqrt(np.diag(camera.explained.covariance)),
     )
 
 
-def _left(
-    seen: PredictedStops, belief: Belief, cause: Cause, explained: CauseEvidence
-) -> FloatArray:
-    """(m, 6) where each sight places its board with a change undone, from where it was."""
-    before = undone(seen.problem, cause, explained.values)
-    return log(asked_of_boards(before, with_change(belief.state, cause)))
-
-
-def _shares(causes: Sequence[Cause]) -> FloatArray:
-    """How likely each cause is beforehand: each kind alike, and each of a kind alike."""
+def _prior_probabilities(causes: Sequence[Cause]) -> FloatArray:
+    """Prior probabilities of the causes: equal for each kind, and within a kind."""
     kinds = [kind_of(cause.name) for cause in causes]
     return np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])
 
 
 def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """The likeliest, and what explains the stops about as well."""
-    # That is what is about as likely, and what could explain them but for its more unknowns: a
+    """The likeliest change, and those that explain the stops about as well."""
+    # These are about as likely, or fit about as well if it were not for their more unknowns: a
     # turned base looks like a slip of the first joint, however unlikely a turn about just that
     # axis.
     best, *others = suspects
@@ -226,25 +219,26 @@ def _not_separated(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
         return (best,)
     margin = 2.0 * np.log(_LIMITS.ruled_out)
 
-    def price(suspect: Suspect) -> float:
+    def penalised_misfit(suspect: Suspect) -> float:
         return suspect.explained.misfit + len(suspect.explained.values)
 
     rivals = [
-        other
-        for other in others
-        # Two changes at once imitate either: that says nothing against it.
-        if kind_of(other.name) not in _PAIRS
+        rival
+        for rival in others
+        # Two simultaneous changes can always imitate one of them, and are no rivals.
+        if kind_of(rival.name) not in _PAIRS
         and (
-            other.probability * _LIMITS.ruled_out > best.probability
-            or (other.name != NOISE and price(other) < price(best) + margin)
+            rival.probability * _LIMITS.ruled_out > best.probability
+            or (rival.name != NOISE and penalised_misfit(rival) < penalised_misfit(best) + margin)
         )
     ]
     return (best, *rivals)
 
 
 def _is_explained(best: Suspect, freedom: float) -> bool:
-    """Whether a change leaves no more than noise; one that fits anything cannot be judged."""
-    left = best.explained.freedom
-    if best.name == NOISE or left < 1:
+    """Whether a change leaves residuals no larger than noise; true without degrees of freedom."""
+    remaining = best.explained.freedom
+    if best.name == NOISE or remaining < 1:
         return True
-    return bool(best.explained.misfit < left * f_limit(_LIMITS.unexplained, left, freedom))
+    limit = f_limit(_LIMITS.unexplained, remaining, freedom)
+    return bool(best.explained.misfit < remaining * limit)

@@ -1,4 +1,4 @@
-"""What a check found, in plain sentences, and verify.json."""
+"""Verdict of a check in sentences, and as verify.json."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,11 +28,11 @@ from visioncal.estimation.null_space import joint_words
 from visioncal.estimation.observability import axis_words
 from visioncal.vision.targets import corner_positions
 
-# A part of a motion that is less than so many sigmas is not mentioned.
+# Parts of a motion of fewer sigmas are not mentioned.
 _MENTIONED = 3.0
-# So many stops say roughly where camera and board are, by which more are planned.
+# Fewest stops that locate camera and board roughly, so that more stops can be planned.
 _LEAST_STOPS = 3
-# A camera that moves by so many sigmas is detected in nearly every check.
+# Sigmas of a camera's motion that nearly every check detects.
 _SURE = 6.0
 _ALUMINIUM, _STEEL = 23e-6, 12e-6
 _ANEW = "calibrate again; these stops make a first result, and more a good one."
@@ -70,21 +70,21 @@ _WRONG_VIEW = Remedy(
 )
 
 SCHEMA = 1
-# Changes that are less likely than this share get no line.
+# Changes of a smaller probability are not listed.
 _LISTED_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
 class MeasuredMove:
-    """How far something moved: lengths, their standard deviations, and directions in words.
+    """Estimated motion of a camera or board.
 
     Attributes:
         mm: Distance [mm].
         sigma_mm: Its standard deviation [mm].
-        along: Its direction.
+        along: Its direction in words.
         deg: Angle [deg].
         sigma_deg: Its standard deviation [deg].
-        about: Its axis.
+        about: Its axis in words.
     """
 
     mm: float
@@ -96,36 +96,30 @@ class MeasuredMove:
 
     @property
     def words(self) -> str:
-        """What of it is beyond noise, in words."""
+        """The significant parts of the motion, in words."""
         shift = f"by {figure(self.mm)} mm (sigma {figure(self.sigma_mm)}) along {self.along}"
         turn = f"by {figure(self.deg)} deg (sigma {figure(self.sigma_deg)}) about {self.about}"
-        parts = [
-            text
-            for text, value, sigma in (
-                (f"moved {shift}", self.mm, self.sigma_mm),
-                (f"turned {turn}", self.deg, self.sigma_deg),
-            )
-            if value > _MENTIONED * sigma
-        ]
+        parts = [f"moved {shift}"] * (self.mm > _MENTIONED * self.sigma_mm)
+        parts += [f"turned {turn}"] * (self.deg > _MENTIONED * self.sigma_deg)
         return " and ".join(parts) or f"moved {shift}"
 
 
 def verdict_of(check: Check) -> Verdict:
-    """What the check found: whether the calibration holds, what changed, and what to do."""
+    """Verdict of a check: whether the calibration holds, what changed, and what to do."""
     doubts = tuple(_doubts(check))
     if check.passed:
-        found = (Finding(AGREEMENT, _agreement(check)), *doubts)
-        return Verdict("check" if doubts else "good", found)
-    best, *others = check.named
+        findings = (Finding(AGREEMENT, _agreement(check)), *doubts)
+        return Verdict("check" if doubts else "good", findings)
+    likeliest, *others = check.named
     changed = Finding(
-        kind_of(best.name),
-        _changed(check, best),
-        _runnable(check, _NEXT.get(kind_of(best.name), _WRONG_VIEW)),
-        probability=best.probability,
+        kind_of(likeliest.name),
+        _changed(check, likeliest),
+        _runnable(check, _NEXT.get(kind_of(likeliest.name), _WRONG_VIEW)),
+        probability=likeliest.probability,
     )
     reasons = [changed]
     if others:
-        reasons.append(_rivals(check, best, others))
+        reasons.append(_rivals(check, likeliest, others))
     if not check.explained:
         words = "Alone it does not explain the stops: something else has changed too."
         anew = _runnable(check, Remedy(_capital(_ANEW), CALIBRATE_ANEW))
@@ -134,7 +128,7 @@ def verdict_of(check: Check) -> Verdict:
 
 
 def _runnable(check: Check, step: Remedy) -> Remedy:
-    """Advice without its command where these stops do not allow it."""
+    """Drops a remedy's command where these stops do not allow it."""
     session = check.seen.known.session
     of_images = any(view.image for view in session.views)
     is_lens_known = not of_images or session.camera is not None
@@ -149,11 +143,11 @@ def _runnable(check: Check, step: Remedy) -> Remedy:
 
 
 def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
-    """What the likeliest change cannot be distinguished from."""
+    """Finding on the changes that cannot be distinguished from the likeliest."""
     named = listed([thing(check, other) for other in others])
     robot = check.calibration.calibrated_robot
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
-        # A base that turns about the first axis, or a tool about the last, looks the same anywhere.
+        # A rotation of the base about the first axis, or of the tool about the last, is equivalent.
         return Finding("rivals", f"No stops separate that from {named}.", Remedy("Look at both."))
     these = "This stop does" if check.seen.stops == 1 else f"These {check.seen.stops} stops do"
     words = f"{these} not separate that from {named}."
@@ -162,7 +156,7 @@ def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
 
 
 def described(check: Check, suspect: Suspect) -> dict[str, Any]:
-    """The figures of a change, as JSON has them: millimetres, degrees, shares."""
+    """Estimates of a change for the JSON document: millimetres, degrees, shares."""
     kind = kind_of(suspect.name)
     values, sigmas = suspect.explained.values, np.sqrt(np.diag(suspect.explained.covariance))
     if kind == NOISE:
@@ -172,25 +166,24 @@ def described(check: Check, suspect: Suspect) -> dict[str, Any]:
     if kind == JOINT:
         value, sigma, unit = _joint_figures(check, suspect)
         return {f"offset_{unit}": value, f"sigma_{unit}": sigma}
-    documents = {name: _motion_document(motion) for name, motion in motions(check, suspect).items()}
+    documents: dict[str, Any] = {
+        name: {
+            "moved_mm": motion.mm,
+            "sigma_mm": motion.sigma_mm,
+            "along": motion.along,
+            "turned_deg": motion.deg,
+            "sigma_deg": motion.sigma_deg,
+            "about": motion.about,
+        }
+        for name, motion in motions(check, suspect).items()
+    }
     if kind == REPLACED:
         return {**documents[suspect.name], "share": float(values[6]), "sigma": float(sigmas[6])}
     return documents if kind == BOTH else documents[suspect.name]
 
 
-def _motion_document(moved: MeasuredMove) -> dict[str, Any]:
-    return {
-        "moved_mm": moved.mm,
-        "sigma_mm": moved.sigma_mm,
-        "along": moved.along,
-        "turned_deg": moved.deg,
-        "sigma_deg": moved.sigma_deg,
-        "about": moved.about,
-    }
-
-
 def motions(check: Check, suspect: Suspect) -> dict[str, MeasuredMove]:
-    """How far the camera, a board, or the board of one view moved, by their names."""
+    """Estimated motions of the camera, a board, or the board of one view, by name."""
     names = (CAMERA, BOARD) if kind_of(suspect.name) == BOTH else (suspect.name,)
     values, covariance = suspect.explained.values, suspect.explained.covariance
     parts = [slice(6 * at, 6 * at + 6) for at in range(len(names))]
@@ -204,65 +197,65 @@ def motions(check: Check, suspect: Suspect) -> dict[str, MeasuredMove]:
 def _motion(
     check: Check, name: str, twist: FloatArray, covariance: FloatArray, grown: float
 ) -> MeasuredMove:
-    """How far the middle of something moved that is larger by a share than it was."""
+    """Motion of a camera, or of the middle of a board that also grew by a share."""
     x, *boards = check.prior_calibration.state.edges
-    hand = check.calibration.mount == "eye-in-hand"
+    in_hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
-        rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if hand else "base"
+        rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if in_hand else "base"
     else:
-        place = _board(check, name)
-        rotation, point = boards[place][:3, :3], _middle(check, place)
-        parent = "base" if hand else "tool"
+        board = _board(check, name)
+        rotation, point = boards[board][:3, :3], _middle(check, board)
+        parent = "base" if in_hand else "tool"
     moved = exp(twist)
     shift = moved[:3, :3] @ point * (1.0 + grown) + moved[:3, 3] - point
-    # How the point goes on moving with the twist, by its right perturbation.
-    onward = np.linalg.inv(inverse_right_jacobian(twist))
-    slope = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ onward
-    mm, sigma_mm = _length(shift, slope @ covariance @ slope.T)
-    turn, sigma = _length(twist[:3], covariance[:3, :3])
+    # Jacobian of the point with respect to the twist, through its right perturbation.
+    right = np.linalg.inv(inverse_right_jacobian(twist))
+    jacobian = moved[:3, :3] @ np.concatenate([-skew(point), np.eye(3)], axis=1) @ right
+    metres, sigma_m = _length(shift, jacobian @ covariance @ jacobian.T)
+    rad, sigma_rad = _length(twist[:3], covariance[:3, :3])
     return MeasuredMove(
-        1e3 * mm,
-        1e3 * sigma_mm,
+        1e3 * metres,
+        1e3 * sigma_m,
         f"the {parent}'s {_signed_axis(rotation @ shift)}",
-        float(np.rad2deg(turn)),
-        float(np.rad2deg(sigma)),
+        float(np.rad2deg(rad)),
+        float(np.rad2deg(sigma_rad)),
         f"the {parent}'s {_signed_axis(rotation @ twist[:3])}",
     )
 
 
 def _board(check: Check, name: str) -> int:
-    """The place among the calibration's boards of the one that a cause is about."""
+    """Index, among the calibration's boards, of the board of a cause."""
     kind, _, which = name.partition(" ")
-    prior_calibration, seen = check.prior_calibration, check.seen
+    prior, predicted = check.prior_calibration, check.seen
     if kind in (BOARD, REPLACED):
-        names = list(prior_calibration.targets)
-        return prior_calibration.boards.index(names.index(which)) if which in names else 0
-    return int(seen.boards[[int(which) in view for view in seen.views]][0])
+        names = list(prior.targets)
+        return prior.boards.index(names.index(which)) if which in names else 0
+    return int(predicted.boards[[int(which) in views for views in predicted.views]][0])
 
 
-def _middle(check: Check, place: int) -> FloatArray:
+def _middle(check: Check, board: int) -> FloatArray:
     """(3,) middle of one of the calibration's boards, in its frame [m]."""
     targets = tuple(check.prior_calibration.targets.values())
     if not targets:
         return np.zeros(3)
-    return np.asarray(corner_positions(targets[check.prior_calibration.boards[place]]).mean(axis=0))
+    return np.asarray(corner_positions(targets[check.prior_calibration.boards[board]]).mean(axis=0))
 
 
 def _length(vector: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Length of a (3,) vector, and its standard deviation along itself."""
+    """Length of a (3,) vector, and its standard deviation along the vector."""
     length = float(np.linalg.norm(vector))
-    along = vector / length if length > 0.0 else np.full(3, 1.0 / np.sqrt(3.0))
-    return length, float(np.sqrt(max(float(along @ covariance @ along), 0.0)))
+    unit = vector / length if length > 0.0 else np.full(3, 1.0 / np.sqrt(3.0))
+    return length, float(np.sqrt(max(float(unit @ covariance @ unit), 0.0)))
 
 
 def _signed_axis(vector: FloatArray) -> str:
     """Names a direction with its sign: `-x`, or `direction (-0.71, 0.71, 0.00)`."""
     length = float(np.linalg.norm(vector))
-    along = vector / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
-    words = axis_words(along)
+    unit = vector / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+    words = axis_words(unit)
     if len(words) == 1:
-        return words if along["xyz".index(words)] > 0.0 else f"-{words}"
-    return "direction ({:.2f}, {:.2f}, {:.2f})".format(*along)
+        return words if unit["xyz".index(words)] > 0.0 else f"-{words}"
+    return "direction ({:.2f}, {:.2f}, {:.2f})".format(*unit)
 
 
 def _changed(check: Check, suspect: Suspect) -> str:
@@ -274,12 +267,12 @@ def _changed(check: Check, suspect: Suspect) -> str:
         return f"{_capital('; '.join(f'the {name} {move.words}' for name, move in moved.items()))}."
     return (
         f"{_capital(suspect.name)} alone contradicts the calibration, by "
-        f"{_short(moved[suspect.name])}; the other stops agree with it."
+        f"{_size_words(moved[suspect.name])}; the other stops agree with it."
     )
 
 
 def thing(check: Check, suspect: Suspect) -> str:
-    """A change with its figures, as the part of a sentence."""
+    """A change with its estimates, as a part of a sentence."""
     kind, explained = kind_of(suspect.name), suspect.explained
     if kind == JOINT:
         value, sigma, unit = _joint_figures(check, suspect)
@@ -305,27 +298,28 @@ def thing(check: Check, suspect: Suspect) -> str:
         return f"the robot scatters about {explained.noise_factor:.0f} times as much as it did"
     if kind in (CAMERA, BOARD, BOTH):
         moved = motions(check, suspect)
-        return listed([f"the {name} moved by {_short(move)}" for name, move in moved.items()])
+        return listed([f"the {name} moved by {_size_words(move)}" for name, move in moved.items()])
     return f"{suspect.name} alone being wrong"
 
 
 def _other_board(check: Check, suspect: Suspect) -> str:
-    """A board of another size, with its place where that is another too."""
+    """A board of another size, in words, with its displacement where it also moved."""
     kind, _, which = suspect.name.partition(" ")
     share = float(suspect.explained.values[-1])
     sigma = float(np.sqrt(suspect.explained.covariance[-1, -1]))
     size = "larger" if share > 0.0 else "smaller"
-    named = f"the board {which}".strip()
+    board = f"the board {which}".strip()
     words = (
-        f"{named} is {figure(1e2 * abs(share))} % {size} (sigma {figure(1e2 * sigma)}) than it "
+        f"{board} is {figure(1e2 * abs(share))} % {size} (sigma {figure(1e2 * sigma)}) than it "
         "was: it was printed again or exchanged"
     )
     if kind == SIZE:
         return words
-    return f"{words}; its middle lies {_short(motions(check, suspect)[suspect.name])} elsewhere"
+    moved = motions(check, suspect)[suspect.name]
+    return f"{words}; its middle lies {_size_words(moved)} elsewhere"
 
 
-def _short(moved: MeasuredMove) -> str:
+def _size_words(moved: MeasuredMove) -> str:
     return mm_and_deg(moved.mm, moved.deg)
 
 
@@ -346,11 +340,10 @@ def _agreement(check: Check) -> str:
     sure, verb = _SURE * check.camera_sigma, "agrees" if check.seen.stops == 1 else "agree"
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     return (
-        f"{_stops(check)} {verb} with the calibration: off by {off_mm} mm "
-        f"and {off_deg} deg (rms); by chance alone it is more in "
-        f"{chance} of checks. "
-        f"A camera that had moved by {figure(1e3 * float(sure[3:].max()))} mm or "
-        f"{figure(float(np.rad2deg(sure[:3].max())))} deg would have shown."
+        f"{_stops(check)} {verb} with the calibration: off by {off_mm} mm and {off_deg} deg (rms); "
+        f"by chance alone it is more in {chance} of checks. A camera that had moved by "
+        f"{figure(1e3 * float(sure[3:].max()))} mm or {figure(float(np.rad2deg(sure[:3].max())))} "
+        "deg would have shown."
     )
 
 
@@ -373,14 +366,18 @@ def _capital(text: str) -> str:
 def to_document(
     check: Check, triggers: Sequence[Outcome], verdict: Verdict | None = None
 ) -> dict[str, Any]:
-    """Writes a check as JSON has it; what is not known is absent.
+    """Converts a check to a JSON document; unknown values are absent.
 
     Args:
         check: The check.
-        triggers: What became of the policy's triggers.
-        verdict: What it found, with the paths of the run; without them where None.
+        triggers: Evaluation of the policy's triggers.
+        verdict: Its verdict, with the paths of the run; that of `verdict_of` where None.
     """
-    calibration, known, verdict = check.calibration, check.seen.known, verdict or verdict_of(check)
+    calibration, observed, verdict = (
+        check.calibration,
+        check.seen.known,
+        verdict or verdict_of(check),
+    )
     return {
         "schema": SCHEMA,
         "passed": check.passed,
@@ -389,7 +386,7 @@ def to_document(
             "sha256": calibration.session_sha256,
             "created": calibration.created,
         },
-        "session": {"name": known.session.name, "sha256": known.session.digest()},
+        "session": {"name": observed.session.name, "sha256": observed.session.digest()},
         "sentences": list(verdict.reasons),
         "next": [vars(step) for step in verdict.next_steps],
         "changes": [_change(check, suspect) for suspect in check.named],
@@ -418,7 +415,7 @@ def to_document(
             for views, away, left in zip(check.seen.views, check.away, check.left, strict=True)
         ],
         "not_used": [
-            {"view": view, "reason": reason} for view, reason in sorted(known.reasons.items())
+            {"view": view, "reason": reason} for view, reason in sorted(observed.reasons.items())
         ],
         "warnings": list(check.seen.warnings),
         "recalibrate": any(trigger.state == "fired" for trigger in triggers),
@@ -427,17 +424,13 @@ def to_document(
 
 
 def listed_suspects(check: Check) -> tuple[Suspect, ...]:
-    """The changes that are listed: those that are named, and others that are not unlikely."""
+    """Changes to list: those that are named, and others that are not unlikely."""
     others = (suspect for suspect in check.suspects if suspect not in check.named)
     return (*check.named, *(other for other in others if other.probability > _LISTED_SHARE))
 
 
 def _change(check: Check, suspect: Suspect) -> dict[str, Any]:
-    return {
-        "cause": suspect.name,
-        "probability": suspect.probability,
-        **described(check, suspect),
-    }
+    return {"cause": suspect.name, "probability": suspect.probability, **described(check, suspect)}
 
 
 def _trigger(outcome: Outcome) -> dict[str, Any]:

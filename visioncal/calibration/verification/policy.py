@@ -1,4 +1,4 @@
-"""When to calibrate again: triggers, as a table says them."""
+"""Triggers of a recalibration, from a policy table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ State: TypeAlias = Literal["fired", "quiet", "unknown"]
 
 _FILE = Path(__file__).with_name("policy.toml")
 _DAY_S = 86400.0
-# Quantities that are yes or no, and those that have a limit, with their units.
+# Yes or no quantities; quantities with a limit, by unit.
 _FLAGS = ("failed_check", "collision")
 _UNITS = {"ambient_change_k": "K", "payload_change_kg": "kg", "age_days": "days"}
 _COLUMNS = {"ambient_change_k": "ambient_c", "payload_change_kg": "payload_kg"}
@@ -36,8 +36,8 @@ class Trigger:
     """A reason to calibrate again.
 
     Attributes:
-        quantity: What is looked at.
-        limit: Beyond what it fires; None for what is yes or no.
+        quantity: The quantity that is compared.
+        limit: The limit beyond which it fires; None for a yes or no quantity.
     """
 
     quantity: str
@@ -46,13 +46,13 @@ class Trigger:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one trigger.
+    """Evaluation of one trigger.
 
     Attributes:
-        trigger: Which.
+        trigger: The trigger.
         state: Whether it fired, or could not be judged.
         value: The figure that was compared with the limit; None for yes or no, and where unknown.
-        words: Its name, with its figure and limit, or why it is not known.
+        words: Its name, with figure and limit, or why the figure is unknown.
     """
 
     trigger: Trigger
@@ -63,12 +63,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class TriggerFacts:
-    """What the triggers look at; None where it is not known.
+    """Input of the triggers.
 
     Attributes:
-        values: The figures by quantity.
-        flags: What is yes or no, by quantity.
-        unknown: Why a figure is not known, by quantity.
+        values: Figures by quantity.
+        flags: Yes or no, by quantity.
+        unknown: Why a figure is unknown, by quantity.
     """
 
     values: Mapping[str, float]
@@ -80,10 +80,10 @@ def load_policy(path: Path | None = None) -> tuple[Trigger, ...]:
     """Reads a table of triggers.
 
     Args:
-        path: A file of one's own; the shipped one where None.
+        path: A custom file; the shipped one where None.
 
     Raises:
-        DataError: It is missing, or a trigger has an unknown quantity or no limit.
+        DataError: The file is missing, or a trigger has an unknown quantity or no limit.
     """
     file = _FILE if path is None else path
     rows = read_toml(file, str(file)).get("trigger")
@@ -116,25 +116,25 @@ def facts_of(
     collision: bool,
     now: datetime | None = None,
 ) -> TriggerFacts:
-    """Collects what triggers look at.
+    """Collects the input of the triggers.
 
     Args:
-        session: The check's; its columns `ambient_c` and `payload_kg` are averaged.
-        calibration: The one that was checked, with the conditions of its own views.
-        failed: Whether the stops say that something has changed.
-        collision: Whether one was reported.
+        session: The check's session; its columns `ambient_c` and `payload_kg` are averaged.
+        calibration: The checked calibration, with the mean conditions of its views.
+        failed: Whether the check failed.
+        collision: Whether a collision was reported.
         now: The time; that of the clock where None.
     """
     values, unknown = {}, {}
     before = calibration.conditions
     for quantity, column in _COLUMNS.items():
-        here = [view.numbers[column] for view in session.views if column in view.numbers]
+        readings = [view.numbers[column] for view in session.views if column in view.numbers]
         if column not in before:
             unknown[quantity] = f"the views that were calibrated with do not all have {column}"
-        elif not here:
+        elif not readings:
             unknown[quantity] = f"the check's views have no {column}"
         else:
-            values[quantity] = abs(float(np.mean(here)) - before[column])
+            values[quantity] = abs(float(np.mean(readings)) - before[column])
     age_days = _age_days(calibration.created, now or datetime.now(UTC))
     if age_days is None:
         unknown["age_days"] = f"the calibration's time is {calibration.created!r}"
@@ -153,7 +153,7 @@ def _age_days(created: str, now: datetime) -> float | None:
 
 
 def outcomes(policy: Sequence[Trigger], facts: TriggerFacts) -> tuple[Outcome, ...]:
-    """Says of each trigger whether it fires."""
+    """Evaluates each trigger."""
     return tuple(_outcome(trigger, facts) for trigger in policy)
 
 

@@ -1,4 +1,4 @@
-"""A few stops of a session, seen with a calibration's own lens, boards and arm."""
+"""Predicts the stops of a session with a calibration's lens, boards and arm."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -29,23 +29,23 @@ from visioncal.session import Session
 from visioncal.session.boards import COLUMN
 from visioncal.vision.targets import numbered_positions, target_document
 
-# Models that place the flange alike to this are of one robot; tables are written with six digits.
+# Models whose flanges differ by less are of the same robot; tables are written with six digits.
 _ONE_ROBOT_MM, _ONE_ROBOT_DEG = 0.01, 0.001
 _POSTURES = 5
 _STAGES = {stage.name: stage.run for stage in STAGES}
-# Corners that scatter by so many times as much as when they were calibrated with are mentioned.
+# Growth of the corners' noise since the calibration beyond which a warning is given.
 _MENTIONED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedStops:
-    """The stops of a session as a calibration sees them.
+    """The stops of a session with a calibration's lens, boards and arm.
 
     Attributes:
-        known: What is known of the session, with the calibration's lens, boards and arm.
-        problem: The m sights of a board at a stop, with the calibration's unknowns.
-        views: (m,) the views of each sight.
-        warnings: What is odd, in sentences.
+        known: The session's observations, with the calibration's lens, boards and arm.
+        problem: The m observations of a board at a stop, with the calibration's unknowns.
+        views: (m,) the views that each observation combines.
+        warnings: Warnings, in sentences.
     """
 
     known: ObservedPoses
@@ -55,7 +55,7 @@ class PredictedStops:
 
     @property
     def stops(self) -> int:
-        """How many stops there are."""
+        """Number of stops."""
         return len(self.problem.poses[ROBOT])
 
     @property
@@ -65,14 +65,14 @@ class PredictedStops:
 
     @property
     def boards(self) -> IntArray:
-        """(m,) which of the calibration's boards each sight is of."""
+        """(m,) index of each observation's board among the calibration's."""
         return np.array(
             [self.problem.unknown[name] - 1 for name in self.problem.observations.observed]
         )
 
-    def away(self, prior_calibration: CalibrationPrior) -> FloatArray:
-        """(m, 4, 4) by how much its board has moved, on its right, as each sight places it."""
-        return asked_of_boards(self.problem, prior_calibration.state)
+    def away(self, prior: CalibrationPrior) -> FloatArray:
+        """(m, 4, 4) change of its board's edge, on the right, by each observation."""
+        return board_changes(self.problem, prior.state)
 
     @property
     def from_corners(self) -> bool:
@@ -82,215 +82,208 @@ class PredictedStops:
 
 def predict_stops(
     session: Session,
-    prior_calibration: CalibrationPrior,
+    prior: CalibrationPrior,
     progress: Progress | None = None,
     without: Mapping[int, str] | None = None,
 ) -> PredictedStops:
-    """Looks at a session with what a calibration rests on, and estimates nothing anew.
+    """Observes a session with a calibration's lens, boards and arm; nothing is estimated.
 
     Args:
-        session: Of the same cell.
-        prior_calibration: The calibration's.
-        progress: Told of long work.
-        without: Views that are not to be looked at, and why not.
+        session: A session of the same cell.
+        prior: The calibration as a prior.
+        progress: Called with the progress of long work.
+        without: Why views are to be left out, by view.
 
     Raises:
-        DataError: It is of another mount, camera, target or robot, lacks joint angles that the
-            calibrated arm needs, or shows nothing.
+        DataError: The session is of another mount, camera, target or robot, lacks joint angles that
+            the calibrated arm needs, or shows no target.
     """
-    known = _STAGES["robot"](known_before(session, prior_calibration, progress))
-    known = _STAGES["detect"](known)
-    rejected = {key: why for key, why in (without or {}).items() if key not in known.held_back}
-    return seen_by(known.noting(Rejection(*pair) for pair in rejected.items()), prior_calibration)
+    run = _STAGES["robot"](known_before(session, prior, progress))
+    run = _STAGES["detect"](run)
+    rejected = {key: why for key, why in (without or {}).items() if key not in run.held_back}
+    return seen_by(run.noting(Rejection(*pair) for pair in rejected.items()), prior)
 
 
 def known_before(
-    session: Session, prior_calibration: CalibrationPrior, progress: Progress | None = None
+    session: Session, prior: CalibrationPrior, progress: Progress | None = None
 ) -> RunState:
-    """What is known before anything is looked at: that the session is of the same cell.
+    """Initial state of a run, once it is checked that the session is of the same cell.
 
     Raises:
-        DataError: It is of another mount, target or robot.
+        DataError: The session is of another mount, target or robot.
     """
-    calibration = prior_calibration.calibration
+    calibration = prior.calibration
     check_mount(session, calibration)
-    session = _with_its_targets(session, prior_calibration)
+    session = _with_calibrated_targets(session, prior)
     document, robot = session.robot_document, calibration.robot
     if robot is not None and document is not None:
         check_robot(session, Robot.from_document(document), robot)
     if robot is not None:
-        # As calibrated, with its base in the frame of the poses.
+        # The calibrated robot has its base in the frame of the poses.
         session = replace(session, robot_document=robot.document)
     return RunState(session, progress)
 
 
-def seen_by(known: RunState, prior_calibration: CalibrationPrior) -> PredictedStops:
-    """Carries on where targets have been detected; see `predict_stops`."""
-    calibration, detected = prior_calibration.calibration, known.cameras
-    for frame, look in known.cameras.items():
+def seen_by(run: RunState, prior: CalibrationPrior) -> PredictedStops:
+    """Does what `predict_stops` does, once targets have been detected."""
+    calibration, detected = prior.calibration, run.cameras
+    for frame, look in run.cameras.items():
         if look.resolution is None:
             continue
         if calibration.camera is None:
             raise DataError(
                 f"calibration {calibration.session_name!r} holds no camera, and session "
-                f"{known.session.name!r} has images.",
+                f"{run.session.name!r} has images.",
                 next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
             )
-        check_resolution(known.session, calibration, look.resolution)
+        check_resolution(run.session, calibration, look.resolution)
         lens = CameraResult(calibration.camera.camera, estimated=False)
-        straight = _straightened(look.corners, calibration.camera, {})
-        known = known.with_camera(frame, replace(look, lens=lens, corners=straight))
-    known = _breathed(known, detected, calibration.camera)
-    # Of a sweep the slower views are taken, in which the offset's error is lost in the robot's.
-    known = replace(_STAGES["clock"](_STAGES["pnp"](known)), clocks={})
-    looked = _posed(_with_arm(ObservedPoses.of(known), prior_calibration), prior_calibration)
-    problem = looked.problem(looked.used)
-    sights = problem.of_one_stop
+        corrected = _in_lens_model(look.corners, calibration.camera, {})
+        run = run.with_camera(frame, replace(look, lens=lens, corners=corrected))
+    run = _without_breathing(run, detected, calibration.camera)
+    # Of a sweep the slower views are used, where the error of the clock offset is below the
+    # robot's.
+    run = replace(_STAGES["clock"](_STAGES["pnp"](run)), clocks={})
+    observed = _with_poses(_with_arm(ObservedPoses.of(run), prior), prior)
+    problem, used = observed.problem(observed.used), np.array(observed.used)
+    merged = problem.of_one_stop
     return PredictedStops(
-        looked,
+        observed,
         problem.merged(),
-        tuple(
-            tuple(np.array(looked.used)[sights == at].tolist()) for at in range(sights.max() + 1)
-        ),
-        tuple(_warnings(looked, prior_calibration)),
+        tuple(tuple(used[merged == at].tolist()) for at in range(merged.max() + 1)),
+        tuple(_warnings(observed, prior)),
     )
 
 
-def _breathed(
-    known: RunState, detected: Mapping[str, CameraLook], lens: CameraResult | None
+def _without_breathing(
+    run: RunState, detected: Mapping[str, CameraLook], lens: CameraResult | None
 ) -> RunState:
-    """Corners where a lens that breathes would show them at the views' mean distance."""
+    """Corrects corners for focus breathing, to the calibration's mean distance."""
     if lens is None or lens.field is None or lens.field.breathing == 0.0:
-        return known
-    targets = tuple(known.session.boards.values())
-    placed = _STAGES["pnp"](known).poses
+        return run
+    targets = tuple(run.session.boards.values())
+    rough_poses = _STAGES["pnp"](run).poses
     for frame, look in detected.items():
-        shown = {
-            view: view_corners for view, view_corners in look.corners.items() if view in placed
-        }
+        shown = {view: corners for view, corners in look.corners.items() if view in rough_poses}
         if not shown:
             continue
         stack = CornerStack.of(shown, numbered_positions(targets))
-        poses = np.array([placed[view].cam_from_target[0] for view in stack.views])
-        far = dict(zip(stack.views, depths_m(stack, poses).tolist(), strict=True))
-        straight = _straightened(look.corners, lens, far)
-        known = known.with_camera(frame, replace(known.cameras[frame], corners=straight))
-    return known
+        poses = np.array([rough_poses[view].cam_from_target[0] for view in stack.views])
+        depths = dict(zip(stack.views, depths_m(stack, poses).tolist(), strict=True))
+        corrected = _in_lens_model(look.corners, lens, depths)
+        run = run.with_camera(frame, replace(run.cameras[frame], corners=corrected))
+    return run
 
 
-def _straightened(
+def _in_lens_model(
     corners: Mapping[int, Corners], lens: CameraResult, depths: Mapping[int, float]
 ) -> dict[int, Corners]:
-    """Corners by view where the lens would show them, were it what its model says."""
+    """Corrects corners, by view, for the lens's errors beyond its model."""
     return {
-        view: replace(view_corners, px=lens.in_model(view_corners.px, depths.get(view)))
-        for view, view_corners in corners.items()
+        view: replace(detected, px=lens.in_model(detected.px, depths.get(view)))
+        for view, detected in corners.items()
     }
 
 
-def asked_of_boards(problem: Problem, state: State) -> FloatArray:
-    """(m, 4, 4) the change of its board's edge, on the right, that each observation asks for."""
-    asked, observed = np.zeros((len(problem), 4, 4)), np.array(problem.observations.observed)
+def board_changes(problem: Problem, state: State) -> FloatArray:
+    """(m, 4, 4) change of its board's edge, on the right, that each observation requires."""
+    changes, observed = np.zeros((len(problem), 4, 4)), np.array(problem.observations.observed)
     for board in set(problem.observations.observed):
-        mine = observed == board
-        asked[mine] = problem.change_of(board, state)[mine]
-    return asked
+        of_board = observed == board
+        changes[of_board] = problem.change_of(board, state)[of_board]
+    return changes
 
 
-def _with_arm(known: ObservedPoses, prior_calibration: CalibrationPrior) -> ObservedPoses:
-    """Takes the arm for what the calibration has it for."""
-    known = replace(known, calibrated=replace(known.robot_arm, model=prior_calibration.model))
-    if prior_calibration.arm in ("none", "poses"):
-        return known
-    if known.robot_arm.joints_rad is None:
-        missing = [view.number for view in known.session.views if view.joints_rad is None]
+def _with_arm(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
+    """Takes over the calibration's arm."""
+    observed = replace(observed, calibrated=replace(observed.robot_arm, model=prior.model))
+    if prior.arm in ("none", "poses"):
+        return observed
+    if observed.robot_arm.joints_rad is None:
+        missing = [view.number for view in observed.session.views if view.joints_rad is None]
         raise DataError(
-            f"session {known.session.name!r}: the calibration is of an arm by its joints, and "
+            f"session {observed.session.name!r}: the calibration is of an arm by its joints, and "
             + (f"{len(missing)} views have no joint angles." if missing else "its joints differ."),
             culprits=[f"views.csv: view {index}" for index in missing],
             next_step="Record q1_rad ... with every view.",
         )
-    return known
+    return observed
 
 
-def _posed(known: ObservedPoses, prior_calibration: CalibrationPrior) -> ObservedPoses:
-    """Chooses each view's pose by the calibration, and makes it by its lens and boards."""
-    mount, targets = known.session.mount, tuple(prior_calibration.targets.values())
-    x, *placed = prior_calibration.state.edges
-    order = {board: at for at, board in enumerate(prior_calibration.boards)}
+def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
+    """Chooses each view's pose by the calibration, and recomputes it with its lens and boards."""
+    mount, targets = observed.session.mount, tuple(prior.targets.values())
+    x, *boards = prior.state.edges
+    order = {board: at for at, board in enumerate(prior.boards)}
     views, chosen = [], []
-    for view in (view.number for view in known.session.views):
-        poses = known.poses.get(view)
-        if poses is None or view not in known.base_from_flange or view in known.reasons:
+    for view in (view.number for view in observed.session.views):
+        poses = observed.poses.get(view)
+        if poses is None or poses.board not in order:
             continue
-        if poses.board not in order:
+        if view not in observed.base_from_flange or view in observed.reasons:
             continue
-        robot = robot_part(known.arm_at([view]).poses, mount)[0]
-        predicted = invert(robot @ x) @ placed[order[poses.board]]
+        robot = robot_part(observed.arm_at([view]).poses, mount)[0]
+        predicted = invert(robot @ x) @ boards[order[poses.board]]
         views.append(view)
         chosen.append(choose_by(poses, predicted, targets[poses.board] if targets else None))
     if not views:
         raise DataError(
-            f"session {known.session.name!r}: no view shows the target from a known pose of the "
+            f"session {observed.session.name!r}: no view shows the target from a known pose of the "
             "robot.",
-            culprits=known.lost_views,
+            culprits=observed.lost_views,
         )
-    known = replace(
-        known, used=tuple(views), boards=prior_calibration.boards, free=prior_calibration.free
-    )
-    known = replace(known, frames=known.framed(prior_calibration.state.edges)).posed(chosen)
-    if known.free is not None and all(view.corners is not None for view in chosen):
-        known = known.with_noise(_noise_px(known)).posed(chosen)
-    return _with_errors(known, prior_calibration)
+    observed = replace(observed, used=tuple(views), boards=prior.boards, free=prior.free)
+    observed = replace(observed, frames=observed.framed(prior.state.edges)).posed(chosen)
+    if observed.free is not None and all(view.corners is not None for view in chosen):
+        observed = observed.with_noise(_noise_px(observed)).posed(chosen)
+    return _with_errors(observed, prior)
 
 
-def _with_errors(known: ObservedPoses, prior_calibration: CalibrationPrior) -> ObservedPoses:
-    """Adds the arm's errors as unknowns, as the calibration's covariance has them."""
-    if prior_calibration.arm == "none":
-        return known
-    arm = known.robot_arm
-    if prior_calibration.arm == "poses":
+def _with_errors(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses:
+    """Adds the arm's errors as unknowns, which the calibration's covariance includes."""
+    if prior.arm == "none":
+        return observed
+    arm = observed.robot_arm
+    if prior.arm == "poses":
         arm = replace(arm, joints_rad=None)
     errors = ArmErrors(arm.basis, 1.0, np.inf, of_links=True)
-    return replace(known, calibrated=replace(arm, errors=errors))
+    return replace(observed, calibrated=replace(arm, errors=errors))
 
 
-def _noise_px(known: ObservedPoses) -> float:
-    """Noise of a corner's coordinate around the poses, by lens and boards as calibrated [px]."""
-    corners = {
-        view: corners
-        for view, corners in zip(known.used, known.seen(known.used), strict=True)
-        if corners
-    }
-    free = known.free
+def _noise_px(observed: ObservedPoses) -> float:
+    """Noise of a corner's coordinate around the poses, by calibrated lens and boards [px]."""
+    pairs = ((view, observed.poses[view].corners) for view in observed.used)
+    corners = {view: detected for view, detected in pairs if detected}
+    free = observed.free
     if free is None or not corners:
-        return known.pixel_px or 0.0
-    shaped = free.positions + free.basis @ free.appearance.board
-    stack = CornerStack.of(corners, shaped)
-    poses = np.array([known.poses[view].cam_from_target[0] for view in corners])
-    left = reproject(stack, free.appearance.camera, poses).residuals
-    return stack.sigma_px(left, 6 * len(corners))
+        return observed.pixel_px or 0.0
+    stack = CornerStack.of(corners, free.positions + free.basis @ free.appearance.board)
+    poses = np.array([observed.poses[view].cam_from_target[0] for view in corners])
+    residuals = reproject(stack, free.appearance.camera, poses).residuals
+    return stack.sigma_px(residuals, 6 * len(corners))
 
 
-def _with_its_targets(session: Session, prior_calibration: CalibrationPrior) -> Session:
-    """Numbers the session's targets as the calibration does, by their names."""
-    # The only one of a session has no name: where several were calibrated with, it is the one among
-    # them that is printed alike.
-    known, shown = prior_calibration.targets, session.boards
-    if len(known) < 2 and len(shown) < 2:
+def _with_calibrated_targets(session: Session, prior: CalibrationPrior) -> Session:
+    """Replaces the session's targets by the calibration's, by their names."""
+    # A session's only target has no name: of several calibrated ones, it is that with an equal
+    # print.
+    calibrated, shown = prior.targets, session.boards
+    if len(calibrated) < 2 and len(shown) < 2:
         if any(view.image or view.has_corners for view in session.views):
-            _check_targets(session, prior_calibration)
+            _check_targets(session, prior)
         return session
     name = ""
     if "" in shown:
-        alike = [name for name, target in known.items() if not _differing(target, shown[""])]
+        alike = [
+            name for name, target in calibrated.items() if not _print_differences(target, shown[""])
+        ]
         name = alike[0] if len(alike) == 1 else ""
     if not name:
-        _check_targets(session, prior_calibration)
+        _check_targets(session, prior)
     if not shown:
         raise DataError(
             f"session {session.name!r} does not say which of the targets that were calibrated with "
-            f"({', '.join(known)}) its rows show.",
+            f"({', '.join(calibrated)}) its rows show.",
             culprits=["session.toml: targets"],
             next_step="Declare them as in the calibration's session, and name one in each row's "
             "column target.",
@@ -298,41 +291,42 @@ def _with_its_targets(session: Session, prior_calibration: CalibrationPrior) -> 
     views = session.views
     if name:
         views = tuple(replace(view, text={**view.text, COLUMN: name}) for view in views)
-    return replace(session, target=None, targets=known, views=views)
+    return replace(session, target=None, targets=calibrated, views=views)
 
 
-def _differing(ours: Target, theirs: Target) -> list[str]:
+def _print_differences(ours: Target, theirs: Target) -> list[str]:
     """The fields in which two targets are printed differently."""
-    one, other = target_document(ours), target_document(theirs)
-    differing = [name for name in {**one, **other} if one.get(name) != other.get(name)]
-    return [name for name in differing if name != "square_sigma_m"]
+    first, second = target_document(ours), target_document(theirs)
+    return [
+        name
+        for name in {**first, **second}
+        if first.get(name) != second.get(name) and name != "square_sigma_m"
+    ]
 
 
-def _check_targets(session: Session, prior_calibration: CalibrationPrior) -> None:
-    """Refuses other targets than were calibrated with; how well a size is known may differ."""
-    if not prior_calibration.targets:
+def _check_targets(session: Session, prior: CalibrationPrior) -> None:
+    """Refuses targets other than the calibrated ones; the stated sigma of a size may differ."""
+    if not prior.targets:
         raise DataError(
-            f"calibration {prior_calibration.calibration.session_name!r} was made from measured "
+            f"calibration {prior.calibration.session_name!r} was made from measured "
             f"poses, and does not say of which target; session {session.name!r} has images.",
             culprits=["session.toml: target"],
             next_step="Give the target's poses (cft_x_m ...) as when it was calibrated.",
         )
     for name, target in session.boards.items():
-        known = prior_calibration.targets.get(name)
-        if known is None:
-            there = ", ".join(
-                target or "one without a name" for target in prior_calibration.targets
-            )
+        calibrated = prior.targets.get(name)
+        if calibrated is None:
+            names = [target or "one without a name" for target in prior.targets]
             raise DataError(
                 f"session {session.name!r}: target {name or target.name!r} is none of those that "
-                f"were calibrated with ({there}).",
+                f"were calibrated with ({', '.join(names)}).",
                 culprits=["session.toml: target"],
                 next_step="Verify with views of that target alone."
-                if "" in prior_calibration.targets
+                if "" in prior.targets
                 else "Name the targets as in the calibration's session.",
             )
-        ours, theirs = target_document(known), target_document(target)
-        for field in _differing(known, target):
+        ours, theirs = target_document(calibrated), target_document(target)
+        for field in _print_differences(calibrated, target):
             raise DataError(
                 f"session {session.name!r}: target {name or target.name!r} has {field} = "
                 f"{shorten(theirs.get(field))}, and the calibration was made with "
@@ -343,46 +337,46 @@ def _check_targets(session: Session, prior_calibration: CalibrationPrior) -> Non
             )
 
 
-def check_robot(session: Session, stated: Robot, known: Robot) -> None:
-    """Refuses another robot than a calibration's; the same model written otherwise passes.
+def check_robot(session: Session, stated: Robot, calibrated: Robot) -> None:
+    """Refuses a robot other than the calibration's, by the motion of its flange.
 
     Raises:
         DataError: They differ.
     """
     culprit = ["session.toml: robot.model"]
-    if stated.joint_count != known.joint_count:
+    if stated.joint_count != calibrated.joint_count:
         raise DataError(
             f"session {session.name!r} names robot {stated.name} with {stated.joint_count} joints, "
-            f"and the calibration is of {known.name} with {known.joint_count}.",
+            f"and the calibration is of {calibrated.name} with {calibrated.joint_count}.",
             culprits=culprit,
             next_step="Name the calibration of this robot.",
         )
-    q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, known.joint_count))
-    # The calibrated one's base may have been placed by the poses: motions are compared.
-    ours, theirs = (robot.base_from_flange(q) for robot in (known, stated))
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, calibrated.joint_count))
+    # Motions are compared: the calibrated base may have been moved to the frame of the poses.
+    ours, theirs = (robot.base_from_flange(q) for robot in (calibrated, stated))
     between = [invert(array[0]) @ array for array in (ours, theirs)]
     off = np.max([pose_difference(a, b) for a, b in zip(*between, strict=True)], axis=0)
     if off[0] > _ONE_ROBOT_MM or off[1] > _ONE_ROBOT_DEG:
         raise DataError(
             f"session {session.name!r} names robot {stated.name}, whose flange is up to "
-            f"{off[0]:.3g} mm and {figure(off[1])} deg off from the calibrated {known.name}'s: "
-            "it is another robot, or another tip.",
+            f"{off[0]:.3g} mm and {figure(off[1])} deg off from the calibrated "
+            f"{calibrated.name}'s: it is another robot, or another tip.",
             culprits=culprit,
             next_step="Name the robot and tip as in the calibration's session.",
         )
 
 
-def _warnings(known: ObservedPoses, prior_calibration: CalibrationPrior) -> Iterator[str]:
-    """What is odd about the session."""
-    yield from dict.fromkeys(warning.reason for warning in known.warnings)
-    if prior_calibration.calibration.thermal is not None:
-        cold_c = float(prior_calibration.calibration.drift.reference_c.mean())
+def _warnings(observed: ObservedPoses, prior: CalibrationPrior) -> Iterator[str]:
+    """Warnings on the session."""
+    yield from dict.fromkeys(warning.reason for warning in observed.warnings)
+    if prior.calibration.thermal is not None:
+        cold_c = float(prior.calibration.drift.reference_c.mean())
         yield (
             "The calibrated arm drifts with its temperature, and a check takes it for as warm as "
             f"it was at the start (about {cold_c:.0f} deg C): one at work looks longer, or as if "
             "its joints had slipped. Verify with the arm as warm as then."
         )
-    before, now = prior_calibration.calibration.noise.get("pixel_px"), known.pixel_px
+    before, now = prior.calibration.noise.get("pixel_px"), observed.pixel_px
     if before is not None and now is not None and now > _MENTIONED * max(before, 1e-3):
         yield (
             f"The corners scatter by {figure(now)} px around the target's poses, and by "

@@ -1,4 +1,4 @@
-"""Whether a result comes out again of what was recorded."""
+"""Reproducibility of a result from its recording."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from visioncal.core.types import Progress
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
 
-# What is computed; the rest is when, by which version, and in which words.
+# Computed sections; the others state when, by which version, and in which words.
 _NUMBERS = (
     "transforms",
     "joint_covariance",
@@ -24,11 +24,11 @@ _NUMBERS = (
 
 @dataclass(frozen=True)
 class Recomputed:
-    """What came out.
+    """Result of recomputing a calibration.
 
     Attributes:
         is_same: Whether all numbers are the same, bit for bit.
-        words: The same in a sentence, with how far the transforms are off where they are.
+        words: The comparison in a sentence, with the differences of the transforms.
     """
 
     is_same: bool
@@ -42,11 +42,11 @@ def recompute(
 
     Args:
         calibration: The result.
-        session: What was recorded.
-        progress: Told of long work.
+        session: Its recording.
+        progress: Called with the progress of long work.
 
     Raises:
-        VisioncalError: It cannot be calibrated.
+        VisioncalError: The recording cannot be calibrated.
     """
     again = calibrate(session, progress=progress)
     before, after = to_document(calibration), to_document(again)
