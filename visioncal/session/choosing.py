@@ -1,4 +1,4 @@
-"""Which camera, robot and target of a whole cell are meant, and whether one robot parts them."""
+"""Choice of one camera, robot and target of a whole cell, with the robot between the other two."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from visioncal.session.frames import frame_name, frames_of_kind, robots_between,
 
 Part: TypeAlias = Literal["camera", "robot", "target"]
 PARTS: tuple[Part, ...] = get_args(Part)
-# What has to be clear where a camera looks at things of any kind, and where none looks.
+# Parts that must be unambiguous for a camera with any target, and without a camera.
 EYE: tuple[Part, ...] = ("camera", "robot")
 ARM: tuple[Part, ...] = ("robot",)
 LENS: tuple[Part, ...] = ("camera",)
@@ -19,7 +19,7 @@ LENS: tuple[Part, ...] = ("camera",)
 
 @dataclass(frozen=True)
 class Choice:
-    """A camera, a robot and a target by name; None where any will do or there is only one.
+    """Names of a camera, a robot and a target; None for any.
 
     A name is that of the session's table, as `left`, or of the frame, as `cam_left`.
     """
@@ -32,11 +32,11 @@ class Choice:
         return any(name is not None for name in (self.camera, self.robot, self.target))
 
     def of(self, part: Part) -> str | None:
-        """The name that was given of a part."""
+        """The given name of a part."""
         return {"camera": self.camera, "robot": self.robot, "target": self.target}[part]
 
 
-# What is meant where there is one of each.
+# The choice without names.
 ANY = Choice()
 
 
@@ -48,7 +48,7 @@ class Chosen:
         mount: Whether this robot carries the camera.
         camera: The camera's frame; empty where none is needed.
         robot: The robot's name in the session.
-        target: The target's frame; empty likewise.
+        target: The target's frame; empty where none is needed.
     """
 
     mount: Mount
@@ -67,7 +67,7 @@ class Chosen:
         return frame_name("flange", self.robot)
 
     def frame_of(self, part: Part) -> str:
-        """The frame that a part is named by: the robot's is its flange."""
+        """Frame that identifies a part: the robot's is its flange."""
         return {"camera": self.camera, "robot": self.flange, "target": self.target}[part]
 
 
@@ -80,27 +80,30 @@ def choose(
     parted: bool = True,
     seen: Collection[tuple[str, str]] = (),
 ) -> Chosen:
-    """Finds the one camera, robot and target that are meant.
+    """Finds the chosen camera, robot and target.
 
     Args:
-        frames: What each frame of the cell hangs on.
-        choice: What is named.
-        needs: What has to be clear; of the rest, any that fits is taken, or none.
-        label: What the cell is called in messages.
-        parted: Whether the robot is to move camera and target before each other.
-        seen: Which cameras saw which targets, by frame; where targets are needed, others are meant
-            only where none of these fits.
+        frames: Parent of each frame of the cell.
+        choice: The given names.
+        needs: Parts that must be unambiguous; for the others, any that fits is taken, or none.
+        label: Name of the cell in messages.
+        parted: Whether the robot must be between camera and target.
+        seen: Observed pairs of camera and target frames; where targets are needed, other pairs are
+            options only where none of these fits.
 
     Raises:
-        DataError: There is no such thing, several are meant, or this robot does not part these.
+        DataError: There is none of that name, the choice is ambiguous, or this robot is not between
+            camera and target.
     """
     known = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
     named = {
-        part: _named(known[part], part, name, label) for part in PARTS if (name := choice.of(part))
+        part: _frame_of_name(known[part], part, name, label)
+        for part in PARTS
+        if (name := choice.of(part))
     }
     options = [
         option
-        for option in _options(frames, known, parted=parted)
+        for option in _combinations(frames, known, parted=parted)
         if all(map(option.frame_of, needs))
     ]
     fitting = [
@@ -123,12 +126,12 @@ def choose(
     return fitting[0]
 
 
-# What a part's frame begins with: a robot is known by its flange.
+# Kind of a part's frame: a robot is identified by its flange.
 _KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "target"}
 
 
-def _named(known: Collection[str], part: Part, name: str, label: str) -> str:
-    """The frame of what is named."""
+def _frame_of_name(known: Collection[str], part: Part, name: str, label: str) -> str:
+    """Frame of a named part."""
     for frame in known:
         if name in (frame, thing_name(frame, part)):
             return frame
@@ -140,10 +143,10 @@ def _named(known: Collection[str], part: Part, name: str, label: str) -> str:
     )
 
 
-def _options(
+def _combinations(
     frames: Mapping[str, str], known: Mapping[Part, Collection[str]], *, parted: bool
 ) -> Iterator[Chosen]:
-    """All that go together, what has a target or a camera before what has none."""
+    """All valid combinations, those with target and camera first."""
     for flange in known["robot"]:
         robot = flange.partition("_")[2]
         for camera in (*known["camera"], ""):
@@ -164,7 +167,7 @@ def _none_fits(
     needs: Collection[Part],
     label: str,
 ) -> DataError:
-    """Says why nothing goes with what is named."""
+    """Error that no combination fits the names."""
     culprits = [f"--{name}" for name in named]
     for part in needs:
         if not known[part]:
@@ -199,7 +202,7 @@ def _none_fits(
     pairs = [
         f"{thing_name(option.camera, 'camera')} and {thing_name(option.target, 'target')} by robot "
         f"{thing_name(option.flange, 'robot')}"
-        for option in _options(frames, known, parted=True)
+        for option in _combinations(frames, known, parted=True)
         if option.camera and option.target
     ]
     return DataError(
