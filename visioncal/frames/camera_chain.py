@@ -55,18 +55,11 @@ class ArmErrors:
     def of(cls, calibration: Calibration, camera: FloatArray) -> Self | None:
         """Reads the posterior from a calibration; None where its arm was not calibrated.
 
-        Args:
-            calibration: The camera's.
-            camera: (6 + k + m, 6 + k + m) covariance of the camera's edge and lens.
+        `camera` is the (6 + k + m, 6 + k + m) covariance of the camera's edge and lens.
         """
-        arm_result, fit = calibration.arm, calibration.joint_fit
+        result, fit = calibration.arm, calibration.joint_fit
         # The joint fit's covariance does not contain functions of the joints.
-        if (
-            fit is None
-            or not calibration.arm_is_calibrated
-            or arm_result is None
-            or arm_result.functions
-        ):
+        if fit is None or not calibration.arm_is_calibrated or result is None or result.functions:
             return None
         from visioncal.calibration.verification.calibration_prior import fitted_model
 

@@ -84,7 +84,7 @@ def touched_fixture(
         touch_noise_m, tuple(_tool_findings(tool)), _tool_details(tool), options or FixtureLimits()
     )
     if drawing is None:
-        return _fixture_from_features(measured, rows.kinds, setting)
+        return _feature_fixture(measured, rows.kinds, setting)
     return drawn_fixture(measured, drawing, setting)
 
 
@@ -120,9 +120,7 @@ def _tool_details(tool: Tool | None) -> dict[str, object]:
     return {"tool": {"name": tool.name, "sigma_mm": tool.edge.sigma_mm}}
 
 
-def _fixture_from_features(
-    measured: MeasuredPoints, kinds: Sequence[str], setting: Setting
-) -> Frame:
+def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Setting) -> Frame:
     """Fits the fixture to touches of its origin, x axis and xy plane."""
     touches = FeatureTouches(
         measured.labels,
@@ -167,40 +165,27 @@ def _feature_fit(
 def _redundancy_findings(
     fitted: FixtureFit[FloatArray], kinds: Sequence[str], setting: Setting
 ) -> Iterator[Finding]:
-    touched_once = [
-        _THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1
-    ]
+    used = [kind for kind, ok in zip(kinds, fitted.agrees.tolist(), strict=True) if ok]
+    once = [_THINGS[kind] for kind in FEATURE_KINDS if used.count(kind) == 1]
     assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
-    if len(touched_once) == len(FEATURE_KINDS):
+    if len(once) == len(FEATURE_KINDS):
         yield Finding(
             "unchecked",
             f"Three touches leave nothing to check the fixture with.{assumed}",
             Remedy("Touch each feature once more, elsewhere."),
         )
-    elif touched_once:
-        verb = "was" if len(touched_once) == 1 else "were"
+    elif once:
+        verb = "was" if len(once) == 1 else "were"
         yield Finding(
             "unchecked",
-            f"{' and '.join(touched_once).capitalize()} {verb} touched once only, which nothing "
-            f"checks.{assumed}",
+            f"{' and '.join(once).capitalize()} {verb} touched once only, which nothing checks."
+            f"{assumed}",
             Remedy("Touch again, elsewhere."),
         )
 
 
-def _count(kinds: Sequence[str], kind: str, agrees: Mask) -> int:
-    return sum(name == kind and used for name, used in zip(kinds, agrees.tolist(), strict=True))
-
-
 def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Setting) -> Frame:
-    """Fits the fixture to measured points of a drawing.
-
-    Args:
-        measured: The points, named as in the drawing.
-        drawing: The nominal points.
-        setting: Noise, limits and wording.
-
-    Returns:
-        `base_from_fixture`.
+    """Fits `base_from_fixture` to measured points, which are named as in the drawing.
 
     Raises:
         DataError: A point is not drawn, or the points do not fit the drawing.

@@ -21,7 +21,7 @@ from visioncal.frames.verdicts import (
     off_words,
     outlier_findings,
     placed_name,
-    weak_direction_findings,
+    sigma_findings,
 )
 from visioncal.results import Edge, Frame, Observation
 
@@ -145,13 +145,8 @@ def fixture_frame(
 ) -> Frame:
     """Builds the fixture's frame with its verdict.
 
-    Args:
-        fitted: The fit.
-        kinds: (n,) kinds of the touches; empty where points have no kinds.
-        method: Description of the method.
-        more: Findings specific to the method.
-        details: Figures specific to the method.
-        setting: Noise, limits and wording.
+    `kinds` are the (n,) kinds of the touches, or empty texts; `more` and `details` are findings and
+    figures specific to the method.
     """
     findings = [*_findings(fitted, setting), *more, *setting.doubts]
     offset, rotation = fitted.worst
@@ -204,10 +199,7 @@ def _findings(fitted: FixtureFit[State], setting: Setting) -> list[Finding]:
             explained=fitted.agreement.explained,
             things=setting.words.things,
         ),
-        *weak_direction_findings(
-            fitted.worst,
-            setting.options.sigma_mm,
-            setting.options.sigma_deg,
-            setting.words.weak,
+        *sigma_findings(
+            fitted.worst, setting.options.sigma_mm, setting.options.sigma_deg, setting.words.weak
         ),
     ]

@@ -119,7 +119,7 @@ def seen_markers(
     targets = [_target(number, dictionary, size_m, size_sigma_m) for number in ids]
     if not targets:
         raise DataError("no markers to look for: give their ids.")
-    markers = [_detect_marker(eye, sights, target, sigma_px) for target in targets]
+    markers = [_detect(eye, sights, target, sigma_px) for target in targets]
     unseen = [marker.name for marker in markers if not marker.images]
     if unseen:
         raise DataError(
@@ -140,7 +140,7 @@ def seen_markers(
     return MarkerPoints(
         tuple(marker.name for marker in markers),
         np.array([fit.mean.matrix[:3, 3] for fit in fits]),
-        np.array([_independent_covariance(*pair) for pair in zip(markers, fits, strict=True)]),
+        np.array([_own_covariance(*pair) for pair in zip(markers, fits, strict=True)]),
         _common_covariance(eye, markers, fits, common, len(sights)),
         tuple(int(fit.agrees.sum()) for fit in fits),
         (*eye.warnings, *warnings),
@@ -154,9 +154,7 @@ def _target(marker: int, dictionary: str, size_m: float, sigma_m: float | None) 
     return target_from_document(document, f"marker {marker}")
 
 
-def _detect_marker(
-    eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float | None
-) -> _Marker:
+def _detect(eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float | None) -> _Marker:
     """Detects one marker in all images; images without it are skipped."""
     seen = [(at, _corners(eye, sight, target)) for at, sight in enumerate(sights)]
     shown = [(at, corners) for at, corners in seen if corners is not None]
@@ -209,7 +207,7 @@ def _place_jacobians(
     ]
 
 
-def _independent_covariance(marker: _Marker, fit: ImageInliers) -> FloatArray:
+def _own_covariance(marker: _Marker, fit: ImageInliers) -> FloatArray:
     """(3, 3) covariance of a centre by the pixel noise of its images."""
     covariance = np.sum(
         [
@@ -306,7 +304,7 @@ def marked_fixture(
     )
     setting = Setting(
         doubts=findings,
-        details=_marker_details(shown.target, points, calibration),
+        details=_details(shown.target, points, calibration),
         options=options or FixtureLimits(),
         words=_WORDS,
         # Each point's own covariance already holds its noise.
@@ -356,9 +354,7 @@ def _outward(calibration: Calibration, sights: Sequence[Sight], points: MarkerPo
     return np.asarray(directions / np.linalg.norm(directions, axis=1)[:, None])
 
 
-def _marker_details(
-    target: Target, points: MarkerPoints, calibration: Calibration
-) -> dict[str, Any]:
+def _details(target: Target, points: MarkerPoints, calibration: Calibration) -> dict[str, Any]:
     return {
         "dictionary": target.dictionary,
         "marker_mm": 1e3 * target.square_m,

@@ -29,7 +29,7 @@ from visioncal.frames.session_observations import (
 from visioncal.frames.single_view import Sight, needs_robot
 from visioncal.frames.target_in_image import SeenTarget, see
 from visioncal.frames.target_pose import TargetPose, place_target
-from visioncal.frames.verdicts import weak_direction_findings
+from visioncal.frames.verdicts import sigma_findings
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, picked
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
@@ -113,7 +113,7 @@ def seen_frame(
     point = checked_point(point_target_m, "point_target_m")
     eye, parent = Eye.of(calibration), PARENTS[kind]
     shown = session_looks(session, calibration, parent, among=fit_views(session), progress=progress)
-    views, looks, lost = _target_poses(eye, shown)
+    views, looks, lost = _measure(eye, shown)
     lost |= held_out_views(session)
     sights = [sight for sight, view in zip(shown.sights, shown.views, strict=True) if view in views]
     seen = place_target(eye, sights, looks, parent).at(point)
@@ -125,7 +125,7 @@ def seen_frame(
             replace(remark, is_fatal=remark.words in eye.warnings)
             for remark in remarks(seen.warnings)
         ),
-        *weak_direction_findings(worst, options.sigma_mm, options.sigma_deg, _advice(seen)),
+        *sigma_findings(worst, options.sigma_mm, options.sigma_deg, _advice(seen)),
         *view_findings(session, lost),
         *remarks(shown.warnings),
     ]
@@ -143,7 +143,7 @@ def seen_frame(
     )
 
 
-def _target_poses(
+def _measure(
     eye: Eye, shown: SessionImages
 ) -> tuple[tuple[View, ...], list[SeenTarget], dict[int, str]]:
     """The usable views, their target poses, and why the other views were rejected."""
@@ -162,11 +162,7 @@ def _target_poses(
 def _check_parent(
     eye: Eye, placed: _PlacedTarget, sights: Sequence[Sight], looks: Sequence[SeenTarget]
 ) -> None:
-    """Checks that the target is fixed to the stated parent and not to the other one.
-
-    Raises:
-        DataError: It is on the other one.
-    """
+    """Raises an error where the target is fixed to the other parent."""
     other: FrameKind = "fixture" if placed.kind == "tool" else "tool"
     parent, seen = PARENTS[other], placed.seen
     has_poses = all(sight.base_from_flange is not None for sight in sights)

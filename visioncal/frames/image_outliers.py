@@ -105,13 +105,11 @@ def find_inliers(candidates: CandidateViews) -> ImageInliers:
 
     Where no more than half are inliers, the correct ones are unknown, and all are kept.
     """
-    picks, agrees = _initial_inliers(candidates)
+    picks, agrees = _start(candidates)
     search = _ImageSearch(candidates, picks)
-    agrees, fit = settled(
-        search, agrees, _evaluate(candidates, picks, agrees), fewest=2, suspect=0.0
-    )
+    agrees, fit = settled(search, agrees, _fit(candidates, picks, agrees), fewest=2, suspect=0.0)
     if 2 * int(agrees.sum()) <= len(picks):
-        return _evaluate(candidates, picks, np.ones(len(picks), dtype=bool))
+        return _fit(candidates, picks, np.ones(len(picks), dtype=bool))
     return fit
 
 
@@ -123,14 +121,14 @@ class _ImageSearch:
     picks: IntArray
 
     def fit(self, used: Mask, _: ImageInliers) -> ImageInliers:
-        return _evaluate(self.candidates, self.picks, used)
+        return _fit(self.candidates, self.picks, used)
 
     def distances(self, _: Mask, fit: ImageInliers) -> Distances:
         six = np.full(len(self.picks), 6.0)
         return Distances(fit.mahalanobis_sq, six, fit.variance * fit.limit * np.ones_like(six))
 
 
-def _initial_inliers(candidates: CandidateViews) -> tuple[IntArray, Mask]:
+def _start(candidates: CandidateViews) -> tuple[IntArray, Mask]:
     """Selected candidates, and the half of the images nearest to one pose (least median)."""
     best: tuple[float, IntArray, FloatArray] | None = None
     half = len(candidates.views) // 2 + 1
@@ -163,30 +161,30 @@ def _nearest(candidates: CandidateViews, seed: TargetPlace) -> tuple[FloatArray,
     )
 
 
-def _evaluate(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
+def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
     """Mean over the inliers, and the distances of all images from it."""
     chosen = [view[at] for view, at in zip(candidates.views, picks, strict=True)]
     mean = _mean(candidates, chosen, agrees)
-    residuals = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
+    errors = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
     own = np.array([candidates.own(value) for value in chosen])
     common_difference = np.array([value.by_common for value in chosen]) - mean.by_common
     shared = common_difference @ candidates.common @ np.swapaxes(common_difference, 1, 2)
     is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
     squared = np.einsum(
-        "mi,mi->m", residuals, np.linalg.solve(own + shared, residuals[..., None])[..., 0]
+        "mi,mi->m", errors, np.linalg.solve(own + shared, errors[..., None])[..., 0]
     )
     # Six degrees of freedom for each image beyond the first.
     variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
     # The residual of an image that is part of the mean has a smaller covariance.
     covariance = own + shared + np.where(is_inlier, -1.0, 1.0) * mean.own
     mahalanobis_sq = (
-        squared_lengths(residuals, covariance, own)[0] if others else np.where(agrees, 0.0, squared)
+        squared_lengths(errors, covariance, own)[0] if others else np.where(agrees, 0.0, squared)
     )
     return ImageInliers(
         mean,
         picks,
         agrees,
-        residuals,
+        errors,
         mahalanobis_sq,
         candidates.limit,
         variance,
@@ -222,10 +220,8 @@ def _rival(
     limit = variance * candidates.limit
     first = candidates.views[int(np.flatnonzero(agrees)[0])]
     for seed in first:
-        difference = log(invert(matrix) @ seed.matrix)
-        is_other = (
-            float(difference @ np.linalg.solve(2.0 * candidates.own(seed), difference)) > _DIFFERENT
-        )
+        delta = log(invert(matrix) @ seed.matrix)
+        is_other = float(delta @ np.linalg.solve(2.0 * candidates.own(seed), delta)) > _DIFFERENT
         if is_other and bool(np.all(_nearest(candidates, seed)[0][agrees] < limit)):
             return seed.matrix
     return None

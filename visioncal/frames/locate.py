@@ -131,15 +131,15 @@ def _on_plane(
     # Projection along the ray onto the plane, where the point stays.
     projection = np.eye(3) - np.outer(along, plane.normal) / rise
     (by_px,), (by_lens,) = eye.lens.rays_by_lens(px[None], point_cam[None], depth)
-    by_cam_point = projection @ cam_pose.base_from_cam[:3, :3]
-    by_focus = eye.jitter * by_cam_point @ by_px @ (px - eye.camera.matrix[2:])
+    by_cam = projection @ cam_pose.base_from_cam[:3, :3]
+    by_focus = eye.jitter * by_cam @ by_px @ (px - eye.camera.matrix[2:])
     by_camera = projection @ cam_pose.camera_jacobian(point_cam)
     by_plane = np.outer(along / rise, np.append(-p_base, 1.0))
     parts = {
-        "pixels": _propagated(noise_px * by_cam_point @ by_px, np.eye(2)),
+        "pixels": _mapped(noise_px * by_cam @ by_px, np.eye(2)),
         "focus": np.outer(by_focus, by_focus),
-        "plane": _propagated(by_plane, plane.covariance),
-        **_camera_parts(eye, cam_pose, by_camera, by_cam_point @ by_lens),
+        "plane": _mapped(by_plane, plane.covariance),
+        **_camera_parts(eye, cam_pose, by_camera, by_cam @ by_lens),
     }
     return _located(eye, p_base, parts, ())
 
@@ -162,13 +162,13 @@ def _camera_parts(
     calibrated[:, independent] = 0.0
     by_calibration = np.concatenate([by_camera, by_lens, calibrated], axis=1)
     return {
-        "calibration": _propagated(by_calibration, eye.shared_covariance),
-        "robot": _propagated(flange_jacobian, cam_pose.flange_noise),
-        "arm": _propagated(by_arm[:, independent], np.eye(eye.posture_error_count)),
+        "calibration": _mapped(by_calibration, eye.shared_covariance),
+        "robot": _mapped(flange_jacobian, cam_pose.flange_noise),
+        "arm": _mapped(by_arm[:, independent], np.eye(eye.posture_error_count)),
     }
 
 
-def _propagated(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+def _mapped(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(jacobian @ covariance @ jacobian.T)
 
 
@@ -257,14 +257,12 @@ def locate_target(
     point = checked_point(point_target_m, "point_target_m")
     candidates_cam = view.cam_from_target[:, :3, :3] @ point + view.cam_from_target[:, :3, 3]
     pose, point_cam = view.cam_from_target[0], candidates_cam[0]
-    by_cam_point = cam_pose.base_from_cam[:3, :3] @ point_jacobian(pose, point)
+    by_cam = cam_pose.base_from_cam[:3, :3] @ point_jacobian(pose, point)
     parts = {
-        "pixels": _propagated(by_cam_point, view.covariance[0]),
-        "target": _propagated(
-            (by_cam_point @ view.by_scale[0])[:, None], np.array([[view.scale_sigma**2]])
-        ),
+        "pixels": _mapped(by_cam, view.covariance[0]),
+        "target": _mapped((by_cam @ view.by_scale[0])[:, None], np.array([[view.scale_sigma**2]])),
         **_camera_parts(
-            eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam_point @ view.by_lens[0]
+            eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam @ view.by_lens[0]
         ),
     }
     located = _located(eye, cam_pose.point(point_cam), parts, view.warnings)

@@ -72,10 +72,8 @@ class Located:
         """Whether the 95 % ellipsoid around the position contains a point.
 
         Its semi-axes are the covariance's, times the root of the 95 % quantile of `n F(n, freedom)`
-        over the n uncertain directions: two for a point of an exactly known plane.
-
-        Args:
-            p_base: (3,) [m].
+        over the n uncertain directions: two for a point of an exactly known plane. The point is
+        (3,) [m].
         """
         values, vectors = np.linalg.eigh(self.covariance)
         offset = vectors.T @ (p_base - self.p_base)

@@ -53,11 +53,9 @@ class Tool:
         if name is None and len(tools) == 1:
             name = next(iter(tools))
         if name is None or not tools:
-            tools_words = (
-                f"has {len(tools)} tools: {some_of(list(tools))}" if tools else "has no tool"
-            )
+            state = f"has {len(tools)} tools: {some_of(list(tools))}" if tools else "has no tool"
             raise DataError(
-                f"{source} {tools_words}; the one that the points were touched with is needed.",
+                f"{source} {state}; the one that the points were touched with is needed.",
                 culprits=list(tools) or [source],
                 next_step=f"Say --tool {next(iter(tools))}, or the like." if tools else NO_TOOL,
             )

@@ -14,11 +14,7 @@ _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
 
 
 def transform_name(kind: FrameKind, name: str | None) -> str:
-    """Transform name of a tool or a fixture.
-
-    Args:
-        kind: Tool or fixture.
-        name: The user's name for it; the kind's where None.
+    """Transform name of a tool or a fixture, by the user's name for it or else the kind's.
 
     Raises:
         DataError: The name is invalid in a transform's name, or taken.

@@ -70,12 +70,12 @@ def session_looks(
         DataError: No view is usable, or the session is of another camera.
     """
     target = _checked_target(session, calibration)
-    requested = session.views if among is None else tuple(among)
-    poses, lost = _poses(session, calibration, parent, requested)
-    views = _usable(session, requested, target, lost)
+    wanted = session.views if among is None else tuple(among)
+    poses, lost = _poses(session, calibration, parent, wanted)
+    views = _usable(session, wanted, target, lost)
     detected = detect(session, progress=progress, among=views)
     lost |= {rejection.view: rejection.reason for rejection in detected.rejections}
-    views = _usable(session, requested, target, lost)
+    views = _usable(session, wanted, target, lost)
     check_resolution(session, calibration, detected.resolution)
     sights = [_sight(view, detected.corners[view.number], poses, calibration) for view in views]
     return SessionImages(
@@ -86,32 +86,23 @@ def session_looks(
 def session_images(
     session: Session, calibration: Calibration, *, among: Sequence[View] | None = None
 ) -> SessionImages:
-    """Reads a session's images for detecting several markers, to be placed in the base.
+    """Reads a session's images for detecting several markers, one of which is its target.
 
-    Args:
-        session: As for `session_looks`; its target is one of the markers.
-        calibration: The camera's.
-        among: The views to use; all where None.
-
-    Returns:
-        The images and poses of the usable views.
-
-    Raises:
-        DataError: No view is usable, or the session is of another camera.
+    As `session_looks` with the base as parent, but without detection.
     """
     target = _checked_target(session, calibration)
-    requested = session.views if among is None else tuple(among)
-    poses, lost = _poses(session, calibration, "base", requested)
+    wanted = session.views if among is None else tuple(among)
+    poses, lost = _poses(session, calibration, "base", wanted)
     sights = []
-    lost |= {view.number: _NO_IMAGE for view in requested if not view.image}
-    for view in _usable(session, requested, target, lost):
+    lost |= {view.number: _NO_IMAGE for view in wanted if not view.image}
+    for view in _usable(session, wanted, target, lost):
         image = image_of(session, view)
         if isinstance(image, Rejection):
             lost[view.number] = image.reason
             continue
         check_resolution(session, calibration, (image.shape[1], image.shape[0]))
         sights.append(_sight(view, image, poses, calibration))
-    views = _usable(session, requested, target, lost)
+    views = _usable(session, wanted, target, lost)
     return SessionImages(
         session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
     )
@@ -136,10 +127,7 @@ def calibrated_joints(view: View, calibration: Calibration) -> FloatArray | None
 
 
 def _sight(
-    view: View,
-    seen: Corners | Image,
-    poses: Mapping[int, FloatArray],
-    calibration: Calibration,
+    view: View, seen: Corners | Image, poses: Mapping[int, FloatArray], calibration: Calibration
 ) -> Sight:
     pose = poses.get(view.number)
     joints_rad = None if pose is None else calibrated_joints(view, calibration)
@@ -157,7 +145,7 @@ def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArra
 
 def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
     """Warnings on the session itself, and on differences from the calibration."""
-    calibrated, stated = calibration.camera, session.camera
+    lens, stated = calibration.camera, session.camera
     words = session.warnings
     if calibration.arm_is_calibrated and any(view.joints_rad is None for view in session.views):
         words = (
@@ -165,14 +153,12 @@ def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
             "The calibration is of a calibrated arm, but views come without joint angles: their "
             "poses are the nominal arm's, off by as much as its errors. Record q1_rad ... too.",
         )
-    if calibrated is None or stated is None:
+    if lens is None or stated is None:
         return words
-    difference = stated.matrix - calibrated.camera.matrix
-    if np.abs(difference).max() <= _OTHER_LENS * calibrated.camera.matrix[0]:
+    difference = stated.matrix - lens.camera.matrix
+    if np.abs(difference).max() <= _OTHER_LENS * lens.camera.matrix[0]:
         return words
-    fx, cx, of_fx, of_cx = (
-        camera.matrix[at] for camera in (stated, calibrated.camera) for at in (0, 2)
-    )
+    fx, cx, of_fx, of_cx = (camera.matrix[at] for camera in (stated, lens.camera) for at in (0, 2))
     return (
         *words,
         f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
@@ -224,25 +210,25 @@ def _checked_target(session: Session, calibration: Calibration) -> Target:
 
 
 def _poses(
-    session: Session, calibration: Calibration, parent: Parent, requested: tuple[View, ...]
+    session: Session, calibration: Calibration, parent: Parent, wanted: tuple[View, ...]
 ) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
     """The robot's poses by view, and why views without pose or image are unusable."""
-    lost = {view.number: _NO_IMAGE for view in requested if not (view.image or view.has_corners)}
+    lost = {view.number: _NO_IMAGE for view in wanted if not (view.image or view.has_corners)}
     if needs_robot(Eye.of(calibration), parent):
-        reported = _flange(session, calibration, requested)
+        reported = _flange(session, calibration, wanted)
         lost = {rejection.view: rejection.reason for rejection in reported.rejections} | lost
         return reported.base_from_flange, lost
-    poses = {
-        view.number: pose for view in requested if (pose := view.base_from_flange()) is not None
-    }
+    poses = {view.number: pose for view in wanted if (pose := view.base_from_flange()) is not None}
     return {view: np.asarray(value.as_matrix()) for view, value in poses.items()}, lost
 
 
-def _flange(session: Session, calibration: Calibration, requested: tuple[View, ...]) -> Reported:
+def _flange(session: Session, calibration: Calibration, wanted: tuple[View, ...]) -> Reported:
     """The flange's poses at some views, by the calibrated arm where there is one."""
-    reported = reported_poses(replace(session, views=requested), _robot(session, calibration))
+    document = session.robot_document
+    robot = calibration.robot if document is None else Robot.from_document(document)
+    reported = reported_poses(replace(session, views=wanted), robot)
     poses = dict(reported.base_from_flange)
-    for view in requested:
+    for view in wanted:
         joints = calibrated_joints(view, calibration)
         if joints is not None:
             loads = loads_of([view.numbers])
@@ -250,23 +236,16 @@ def _flange(session: Session, calibration: Calibration, requested: tuple[View, .
     return replace(reported, base_from_flange=poses)
 
 
-def _robot(session: Session, calibration: Calibration) -> Robot | None:
-    """The session's robot model; the calibration's where it names none."""
-    document = session.robot_document
-    return calibration.robot if document is None else Robot.from_document(document)
-
-
 def _usable(
-    session: Session, requested: Sequence[View], target: Target, lost: Mapping[int, str]
+    session: Session, wanted: Sequence[View], target: Target, lost: Mapping[int, str]
 ) -> tuple[View, ...]:
     """The views that are not rejected so far; an error where there are none."""
-    views = tuple(view for view in requested if view.number not in lost)
+    views = tuple(view for view in wanted if view.number not in lost)
     if views:
         return views
     culprits = by_reason(lost) or (f"all views: {HELD_BACK}",)
     raise DataError(
-        f"session {session.name!r}: no view of {len(requested)} serves to place target "
-        f"{target.name}.",
+        f"session {session.name!r}: no view of {len(wanted)} serves to place target {target.name}.",
         culprits=culprits,
         next_step=f"First: {culprits[0]}.",
     )

@@ -101,12 +101,7 @@ def places(
 ) -> tuple[TargetPlace, ...]:
     """Candidate poses of one image in the parent's frame.
 
-    Args:
-        eye: The calibrated camera.
-        sight: The image.
-        view: The target's candidate poses in the camera.
-        parent: The frame to place the target in.
-        of_stop: Number of images of the same stop of the robot.
+    `view` has those in the camera's frame; `of_stop` is the number of images of the same stop.
 
     Raises:
         DataError: The robot's pose is needed and missing or invalid.

@@ -82,7 +82,7 @@ def see(
         if eye.breathes:
             in_model = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
             poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
-        candidates = [
+        fits = [
             _with_jacobians(eye, poses, at, kept, target, noise_px, distance_m)
             for at in range(len(poses.turns))
         ]
@@ -90,19 +90,12 @@ def see(
     # Corners without noise get a millionth of a pixel, so that the covariance is not zero.
     variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
     return SeenTarget(
-        np.array([compressed.cam_from_target[0] for compressed, _ in candidates]),
+        np.array([compressed.cam_from_target[0] for compressed, _ in fits]),
+        np.array([variance * covariance_from(compressed.information[0]) for compressed, _ in fits]),
         np.array(
-            [variance * covariance_from(compressed.information[0]) for compressed, _ in candidates]
+            [np.hstack([compressed.by_shared[0, :, :lens], beyond]) for compressed, beyond in fits]
         ),
-        np.array(
-            [
-                np.hstack([compressed.by_shared[0, :, :lens], beyond])
-                for compressed, beyond in candidates
-            ]
-        ),
-        np.array(
-            [_by_scale(compressed.by_shared[0, :, lens:], target) for compressed, _ in candidates]
-        ),
+        np.array([_by_scale(compressed.by_shared[0, :, lens:], target) for compressed, _ in fits]),
         target.square_sigma_m / target.square_m,
         poses.turns,
         warnings,

@@ -70,11 +70,7 @@ class TargetPose:
         return Edge(self.matrix, self.covariance)
 
     def at(self, point_m: FloatArray) -> Self:
-        """Pose of the frame with the target's axes and its origin at a point of the target.
-
-        Args:
-            point_m: (3,) in the target's frame [m].
-        """
+        """Pose of the frame with the target's axes and its origin at a point (3,) of it [m]."""
         target_from_point = compose(np.eye(3), point_m)
         transport = adjoint(invert(target_from_point))
         return replace(
@@ -162,12 +158,7 @@ def inlier_warnings(
 ) -> Iterator[str]:
     """Warnings on the inliers of a target's images.
 
-    Args:
-        fit: The inliers and their mean.
-        labels: The images' names.
-        looks: The target's candidate poses in each.
-        stops: Number of the robot's stops; None where the robot is not between.
-        thing: The target, in words.
+    `stops` is the number of the robot's stops, None where the robot is not between.
     """
     count = len(labels)
     for at in np.flatnonzero(~fit.agrees).tolist():

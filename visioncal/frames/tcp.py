@@ -31,7 +31,7 @@ from visioncal.frames.verdicts import (
     off_words,
     outlier_findings,
     placed_name,
-    weak_direction_findings,
+    sigma_findings,
 )
 from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
@@ -206,7 +206,7 @@ def _findings(
             "and of that tool's tip.",
             Remedy("Set the controller's tool to zero, and write the poses of the flange."),
         )
-    yield from weak_direction_findings(
+    yield from sigma_findings(
         fit.worst,
         options.sigma_mm,
         options.sigma_deg,

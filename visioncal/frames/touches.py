@@ -261,17 +261,14 @@ def _check_same_arm(rows: TouchRows, poses: FloatArray, has_joints: Mask, robot:
     both = np.flatnonzero(has_joints & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
     if not len(both):
         return
-    differences = invert(poses[both]) @ rows.base_from_flange[both]
-    distances_m, angles_rad = (
-        np.linalg.norm(differences[:, :3, 3], axis=1),
-        rotation_angle(differences),
-    )
-    odd = (distances_m > _SAME_ARM_M) | (angles_rad > _SAME_ARM_RAD)
+    delta = invert(poses[both]) @ rows.base_from_flange[both]
+    off_m, off_rad = (np.linalg.norm(delta[:, :3, 3], axis=1), rotation_angle(delta))
+    odd = (off_m > _SAME_ARM_M) | (off_rad > _SAME_ARM_RAD)
     if odd.any():
         at = int(np.argmax(odd))
         raise DataError(
             f"{rows.places[both[at]]}: the joints lead through {robot.name} to a flange "
-            f"{1e3 * distances_m[at]:.0f} mm and {np.rad2deg(angles_rad[at]):.1f} deg away from "
+            f"{1e3 * off_m[at]:.0f} mm and {np.rad2deg(off_rad[at]):.1f} deg away from "
             "the pose that is reported.",
             culprits=[rows.places[index] for index in both[odd]],
             next_step="Check the robot's model and its base, and whether the controller reports "

@@ -15,20 +15,13 @@ RENAMED = ": is its name exchanged?"
 _RENAME = "Correct the names of what is named; where they are right, touch it once more."
 
 
-def weak_direction_findings(
+def sigma_findings(
     worst: Sequence[Direction],
     sigma_mm: tuple[float, float],
     sigma_deg: tuple[float, float],
     advice: str,
 ) -> Iterator[Finding]:
-    """Findings on directions with a large sigma.
-
-    Args:
-        worst: The directions of the largest sigmas.
-        sigma_mm: (check, bad) limits of an offset's sigma [mm].
-        sigma_deg: (check, bad) limits of a rotation's sigma [deg].
-        advice: The remedy, as a sentence.
-    """
+    """Findings on directions whose sigma exceeds (check, bad) limits of offset or rotation."""
     for direction in worst:
         scale, unit = (np.rad2deg(1.0), "deg") if direction.is_rotation else (1e3, "mm")
         check, bad = sigma_deg if direction.is_rotation else sigma_mm
@@ -47,21 +40,15 @@ def outlier_findings(
 ) -> Iterator[Finding]:
     """Findings on outliers, and on contradicting measurements that were kept.
 
-    Args:
-        names: (n,) names of the touches, points or images in messages.
-        reasons: (n,) why each is an outlier.
-        inliers: The inliers.
-        again: The remedy, as a sentence.
+    `names` and `reasons` are (n,); `again` is the remedy, as a sentence.
     """
     for at in np.flatnonzero(~inliers.agrees).tolist():
         renamed = reasons[at].endswith(RENAMED)
         words = f"{names[at]} was left out: {reasons[at]}{'' if renamed else '.'}"
         yield Finding("left_out", words, Remedy(_RENAME if renamed else again, AGAIN))
     if inliers.doubtful.any():
-        contradicting = some_of([names[at] for at in np.flatnonzero(inliers.doubtful).tolist()])
-        words = (
-            f"{contradicting} contradict each other, and which is wrong is not known: all are used."
-        )
+        some = some_of([names[at] for at in np.flatnonzero(inliers.doubtful).tolist()])
+        words = f"{some} contradict each other, and which is wrong is not known: all are used."
         yield Finding("contradicting", words, Remedy(again))
 
 
@@ -73,14 +60,9 @@ def noise_findings(
     explained: bool,
     things: str = "touches",
 ) -> Iterator[Finding]:
-    """Findings on noisy touches, or on touches noisier than stated.
+    """Findings on noise per axis above (check, bad) limits, or else unexplained by the stated one.
 
-    Args:
-        noise_mm: Noise of a touch per axis [mm].
-        limits_mm: (check, bad) limits of it [mm].
-        cause: Probable cause or remedy, as a sentence.
-        explained: Whether the stated noise explains it.
-        things: Name of the measurements.
+    `cause` is a probable cause or remedy, as a sentence; `things` names the measurements.
     """
     check, bad = limits_mm
     if noise_mm > check:

@@ -585,11 +585,7 @@ class ThermalResult(Section):
     views: tuple[ViewDrift, ...]
 
     def model(self, robot: Robot) -> ThermalModel:
-        """Thermal model of the arm.
-
-        Args:
-            robot: The arm at its reference temperatures.
-        """
+        """Thermal model of the arm; `robot` is the arm at its reference temperatures."""
         rows = self.joints
         gains = [1.0 if row.gain_k_per_a2 is None else row.gain_k_per_a2 for row in rows]
         return ThermalModel(

@@ -239,11 +239,8 @@ def _edge_change(name: str, a: Edge, b: Edge, freedom: tuple[int, int], limit: f
     first, second = a.matrix, b.matrix
     twist = log(invert(first) @ second)
     # First order of log(exp(-error_a) * exp(twist) * exp(error_b)) in both errors.
-    jacobian_a, jacobian_b = inverse_right_jacobian(-twist), inverse_right_jacobian(twist)
-    covariances = (
-        jacobian_a @ a.covariance @ jacobian_a.T,
-        jacobian_b @ b.covariance @ jacobian_b.T,
-    )
+    by_a, by_b = inverse_right_jacobian(-twist), inverse_right_jacobian(twist)
+    covariances = (by_a @ a.covariance @ by_a.T, by_b @ b.covariance @ by_b.T)
     moved_mm, moved_deg = pose_difference(first, second)
     rotation, translation = (
         _hotelling(twist[part], [each[part, part] for each in covariances], freedom, limit)
@@ -255,10 +252,7 @@ def _edge_change(name: str, a: Edge, b: Edge, freedom: tuple[int, int], limit: f
 
 
 def _hotelling(
-    difference: FloatArray,
-    covariances: Sequence[FloatArray],
-    freedom: Sequence[int],
-    limit: float,
+    difference: FloatArray, covariances: Sequence[FloatArray], freedom: Sequence[int], limit: float
 ) -> Significance:
     """Tests a difference whose covariance is the sum of two of estimated scale."""
     sizes = np.array([np.trace(covariance) for covariance in covariances]) + _LEAST_SIGMA**2

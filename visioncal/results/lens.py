@@ -268,10 +268,7 @@ def refitted(lens: CameraResult) -> RefittedLens:
 
 
 def _fitted_count(camera: Camera) -> int:
-    """Number of fitted intrinsics: trailing zero coefficients are not part of the lens model.
-
-    Without nonzero coefficients, all are fitted.
-    """
+    """Number of fitted intrinsics: without trailing zero coefficients, unless all are zero."""
     used = np.flatnonzero(camera.distortion)
     return len(intrinsics(camera)) if not len(used) else 4 + int(used[-1]) + 1
 
@@ -327,13 +324,11 @@ def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:
     if not np.isfinite(ray).all():
         return None
     turn = np.eye(4)
-    turn[:3, :3] = _rotation_to_ray(ray)
+    turn[:3, :3] = _to_ray(ray)
     _, by_lens = lens.rays_by_lens(px[None], np.append(ray, 1.0)[None])
     by_ray = np.array(
         [
-            Rotation.from_matrix(
-                _rotation_to_ray(ray - step).T @ _rotation_to_ray(ray + step)
-            ).as_rotvec()
+            Rotation.from_matrix(_to_ray(ray - step).T @ _to_ray(ray + step)).as_rotvec()
             for step in _STEP * np.eye(2)
         ]
     ).T / (2.0 * _STEP)
@@ -346,7 +341,7 @@ def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:
     return RayFrame(name=f"{parent}_from_ray", px=px, cam_from_ray=turn, transform=placed)
 
 
-def _rotation_to_ray(ray: FloatArray) -> FloatArray:
+def _to_ray(ray: FloatArray) -> FloatArray:
     """(3, 3) the smallest rotation of z into the ray of a point (2,) at unit depth."""
     tangent = float(np.hypot(*ray))
     axis = np.array([-ray[1], ray[0], 0.0]) / max(tangent, np.finfo(float).tiny)

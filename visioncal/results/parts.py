@@ -175,12 +175,10 @@ class VerdictForm:
 
     def verdict(self, _: str) -> Verdict:
         """The verdict."""
-        findings = (
-            tuple(self._findings_of_earlier_file()) if self.findings is None else self.findings
-        )
+        findings = tuple(self._earlier_findings()) if self.findings is None else self.findings
         return Verdict(self.status, findings, self.good_for_mm)
 
-    def _findings_of_earlier_file(self) -> Iterator[Finding]:
+    def _earlier_findings(self) -> Iterator[Finding]:
         """Findings from reasons and causes; a reason may begin with a cause's sentence."""
         causes = {cause.sentence: cause for cause in self.causes}
         for reason in self.reasons:

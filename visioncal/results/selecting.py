@@ -15,7 +15,7 @@ from visioncal.results.cell import CellResult
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.parts import RobotResult
-from visioncal.results.sections import ClockResult, JointFit, NoiseIntervals
+from visioncal.results.sections import JointFit, NoiseIntervals
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, rms_of
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
@@ -30,22 +30,16 @@ def selected_fields(
 ) -> dict[str, Any]:
     """Fields of the calibration of one camera, robot and target that differ from the cell's.
 
-    Args:
-        whole: The calibration of the whole cell.
-        cell: Its cameras, robots and targets by name.
-        choice: See `Calibration.chosen`.
-        needs: See `Calibration.chosen`.
-
     Raises:
-        DataError: There is none of that name, the choice is ambiguous, or no robot is between
-            camera and target.
+        DataError: See `Calibration.of`.
     """
     chosen = _chosen(whole, choice, needs)
     chain = _transforms(whole.tree, chosen)
     empty = np.zeros((0, len(whole.joint_covariance)))
     jacobian = np.concatenate([empty, *(pair[1] for pair in chain.values())])
     covariance = jacobian @ whole.joint_covariance @ jacobian.T
-    arm = cell.robots.get(chosen.robot or "robot", RobotResult())
+    camera_name, robot = thing_name(chosen.camera, "camera"), chosen.robot or "robot"
+    arm = cell.robots.get(robot, RobotResult())
     views = [
         view
         for view in whole.views
@@ -70,7 +64,7 @@ def selected_fields(
         "robot": arm.model,
         "frames": _frames(whole.tree, chosen),
         **{entry.name: getattr(arm, entry.name) for entry in entries(ArmSections)},
-        "clock": _clock(cell, chosen),
+        "clock": cell.details.clocks.get(f"{chosen.camera} and robot {robot}"),
         "uncertainty": _intervals(cell, chosen),
         "board": whole.boards.get(target),
         "boards": {},
@@ -78,7 +72,7 @@ def selected_fields(
         "rigs": {},
         "joint_fit": _joint_fit(cell, chosen, jacobian),
         "cell": None,
-        "need": None if whole.need is None else whole.need.of(*_pair(chosen)),
+        "need": None if whole.need is None else whole.need.of(camera_name, robot),
         "further": {},
     }
 
@@ -116,11 +110,6 @@ def _chosen(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> Ch
     )
 
 
-def _pair(chosen: Chosen) -> tuple[str, str]:
-    """Names of camera and robot."""
-    return thing_name(chosen.camera, "camera"), chosen.robot or "robot"
-
-
 def _transforms(tree: FrameTree, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Transforms of camera and target by name, each with its Jacobian by all edges."""
     in_hand = chosen.mount == "eye-in-hand"
@@ -130,7 +119,7 @@ def _transforms(tree: FrameTree, chosen: Chosen) -> dict[str, tuple[FloatArray, 
         f"{camera_parent}_from_cam": (frames[camera_parent], chosen.camera),
         f"{target_parent}_from_target": (frames[target_parent], chosen.target),
     }
-    return {name: tree.transform_and_jacobian(*pair) for name, pair in ends.items() if pair[1]}
+    return {name: tree.compose(*pair) for name, pair in ends.items() if pair[1]}
 
 
 def _noise(cell: CellResult, chosen: Chosen, rms: Rms) -> dict[str, float]:
@@ -174,11 +163,6 @@ def _frames(tree: FrameTree, chosen: Chosen) -> dict[str, Frame]:
         elif parent.startswith("base") and not robots_between(tree.parents, chosen.base, parent):
             frames[f"base_from_{child}"] = replace(frame, edge=tree.between(chosen.base, child))
     return frames
-
-
-def _clock(cell: CellResult, chosen: Chosen) -> ClockResult | None:
-    """Clock offset of camera and robot."""
-    return cell.details.clocks.get(f"{chosen.camera} and robot {chosen.robot or 'robot'}")
 
 
 def _intervals(cell: CellResult, chosen: Chosen) -> NoiseIntervals | None:

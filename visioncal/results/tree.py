@@ -58,7 +58,7 @@ class FrameTree:
             DataError: There is no such frame, or a robot's pose is needed.
         """
         near, far = self.placement(first), self.placement(second)
-        matrix, jacobian = self.transform_and_jacobian(
+        matrix, jacobian = self.compose(
             near[0] if near else first, far[0] if far else second, poses
         )
         covariance = jacobian @ self.joint_covariance @ jacobian.T
@@ -82,7 +82,7 @@ class FrameTree:
                 return parent, frame
         return None
 
-    def transform_and_jacobian(
+    def compose(
         self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Transform of `between` without tools and fixtures, (4, 4), and its Jacobian (6, 6 k)."""

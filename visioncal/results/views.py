@@ -74,13 +74,7 @@ class ViewResult:
     def of_pair(self) -> "ViewResult":
         """The result as one of a single camera, robot and target, without names."""
         return replace(
-            self,
-            seer="",
-            seen="",
-            stop=None,
-            left_out_mm=None,
-            left_out_deg=None,
-            left_out_px=None,
+            self, seer="", seen="", stop=None, left_out_mm=None, left_out_deg=None, left_out_px=None
         )
 
 
@@ -131,12 +125,7 @@ class CellView(SeerAndSeen):
 
     @classmethod
     def of(cls, tree: Mapping[str, str], view: ViewResult) -> "CellView":
-        """Form of an observation.
-
-        Args:
-            tree: Parent of each frame.
-            view: The observation.
-        """
+        """Form of an observation; `tree` has the parent of each frame."""
         connected = {view.seer, view.seen} <= tree.keys()
         robots = robots_between(tree, view.seer, view.seen) if connected else ()
         named = tuple(robot or "robot" for robot in robots)
@@ -253,11 +242,7 @@ def worst_view(views: Sequence[ViewResult], rms: Rms) -> int | None:
     """
 
     def relative(view: ViewResult) -> float:
-        pairs = (
-            (view.residual_mm, rms.mm),
-            (view.residual_deg, rms.deg),
-            (view.rms_px, rms.px),
-        )
+        pairs = ((view.residual_mm, rms.mm), (view.residual_deg, rms.deg), (view.rms_px, rms.px))
         return max((value / typical for value, typical in pairs if value and typical), default=0.0)
 
     worst = max(views, key=relative, default=None)

@@ -72,12 +72,7 @@ def _load(path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
 
 
 def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
-    """Warnings of misspelt keys in the targets' descriptions.
-
-    Args:
-        declaration: The typed session.toml.
-        document: The descriptions, in the form of `read_targets`.
-    """
+    """Warnings of misspelt keys in the targets' descriptions, in the form of `read_targets`."""
     paths = _declared_targets(declaration)
     for name, path in paths.items():
         described = document if len(paths) == 1 else (document or {}).get(name)

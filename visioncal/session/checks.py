@@ -67,12 +67,7 @@ def check_times(views: Sequence[View]) -> None:
 
 
 def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
-    """Warning that most positions seem to be in another unit than metres; else empty.
-
-    Args:
-        views: The rows.
-        names: The columns of a position.
-    """
+    """Warning that most positions, in columns `names`, seem to be in another unit than metres."""
     norms = [
         float(np.linalg.norm([view.numbers[name] for name in names]))
         for view in views
@@ -81,17 +76,15 @@ def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
     far = [norm for norm in norms if norm > _FAR_M]
     if 2 * len(far) <= len(norms):
         return ""
-    median_m, share = float(np.median(far)), ""
+    size, share = float(np.median(far)), ""
     if len(far) < len(norms):
         share = f" in {len(far)} of {len(norms)} rows"
     unit = (
         f"It looks like millimetres: multiply these columns by 0.001{share and ' there'}."
-        if median_m > _SURELY_MM
+        if size > _SURELY_MM
         else "Metres are needed, and these are inches, centimetres or millimetres."
     )
-    return (
-        f"views.csv: the median length of ({', '.join(names)}) is {median_m:.4g} m{share}. {unit}"
-    )
+    return f"views.csv: the median length of ({', '.join(names)}) is {size:.4g} m{share}. {unit}"
 
 
 def view_warnings(views: Sequence[View]) -> Iterator[str]:

@@ -97,9 +97,7 @@ def choose(
     """
     known = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
     named = {
-        part: _frame_of_name(known[part], part, name, label)
-        for part in PARTS
-        if (name := choice.of(part))
+        part: _frame(known[part], part, name, label) for part in PARTS if (name := choice.of(part))
     }
     options = [
         option
@@ -130,7 +128,7 @@ def choose(
 _KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "target"}
 
 
-def _frame_of_name(known: Collection[str], part: Part, name: str, label: str) -> str:
+def _frame(known: Collection[str], part: Part, name: str, label: str) -> str:
     """Frame of a named part."""
     for frame in known:
         if name in (frame, thing_name(frame, part)):

@@ -79,6 +79,8 @@ _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
 _LARGEST = 1e60
 # Smallest similarity of a misspelt name; that of `status` and `stamp_s` is 0.62.
 _MISSPELT = 0.76
+# What cells look like, and column names do not: a number, or a file's name.
+_CELL = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?|.*\.(png|jpe?g|tiff?)", re.I)
 # Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
@@ -135,7 +137,7 @@ def check_header(columns: Sequence[str], where: str) -> None:
         DataError: A name is empty or duplicate, `view` is missing, the joints have gaps, or a pose
             lacks some of its columns.
     """
-    if sum(_is_cell(name) for name in columns) > len(columns) / 2:
+    if sum(_CELL.fullmatch(name) is not None for name in columns) > len(columns) / 2:
         raise DataError(
             f"{where}: its first line has numbers, {', '.join(columns)[:80]!r}, and the names of "
             "the columns are needed.",
@@ -143,17 +145,17 @@ def check_header(columns: Sequence[str], where: str) -> None:
             next_step=f"Begin it with a line of names, as view,image,{','.join(POSE)}.",
         )
     problems = list(_header_problems(columns))
-    by_lower_case = {name.lower(): name for name in columns}
+    lower = {name.lower(): name for name in columns}
     positions = position_columns(columns)
     rotation_names = next(
-        (rotation for rotation in ROTATIONS if by_lower_case.keys() >= set(rotation)), None
+        (rotation for rotation in ROTATIONS if lower.keys() >= set(rotation)), None
     )
     # Additional columns beside complete poses or joints are not meant as poses.
     has_state = bool(set(POSE) & set(columns) or joint_columns(columns))
     if not problems and (has_state or positions is None or rotation_names is None):
         return
     if rotation_names is not None and not set(QUATERNION) & set(columns):
-        names = ",".join(by_lower_case[word] for word in rotation_names)
+        names = ",".join(lower[word] for word in rotation_names)
         raise DataError(
             f"{where}: the rotations are in {names}, and quaternions qx, qy, qz, qw are needed.",
             culprits=[where],
@@ -172,20 +174,13 @@ def check_header(columns: Sequence[str], where: str) -> None:
 
 def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
     """Columns of positions with other names; None where there are none."""
-    by_lower_case = {name.lower(): name for name in columns}
-    group = next(
-        (position for position in _POSITIONS if by_lower_case.keys() >= set(position)), None
-    )
+    lower = {name.lower(): name for name in columns}
+    group = next((position for position in _POSITIONS if lower.keys() >= set(position)), None)
     return (
         None
         if group is None or set(POSITION) & set(columns)
-        else tuple(by_lower_case[word] for word in group)
+        else tuple(lower[word] for word in group)
     )
-
-
-def _is_cell(name: str) -> bool:
-    """Whether a name looks like a cell: a number or a file's name."""
-    return re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?|.*\.(png|jpe?g|tiff?)", name, re.I) is not None
 
 
 def _header_problems(columns: Sequence[str]) -> Iterator[str]:

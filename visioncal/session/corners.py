@@ -216,10 +216,10 @@ def with_corners(
     """
     rows = {view.number: view for view in views}
     table = _without_deleted(table, rows)
-    view_targets = [
+    named = [
         rows[view].text.get(COLUMN, "").strip() if view in rows else "" for view in table.views
     ]
-    problems = list(_target_problems(table, rows, view_targets, names))
+    problems = list(_target_problems(table, rows, named, names))
     if problems:
         raise problems_error(problems)
     if not names:
@@ -229,7 +229,7 @@ def with_corners(
             tuple(replace(view, has_corners=view.number in has) for view in views),
             table,
         )
-    shown = [stated or by_view for stated, by_view in zip(table.targets, view_targets, strict=True)]
+    shown = [stated or by_view for stated, by_view in zip(table.targets, named, strict=True)]
     numbers = table.views.copy()
     added: list[View] = []
     new, stop = (1 + max([0, *mapping]) for mapping in (rows, (view.stop or 0 for view in views)))
@@ -262,20 +262,16 @@ def _without_deleted(table: CornerTable, rows: Mapping[int, View]) -> CornerTabl
     """The corners without those of deleted rows; unchanged where view numbers seem wrong."""
     # A row with neither corners nor an image means that views are numbered differently; a view
     # number with fewer corners than determine a pose is mistyped.
-    numbers, counts = np.unique(table.views, return_counts=True)
-    deleted = {value for value in numbers.tolist() if value not in rows}
-    few = {*numbers[counts < _FEWEST].tolist()}
-    if (
-        not deleted
-        or deleted & few
-        or any(row not in numbers and not rows[row].image for row in rows)
-    ):
+    seen, counts = np.unique(table.views, return_counts=True)
+    lost = {value for value in seen.tolist() if value not in rows}
+    few = {*seen[counts < _FEWEST].tolist()}
+    if not lost or lost & few or any(row not in seen and not rows[row].image for row in rows):
         return table
     return table.of_views(list(rows))
 
 
 def _target_problems(
-    table: CornerTable, rows: Mapping[int, View], view_targets: Sequence[str], names: Sequence[str]
+    table: CornerTable, rows: Mapping[int, View], named: Sequence[str], names: Sequence[str]
 ) -> Iterator[TableProblem]:
     """Problems of the rows' views and targets."""
     first = next((target for target in table.targets if target), "")
@@ -302,15 +298,15 @@ def _target_problems(
         if not names and target not in ("", first):
             words = f"{target!r} beside {first!r}, but session.toml declares one target"
             yield TableProblem(f"{place}, column {COLUMN}", words)
-        elif names and not (target or view_targets[at]):
+        elif names and not (target or named[at]):
             words = f"it is empty, and so is view {view}'s; one of {', '.join(names)} is needed"
             yield TableProblem(f"{place}, column {COLUMN}", words)
         elif names and target and target not in names:
             words = f"{target!r} is not declared; session.toml declares {', '.join(names)}"
             yield TableProblem(f"{place}, column {COLUMN}", words)
-        elif names and target and view_targets[at] not in ("", target):
+        elif names and target and named[at] not in ("", target):
             words = (
-                f"{target!r}, but views.csv says that view {view} shows {view_targets[at]!r}; a "
+                f"{target!r}, but views.csv says that view {view} shows {named[at]!r}; a "
                 "view that shows both has a row for each there, or names none"
             )
             yield TableProblem(f"{place}, column {COLUMN}", words)
@@ -406,13 +402,8 @@ def corners_by_view(
 ) -> dict[int, Corners]:
     """Corners of views, numbered by index on the target.
 
-    Weights are the ratio of the camera's median stated sigma to each corner's.
-
-    Args:
-        table: The corners.
-        views: The views.
-        declaration: The typed session.toml.
-        board_of: Target of each view, by view number.
+    Weights are the ratio of the camera's median stated sigma to each corner's. `board_of` has the
+    target of each view, by view number.
     """
     order = np.argsort(table.views, kind="stable")
     cuts = np.flatnonzero(np.diff(table.views[order])) + 1

@@ -35,13 +35,7 @@ def frame_name(kind: str, name: str) -> str:
 def robots_of(
     declaration: Declaration, views: Sequence[View], *, in_streams: bool = False
 ) -> dict[str, RobotTable]:
-    """Robots by name; one without a name where poses are given and none is declared.
-
-    Args:
-        declaration: The typed session.toml.
-        views: The rows of views.csv.
-        in_streams: Whether a stream has poses or joints.
-    """
+    """Robots by name; one without a name where rows or streams have poses and none is declared."""
     declared = declaration.named("robot")
     if not declared and (in_streams or any(has_robot_state(view) for view in views)):
         return {"": RobotTable()}
@@ -296,11 +290,7 @@ def _carrier(parents: Mapping[str, str], frame: str, tree: _DeclaredTree) -> str
     while (
         parent is not None
         and parent != CELL
-        and tree.frames.get(parent, ("", ""))[0]
-        not in (
-            "base",
-            "flange",
-        )
+        and tree.frames.get(parent, ("", ""))[0] not in ("base", "flange")
     ):
         parent = parents.get(parent)
     return parent

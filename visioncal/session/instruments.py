@@ -71,12 +71,6 @@ def stated_instrument(
 ) -> Instrument:
     """Instrument of a session: stated values, with those of the table for the others.
 
-    Args:
-        name: The instrument's name, in the table or not.
-        sigma_m: See `Instrument`; needed where the table does not have the name.
-        sigma_per_m: See `Instrument`.
-        sigma_rad: See `Instrument`.
-
     Raises:
         DataError: The name is unknown and no noise is stated, or the stated noise is not positive.
     """

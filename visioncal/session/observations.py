@@ -55,15 +55,9 @@ class _StopRows:
 def observations_of(
     declaration: Declaration, views: Sequence[View], frames: Mapping[str, str]
 ) -> tuple[Observation, ...]:
-    """Observations in the order of the rows.
+    """Observations in the order of the rows; rows with only a robot's pose have none.
 
-    Args:
-        declaration: The typed session.toml.
-        views: The rows of views.csv.
-        frames: Parents by frame, of `resolve_frames`.
-
-    Returns:
-        One observation for each row that has one: rows with only a robot's pose have none.
+    `frames` has the parent of each frame, by `resolve_frames`.
     """
     index_of = {view.number: at for at, view in enumerate(views)}
     observations, station = [], 0
@@ -72,10 +66,8 @@ def observations_of(
         states: dict[tuple[int, ...], int] = {}
         for view in stop.rows:
             own = {name_of(declaration, "robot", view): view} if has_robot_state(view) else {}
-            deviating = {
-                name: row for name, row in own.items() if _differ(row, stop.robot_rows[name])
-            }
-            by_robot = {**stop.robot_rows, **deviating}
+            strays = {name: row for name, row in own.items() if _differ(row, stop.robot_rows[name])}
+            by_robot = {**stop.robot_rows, **strays}
             key = tuple(by_robot[name].number for name in sorted(by_robot))
             seer, seen = observed(declaration, view)
             if not seer:
@@ -154,11 +146,7 @@ def _stops(declaration: Declaration, views: Sequence[View]) -> list[_StopRows]:
     for view in views:
         if view.stop is None and not view.is_of_lens and has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
-    since = {
-        row: first
-        for robot_views in rows_of.values()
-        for row, first in _still_since(robot_views).items()
-    }
+    since = {row: first for own in rows_of.values() for row, first in _still_since(own).items()}
     for view in views:
         alone = view.stop is None or view.is_of_lens
         key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)
@@ -173,10 +161,10 @@ def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, Vie
         if has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
     majority = {}
-    for robot, robot_views in rows_of.items():
+    for robot, own in rows_of.items():
         counts, first = (
-            Counter(map(_pose_cells, robot_views)),
-            {_pose_cells(view): view for view in robot_views[::-1]},
+            Counter(map(_pose_cells, own)),
+            {_pose_cells(view): view for view in own[::-1]},
         )
         votes = Counter(
             {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}

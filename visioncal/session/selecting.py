@@ -31,40 +31,18 @@ def has_several(session: "Session") -> bool:
 def chosen_of(
     session: "Session", choice: Choice, needs: Collection[Part] = PARTS, *, parted: bool = True
 ) -> Chosen:
-    """Finds the camera, robot and target chosen by names and by a session's rows.
-
-    Args:
-        session: A session.
-        choice: The given names.
-        needs: Parts that must be unambiguous.
-        parted: Whether the robot must be between camera and target.
-
-    Raises:
-        DataError: See `choose`.
-    """
+    """Finds the camera, robot and target chosen by names and by a session's rows; see `choose`."""
     seen = {(observation.seer, observation.seen) for observation in session.observations}
     label = f"session {session.name!r}"
     return choose(session.frames, choice, needs, label=label, parted=parted, seen=seen)
 
 
 def select(
-    session: "Session",
-    choice: Choice,
-    needs: Collection[Part] = PARTS,
-    *,
-    parted: bool = True,
+    session: "Session", choice: Choice, needs: Collection[Part] = PARTS, *, parted: bool = True
 ) -> "Session":
-    """Selects one camera, robot and target from a session; see `Session.of`.
+    """Selects one camera, robot and target from a session; see `Session.of` and `choose`.
 
-    Args:
-        session: A session.
-        choice: The given names.
-        needs: Parts that must be unambiguous; without a camera, the rows are those without images
-            with the robot's pose.
-        parted: Whether the robot must be between camera and target.
-
-    Raises:
-        DataError: See `choose`.
+    Where no camera is needed, the rows are those without images with the robot's pose.
     """
     if not choice and not has_several(session):
         return session

@@ -445,10 +445,8 @@ class Session:
             return "instrument"
         if declared is not None:
             return declared
-        parents = [self.frames[frame_name("camera", camera)] for camera in self.cameras]
-        return (
-            "eye-in-hand" if all(name.startswith("flange") for name in parents) else "eye-to-hand"
-        )
+        on = [self.frames[frame_name("camera", camera)] for camera in self.cameras]
+        return "eye-in-hand" if all(name.startswith("flange") for name in on) else "eye-to-hand"
 
     @property
     def is_network(self) -> bool:
@@ -595,8 +593,6 @@ def _build(
     )
     if corners is not None:
         seen = (view for view in views if view.has_corners)
-        board_names = {view.number: session.board_of(view) for view in seen}
-        check_points(
-            corners, [board_names[index] for index in corners.views.tolist()], session.boards
-        )
+        named = {view.number: session.board_of(view) for view in seen}
+        check_points(corners, [named[index] for index in corners.views.tolist()], session.boards)
     return session

@@ -21,7 +21,7 @@ from visioncal.session.session import Session
 from visioncal.session.table import View
 
 # Fields of session.toml that differ between the sessions and are not copied.
-_PER_SESSION = ("camera", "target", "mount", "frames", "clock", "clocks", "prior", "name")
+_OWN = ("camera", "target", "mount", "frames", "clock", "clocks", "prior", "name")
 # Time between two sessions whose clocks overlap [s]: the robot cools down completely.
 _BETWEEN_S = 86_400.0
 
@@ -79,9 +79,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             )
     names = [f"s{at}" for at in range(1, len(sessions) + 1)]
     by_name = dict(zip(names, sessions, strict=True))
-    document = {
-        name: value for name, value in sessions[0].document.items() if name not in _PER_SESSION
-    }
+    document = {name: value for name, value in sessions[0].document.items() if name not in _OWN}
     document |= {
         "name": " + ".join(session.name for session in sessions),
         "cameras": {name: session.document.get("camera", {}) for name, session in by_name.items()},

@@ -127,11 +127,7 @@ def _check_sizes(stream: Stream, label: str) -> None:
 
 
 def parse_stream(text: str, label: str) -> Stream:
-    """Reads the text of a stream.
-
-    Args:
-        text: A header row, and a row of numbers a sample.
-        label: The file's name, for messages.
+    """Reads the text of a stream: a header row, and a row of numbers for each sample.
 
     Raises:
         DataError: A cell is not a number.
@@ -162,11 +158,7 @@ def _read_fast(body: str, count: int) -> FloatArray | None:
 def _read_cells(
     body: str, columns: Sequence[str], label: str, separator: str
 ) -> tuple[FloatArray, IntArray]:
-    """Reads rows cell by cell, with their lines.
-
-    Raises:
-        DataError: Rows or cells are wrong.
-    """
+    """Reads rows cell by cell, with their lines; raises an error for wrong ones."""
     rows: list[list[float]] = []
     lines: list[int] = []
     problems: list[str] = []
@@ -182,11 +174,12 @@ def _read_cells(
                 f"{len(columns)} columns"
             )
             continue
-        rows.append([_number(cell.strip()) for cell in cells])
+        texts = [cell.strip() for cell in cells]
+        rows.append([float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in texts])
         lines.append(line)
-        for name, cell, value in zip(columns, cells, rows[-1], strict=True):
-            if cell.strip() and not np.isfinite(value):
-                wrong.setdefault(name, []).append((line, cell.strip()))
+        for name, cell, value in zip(columns, texts, rows[-1], strict=True):
+            if cell and not np.isfinite(value):
+                wrong.setdefault(name, []).append((line, cell))
     if problems or wrong:
         shown = [*problems, *_wrong_cells(wrong, label)][:_SHOWN_PROBLEMS]
         missing = all(cell.lower() in _NONE for of in wrong.values() for _, cell in of)
@@ -223,10 +216,6 @@ def numbered_rows(
     except csv.Error as error:
         place = f"{label}, line {reader.line_num + first - 1}"
         raise DataError(f"{place}: {error}.", culprits=[place]) from error
-
-
-def _number(cell: str) -> float:
-    return float(cell) if NUMBER.fullmatch(cell) else np.nan
 
 
 def write_stream(stream: Stream) -> str:

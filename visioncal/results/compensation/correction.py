@@ -289,9 +289,7 @@ def _matrices(poses: Poses) -> FloatArray:
     matrices = np.asarray(given, dtype=float)
     matrices = matrices[None] if matrices.ndim == 2 else matrices
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
-        raise DataError(
-            f"correct: targets of shape (m, 4, 4) are needed, not {np.shape(given)}.",
-        )
+        raise DataError(f"correct: targets of shape (m, 4, 4) are needed, not {np.shape(given)}.")
     rotations = matrices[:, :3, :3]
     off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
     rigid = (off < RIGID) & (np.abs(matrices[:, 3] - LAST_ROW).max(axis=1, initial=0.0) < RIGID)
@@ -329,7 +327,7 @@ def _seeds(q_seed: FloatArray | Sequence[float] | None, robot: Robot, count: int
     if seeds.shape not in ((size,), (count, size)):
         raise DataError(
             f"correct: seeds of shape ({size},) or ({count}, {size}) are needed, for the joints of "
-            f"{robot.name}, not {seeds.shape}.",
+            f"{robot.name}, not {seeds.shape}."
         )
     if seeds.ndim == 1:
         if not np.isfinite(seeds).all():

@@ -166,10 +166,7 @@ def joint_names(robot: Robot) -> tuple[str, ...]:
 
 
 def columns_to_send(
-    targets: Targets,
-    corrected: Corrected,
-    base_from_tool: FloatArray,
-    sigma_mm: FloatArray,
+    targets: Targets, corrected: Corrected, base_from_tool: FloatArray, sigma_mm: FloatArray
 ) -> dict[str, FloatArray]:
     """Corrected values of all targets, (m,) by column name.
 
