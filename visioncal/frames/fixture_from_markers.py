@@ -158,12 +158,12 @@ def _detect(eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float |
     """Detects one marker in all images; images without it are skipped."""
     seen = [(at, _corners(eye, sight, target)) for at, sight in enumerate(sights)]
     shown = [(at, corners) for at, corners in seen if corners is not None]
-    own = [sights[at] for at, _ in shown]
+    own_sights = [sights[at] for at, _ in shown]
     looks = [
         see(eye, corners, target, sight.label, sigma_px)
-        for (_, corners), sight in zip(shown, own, strict=True)
+        for (_, corners), sight in zip(shown, own_sights, strict=True)
     ]
-    views = all_places(eye, own, looks, "base")
+    views = all_places(eye, own_sights, looks, "base")
     images = tuple(at for at, _ in shown)
     return _Marker(str(target.marker_id), images, tuple(views), tuple(looks))
 

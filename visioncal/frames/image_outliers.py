@@ -43,7 +43,7 @@ class CandidateViews:
     common: FloatArray
     freedom: float
 
-    def own(self, place: TargetPlace) -> FloatArray:
+    def independent(self, place: TargetPlace) -> FloatArray:
         """(6, 6) covariance of a candidate by errors of its image alone: pixels and robot."""
         carried = place.flange_jacobian @ self.flange_noise @ place.flange_jacobian.T
         return np.asarray(place.pixels + carried)
@@ -64,13 +64,13 @@ class Mean:
 
     Attributes:
         matrix: (4, 4) `parent_from_target`.
-        own: (6, 6) covariance by the images' independent errors.
+        independent: (6, 6) covariance by the images' independent errors.
         gains: (m, 6, 6) weight of each image; zero for outliers.
         by_common: (6, c) Jacobian by the errors that all images share.
     """
 
     matrix: FloatArray
-    own: FloatArray
+    independent: FloatArray
     gains: FloatArray
     by_common: FloatArray
 
@@ -83,7 +83,7 @@ class ImageInliers:
         mean: Mean of the inliers.
         picks: (m,) index of each image's selected candidate.
         agrees: (m,) inlier mask.
-        away: (m, 6) residual of each image's pose from the mean [rad, m].
+        residuals: (m, 6) residual of each image's pose from the mean [rad, m].
         mahalanobis_sq: (m,) its squared Mahalanobis distance; six on average under noise.
         limit: Its outlier limit.
         variance: Variance factor of the images' independent errors; at least one.
@@ -93,7 +93,7 @@ class ImageInliers:
     mean: Mean
     picks: IntArray
     agrees: Mask
-    away: FloatArray
+    residuals: FloatArray
     mahalanobis_sq: FloatArray
     limit: float
     variance: float
@@ -148,11 +148,11 @@ def _start(candidates: CandidateViews) -> tuple[IntArray, Mask]:
 
 def _nearest(candidates: CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
     """Squared distance (m,) of each image's nearest candidate from a pose, and its index."""
-    own, nearest = candidates.own(seed), []
+    independent, nearest = candidates.independent(seed), []
     for view in candidates.views:
         differences = [log(invert(seed.matrix) @ place.matrix) for place in view]
         squared = [
-            float(d @ np.linalg.solve(own + candidates.own(place), d))
+            float(d @ np.linalg.solve(independent + candidates.independent(place), d))
             for d, place in zip(differences, view, strict=True)
         ]
         nearest.append((min(squared), int(np.argmin(squared))))
@@ -166,19 +166,21 @@ def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInli
     chosen = [view[at] for view, at in zip(candidates.views, picks, strict=True)]
     mean = _mean(candidates, chosen, agrees)
     errors = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
-    own = np.array([candidates.own(value) for value in chosen])
+    independent = np.array([candidates.independent(value) for value in chosen])
     common_difference = np.array([value.by_common for value in chosen]) - mean.by_common
     shared = common_difference @ candidates.common @ np.swapaxes(common_difference, 1, 2)
     is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
     squared = np.einsum(
-        "mi,mi->m", errors, np.linalg.solve(own + shared, errors[..., None])[..., 0]
+        "mi,mi->m", errors, np.linalg.solve(independent + shared, errors[..., None])[..., 0]
     )
     # Six degrees of freedom for each image beyond the first.
     variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
     # The residual of an image that is part of the mean has a smaller covariance.
-    covariance = own + shared + np.where(is_inlier, -1.0, 1.0) * mean.own
+    covariance = independent + shared + np.where(is_inlier, -1.0, 1.0) * mean.independent
     mahalanobis_sq = (
-        squared_lengths(errors, covariance, own)[0] if others else np.where(agrees, 0.0, squared)
+        squared_lengths(errors, covariance, independent)[0]
+        if others
+        else np.where(agrees, 0.0, squared)
     )
     return ImageInliers(
         mean,
@@ -196,12 +198,12 @@ def _mean(candidates: CandidateViews, chosen: Sequence[TargetPlace], agrees: Mas
     """Mean pose weighted by the images' independent errors; common errors do not average out."""
     weights = np.array(
         [
-            np.linalg.inv(candidates.own(place)) if ok else np.zeros((6, 6))
+            np.linalg.inv(candidates.independent(place)) if ok else np.zeros((6, 6))
             for place, ok in zip(chosen, agrees, strict=True)
         ]
     )
-    own = covariance_from(weights.sum(axis=0))
-    gains = own @ weights
+    independent = covariance_from(weights.sum(axis=0))
+    gains = independent @ weights
     matrices = np.array([place.matrix for place in chosen])
     matrix = matrices[int(np.flatnonzero(agrees)[0])]
     for _ in range(_STEPS):
@@ -210,7 +212,7 @@ def _mean(candidates: CandidateViews, chosen: Sequence[TargetPlace], agrees: Mas
         if np.abs(step).max() < _CONVERGED:
             break
     by_common = np.einsum("mij,mjk->ik", gains, np.array([place.by_common for place in chosen]))
-    return Mean(matrix, own, gains, by_common)
+    return Mean(matrix, independent, gains, by_common)
 
 
 def _rival(
@@ -221,7 +223,9 @@ def _rival(
     first = candidates.views[int(np.flatnonzero(agrees)[0])]
     for seed in first:
         delta = log(invert(matrix) @ seed.matrix)
-        is_other = float(delta @ np.linalg.solve(2.0 * candidates.own(seed), delta)) > _DIFFERENT
+        is_other = (
+            float(delta @ np.linalg.solve(2.0 * candidates.independent(seed), delta)) > _DIFFERENT
+        )
         if is_other and bool(np.all(_nearest(candidates, seed)[0][agrees] < limit)):
             return seed.matrix
     return None

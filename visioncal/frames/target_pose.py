@@ -134,12 +134,12 @@ def place_target(
     labels = tuple(sight.label for sight in sights)
     return TargetPose(
         fit.mean.matrix,
-        fit.variance * fit.mean.own,
+        fit.variance * fit.mean.independent,
         fit.mean.by_common @ common @ fit.mean.by_common.T,
         labels,
         fit.agrees,
-        1e3 * np.linalg.norm(fit.away[:, 3:], axis=1),
-        np.rad2deg(np.linalg.norm(fit.away[:, :3], axis=1)),
+        1e3 * np.linalg.norm(fit.residuals[:, 3:], axis=1),
+        np.rad2deg(np.linalg.norm(fit.residuals[:, :3], axis=1)),
         float(np.sqrt(fit.variance)),
         (
             *eye.warnings,
@@ -194,7 +194,7 @@ def inlier_warnings(
 
 
 def _distance_words(fit: ImageInliers, at: int) -> str:
-    residual = fit.away[at]
+    residual = fit.residuals[at]
     millimetres = 1e3 * float(np.linalg.norm(residual[3:]))
     degrees = float(np.rad2deg(np.linalg.norm(residual[:3])))
     return mm_and_deg(millimetres, degrees)
@@ -203,13 +203,13 @@ def _distance_words(fit: ImageInliers, at: int) -> str:
 def _ambiguity_warning(fit: ImageInliers, looks: Sequence[SeenTarget], thing: str) -> str:
     rival = np.eye(4) if fit.rival is None else fit.rival
     millimetres, degrees = pose_difference(fit.mean.matrix, rival)
-    away = f"{mm_and_deg(millimetres, degrees)} away"
+    shift = f"{mm_and_deg(millimetres, degrees)} away"
     if any(len(set(look.turns)) > 1 for look in looks):
         return (
-            f"The {thing} looks the same when it is turned: it may as well be {away}. Use a board "
+            f"The {thing} looks the same when it is turned: it may as well be {shift}. Use a board "
             "without symmetry, or see to it that it is not turned."
         )
     return (
-        f"Seen so flat, the {thing} may as well be tilted the other way, {away}. Look from another "
-        "side, or from nearer."
+        f"Seen so flat, the {thing} may as well be tilted the other way, {shift}. Look from "
+        "another side, or from nearer."
     )

@@ -81,13 +81,13 @@ def touch_points(
     turned = np.deg2rad(noise.get("robot_rotation_deg", 0.0)) * np.linalg.norm(tip.matrix[:3, 3])
     shifted = 1e-3 * noise.get("robot_translation_mm", 0.0)
     # The robot's noise at the stop and the tip's covariance.
-    own = (shifted**2 + turned**2) * np.eye(3) + tip.covariance[3:, 3:]
+    independent = (shifted**2 + turned**2) * np.eye(3) + tip.covariance[3:, 3:]
     rotation = frame.edge.matrix[:3, :3]
     points = []
     for name, at in _five_corners(board).items():
         placed = frame.edge.matrix @ compose(np.eye(3), at)
         located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
-        covariance = located + rotation @ own @ rotation.T
+        covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
         radius_mm = float(np.hypot(1e3 * radius95(covariance), READING_MM))
         points.append(TouchPoint(name, at, placed[:3, 3], flange, radius_mm, rotation[:, 2]))

@@ -29,11 +29,11 @@ def check_schema(document: Mapping[str, Any]) -> None:
     Raises:
         DataError: It is of another.
     """
-    found = document.get("schema")
-    if found != SCHEMA:
-        is_newer = isinstance(found, int) and found > SCHEMA
+    schema = document.get("schema")
+    if schema != SCHEMA:
+        is_newer = isinstance(schema, int) and schema > SCHEMA
         raise DataError(
-            f"schema is {found!r}, this version reads {SCHEMA}.",
+            f"schema is {schema!r}, this version reads {SCHEMA}.",
             culprits=["schema"],
             next_step="A newer visioncal reads it." if is_newer else "Calibrate the session again.",
         )

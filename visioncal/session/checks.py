@@ -6,7 +6,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.document import Declaration
 from visioncal.session.table import View
 
@@ -60,7 +60,7 @@ def check_times(views: Sequence[View]) -> None:
         DataError: One is not; it names the view.
     """
     for view in views:
-        wrong = "" if view.stamp_s is None else known.no_size("stamp_s", np.array([view.stamp_s]))
+        wrong = "" if view.stamp_s is None else cols.no_size("stamp_s", np.array([view.stamp_s]))
         if wrong:
             place = f"views.csv, view {view.number}, column stamp_s"
             raise DataError(f"{place}: {wrong}.", culprits=[place])
@@ -89,7 +89,7 @@ def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
 
 def view_warnings(views: Sequence[View]) -> Iterator[str]:
     """Warnings of positions and angles in another unit."""
-    for names in (known.POSITION, known.MEASURED_CAM_POSE[:3]):
+    for names in (cols.POSITION, cols.MEASURED_CAM_POSE[:3]):
         if words := unit_warning(views, names):
             yield words
     angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]

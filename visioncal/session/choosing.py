@@ -95,27 +95,29 @@ def choose(
         DataError: There is none of that name, the choice is ambiguous, or this robot is not between
             camera and target.
     """
-    known = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
+    by_part = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
     named = {
-        part: _frame(known[part], part, name, label) for part in PARTS if (name := choice.of(part))
+        part: _frame(by_part[part], part, name, label)
+        for part in PARTS
+        if (name := choice.of(part))
     }
     options = [
         option
-        for option in _combinations(frames, known, parted=parted)
+        for option in _combinations(frames, by_part, parted=parted)
         if all(map(option.frame_of, needs))
     ]
     fitting = [
         option for option in options if all(option.frame_of(p) == at for p, at in named.items())
     ]
     if not fitting:
-        raise _none_fits(frames, known, named, needs, label)
+        raise _none_fits(frames, by_part, named, needs, label)
     if "target" in needs:
         observed = [option for option in fitting if (option.camera, option.target) in seen]
         fitting = observed or fitting
     for part in PARTS:
-        meant = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
-        if part in needs and len(meant) > 1:
-            names = [thing_name(name, part) for name in meant]
+        remaining = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
+        if part in needs and len(remaining) > 1:
+            names = [thing_name(name, part) for name in remaining]
             raise DataError(
                 f"{label} has several {part}s ({some_of(names)}), and which is meant is not said.",
                 culprits=[f"--{part}"],
@@ -128,12 +130,12 @@ def choose(
 _KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "target"}
 
 
-def _frame(known: Collection[str], part: Part, name: str, label: str) -> str:
+def _frame(frames: Collection[str], part: Part, name: str, label: str) -> str:
     """Frame of a named part."""
-    for frame in known:
+    for frame in frames:
         if name in (frame, thing_name(frame, part)):
             return frame
-    names = [thing_name(word, part) for word in known]
+    names = [thing_name(word, part) for word in frames]
     raise DataError(
         f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
         culprits=[f"--{part}"],
@@ -142,17 +144,17 @@ def _frame(known: Collection[str], part: Part, name: str, label: str) -> str:
 
 
 def _combinations(
-    frames: Mapping[str, str], known: Mapping[Part, Collection[str]], *, parted: bool
+    frames: Mapping[str, str], by_part: Mapping[Part, Collection[str]], *, parted: bool
 ) -> Iterator[Chosen]:
     """All valid combinations, those with target and camera first."""
-    for flange in known["robot"]:
+    for flange in by_part["robot"]:
         robot = flange.partition("_")[2]
-        for camera in (*known["camera"], ""):
+        for camera in (*by_part["camera"], ""):
             between = robots_between(frames, camera, frames[flange]) if camera else ()
             if between not in ((), (robot,)):
                 continue
             mount: Mount = "eye-in-hand" if between else "eye-to-hand"
-            for target in (*known["target"], ""):
+            for target in (*by_part["target"], ""):
                 both = camera and target and parted
                 if not both or robots_between(frames, camera, target) == (robot,):
                     yield Chosen(mount if camera else "instrument", camera, robot, target)
@@ -160,7 +162,7 @@ def _combinations(
 
 def _none_fits(
     frames: Mapping[str, str],
-    known: Mapping[Part, Collection[str]],
+    by_part: Mapping[Part, Collection[str]],
     named: Mapping[Part, str],
     needs: Collection[Part],
     label: str,
@@ -168,10 +170,10 @@ def _none_fits(
     """Error that no combination fits the names."""
     culprits = [f"--{name}" for name in named]
     for part in needs:
-        if not known[part]:
+        if not by_part[part]:
             return DataError(f"{label} has no {part}.", culprits=[f"--{part}"])
     only = {
-        part: next(iter(collection)) for part, collection in known.items() if len(collection) == 1
+        part: next(iter(collection)) for part, collection in by_part.items() if len(collection) == 1
     } | dict(named)
     camera, target, flange = (only.get(name) for name in ("camera", "target", "robot"))
     robot = None if flange is None else thing_name(flange, "robot")
@@ -200,7 +202,7 @@ def _none_fits(
     pairs = [
         f"{thing_name(option.camera, 'camera')} and {thing_name(option.target, 'target')} by robot "
         f"{thing_name(option.flange, 'robot')}"
-        for option in _combinations(frames, known, parted=True)
+        for option in _combinations(frames, by_part, parted=True)
         if option.camera and option.target
     ]
     return DataError(

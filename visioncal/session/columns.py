@@ -212,8 +212,8 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
 def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
     """Hint at columns that differ from missing ones by capitals or an appended unit."""
     plain = {re.sub(r"[ _]*[\[(].*", "", name).lower(): name for name in columns}
-    found = [plain[word] for word in missing if word in plain]
-    return f"; {', '.join(found)} may be meant: names are plain and small" if found else ""
+    similar = [plain[word] for word in missing if word in plain]
+    return f"; {', '.join(similar)} may be meant: names are plain and small" if similar else ""
 
 
 def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
@@ -230,6 +230,6 @@ def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
         is_other = (
             name in (*known, *degrees) or is_number(name) or re.split(r"[_.]", name)[0] in known
         )
-        meant = name.replace("_deg", "_rad")
-        if hint := "" if is_other else did_you_mean(meant, known, _MISSPELT):
+        in_radians = name.replace("_deg", "_rad")
+        if hint := "" if is_other else did_you_mean(in_radians, known, _MISSPELT):
             yield f"{where}: column {name} is not a known one and is kept as text. {hint}"

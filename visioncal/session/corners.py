@@ -330,10 +330,10 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
     boards, file = [targets[name] for name in names], FILE if table.is_file else "corners"
     numbers = {board: frozenset(point_numbers(board)) for board in dict.fromkeys(boards)}
     for target, known in numbers.items():
-        mine = {
+        used = {
             point for point, of in zip(table.points.tolist(), boards, strict=True) if of is target
         }
-        _check_first_number(mine, known, target, file)
+        _check_first_number(used, known, target, file)
     by_name: dict[str, set[int]] = {}
     for name, point in zip(names, table.points.tolist(), strict=True):
         by_name.setdefault(name, set()).add(point)

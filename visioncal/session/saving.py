@@ -126,9 +126,9 @@ def _place_robots(
         return {model: content}
     texts, several = {}, len(declaration.robots) > 1
     for robot, table in declaration.robots.items():
-        mine = contents.get(robot) if several else contents
-        if table.model is not None and is_file(table.model) and mine is not None:
-            name, content = robot_file(mine, table.model)
+        model_document = contents.get(robot) if several else contents
+        if table.model is not None and is_file(table.model) and model_document is not None:
+            name, content = robot_file(model_document, table.model)
             path = _place_inside(table.model, f"{robot}_{name}")
             kept = {**table.model_dump(exclude_none=True), "model": path}
             document["robots"] = {**document["robots"], robot: kept}

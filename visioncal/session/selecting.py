@@ -113,9 +113,11 @@ def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
 
 def streams_of(session: "Session", robot: str) -> dict[str, Stream]:
     """The streams of one robot, and those of no robot, by name."""
-    mine = {None, robot or "robot"}
+    owners = {None, robot or "robot"}
     return {
-        name: stream for name, stream in session.streams.items() if _robot_of(session, name) in mine
+        name: stream
+        for name, stream in session.streams.items()
+        if _robot_of(session, name) in owners
     }
 
 

@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.core.shown import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.arrays import CellArguments, Poses, of_corners, of_images
 from visioncal.session.boards import COLUMN, read_targets, target_warnings
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
@@ -568,7 +568,7 @@ def _build(
     check_images_can_be_used(declaration, views)
     warnings = [
         *declaration_warnings(declaration, "session.toml"),
-        *known.column_warnings(columns, "views.csv"),
+        *cols.column_warnings(columns, "views.csv"),
         *view_warnings(views),
         *kind_warnings(declaration, views),
         *target_warnings(declaration, target_document),

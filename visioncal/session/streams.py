@@ -15,7 +15,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, read_text_inside, sha256, write_atomically
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.table import NUMBER
 
 FOLDER, STAMP = "streams", "stamp_s"
@@ -72,7 +72,7 @@ class Stream:
 
     def poses(self) -> tuple[FloatArray, FloatArray]:
         """Reported flange poses: (m,) times [s] and (m, 4, 4) [m]."""
-        stamps_s, numbers = self.group(known.POSE)
+        stamps_s, numbers = self.group(cols.POSE)
         if not len(numbers):
             return stamps_s, np.zeros((0, 4, 4))
         rotations = Rotation.from_quat(numbers[:, 3:])
@@ -82,11 +82,11 @@ class Stream:
     @property
     def has_robot_state(self) -> bool:
         """Whether it has poses or joints of a robot."""
-        return known.POSE[0] in self or "q1_rad" in self
+        return cols.POSE[0] in self or "q1_rad" in self
 
     def joints(self) -> tuple[FloatArray, FloatArray]:
         """Joint angles: (m,) times [s] and (m, n) [rad]."""
-        return self.group(known.joint_columns(self.columns))
+        return self.group(cols.joint_columns(self.columns))
 
     def gaps(self) -> IntArray:
         """Rows after which samples are missing, by comparison with the median step."""
@@ -121,7 +121,7 @@ def read_streams(folder: Path) -> dict[str, Stream]:
 
 def _check_sizes(stream: Stream, label: str) -> None:
     for column in dict.fromkeys(stream.columns):
-        wrong = known.no_size(column, stream[column])
+        wrong = cols.no_size(column, stream[column])
         if wrong:
             raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
 
@@ -253,7 +253,7 @@ def check_stream(name: str, stream: Stream) -> None:
         )
     # A stream needs no `view`, and may have it.
     header = stream.columns if "view" in stream else ("view", *stream.columns)
-    known.check_header(header, f"{label}, header")
+    cols.check_header(header, f"{label}, header")
     if STAMP not in stream:
         raise DataError(
             f"{label}, header: the column {STAMP}, the time of each row, is missing.",
@@ -262,15 +262,15 @@ def check_stream(name: str, stream: Stream) -> None:
     if not len(stream):
         raise DataError(f"{label} has a header row and no samples.", culprits=[label])
     _check_times(stream, label)
-    for group in (*known.WHOLE_GROUPS, known.joint_columns(stream.columns)):
+    for group in (*cols.WHOLE_GROUPS, cols.joint_columns(stream.columns)):
         _check_whole(stream, group, label)
     for column in (
-        column for column in stream.columns if column.endswith("_c") and known.is_number(column)
+        column for column in stream.columns if column.endswith("_c") and cols.is_number(column)
     ):
-        wrong = known.no_celsius(stream[column])
+        wrong = cols.no_celsius(stream[column])
         if wrong:
             raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
-    for group in known.QUATERNION_GROUPS:
+    for group in cols.QUATERNION_GROUPS:
         rows = np.flatnonzero(_are_no_quaternions(stream, group))
         if len(rows):
             raise _wrong_rows(

@@ -16,7 +16,7 @@ from visioncal.core.documents.tables import separator_of, with_points, without_m
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import READ_AGAIN
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.images import image_path
 from visioncal.session.loads import SIDES, load_problems
 
@@ -80,28 +80,28 @@ class View:
     @property
     def joints_rad(self) -> FloatArray | None:
         """(n,) joint angles [rad], if recorded."""
-        names = known.joint_columns(tuple(self.numbers))
+        names = cols.joint_columns(tuple(self.numbers))
         return np.array([self.numbers[name] for name in names]) if names else None
 
     def base_from_flange(self) -> RigidTransform | None:
         """The reported pose of the flange, if recorded."""
-        return self._transform(known.POSE)
+        return self._transform(cols.POSE)
 
     def cam_from_target(self) -> RigidTransform | None:
         """The measured pose of the target (cft_*), if there is one."""
-        return self._transform(known.MEASURED_CAM_POSE)
+        return self._transform(cols.MEASURED_CAM_POSE)
 
     @property
     def reading_m(self) -> FloatArray | None:
         """(3,) position measured by an instrument (meas_*), in its frame [m], if there is one."""
-        names = known.INSTRUMENT_POSITION
+        names = cols.INSTRUMENT_POSITION
         return (
             np.array([self.numbers[name] for name in names]) if names[0] in self.numbers else None
         )
 
     def instrument_from_probe(self) -> RigidTransform | None:
         """Pose of a probe measured by an instrument (meas_*), if its rotation was measured, too."""
-        names = (*known.INSTRUMENT_POSITION, *known.INSTRUMENT_QUATERNION)
+        names = (*cols.INSTRUMENT_POSITION, *cols.INSTRUMENT_QUATERNION)
         complete = names[0] in self.numbers and names[-1] in self.numbers
         return self._transform(names) if complete else None
 
@@ -129,10 +129,10 @@ def reported_matrices(views: Sequence[View]) -> dict[int, FloatArray]:
 
     Vectorised: one pose alone takes as long as a hundred together.
     """
-    reported = [view for view in views if known.POSE[0] in view.numbers]
+    reported = [view for view in views if cols.POSE[0] in view.numbers]
     if not reported:
         return {}
-    values = np.array([[view.numbers[name] for name in known.POSE] for view in reported])
+    values = np.array([[view.numbers[name] for name in cols.POSE] for view in reported])
     poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
     return dict(zip((view.number for view in reported), poses.as_matrix(), strict=True))
 
@@ -236,7 +236,7 @@ def read_views(
     Raises:
         DataError: Rows are wrong; it lists up to ten problems.
     """
-    known.check_header(columns, f"{label}, header")
+    cols.check_header(columns, f"{label}, header")
     views: list[View] = []
     problems: list[TableProblem] = []
     first_seen: dict[int, str] = {}
@@ -280,9 +280,9 @@ def problems_error(problems: Sequence[TableProblem]) -> DataError:
         step = ""
         if len(columns) == 1 and "" not in columns:
             step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
-    own = {problem.step for problem in problems}
-    if len(own) == 1:
-        step = own.pop() or step
+    steps = {problem.step for problem in problems}
+    if len(steps) == 1:
+        step = steps.pop() or step
     if len(problems) <= _SHOWN_PROBLEMS:
         lines = [f"{problem.place}: {problem.words}." for problem in problems]
         return DataError(
@@ -312,8 +312,8 @@ def _kind_message(alike: Sequence[TableProblem]) -> str:
 
 def _are_consecutive(alike: Sequence[TableProblem]) -> bool:
     """Whether problems are in all lines from the first to the last."""
-    lines = [found for problem in alike if (found := _LINE.search(problem.place))]
-    numbers = [int(found[1]) for found in lines]
+    lines = [match for problem in alike if (match := _LINE.search(problem.place))]
+    numbers = [int(match[1]) for match in lines]
     return len(numbers) == len(alike) and numbers[-1] - numbers[0] == len(alike) - 1
 
 
@@ -396,7 +396,7 @@ class _RowReader:
     def _numbers(self, cells: dict[str, str]) -> dict[str, float]:
         numbers = {}
         for column in self.columns:
-            if known.is_number(column):
+            if cols.is_number(column):
                 value = self._take(cells, column, read_number)
                 if value is not None:
                     numbers[column] = value
@@ -405,10 +405,10 @@ class _RowReader:
     def _check_sizes(self, numbers: Mapping[str, float]) -> None:
         for column, value in numbers.items():
             # Recordings of earlier versions may have any time; see `check_times`.
-            wrong = known.no_size(column, np.array([value])) if column != "stamp_s" else ""
+            wrong = cols.no_size(column, np.array([value])) if column != "stamp_s" else ""
             if wrong:
                 self.report(column, wrong)
-            wrong = known.no_celsius(np.array([value])) if column.endswith("_c") else ""
+            wrong = cols.no_celsius(np.array([value])) if column.endswith("_c") else ""
             if wrong:
                 self.report(column, wrong)
 
@@ -425,13 +425,13 @@ class _RowReader:
             )
 
     def _check_groups(self, numbers: Mapping[str, float]) -> None:
-        joints = known.joint_columns(self.columns)
+        joints = cols.joint_columns(self.columns)
         if "robot" in self.columns:
             # Robots may have different numbers of joints.
             filled = [name for name in joints if name in numbers]
             joints = tuple(dict.fromkeys((*joints[: len(filled)], *filled)))
         # A rejected cell would be reported again as missing from its group.
-        groups = () if self.problems else (*known.WHOLE_GROUPS, joints)
+        groups = () if self.problems else (*cols.WHOLE_GROUPS, joints)
         for group in groups:
             missing = [name for name in group if name not in numbers]
             if 0 < len(missing) < len(group):
@@ -440,7 +440,7 @@ class _RowReader:
                     f"it is empty while {group[0] if group[0] in numbers else group[-1]} is "
                     f"filled; a row fills all of {group[0]} ... {group[-1]} or none",
                 )
-        for group in known.QUATERNION_GROUPS:
+        for group in cols.QUATERNION_GROUPS:
             if all(name in numbers for name in group):
                 norm = math.hypot(*(numbers[name] for name in group))
                 if abs(norm - 1.0) > _NORM_TOLERANCE:

@@ -303,12 +303,12 @@ def _matrices(poses: Poses) -> FloatArray:
             culprits=[f"target {at}"],
             next_step=step,
         )
-    away = np.abs(matrices[:, :3, 3]).max(axis=1, initial=0.0)
-    near = away < FAR_M
-    if not near.all():
-        at = int(np.argmin(near))
+    extent_m = np.abs(matrices[:, :3, 3]).max(axis=1, initial=0.0)
+    reachable = extent_m < FAR_M
+    if not reachable.all():
+        at = int(np.argmin(reachable))
         raise DataError(
-            f"correct: target {at} is {away[at]:.4g} m from the base, and no arm reaches "
+            f"correct: target {at} is {extent_m[at]:.4g} m from the base, and no arm reaches "
             f"{FAR_M:g} m.",
             culprits=[f"target {at}"],
             next_step="Positions are in metres.",
