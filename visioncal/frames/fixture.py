@@ -80,9 +80,11 @@ def touched_fixture(
         )
         _check_named(rows)
     measured = touched_points(rows, tool, robot_noise(calibration), robot, calibration)
-    setting = Setting(
-        touch_noise_m, tuple(_tool_findings(tool)), _tool_details(tool), options or FixtureLimits()
-    )
+    details: dict[str, object] = {"tool": "none: the poses are of the tip"}
+    if tool is not None:
+        details = {"tool": {"name": tool.name, "sigma_mm": tool.edge.sigma_mm}}
+    findings = tuple(_tool_findings(tool))
+    setting = Setting(touch_noise_m, findings, details, options or FixtureLimits())
     if drawing is None:
         return _feature_fixture(measured, rows.kinds, setting)
     return drawn_fixture(measured, drawing, setting)
@@ -112,12 +114,6 @@ def _tool_findings(tool: Tool | None) -> list[Finding]:
             is_fatal=tool.verdict.status == "bad",
         )
     ]
-
-
-def _tool_details(tool: Tool | None) -> dict[str, object]:
-    if tool is None:
-        return {"tool": "none: the poses are of the tip"}
-    return {"tool": {"name": tool.name, "sigma_mm": tool.edge.sigma_mm}}
 
 
 def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Setting) -> Frame:

@@ -39,12 +39,7 @@ class Tool:
 
     @classmethod
     def among(cls, frames: Mapping[str, Frame], source: str, name: str | None) -> "Tool":
-        """Selects a tool among frames.
-
-        Args:
-            frames: By transform name.
-            source: Where they were read from, for messages.
-            name: The tool's name, or its transform's; the only tool where None.
+        """Selects a tool among frames by its name or its transform's; the only one where None.
 
         Raises:
             DataError: There is none of that name, or no name is given and there is not one tool.
@@ -111,14 +106,9 @@ class MeasuredPoints:
         return np.asarray(self.independent + uneven[at, :, at, :])
 
     def carried(self, by_points: FloatArray, noise_m: FloatArray) -> FloatArray:
-        """Propagates the points' covariance to a result.
+        """(p, p) covariance of a result with the (n, p, 3) Jacobian `by_points` by each point.
 
-        Args:
-            by_points: (n, p, 3) Jacobian of the result by each point.
-            noise_m: (n,) additional noise of each per axis [m].
-
-        Returns:
-            (p, p) the result's covariance.
+        `noise_m` is the (n,) additional noise of each per axis [m].
         """
         independent = self.independent + noise_m[:, None, None] ** 2 * np.eye(3)
         jacobian = np.concatenate(list(by_points), axis=1)
@@ -134,12 +124,8 @@ def touched_points(
 ) -> MeasuredPoints:
     """Computes the touched points from the flange's poses and the tool.
 
-    Args:
-        rows: The touches.
-        tool: On the flange; None where the poses are of the tip itself.
-        noise: Errors of the flange, per axis.
-        robot: The model for joint angles, where the calibration has none; unused without a tool.
-        calibration: Of the same robot.
+    Without a tool, the poses are of the tip itself. `robot` is the model for joint angles where the
+    calibration has none; `noise` is that of the flange, per axis.
 
     Raises:
         DataError: A row has no pose, or the same one as another.

@@ -58,12 +58,9 @@ class TouchPoint:
 def touch_points(
     session: Session, calibration: Calibration, tool: Tool | None = None
 ) -> tuple[TouchPoint, ...]:
-    """Locates five points of a board, with the flange pose that brings the tip onto each.
+    """Locates five points of a session's board, with the flange poses that bring the tip onto each.
 
-    Args:
-        session: One image or more of the board, by the calibrated camera.
-        calibration: The camera's.
-        tool: The touching tool; None for the flange itself.
+    Without a tool, the tip is the flange's origin.
 
     Raises:
         DataError: No image is usable.
@@ -97,12 +94,7 @@ def touch_points(
 def judged(
     points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: Tool | None = None
 ) -> TouchTest:
-    """Compares measured gaps with the predicted ones.
-
-    Args:
-        points: The points, in order.
-        gaps_mm: Distance from tip to point at each [mm].
-        tool: The touching tool; None for the flange itself.
+    """Compares measured distances from tip to point [mm], in the points' order, with predictions.
 
     Raises:
         DataError: The number of gaps is not that of the points, or one is no length.

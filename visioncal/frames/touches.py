@@ -54,10 +54,8 @@ class TouchRows:
     def of_kinds(self, allowed: Sequence[str], default: str = "", hint: str = "") -> "TouchRows":
         """Returns the rows with every kind filled in.
 
-        Args:
-            allowed: The allowed kinds.
-            default: Kind of a row without one; empty where a kind is required.
-            hint: Advice where a row's kind resembles none of these.
+        `default` is the kind of a row without one, empty where a kind is required; `hint` is the
+        advice where a kind resembles no allowed one.
 
         Raises:
             DataError: A row is of another kind.
@@ -78,11 +76,7 @@ class TouchRows:
 
 
 def touches_of(session: Session, robot: str | None = None) -> TouchRows:
-    """Reads the rows of a session's views.csv as touches.
-
-    Args:
-        session: Of one robot, or of a whole cell.
-        robot: Name of the robot, in a whole cell.
+    """Reads the rows of a session's views.csv as touches, in a whole cell those of one robot.
 
     Raises:
         DataError: It is of several robots, and none is named, or there is none of that name.

@@ -323,11 +323,6 @@ class ArmResult(Section):
     holdout: tuple[UnseenView, ...] = ()
 
     def __post_init__(self) -> None:
-        """Checks that the chosen level is among the fitted ones.
-
-        Raises:
-            ValueError: It is not.
-        """
         if self.is_calibrated and self.level not in [level.level for level in self.levels]:
             raise ValueError(f"level {self.level!r} is not among the levels")
 

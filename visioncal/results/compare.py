@@ -449,12 +449,7 @@ class EdgeError:
 def edge_errors(
     calibration: Calibration, transforms: Mapping[str, FloatArray]
 ) -> dict[str, EdgeError]:
-    """True error of each edge.
-
-    Args:
-        calibration: The result.
-        transforms: (4, 4) true edges by name.
-    """
+    """True error of each edge, by the true transforms (4, 4) by name."""
     errors = {}
     for name, edge in calibration.edges.items():
         mm, deg = pose_difference(transforms[name], edge.matrix)

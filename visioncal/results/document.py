@@ -81,11 +81,6 @@ class CalibrationForm:
     frames: Mapping[str, Frame] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Checks that there is a transform.
-
-        Raises:
-            ValueError: There is none.
-        """
         if not self.edges:
             raise ValueError("transforms is empty")
 

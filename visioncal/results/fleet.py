@@ -307,10 +307,7 @@ def with_changes(
 ) -> list[FleetRow]:
     """The rows with each result's difference from an earlier one of the same session.
 
-    Args:
-        rows: The rows.
-        before: Gives the earlier result by name; None where there is none.
-        after: Gives the present result by name; None where there is none.
+    `before` and `after` give the earlier and the present result by name, None where there is none.
     """
     compared = []
     for row in rows:

@@ -130,11 +130,6 @@ class CameraResult:
     field: LensField | None = None
 
     def __post_init__(self) -> None:
-        """Checks the sizes of the covariances.
-
-        Raises:
-            ValueError: They are not.
-        """
         size = 4 + len(self.camera.distortion)
         for array in (self.covariance, self.edge_covariance):
             if array is not None and len(array) != size:

@@ -94,11 +94,6 @@ class BoardResult(Section):
     bend_mm: float
 
     def __post_init__(self) -> None:
-        """Checks that the shape is complete.
-
-        Raises:
-            ValueError: It is not.
-        """
         for name in BOARD_NAMES:
             if name not in self.shape and name != _LATER:
                 raise ValueError(f"shape.{name} is missing")
@@ -164,11 +159,6 @@ class UncertaintyResult(Section):
     inflation: float = 1.0
 
     def __post_init__(self) -> None:
-        """Checks that the budget has a source and a total.
-
-        Raises:
-            ValueError: It has not.
-        """
         if "total" not in self.budget_mm or len(self.budget_mm) < 2:
             raise ValueError("budget_mm has no total, or no source")
 

@@ -95,11 +95,6 @@ class SeerAndSeen:
     point: str | None = None
 
     def __post_init__(self) -> None:
-        """Checks that observer and observed object are named.
-
-        Raises:
-            ValueError: One is missing.
-        """
         if (self.camera or self.instrument) is None or (self.target or self.point) is None:
             raise ValueError("camera or instrument, or target or point, is missing")
 

@@ -105,12 +105,7 @@ def no_celsius(values: FloatArray) -> str:
 
 
 def no_size(column: str, values: FloatArray) -> str:
-    """Message for an implausibly large number in a column; empty for none.
-
-    Args:
-        column: The column's name, which ends in its unit.
-        values: (n,) its numbers; NaN where a cell is empty.
-    """
+    """Message for an implausibly large number among a column's values (n,); empty for none."""
     rate = _RATE.fullmatch(column)
     unit = rate[1] if rate else column.rpartition("_")[2] if is_number(column) else ""
     most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
@@ -176,11 +171,9 @@ def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
     """Columns of positions with other names; None where there are none."""
     lower = {name.lower(): name for name in columns}
     group = next((position for position in _POSITIONS if lower.keys() >= set(position)), None)
-    return (
-        None
-        if group is None or set(POSITION) & set(columns)
-        else tuple(lower[word] for word in group)
-    )
+    if group is None or set(POSITION) & set(columns):
+        return None
+    return tuple(lower[word] for word in group)
 
 
 def _header_problems(columns: Sequence[str]) -> Iterator[str]:

@@ -317,12 +317,7 @@ _FEWEST_EXCHANGED = 4
 
 
 def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str, Target]) -> None:
-    """Checks that points exist on their targets and are unique in each view.
-
-    Args:
-        table: The corners.
-        names: (n,) names of their targets.
-        targets: The session's targets by name.
+    """Checks that points exist on their targets, with (n,) `names`, and are unique in each view.
 
     Raises:
         DataError: A point is unknown or duplicate.

@@ -16,12 +16,7 @@ _HEAVIEST_KG, _STRONGEST_N = 2500.0, 25000.0
 
 
 def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | None = None) -> Loads:
-    """Loads of views; zero where not stated.
-
-    Args:
-        rows: Numbers of the views by column.
-        approaches: Their cells of the column approach; None where irrelevant.
-    """
+    """Loads of views by their numbers, zero where not stated, and by their cells of approach."""
     sides = [SIDES.get(approach.strip(), 0.0) for approach in approaches or [""] * len(rows)]
 
     def read(*names: str) -> FloatArray:

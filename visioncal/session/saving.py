@@ -33,13 +33,7 @@ def refuse_filled(folder: Path) -> None:
 def write_folder(
     folder: Path, texts: Mapping[str, str], images: ImageStore, paths: Sequence[str]
 ) -> None:
-    """Writes texts and images into a new folder.
-
-    Args:
-        folder: The folder; it must be new or empty.
-        texts: The texts by path.
-        images: Source of the images; missing ones are skipped.
-        paths: Paths of the images.
+    """Writes texts by path, and images that are not missing, into a new or empty folder.
 
     Raises:
         DataError: The folder exists and is not empty, or cannot be written; or only the digest of

@@ -323,13 +323,7 @@ def _wrong_rows(
 
 
 def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:
-    """Error for samples that are too far apart to represent a motion.
-
-    Args:
-        label: The stream's file, as `streams/robot.csv`.
-        usual_s: Typical time between samples by their stamps [s].
-        slowest_s: Largest accepted time between samples [s].
-    """
+    """Error for samples whose typical step `usual_s` exceeds the accepted `slowest_s` [s]."""
     # The first unit in which the steps are plausible for a controller.
     unit = next((name for name, per_s in _UNITS.items() if usual_s <= slowest_s * per_s), "")
     like = "no time in seconds"

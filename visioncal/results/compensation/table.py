@@ -193,13 +193,7 @@ def columns_to_send(
 
 
 def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: IntArray) -> str:
-    """Formats rows as CSV with all their columns, corrected values in place.
-
-    Args:
-        targets: The rows as they were read.
-        columns: Corrected values, of `columns_to_send`.
-        rows: Indices of the rows.
-    """
+    """Formats rows, by index, as CSV with all their columns, corrected values in place."""
     own = targets.table.columns
     names = [*own, *(column for column in columns if column not in own)]
     text = io.StringIO()
