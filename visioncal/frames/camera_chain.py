@@ -1,12 +1,13 @@
-"""The calibrated chain from the base to the camera, its uncertainty at one stop; planes.
+"""Calibrated camera, its pose in the base with uncertainty at one stop, and planes.
 
-Eye-in-hand, `base_from_cam = base_from_flange * flange_from_cam`: the robot's noise at the stop
-where the image was taken is new, and adds to the camera's transform. Eye-to-hand,
-`base_from_cam` is the camera's transform itself, and no robot stands between.
+Eye-in-hand, `base_from_cam = base_from_flange * flange_from_cam`: the robot's noise at the image's
+stop is independent of the calibration and adds to the covariance of the camera's transform.
+Eye-to-hand, `base_from_cam` is the camera's transform itself, and the robot has no part.
 
-Where the arm was calibrated along and the joints of a look are known, the arm errs by what its
-calibration left open, which is correlated with the camera's transform: the last joint's zero, say,
-is in both and moves no place. Any other arm errs by as much as the calibration's own stops showed.
+Where the arm was calibrated with the camera and an image's joints are known, the arm's remaining
+error has the calibration's covariance, correlated with the camera's transform: the last joint's
+zero, say, is in both and moves no point. Otherwise the size of the arm's errors is that which the
+calibration's own stops showed.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from visioncal.estimation.chain import edge_names
 from visioncal.results import Calibration, CameraResult, Edge
 from visioncal.vision.camera import intrinsics
 
-# A pixel is placed in a millisecond, and need not wait for what calibrated arms take to import.
+# Locating a pixel takes a millisecond; the arm's model is slow to import.
 if TYPE_CHECKING:
     from visioncal.estimation.armmodel import ArmModel
 
@@ -37,13 +38,13 @@ FAR_M = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class LearntArm:
-    """An arm that was calibrated along with the camera, and what that left open of its errors.
+class ArmErrors:
+    """Posterior of the errors of an arm that was calibrated with the camera.
 
     Attributes:
-        model: The arm, with the p errors that it may still have.
-        covariance: (p, p) of these.
-        with_camera: (6 + k + m, p) their covariance with the camera's edge and lens, as in `Eye`.
+        model: The arm's model with its p error parameters.
+        covariance: (p, p) of the parameters.
+        with_camera: (6 + k + m, p) cross-covariance with the camera's edge and lens, as in `Eye`.
     """
 
     model: "ArmModel"
@@ -52,15 +53,13 @@ class LearntArm:
 
     @classmethod
     def of(cls, calibration: Calibration, camera: FloatArray) -> Self | None:
-        """Reads it from a calibration; None where its arm was not calibrated.
+        """Reads the posterior from a calibration; None where its arm was not calibrated.
 
-        Args:
-            calibration: The camera's.
-            camera: (6 + k + m,) squared covariance of the camera's edge and lens.
+        `camera` is the (6 + k + m, 6 + k + m) covariance of the camera's edge and lens.
         """
-        found, fit = calibration.arm, calibration.joint_fit
-        # Functions of the joints are in no such covariance.
-        if fit is None or not calibration.arm_is_calibrated or found is None or found.functions:
+        result, fit = calibration.arm, calibration.joint_fit
+        # The joint fit's covariance does not contain functions of the joints.
+        if fit is None or not calibration.arm_is_calibrated or result is None or result.functions:
             return None
         from visioncal.calibration.verification.calibration_prior import fitted_model
 
@@ -69,32 +68,32 @@ class LearntArm:
             return None
         lens_size = len(intrinsics(calibration.camera.camera))
         free = [at for at in fit.looks if at < lens_size]
-        # Behind the camera's edge is that of the first board, where there is one.
-        behind = 12 if fit.boards else 6
-        fitted = [*range(6), *(behind + fit.looks.index(at) for at in free)]
+        # Between the camera's edge and the lens is the first board's edge, where there is one.
+        lens_start = 12 if fit.boards else 6
+        fitted = [*range(6), *(lens_start + fit.looks.index(at) for at in free)]
         kept = [*range(6), *(6 + at for at in free)]
         arm = slice(len(fit.covariance) - len(fit.arm.values), None)
-        # What was no unknown of the fit has to do with the arm only by way of what was.
-        shares = camera[:, kept] @ np.linalg.pinv(camera[np.ix_(kept, kept)], hermitian=True)
-        return cls(model, fit.covariance[arm, arm], shares @ fit.covariance[fitted, arm])
+        # Parameters that were not fitted correlate with the arm only through those that were.
+        gain = camera[:, kept] @ np.linalg.pinv(camera[np.ix_(kept, kept)], hermitian=True)
+        return cls(model, fit.covariance[arm, arm], gain @ fit.covariance[fitted, arm])
 
 
 @dataclass(frozen=True, eq=False)
 class Eye:
-    """A calibrated camera as it is used: its lens, its place, and the covariance of both.
+    """Calibrated camera: lens, extrinsics, their joint covariance, and the noise levels.
 
     Attributes:
         mount: Where it is mounted.
-        lens: The intrinsics, k values, and m coefficients of what the lens does beyond its model.
+        lens: The intrinsics (k values) and the field beyond the lens model (m coefficients).
         edge: (4, 4) `flange_from_cam` or `base_from_cam`.
-        covariance: (6 + k + m,) squared, of the edge's right perturbation and the lens together.
+        covariance: (6 + k + m, 6 + k + m) of the edge's right perturbation and the lens together.
         flange_sigmas: (6,) noise of the flange at one stop, per axis [rad, m].
-        arm_sigma: Size of errors that follow the arm's posture [rad], 0.5 m of length for each
-            radian; zero where there are none.
-        arm: The arm, where it was calibrated along.
-        pixel_px: Noise of a corner's coordinate [px]; None where the calibration does not say.
-        freedom: Degrees of freedom that the noise was estimated with, infinite where not said.
-        warnings: Why not to trust it, in sentences.
+        arm_sigma: Size of posture-dependent arm errors [rad], 0.5 m of length for each radian; zero
+            where there are none.
+        arm: The arm's errors, where it was calibrated with the camera.
+        pixel_px: Noise of a corner's coordinate [px]; None where unknown.
+        freedom: Degrees of freedom of the noise estimate; infinite where unknown.
+        warnings: Reasons not to trust the camera, in sentences.
     """
 
     mount: Mount
@@ -103,14 +102,14 @@ class Eye:
     covariance: FloatArray
     flange_sigmas: FloatArray
     arm_sigma: float
-    arm: LearntArm | None
+    arm: ArmErrors | None
     pixel_px: float | None
     freedom: float
     warnings: tuple[str, ...]
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
-        """Takes from a calibration what a look through its camera needs.
+        """Reads the camera from a calibration.
 
         Raises:
             DataError: The calibration has no camera: it was made from measured poses.
@@ -133,7 +132,7 @@ class Eye:
             covariance,
             _flange_sigmas(calibration),
             _arm_sigma(calibration),
-            LearntArm.of(calibration, covariance),
+            ArmErrors.of(calibration, covariance),
             calibration.noise.get("pixel_px"),
             calibration.noise_dof,
             (bad,) if verdict.status == "bad" else (),
@@ -155,10 +154,10 @@ class Eye:
         return 0.0 if self.lens.field is None else self.lens.field.jitter
 
     def noise_px(self, stated: float | None) -> float:
-        """The noise of a coordinate in the image: the stated one, or the calibration's [px].
+        """Noise of an image coordinate: the stated one, else the calibration's [px].
 
         Raises:
-            DataError: It is not positive, or neither is known.
+            DataError: It is negative or not finite, or neither is known.
         """
         sigma = self.pixel_px if stated is None else stated
         if sigma is None:
@@ -172,21 +171,21 @@ class Eye:
 
     def at(
         self, base_from_flange: Pose | None, joints_rad: FloatArray | None = None
-    ) -> "ChainStop":
-        """The chain while the flange stands somewhere.
+    ) -> "CameraPose":
+        """Camera pose in the base at one pose of the flange.
 
         Args:
-            base_from_flange: As the robot reported it when the image was taken. A camera that
-                stands still needs none, and takes no notice of one.
-            joints_rad: (n,) where that is the calibrated arm's pose by these joints [rad].
+            base_from_flange: As the robot reported it when the image was taken. Ignored for a fixed
+                camera.
+            joints_rad: (n,) joints [rad] where the pose is the calibrated arm's for these joints.
 
         Raises:
             DataError: A camera on the flange needs the pose and there is none, or it is no rigid
                 transform in metres.
         """
         if self.mount == "eye-to-hand":
-            nothing = np.zeros((6, 6))
-            return ChainStop(self.edge, nothing, nothing, np.zeros((6, self.arm_size)))
+            zero = np.zeros((6, 6))
+            return CameraPose(self.edge, zero, zero, np.zeros((6, self.arm_error_count)))
         if base_from_flange is None:
             raise DataError(
                 "locate: the camera is on the flange (eye-in-hand), and the robot's pose at the "
@@ -198,7 +197,7 @@ class Eye:
             base_from_flange = base_from_flange.as_matrix()
         base_from_flange = np.asarray(base_from_flange, dtype=float)
         checked_pose(base_from_flange, "base_from_flange")
-        return ChainStop(
+        return CameraPose(
             base_from_flange @ self.edge,
             adjoint(invert(self.edge)),
             self.flange_noise,
@@ -211,25 +210,25 @@ class Eye:
         return np.asarray(np.diag(self.flange_sigmas**2))
 
     @property
-    def arm_size(self) -> int:
-        """How many errors `arm_basis` knows."""
-        return self.posture_size + (0 if self.arm is None else len(self.arm.covariance))
+    def arm_error_count(self) -> int:
+        """Number of columns of `arm_basis`."""
+        return self.posture_error_count + (0 if self.arm is None else len(self.arm.covariance))
 
     @property
-    def posture_size(self) -> int:
-        """How many of these are of an arm that was not calibrated, or whose joints are not said."""
+    def posture_error_count(self) -> int:
+        """Number of these for an arm that is not calibrated or whose joints are unknown."""
         return pose_basis(np.eye(4)[None]).shape[2] if self.arm_sigma > 0.0 else 0
 
     def arm_basis(
         self, base_from_flange: FloatArray, joints_rad: FloatArray | None = None
     ) -> FloatArray:
-        """(6, a) how the flange errs with the arm's posture, by the errors of `shared_covariance`.
+        """(6, a) Jacobian of the flange's pose by the arm's errors in `shared_covariance`.
 
-        Those of a calibrated arm, where the joints are known. Else by the shape of any arm's errors
-        (`estimation.arm.pose_basis`), as independent of those that the calibration met: the
-        camera's transform has taken a part of them up, and nothing says which.
+        With known joints of a calibrated arm, by its error parameters. Otherwise by generic
+        posture-dependent errors (`estimation.arm.pose_basis`), taken as independent of those in the
+        calibration: the camera's transform has absorbed an unknown part of them.
         """
-        basis, postures = np.zeros((6, self.arm_size)), self.posture_size
+        basis, postures = np.zeros((6, self.arm_error_count)), self.posture_error_count
         if self.arm is not None and joints_rad is not None:
             basis[:, postures:] = self.arm.model.kept_basis(joints_rad[None])[0]
         elif postures:
@@ -238,28 +237,27 @@ class Eye:
 
     @property
     def shared_covariance(self) -> FloatArray:
-        """(6 + k + m + a,) squared, of what all looks share: camera, lens, and the arm's errors."""
-        camera, size = len(self.covariance), len(self.covariance) + self.arm_size
+        """Covariance of the common errors of all images: camera, lens, arm; (6 + k + m + a,)^2."""
+        camera, size = len(self.covariance), len(self.covariance) + self.arm_error_count
         covariance = np.eye(size)
         covariance[:camera, :camera] = self.covariance
         if self.arm is not None:
-            learnt = slice(camera + self.posture_size, size)
-            covariance[learnt, learnt] = self.arm.covariance
-            covariance[:camera, learnt] = self.arm.with_camera
-            covariance[learnt, :camera] = self.arm.with_camera.T
+            arm = slice(camera + self.posture_error_count, size)
+            covariance[arm, arm] = self.arm.covariance
+            covariance[:camera, arm] = self.arm.with_camera
+            covariance[arm, :camera] = self.arm.with_camera.T
         return covariance
 
 
 @dataclass(frozen=True, eq=False)
-class ChainStop:
-    """The chain while the flange stands at one place.
+class CameraPose:
+    """Camera pose in the base at one stop, and its dependence on the flange.
 
     Attributes:
         base_from_cam: (4, 4).
-        flange_jacobian: (6, 6) how it moves, on its right, with the flange; zero for a camera that
-            stands still.
-        flange_noise: (6, 6) covariance of the flange by its noise.
-        arm_basis: (6, a) how the flange errs with the arm's posture; see `Eye.arm_basis`.
+        flange_jacobian: (6, 6) its right perturbation by the flange's; zero for a fixed camera.
+        flange_noise: (6, 6) covariance of the flange's noise.
+        arm_basis: (6, a) see `Eye.arm_basis`.
     """
 
     base_from_cam: FloatArray
@@ -268,24 +266,24 @@ class ChainStop:
     arm_basis: FloatArray
 
     def point(self, point_cam: FloatArray) -> FloatArray:
-        """(3,) a point of the camera's frame in the base [m]."""
+        """(3,) position in the base of a point in the camera's frame [m]."""
         return np.asarray(self.base_from_cam[:3, :3] @ point_cam + self.base_from_cam[:3, 3])
 
-    def by_camera(self, point_cam: FloatArray) -> FloatArray:
-        """(3, 6) how a point that is fixed to the camera moves with the camera's perturbation."""
-        return point_slope(self.base_from_cam, point_cam)
+    def camera_jacobian(self, point_cam: FloatArray) -> FloatArray:
+        """(3, 6) Jacobian of a camera-fixed point in the base by the camera's perturbation."""
+        return point_jacobian(self.base_from_cam, point_cam)
 
 
-def point_slope(a_from_b: FloatArray, point_b: FloatArray) -> FloatArray:
-    """(3, 6) how a point fixed in b moves in a with the right perturbation of `a_from_b`."""
+def point_jacobian(a_from_b: FloatArray, point_b: FloatArray) -> FloatArray:
+    """(3, 6) Jacobian of a b-fixed point in a by the right perturbation of `a_from_b`."""
     return np.asarray(a_from_b[:3, :3] @ np.concatenate([-skew(point_b), np.eye(3)], axis=1))
 
 
 def checked_pose(pose: FloatArray, name: str) -> None:
-    """Refuses what is no pose in metres.
+    """Checks that a matrix is a pose in metres.
 
     Raises:
-        DataError: It is no (4, 4) rigid transform, or it lies farther off than any arm reaches.
+        DataError: It is no (4, 4) rigid transform, or its offset is longer than any arm reaches.
     """
     fault, step = (f"its shape is {pose.shape}", "") if pose.shape != (4, 4) else rigid_fault(pose)
     if fault:
@@ -302,13 +300,13 @@ def checked_pose(pose: FloatArray, name: str) -> None:
 
 
 def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArray:
-    """Refuses what is no point in metres.
+    """Checks that an array is a point in metres.
 
     Returns:
         (3,) the point [m].
 
     Raises:
-        DataError: It is no three finite numbers, or farther off than any arm reaches.
+        DataError: It is not three finite numbers, or is farther off than any arm reaches.
     """
     point = np.asarray(point_m, dtype=float)
     if point.shape != (3,):
@@ -327,18 +325,18 @@ def checked_point(point_m: FloatArray | Sequence[float], name: str) -> FloatArra
 
 
 def _flange_sigmas(calibration: Calibration) -> FloatArray:
-    """The flange's noise; of both together where it could not be separated from the camera's."""
+    """(6,) flange noise [rad, m]; robot and camera combined where they were not separable."""
     noise = calibration.noise
-    of = "robot" if "robot_translation_mm" in noise else "combined"
-    rotation = np.deg2rad(noise.get(f"{of}_rotation_deg", 0.0))
-    translation = 1e-3 * noise.get(f"{of}_translation_mm", 0.0)
+    source = "robot" if "robot_translation_mm" in noise else "combined"
+    rotation = np.deg2rad(noise.get(f"{source}_rotation_deg", 0.0))
+    translation = 1e-3 * noise.get(f"{source}_translation_mm", 0.0)
     return np.repeat([rotation, translation], 3)
 
 
 def _arm_sigma(calibration: Calibration) -> float:
-    found = calibration.arm_errors
-    # Where joints are not known, the flange's noise is that of single looks, all of them in it.
-    return float(np.deg2rad(found.sigma_deg)) if found and found.of is None else 0.0
+    errors = calibration.arm_errors
+    # Without known joints, the estimated noise of the flange already contains the arm's errors.
+    return float(np.deg2rad(errors.sigma_deg)) if errors and errors.of is None else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,22 +356,22 @@ class Plane:
     @classmethod
     @typed
     def horizontal(cls, z_m: float, sigma_m: float = 0.0) -> Self:
-        """The plane `z = z_m` of the base, of a height known to `sigma_m` [m]."""
+        """The plane `z = z_m` of the base, with the height's standard deviation `sigma_m` [m]."""
         return cls.through(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, z_m]), sigma_m)
 
     @classmethod
     @typed
     def through(cls, normal: FloatArray, point: FloatArray, sigma_m: float = 0.0) -> Self:
-        """A plane by its normal and a point in it.
+        """The plane with a given normal through a point.
 
         Args:
             normal: (3,) of any length but zero.
             point: (3,) in the base [m].
-            sigma_m: How well its offset along the normal is known [m].
+            sigma_m: Standard deviation of its offset along the normal [m].
 
         Raises:
-            DataError: The normal has no direction, or a number is not finite or no length in
-                metres.
+            DataError: The normal has no direction, or a number is not finite or farther than any
+                arm reaches.
         """
         for name, array in (("normal", normal), ("point", point)):
             if np.shape(array) != (3,):
@@ -392,24 +390,24 @@ class Plane:
     def of_frame(cls, edge: Edge, z_m: float = 0.0, sigma_m: float = 0.0) -> Self:
         """The plane `z = z_m` of a frame in the base, such as a fixture.
 
-        The frame counts as independent of the calibration. One that this same camera has placed is
-        not: what both have in common is counted twice then.
+        The frame is taken as independent of the calibration. Where this same camera has placed it,
+        the shared errors are counted twice.
 
         Args:
             edge: `base_from_fixture`, with its covariance.
             z_m: Height of the plane in the frame [m].
-            sigma_m: How well that height is known [m].
+            sigma_m: Standard deviation of that height [m].
         """
         rotation, origin = edge.matrix[:3, :3], edge.matrix[:3, 3]
         normal = rotation[:, 2]
-        # What moves the frame by (w, v) turns its normal by w x z and carries its origin along.
+        # A perturbation (w, v) of the frame turns its normal by w x z and shifts its origin by v.
         by_rotation = -rotation @ skew(np.array([0.0, 0.0, 1.0]))
-        slope = np.zeros((4, 6))
-        slope[:3, :3] = by_rotation
-        slope[3, :3] = origin @ by_rotation
-        slope[3, 3:] = normal @ rotation
+        jacobian = np.zeros((4, 6))
+        jacobian[:3, :3] = by_rotation
+        jacobian[3, :3] = origin @ by_rotation
+        jacobian[3, 3:] = normal @ rotation
         offset = float(normal @ origin) + _length(z_m)
-        covariance = slope @ edge.covariance @ slope.T + _offset_covariance(sigma_m)
+        covariance = jacobian @ edge.covariance @ jacobian.T + _offset_covariance(sigma_m)
         return cls(normal, _length(offset), covariance)
 
 

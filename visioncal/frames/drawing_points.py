@@ -1,4 +1,4 @@
-"""Points as a drawing has them, and which of them were measured."""
+"""Nominal points of a drawing, and their matching with measured points by name."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from visioncal.estimation.pointfit import PointPairs
 
 @dataclass(frozen=True, eq=False)
 class NominalPoints:
-    """Points as a drawing has them, n in all.
+    """Nominal points of a drawing, n in all.
 
     Attributes:
         source: What they were read from, for messages and for the record.
-        names: (n,) their names, each once.
+        names: (n,) unique names.
         positions: (n, 3) [m] in the drawing's frame.
-        sigma_m: (n,) how well each is known [m]; 0 where the drawing is taken as exact.
+        sigma_m: (n,) standard deviation of each coordinate [m]; 0 where taken as exact.
     """
 
     source: str
@@ -30,33 +30,33 @@ class NominalPoints:
     def beside(
         self, names: Sequence[str], measured: FloatArray, covariances: FloatArray
     ) -> PointPairs:
-        """Lays measured points beside the drawn ones of the same names.
+        """Pairs measured points with the drawn ones of the same names.
 
-        Letters count as alike in capitals and small where that leaves no doubt.
+        Upper and lower case are the same where the match is unique.
 
         Args:
-            names: (m,) which point each is; one may be there several times.
+            names: (m,) which point each is; names may repeat.
             measured: (m, 3) in the base [m].
-            covariances: (m, 3, 3) what is known of their noise [m^2].
+            covariances: (m, 3, 3) of their known noise [m^2].
 
         Raises:
-            DataError: The drawing has no point of that name; near ones are named.
+            DataError: The drawing has no point of that name.
         """
-        places = {name: at for at, name in enumerate(self.names)}
+        index_of = {name: at for at, name in enumerate(self.names)}
         folded = [name.casefold() for name in self.names]
-        places |= {
+        index_of |= {
             name: folded.index(name.casefold())
             for name in names
-            if name not in places and folded.count(name.casefold()) == 1
+            if name not in index_of and folded.count(name.casefold()) == 1
         }
-        unknown = [name for name in dict.fromkeys(names) if name not in places]
+        unknown = [name for name in dict.fromkeys(names) if name not in index_of]
         if unknown:
             raise DataError(
                 f"{self.source} has no point {some_of(unknown)}; it has {some_of(self.names, 20)}.",
                 culprits=unknown,
                 next_step=did_you_mean(unknown[0], self.names) or "Correct the points' names.",
             )
-        rows = np.array([places[name] for name in names], dtype=np.int64)
+        rows = np.array([index_of[name] for name in names], dtype=np.int64)
         spare = np.setdiff1d(np.arange(len(self.names)), rows)
         return PointPairs(
             tuple(self.names[index] for index in rows),

@@ -1,4 +1,4 @@
-"""A fixture from touches, of a drawing's points or of its origin, its x axis and its xy plane."""
+"""Fixture frame from touches of a drawing's points, or of its origin, x axis and xy plane."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
@@ -31,10 +31,10 @@ from visioncal.robot import Robot
 _CAUSE = "the tip had slipped, it is of another kind, or the pose is of another moment"
 _THINGS = {"origin": "the origin", "x": "the x axis", "xy": "the xy plane"}
 
-# A warm part or a long arm is off by less than this; a drawing of another issue by more.
+# Thermal expansion or an arm's scale error is below this share; the wrong drawing differs by more.
 _WARM = 1e-3
-# Points lie across the drawing's z if their plane's normal is this much along it, and the tool came
-# from a side of that plane if its direction was this much along the normal.
+# Smallest cosine between the points' plane normal and the drawing's z for the plane to be an xy
+# plane, and between the tool's direction and z for the touched side to be known.
 _FLAT, _ASIDE = 0.9, 0.3
 
 
@@ -49,24 +49,24 @@ def touched_fixture(
     touch_noise_m: float | None = None,
     options: FixtureLimits | None = None,
 ) -> Frame:
-    """Finds a fixture by touches of its features, or of points that a drawing has.
+    """Estimates a fixture's frame from touches of its features or of a drawing's points.
 
     Args:
         rows: The touches. Without a drawing each is of kind `origin`, `x` (on the positive x axis)
             or `xy` (in the xy plane, on the side of positive y); with one, each names its point.
-        tool: That touched; None where the poses are of the tip itself.
+        tool: The touching tool; None where the poses are of the tip itself.
         drawing: The points in the fixture's frame; None for features.
-        calibration: Of the same robot, where there is one: its noise and its arm are used.
-        robot: A model for joint angles, where the calibration has none.
-        touch_noise_m: What a touch is known to repeat to, per axis [m].
-        options: Where doubt begins.
+        calibration: Of the same robot, for its noise and arm; optional.
+        robot: The model for joint angles, where the calibration has none.
+        touch_noise_m: Known repeatability of a touch, per axis [m].
+        options: Limits of the verdict.
 
     Returns:
         `base_from_fixture`.
 
     Raises:
         DataError: Touches are missing, wrongly written, or contradict each other or the drawing.
-        DegenerateError: They leave a direction of the fixture open.
+        DegenerateError: They do not determine the fixture in every direction.
     """
     if drawing is None:
         rows = rows.of_kinds(
@@ -80,11 +80,13 @@ def touched_fixture(
         )
         _check_named(rows)
     measured = touched_points(rows, tool, robot_noise(calibration), robot, calibration)
-    setting = Setting(
-        touch_noise_m, tuple(_doubts(tool)), _details(tool), options or FixtureLimits()
-    )
+    details: dict[str, object] = {"tool": "none: the poses are of the tip"}
+    if tool is not None:
+        details = {"tool": {"name": tool.name, "sigma_mm": tool.edge.sigma_mm}}
+    findings = tuple(_tool_findings(tool))
+    setting = Setting(touch_noise_m, findings, details, options or FixtureLimits())
     if drawing is None:
-        return _featured_fixture(measured, rows.kinds, setting)
+        return _feature_fixture(measured, rows.kinds, setting)
     return drawn_fixture(measured, drawing, setting)
 
 
@@ -101,7 +103,7 @@ def _check_named(rows: TouchRows) -> None:
         )
 
 
-def _doubts(tool: Tool | None) -> list[Finding]:
+def _tool_findings(tool: Tool | None) -> list[Finding]:
     if tool is None or tool.verdict.status == "good":
         return []
     return [
@@ -114,33 +116,34 @@ def _doubts(tool: Tool | None) -> list[Finding]:
     ]
 
 
-def _details(tool: Tool | None) -> dict[str, object]:
-    if tool is None:
-        return {"tool": "none: the poses are of the tip"}
-    return {"tool": {"name": tool.name, "sigma_mm": tool.edge.sigma_mm}}
-
-
-def _featured_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Setting) -> Frame:
-    """Finds the fixture whose origin, x axis and xy plane were touched."""
+def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Setting) -> Frame:
+    """Fits the fixture to touches of its origin, x axis and xy plane."""
     touches = FeatureTouches(
         measured.labels,
         cast("tuple[FeatureKind, ...]", tuple(kinds)),
         measured.points,
         measured.scattered,
     )
-    expected = setting.touch_noise_m
-    if expected is None and len(measured) == len(FEATURE_KINDS):
+    noise_m = setting.touch_noise_m
+    if noise_m is None and len(measured) == len(FEATURE_KINDS):
         # One of each kind leaves no residual to estimate the noise from.
-        expected = TOUCH_NOISE_M
-    fitted = _fitted(fit_features(touches, expected), measured, setting)
+        noise_m = TOUCH_NOISE_M
+    fitted = _feature_fit(fit_features(touches, noise_m), measured, setting)
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in FEATURE_KINDS)
     return fixture_frame(
-        fitted, kinds, f"{counts} touches", tuple(_unchecked(fitted, kinds, setting)), {}, setting
+        fitted,
+        kinds,
+        f"{counts} touches",
+        tuple(_redundancy_findings(fitted, kinds, setting)),
+        {},
+        setting,
     )
 
 
-def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> FixtureFit[FloatArray]:
-    matrix, amid = fit.base_from_fixture, measured.points[fit.agreement.agrees].mean(axis=0)
+def _feature_fit(
+    fit: FeatureFit, measured: MeasuredPoints, setting: Setting
+) -> FixtureFit[FloatArray]:
+    matrix, centroid = fit.base_from_fixture, measured.points[fit.agreement.agrees].mean(axis=0)
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
     return FixtureFit(
         measured,
@@ -148,17 +151,18 @@ def _fitted(fit: FeatureFit, measured: MeasuredPoints, setting: Setting) -> Fixt
         tuple(f"Touch {label}" for label in measured.labels),
         matrix,
         measured.carried(fit.by_points, np.full(len(measured), noise_m)),
-        np.asarray((amid - matrix[:3, 3]) @ matrix[:3, :3]),
+        np.asarray((centroid - matrix[:3, 3]) @ matrix[:3, :3]),
         fit.agreement,
         [_CAUSE] * len(measured),
         noise_m,
     )
 
 
-def _unchecked(
+def _redundancy_findings(
     fitted: FixtureFit[FloatArray], kinds: Sequence[str], setting: Setting
 ) -> Iterator[Finding]:
-    once = [_THINGS[kind] for kind in FEATURE_KINDS if _count(kinds, kind, fitted.agrees) == 1]
+    used = [kind for kind, ok in zip(kinds, fitted.agrees.tolist(), strict=True) if ok]
+    once = [_THINGS[kind] for kind in FEATURE_KINDS if used.count(kind) == 1]
     assumed = assumed_words(fitted.noise_m, setting.touch_noise_m)
     if len(once) == len(FEATURE_KINDS):
         yield Finding(
@@ -176,43 +180,31 @@ def _unchecked(
         )
 
 
-def _count(kinds: Sequence[str], kind: str, agrees: Mask) -> int:
-    return sum(name == kind and used for name, used in zip(kinds, agrees.tolist(), strict=True))
-
-
 def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Setting) -> Frame:
-    """Finds the fixture whose drawn points were measured.
-
-    Args:
-        measured: The points; each has the name of a drawn one.
-        drawing: The drawn points.
-        setting: What is known beside.
-
-    Returns:
-        `base_from_fixture`.
+    """Fits `base_from_fixture` to measured points, which are named as in the drawing.
 
     Raises:
         DataError: A point is not drawn, or the points do not fit the drawing.
-        DegenerateError: They leave a direction open.
+        DegenerateError: They do not determine the fixture in every direction.
     """
     pairs = drawing.beside(measured.names, measured.points, measured.scattered)
     fit = fit_points(pairs, setting.touch_noise_m)
-    fitted = _fitted_to_drawing(fit, measured, pairs, setting)
+    fitted = _drawing_fit(fit, measured, pairs, setting)
     count = len(set(pairs.labels))
     several = f"{len(measured)} {setting.words.things} of " if count < len(measured) else ""
-    used = _names_used(pairs, fitted.agrees)
-    less = "" if len(used) == count else f"{len(used)} of "
+    used = _inlier_names(pairs, fitted.agrees)
+    share = "" if len(used) == count else f"{len(used)} of "
     return fixture_frame(
         fitted,
         ("",) * len(measured),
-        f"best fit of {several}{less}{count} points to {drawing.source}",
-        tuple(_drawing_doubts(fit, fitted, pairs, setting)),
+        f"best fit of {several}{share}{count} points to {drawing.source}",
+        tuple(_drawing_findings(fit, fitted, pairs, setting)),
         _drawing_details(fit, pairs),
         setting,
     )
 
 
-def _fitted_to_drawing(
+def _drawing_fit(
     fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting: Setting
 ) -> FixtureFit[FixturePlacement]:
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
@@ -231,7 +223,7 @@ def _fitted_to_drawing(
 
 
 def _labels(measured: MeasuredPoints, pairs: PointPairs) -> tuple[str, ...]:
-    """The points' names; where one was measured several times, with which time it was."""
+    """Point names; a point measured several times also has the measurement's label."""
     several = {label for label in pairs.labels if pairs.labels.count(label) > 1}
     return tuple(
         f"{name}, {label}" if name in several else name
@@ -240,7 +232,7 @@ def _labels(measured: MeasuredPoints, pairs: PointPairs) -> tuple[str, ...]:
 
 
 def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
-    """What makes each point disagree, if it does."""
+    """(n,) probable cause if the point is an outlier."""
     causes = dict.fromkeys(pairs.labels, "it was missed, or the part is not there as drawn")
     if fit.numbering.is_wrong:
         points = pairs.merged()
@@ -250,12 +242,12 @@ def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
     return [causes[label] for label in pairs.labels]
 
 
-def _drawing_doubts(
+def _drawing_findings(
     fit: PointFit, fitted: FixtureFit[FixturePlacement], pairs: PointPairs, setting: Setting
 ) -> Iterator[Finding]:
-    yield from _scaled(fit, pairs)
+    yield from _scale_findings(fit, pairs)
     if not fit.hand_known:
-        yield from _mirrored(fitted, pairs, setting.words.side)
+        yield from _mirror_findings(fitted, pairs, setting.words.side)
     if not fit.numbering.is_unique:
         yield Finding(
             "symmetric",
@@ -266,7 +258,7 @@ def _drawing_doubts(
                 "point that breaks the symmetry."
             ),
         )
-    used = len(_names_used(pairs, fitted.agrees))
+    used = len(_inlier_names(pairs, fitted.agrees))
     if used < setting.options.points:
         yield Finding(
             "few_points",
@@ -275,39 +267,39 @@ def _drawing_doubts(
         )
 
 
-def _names_used(pairs: PointPairs, agrees: Mask) -> set[str]:
+def _inlier_names(pairs: PointPairs, agrees: Mask) -> set[str]:
     return {name for name, ok in zip(pairs.labels, agrees.tolist(), strict=True) if ok}
 
 
-def _scaled(fit: PointFit, pairs: PointPairs) -> Iterator[Finding]:
-    """Doubts a part that is not as large as drawn; the frame does not take that in."""
+def _scale_findings(fit: PointFit, pairs: PointPairs) -> Iterator[Finding]:
+    """Finding on a part whose size differs from the drawing; the frame does not absorb scale."""
     if not fit.scale.differs:
         return
-    off = abs(fit.scale.value - 1.0)
-    reach = float(np.linalg.norm(np.ptp(pairs.nominal, axis=0)))
+    deviation = abs(fit.scale.value - 1.0)
+    extent_m = float(np.linalg.norm(np.ptp(pairs.nominal, axis=0)))
     cause = (
         "a part or an arm that is warm, or an arm whose links are longer or shorter than its "
         "controller has them, does that."
-        if off < _WARM
+        if deviation < _WARM
         else "is it the drawing of this part, in this issue and at full scale?"
     )
     yield Finding(
         "scale",
         f"The part is {fit.scale.value:.5f} times as large as drawn (sigma {fit.scale.sigma:.5f}), "
-        f"{figure(1e3 * off * reach)} mm over its {figure(1e3 * reach)} mm, which the frame does "
-        f"not take in: {cause}",
-        is_fatal=off > _WARM * 10,
+        f"{figure(1e3 * deviation * extent_m)} mm over its {figure(1e3 * extent_m)} mm, which the "
+        f"frame does not take in: {cause}",
+        is_fatal=deviation > _WARM * 10,
     )
 
 
-def _mirrored(
+def _mirror_findings(
     fitted: FixtureFit[FixturePlacement], pairs: PointPairs, seen_from: str
 ) -> Iterator[Finding]:
-    """Doubts points in a plane, unless the side of the touches determines their handedness."""
-    drawn = pairs.nominal[fitted.agrees]
-    normal = np.linalg.svd(drawn - drawn.mean(axis=0))[2][2]
-    along = fitted.measured.outward[fitted.agrees] @ fitted.matrix[:3, 2]
-    side = float(along.mean()) if abs(normal[2]) > _FLAT else 0.0
+    """Finding on coplanar points, unless the side of the touches determines their handedness."""
+    nominal = pairs.nominal[fitted.agrees]
+    normal = np.linalg.svd(nominal - nominal.mean(axis=0))[2][2]
+    cosines = fitted.measured.outward[fitted.agrees] @ fitted.matrix[:3, 2]
+    side = float(cosines.mean()) if abs(normal[2]) > _FLAT else 0.0
     if side > _ASIDE:
         return
     if side < -_ASIDE:

@@ -1,4 +1,4 @@
-"""What all ways to place a fixture by points share: its covariance, its doubts, its words."""
+"""Fixture frame from any point fit: covariance, findings and messages."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,20 +16,26 @@ from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, worst_of
 from visioncal.frames.measured import MeasuredPoints
-from visioncal.frames.verdicts import disputed, noisy, off_words, placed_name, weak_directions
+from visioncal.frames.verdicts import (
+    noise_findings,
+    off_words,
+    outlier_findings,
+    placed_name,
+    sigma_findings,
+)
 from visioncal.results import Edge, Frame, Observation
 
 
 @dataclass(frozen=True)
 class Words:
-    """How messages speak of what points are measured by.
+    """Wording of messages for one way of measuring points.
 
     Attributes:
-        things: What that is.
-        again: What to do about those that disagree, as a sentence.
-        noisy: What makes them noisy and what to do about it, likewise.
-        weak: What to do about a direction that is known badly, likewise.
-        side: From which side they were measured, behind the words `the side that`.
+        things: What the measurements are called.
+        again: Advice for outliers, as a sentence.
+        noisy: Advice for noisy measurements, as a sentence.
+        weak: Advice for a poorly determined direction, as a sentence.
+        side: Side that they were measured from, behind the words `the side that`.
     """
 
     things: str = "touches"
@@ -47,15 +53,15 @@ class Words:
 
 @dataclass(frozen=True)
 class Setting:
-    """What is known beside the points.
+    """Noise, limits and wording of a fixture's fit.
 
     Attributes:
-        touch_noise_m: What a touch is known to repeat to, per axis [m]; None where unknown.
-        doubts: Reasons that lie in what the points were measured with.
-        details: Figures of that, for the record.
-        options: Where doubt begins.
-        words: For what the points are measured by.
-        careful_m: What is taken for that noise where nobody knows it and points are few [m].
+        touch_noise_m: Known repeatability of a touch, per axis [m]; None where unknown.
+        doubts: Findings on the tool or camera that the points were measured with.
+        details: Its figures, for the record.
+        options: Limits of the verdict.
+        words: Wording for the kind of measurement.
+        careful_m: Assumed noise where it is unknown and points are few [m].
     """
 
     touch_noise_m: float | None = None
@@ -67,23 +73,23 @@ class Setting:
 
     @property
     def expected_m(self) -> float:
-        """What a touch is expected to repeat to, per axis [m]."""
+        """Expected repeatability of a touch, per axis [m]."""
         return self.careful_m if self.touch_noise_m is None else self.touch_noise_m
 
 
 @dataclass(frozen=True, eq=False)
 class FixtureFit(Generic[State]):
-    """A fixture's fit to n points, whatever is known of them.
+    """Fit of a fixture to n points.
 
     Attributes:
         measured: The points.
-        labels: (n,) what the record calls them.
-        names: (n,) what messages call them: `Touch 3`, `Point P3`.
+        labels: (n,) their names in the record.
+        names: (n,) their names in messages: `Touch 3`, `Point P3`.
         matrix: (4, 4) `base_from_fixture`.
-        covariance: (6, 6) of its right perturbation, what the points share included.
-        centre: (3,) amid the points, in the fixture [m].
-        agreement: Which of them agree.
-        causes: (n,) what makes each one disagree, if it does.
+        covariance: (6, 6) of its right perturbation, with the points' common errors.
+        centre: (3,) centroid of the points, in the fixture [m].
+        agreement: The inliers.
+        causes: (n,) probable cause if the point is an outlier.
         noise_m: Noise of a touch per axis [m].
     """
 
@@ -99,12 +105,12 @@ class FixtureFit(Generic[State]):
 
     @property
     def agrees(self) -> Mask:
-        """(n,) which points the answer was made from."""
+        """(n,) inlier mask."""
         return self.agreement.agrees
 
     @property
     def reasons(self) -> list[str]:
-        """(n,) what is wrong with each point; empty where nothing is."""
+        """(n,) why each point is an outlier or in doubt; else empty."""
         words = []
         for at, cause in enumerate(self.causes):
             off = off_words(self.agreement, at)
@@ -116,11 +122,11 @@ class FixtureFit(Generic[State]):
 
     @property
     def worst(self) -> tuple[Direction, Direction]:
-        """The worst known offset, amid the points, and the worst known rotation."""
+        """Directions of the largest sigma: of the offset at the centroid, and of the rotation."""
         return worst_of(self.matrix, self.covariance, "fixture", "base", self.centre)
 
     def praise(self, things: str) -> str:
-        """What speaks for the answer, as a sentence about touches or other things."""
+        """Sentence for a good verdict; `things` names the measurements."""
         offset, rotation = self.worst
         return (
             f"{int(self.agrees.sum())} {things} agree to {figure(1e3 * self.noise_m)} mm per axis, "
@@ -137,19 +143,14 @@ def fixture_frame(
     details: Mapping[str, Any],
     setting: Setting,
 ) -> Frame:
-    """Puts the answer together.
+    """Builds the fixture's frame with its verdict.
 
-    Args:
-        fitted: The fit.
-        kinds: (n,) what was touched; empty where points have no kinds.
-        method: How the answer was obtained, in words.
-        more: Doubts of this method's own.
-        details: Figures of this method's own.
-        setting: What is known beside the points.
+    `kinds` are the (n,) kinds of the touches, or empty texts; `more` and `details` are findings and
+    figures specific to the method.
     """
-    doubts = [*_doubts(fitted, setting), *more, *setting.doubts]
+    findings = [*_findings(fitted, setting), *more, *setting.doubts]
     offset, rotation = fitted.worst
-    used = fitted.agreement.off_m[fitted.agrees]
+    inlier_residuals_m = fitted.agreement.off_m[fitted.agrees]
     noise_95 = [1e3 * value for value in fitted.agreement.fit.sigma_95]
     return Frame(
         Edge(fitted.matrix, fitted.covariance),
@@ -157,10 +158,10 @@ def fixture_frame(
         method,
         fitted.measured.source,
         datetime.now(UTC).isoformat(timespec="seconds"),
-        1e3 * float(np.sqrt(np.mean(used**2))),
+        1e3 * float(np.sqrt(np.mean(inlier_residuals_m**2))),
         1e3 * fitted.noise_m,
         _observations(fitted, kinds),
-        Verdict.by(doubts, Finding(AGREEMENT, fitted.praise(setting.words.things))),
+        Verdict.by(findings, Finding(AGREEMENT, fitted.praise(setting.words.things))),
         {
             **({"noise_95_mm": noise_95} if np.isfinite(noise_95).all() else {}),
             "worst": {
@@ -184,24 +185,21 @@ def _observations(fitted: FixtureFit[State], kinds: Sequence[str]) -> tuple[Obse
     )
 
 
-def _doubts(fitted: FixtureFit[State], setting: Setting) -> list[Finding]:
+def _findings(fitted: FixtureFit[State], setting: Setting) -> list[Finding]:
     names = [
         placed_name(name, place)
         for name, place in zip(fitted.names, fitted.measured.places, strict=True)
     ]
     return [
-        *disputed(names, fitted.reasons, fitted.agreement, setting.words.again),
-        *noisy(
+        *outlier_findings(names, fitted.reasons, fitted.agreement, setting.words.again),
+        *noise_findings(
             1e3 * fitted.noise_m,
             setting.options.noise_mm,
             setting.words.noisy,
             explained=fitted.agreement.explained,
             things=setting.words.things,
         ),
-        *weak_directions(
-            fitted.worst,
-            setting.options.sigma_mm,
-            setting.options.sigma_deg,
-            setting.words.weak,
+        *sigma_findings(
+            fitted.worst, setting.options.sigma_mm, setting.options.sigma_deg, setting.words.weak
         ),
     ]

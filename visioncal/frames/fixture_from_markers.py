@@ -1,4 +1,4 @@
-"""A fixture from markers on it, measured in the base, whose places a drawing has."""
+"""Fixture frame from images of markers whose positions a drawing states."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,10 +17,10 @@ from visioncal.frames.camera_chain import Eye
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture import drawn_fixture
 from visioncal.frames.fixture_fit import Setting, Words
-from visioncal.frames.frame_from_images import camera_details, view_doubts
-from visioncal.frames.image_outliers import CandidateViews, ImageInliers, agreeing
+from visioncal.frames.frame_from_images import camera_details, view_findings
+from visioncal.frames.image_outliers import CandidateViews, ImageInliers, find_inliers
 from visioncal.frames.measured import MeasuredPoints
-from visioncal.frames.session_observations import Sighting, for_fits, pictured
+from visioncal.frames.session_observations import SessionImages, fit_views, session_images
 from visioncal.frames.single_view import (
     Sight,
     TargetPlace,
@@ -30,7 +30,7 @@ from visioncal.frames.single_view import (
     needs_robot,
 )
 from visioncal.frames.target_in_image import SeenTarget, check_size, see
-from visioncal.frames.target_pose import doubts
+from visioncal.frames.target_pose import inlier_warnings
 from visioncal.results import Calibration, Frame
 from visioncal.session import Session
 from visioncal.vision.finders import NotFound, find_target
@@ -50,21 +50,21 @@ _WORDS = Words(
 
 
 @dataclass(frozen=True, eq=False)
-class SeenPoints:
-    """Markers' centres in the base, n of them.
+class MarkerPoints:
+    """Markers' centres measured in the base, n of them.
 
-    A fit to points weighs them with `independent`, and carries `common` to its answer: where that
-    moves with the points by a slope J (6, 3 n), J common J^T adds to its covariance.
+    A fit to the points weights them with `independent`; `common` adds J common J^T to the result's
+    covariance, where J (6, 3 n) is the result's Jacobian by the points.
 
     Attributes:
         names: (n,) the markers' ids as text.
         points: (n, 3) [m].
-        independent: (n, 3, 3) covariance of each by its own pixels [m^2].
-        common: (3 n, 3 n) covariance of all by what they share: the camera's transform, its lens,
-            the markers' printed size, the arm's errors, and the robot's noise, which moves all
-            markers of one image together [m^2].
-        seen_in: (n,) how many images place each.
-        warnings: What to know, in sentences.
+        independent: (n, 3, 3) covariance of each by its pixel noise [m^2].
+        common: (3 n, 3 n) covariance by shared errors: the camera's transform, its lens, the
+            markers' printed size, the arm's errors, and the robot's noise, which moves all markers
+            of one image together [m^2].
+        seen_in: (n,) number of inlier images of each.
+        warnings: Sentences.
     """
 
     names: tuple[str, ...]
@@ -76,13 +76,13 @@ class SeenPoints:
 
     @property
     def covariance(self) -> FloatArray:
-        """(3 n, 3 n) of all points together [m^2]."""
+        """(3 n, 3 n) joint covariance of all points [m^2]."""
         return np.asarray(block_diag(*self.independent) + self.common)
 
 
 @dataclass(frozen=True, eq=False)
 class _Marker:
-    """One marker as the images show it: the (i,) images' places in the list, and what they say."""
+    """One marker in the i images that show it: their indices, its places and its poses in each."""
 
     name: str
     images: tuple[int, ...]
@@ -99,8 +99,8 @@ def seen_markers(
     *,
     size_sigma_m: float | None = None,
     sigma_px: float | None = None,
-) -> SeenPoints:
-    """Measures the centres of single markers in the base.
+) -> MarkerPoints:
+    """Measures the centres of markers in the base.
 
     Args:
         calibration: The camera's.
@@ -108,7 +108,7 @@ def seen_markers(
         ids: The markers to look for.
         dictionary: Their ArUco dictionary by OpenCV's name.
         size_m: Side of each [m].
-        size_sigma_m: How well that is known, for all of them alike [m]; 0.1 % of it where None.
+        size_sigma_m: Its standard deviation, common to all markers [m]; 0.1 % of it where None.
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
 
     Raises:
@@ -119,7 +119,7 @@ def seen_markers(
     targets = [_target(number, dictionary, size_m, size_sigma_m) for number in ids]
     if not targets:
         raise DataError("no markers to look for: give their ids.")
-    markers = [_look(eye, sights, target, sigma_px) for target in targets]
+    markers = [_detect(eye, sights, target, sigma_px) for target in targets]
     unseen = [marker.name for marker in markers if not marker.images]
     if unseen:
         raise DataError(
@@ -128,21 +128,21 @@ def seen_markers(
             next_step="Take an image that shows it whole, with its white margin; or leave it out.",
         )
     common = common_covariance(eye, markers[0].looks[0].scale_sigma)
-    found = [
-        agreeing(CandidateViews(marker.views, eye.flange_noise, common, eye.freedom))
+    fits = [
+        find_inliers(CandidateViews(marker.views, eye.flange_noise, common, eye.freedom))
         for marker in markers
     ]
     warnings = [
         warning
-        for marker, agreement in zip(markers, found, strict=True)
-        for warning in _warnings(eye, marker, agreement, sights)
+        for marker, fit in zip(markers, fits, strict=True)
+        for warning in _warnings(eye, marker, fit, sights)
     ]
-    return SeenPoints(
+    return MarkerPoints(
         tuple(marker.name for marker in markers),
-        np.array([inliers.mean.matrix[:3, 3] for inliers in found]),
-        np.array([_own(*pair) for pair in zip(markers, found, strict=True)]),
-        _shared(eye, markers, found, common, len(sights)),
-        tuple(int(inliers.agrees.sum()) for inliers in found),
+        np.array([fit.mean.matrix[:3, 3] for fit in fits]),
+        np.array([_own_covariance(*pair) for pair in zip(markers, fits, strict=True)]),
+        _common_covariance(eye, markers, fits, common, len(sights)),
+        tuple(int(fit.agrees.sum()) for fit in fits),
         (*eye.warnings, *warnings),
     )
 
@@ -154,22 +154,22 @@ def _target(marker: int, dictionary: str, size_m: float, sigma_m: float | None) 
     return target_from_document(document, f"marker {marker}")
 
 
-def _look(eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float | None) -> _Marker:
-    """Looks for one marker in all images; those without it are passed over."""
+def _detect(eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float | None) -> _Marker:
+    """Detects one marker in all images; images without it are skipped."""
     seen = [(at, _corners(eye, sight, target)) for at, sight in enumerate(sights)]
     shown = [(at, corners) for at, corners in seen if corners is not None]
-    own = [sights[at] for at, _ in shown]
+    own_sights = [sights[at] for at, _ in shown]
     looks = [
         see(eye, corners, target, sight.label, sigma_px)
-        for (_, corners), sight in zip(shown, own, strict=True)
+        for (_, corners), sight in zip(shown, own_sights, strict=True)
     ]
-    views = all_places(eye, own, looks, "base")
+    views = all_places(eye, own_sights, looks, "base")
     images = tuple(at for at, _ in shown)
     return _Marker(str(target.marker_id), images, tuple(views), tuple(looks))
 
 
 def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
-    """A marker's corners in an image; None where it is not in it, which is no failure."""
+    """A marker's corners in an image; None where the image does not show it."""
     if isinstance(sight.seen, Corners):
         raise DataError(
             f"{sight.label}: markers are looked for in images, and corners were given.",
@@ -177,60 +177,64 @@ def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
         )
     image: Image = sight.seen
     check_size(eye, image, sight.label)
-    found = find_target(image, target)
-    if isinstance(found, NotFound):
+    detected = find_target(image, target)
+    if isinstance(detected, NotFound):
         return None
-    return Corners(0, found.ids, found.px, blur_at_corners(image, found.px))
+    return Corners(0, detected.ids, detected.px, blur_at_corners(image, detected.px))
 
 
 def _warnings(
-    eye: Eye, marker: _Marker, found: ImageInliers, sights: Sequence[Sight]
+    eye: Eye, marker: _Marker, fit: ImageInliers, sights: Sequence[Sight]
 ) -> Iterator[str]:
-    """What is odd. One image is not: the other markers check it."""
+    """Warnings on a marker; a single image needs none, since the other markers check it."""
     for look in marker.looks:
         yield from look.warnings
     if len(marker.images) > 1:
-        own = [sights[at] for at in marker.images]
-        stops = len({sight.stop_key for sight in own}) if needs_robot(eye, "base") else None
-        labels = [sight.label for sight in own]
-        yield from doubts(found, labels, marker.looks, stops, f"marker {marker.name}")
+        shown = [sights[at] for at in marker.images]
+        stops = len({sight.stop_key for sight in shown}) if needs_robot(eye, "base") else None
+        labels = [sight.label for sight in shown]
+        yield from inlier_warnings(fit, labels, marker.looks, stops, f"marker {marker.name}")
 
 
-def _shares(
-    found: ImageInliers, views: Sequence[Sequence[TargetPlace]]
+def _place_jacobians(
+    fit: ImageInliers, views: Sequence[Sequence[TargetPlace]]
 ) -> list[tuple[TargetPlace, FloatArray]]:
-    """Each image's place, and the (3, 6) slope by which it moves the mean's centre."""
-    mean = np.concatenate([np.zeros((3, 3)), found.mean.matrix[:3, :3]], axis=1)
+    """Each image's place, and the (3, 6) Jacobian of the mean's centre by its perturbation."""
+    mean = np.concatenate([np.zeros((3, 3)), fit.mean.matrix[:3, :3]], axis=1)
     return [
         (view[pick], mean @ gain)
-        for view, pick, gain in zip(views, found.picks, found.mean.gains, strict=True)
+        for view, pick, gain in zip(views, fit.picks, fit.mean.gains, strict=True)
     ]
 
 
-def _own(marker: _Marker, found: ImageInliers) -> FloatArray:
-    """(3, 3) covariance of a centre by the pixels of its images."""
+def _own_covariance(marker: _Marker, fit: ImageInliers) -> FloatArray:
+    """(3, 3) covariance of a centre by the pixel noise of its images."""
     covariance = np.sum(
-        [slope @ place.pixels @ slope.T for place, slope in _shares(found, marker.views)], axis=0
+        [
+            jacobian @ place.pixels @ jacobian.T
+            for place, jacobian in _place_jacobians(fit, marker.views)
+        ],
+        axis=0,
     )
-    return np.asarray(found.variance * covariance)
+    return np.asarray(fit.variance * covariance)
 
 
-def _shared(
+def _common_covariance(
     eye: Eye,
     markers: Sequence[_Marker],
-    found: Sequence[ImageInliers],
+    fits: Sequence[ImageInliers],
     common: FloatArray,
     images: int,
 ) -> FloatArray:
-    """(3 n, 3 n) covariance of all centres by what they share."""
+    """(3 n, 3 n) covariance of all centres by their common errors."""
     by_common = np.zeros((len(markers), 3, len(common)))
     by_stop = np.zeros((images, len(markers), 3, 6))
-    for at, (marker, agreement) in enumerate(zip(markers, found, strict=True)):
-        for image, (place, slope) in zip(
-            marker.images, _shares(agreement, marker.views), strict=True
+    for at, (marker, fit) in enumerate(zip(markers, fits, strict=True)):
+        for image, (place, jacobian) in zip(
+            marker.images, _place_jacobians(fit, marker.views), strict=True
         ):
-            by_common[at] += slope @ place.by_common
-            by_stop[image, at] = np.sqrt(agreement.variance) * slope @ place.flange_jacobian
+            by_common[at] += jacobian @ place.by_common
+            by_stop[image, at] = np.sqrt(fit.variance) * jacobian @ place.flange_jacobian
     flat = by_common.reshape(3 * len(markers), -1)
     stops = by_stop.reshape(images, 3 * len(markers), 6)
     return np.asarray(
@@ -245,27 +249,27 @@ def marked_fixture(
     *,
     options: FixtureLimits | None = None,
 ) -> Frame:
-    """Finds a fixture by the markers on it.
+    """Estimates a fixture's frame from images of the markers on it.
 
-    Each marker's centre is a point of the drawing, by its id. What the markers share, the camera's
-    calibration above all, is carried to the frame's covariance as it is.
+    Each marker's centre is a point of the drawing, named by the marker's id. The markers' common
+    errors, mainly the camera's calibration, are part of the frame's covariance.
 
     Args:
         session: The images, of the same camera. Its target is one of the markers: the others are of
             the same dictionary and size.
         calibration: The camera's.
-        drawing: Where the markers' centres are; their names are the ids.
-        options: Where doubt begins.
+        drawing: The markers' centres, named by their ids.
+        options: Limits of the verdict.
 
     Returns:
         `base_from_fixture`.
 
     Raises:
         DataError: Fewer than three drawn markers are seen, or they do not fit the drawing.
-        DegenerateError: They leave a direction open.
+        DegenerateError: They do not determine the fixture in every direction.
     """
     ids = {_id(name, drawing): name for name in drawing.names}
-    shown = pictured(session, calibration, among=for_fits(session))
+    shown = session_images(session, calibration, among=fit_views(session))
     if shown.target.kind != "marker":
         raise DataError(
             f"session {session.name!r} has the target {shown.target.name}, a {shown.target.kind}; "
@@ -273,8 +277,8 @@ def marked_fixture(
             culprits=["session.toml: target"],
             next_step="Name a marker there; or leave --cad away, and the board places the fixture.",
         )
-    seen = _seen(shown, tuple(ids))
-    found = seen_markers(
+    seen = _shown_markers(shown, tuple(ids))
+    points = seen_markers(
         calibration,
         shown.sights,
         seen,
@@ -284,26 +288,26 @@ def marked_fixture(
     )
     measured = MeasuredPoints(
         session.name,
-        found.names,
-        tuple(counted(index, "image") for index in found.seen_in),
-        tuple(ids[index] for index in seen),
-        found.points,
-        found.independent,
-        found.common,
-        _outward(calibration, shown.sights, found),
+        points.names,
+        tuple(counted(images, "image") for images in points.seen_in),
+        tuple(ids[number] for number in seen),
+        points.points,
+        points.independent,
+        points.common,
+        _outward(calibration, shown.sights, points),
     )
-    trusted = Eye.of(calibration).warnings
-    doubts = (
-        *(replace(remark, is_fatal=remark.words in trusted) for remark in remarks(found.warnings)),
-        *view_doubts(session, shown.lost),
+    fatal = Eye.of(calibration).warnings
+    findings = (
+        *(replace(remark, is_fatal=remark.words in fatal) for remark in remarks(points.warnings)),
+        *view_findings(session, shown.lost),
         *remarks(shown.warnings),
     )
     setting = Setting(
-        doubts=doubts,
-        details=_details(shown.target, found, calibration),
+        doubts=findings,
+        details=_details(shown.target, points, calibration),
         options=options or FixtureLimits(),
         words=_WORDS,
-        # Images tell the noise of each point by themselves.
+        # Each point's own covariance already holds its noise.
         careful_m=0.0,
     )
     return drawn_fixture(measured, drawing, setting)
@@ -319,20 +323,20 @@ def _id(name: str, drawing: NominalPoints) -> int:
     return int(name)
 
 
-def _seen(shown: Sighting, ids: Sequence[int]) -> tuple[int, ...]:
-    """The drawn markers that an image shows."""
-    pictures = [sight.seen for sight in shown.sights if not isinstance(sight.seen, Corners)]
-    there = {id_ for image in pictures for id_ in marker_ids(image, shown.target.dictionary)}
-    seen = tuple(number for number in ids if number in there)
+def _shown_markers(shown: SessionImages, ids: Sequence[int]) -> tuple[int, ...]:
+    """Ids of the drawn markers that are in any of the images."""
+    images = [sight.seen for sight in shown.sights if not isinstance(sight.seen, Corners)]
+    detected = {id_ for image in images for id_ in marker_ids(image, shown.target.dictionary)}
+    seen = tuple(number for number in ids if number in detected)
     if len(seen) >= FEWEST_POINTS:
         return seen
-    others = sorted(there - set(ids))
+    others = sorted(detected - set(ids))
     raise DataError(
-        f"session {shown.source!r}: its {counted(len(pictures), 'image')} show "
+        f"session {shown.source!r}: its {counted(len(images), 'image')} show "
         f"{counted(len(seen), 'drawn marker')} of {shown.target.dictionary}"
         f"{_listed(seen)}, at least {FEWEST_POINTS} are needed"
         f"{'; markers that are not drawn' if others else ''}{_listed(others)}.",
-        culprits=[f"marker {number}" for number in ids if number not in there],
+        culprits=[f"marker {number}" for number in ids if number not in detected],
         next_step="Take images that show them whole, with their white margins; or correct the ids "
         "in the drawing.",
     )
@@ -342,18 +346,18 @@ def _listed(ids: Sequence[int]) -> str:
     return f" ({some_of([str(number) for number in ids])})" if ids else ""
 
 
-def _outward(calibration: Calibration, sights: Sequence[Sight], found: SeenPoints) -> FloatArray:
-    """(n, 3) directions from the markers to the camera, on the mean over the images."""
+def _outward(calibration: Calibration, sights: Sequence[Sight], points: MarkerPoints) -> FloatArray:
+    """(n, 3) unit directions in the base from the markers to the camera's mean position."""
     eye = Eye.of(calibration)
-    eyes = np.array([eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in sights])
-    away = eyes.mean(axis=0) - found.points
-    return np.asarray(away / np.linalg.norm(away, axis=1)[:, None])
+    positions = np.array([eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in sights])
+    directions = positions.mean(axis=0) - points.points
+    return np.asarray(directions / np.linalg.norm(directions, axis=1)[:, None])
 
 
-def _details(target: Target, found: SeenPoints, calibration: Calibration) -> dict[str, Any]:
+def _details(target: Target, points: MarkerPoints, calibration: Calibration) -> dict[str, Any]:
     return {
         "dictionary": target.dictionary,
         "marker_mm": 1e3 * target.square_m,
-        "seen_in": dict(zip(found.names, found.seen_in, strict=True)),
+        "seen_in": dict(zip(points.names, points.seen_in, strict=True)),
         **camera_details(calibration),
     }

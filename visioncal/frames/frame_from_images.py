@@ -1,4 +1,4 @@
-"""A tool or a fixture from a session's images: the frame, the words for it, whether to trust it."""
+"""Tool or fixture frame from a session's images, with its verdict."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,52 +19,51 @@ from visioncal.estimation.placing import worst_of
 from visioncal.frames.camera_chain import Eye, checked_point
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.frames.session_observations import (
-    Sighting,
-    for_fits,
-    held_back,
-    nothing_fits,
+    SessionImages,
+    fit_views,
+    held_out_views,
+    no_usable_image,
     session_looks,
     without_label,
 )
 from visioncal.frames.single_view import Sight, needs_robot
 from visioncal.frames.target_in_image import SeenTarget, see
-from visioncal.frames.target_pose import TargetPose, place_looks
-from visioncal.frames.verdicts import weak_directions
+from visioncal.frames.target_pose import TargetPose, place_target
+from visioncal.frames.verdicts import sigma_findings
 from visioncal.results import HELD_BACK, Calibration, Frame, Observation, picked
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
 
-# The detail of a frame by which its camera's calibration is known.
+# Key of the detail that identifies the calibration of a frame's camera.
 SEEN_BY = "camera_calibrated"
 _ORIGIN = (0.0, 0.0, 0.0)
-# What is to be known of a frame that a camera has placed, whoever reads it.
 _COUNTED_TWICE = (
     "the sigma holds the camera's own calibration: a pick by the same camera on a plane of this "
     "frame counts it twice"
 )
-# Images scatter wildly beyond this, in units of noise; they scatter under this share of it where
-# the target really stands still.
+# A target is on the other parent if its scatter exceeds this multiple of the noise, and falls below
+# this share of itself against the other parent.
 _WILD, _STILL = 10.0, 0.1
-# Beyond this share of views that could not be used it is a doubt; so many reasons are listed.
+# Largest share of unused views without a finding, and the number of reasons listed.
 _LOST_SHARE, _LISTED = 0.25, 3
 _COMMANDS: dict[FrameKind, str] = {"tool": "tcp", "fixture": "fixture"}
 
 
 @dataclass(frozen=True, eq=False)
 class _PlacedTarget:
-    """A target's place, with what it was made from.
+    """Estimated pose of a target on a tool or fixture, with its input.
 
     Attributes:
-        kind: What it is on.
+        kind: What the target is on.
         shown: The images.
-        seen: The place of the frame's origin.
-        worst: Its worst known directions.
-        views: (m,) the views that it was made from.
-        lost: Why others were not used, by their numbers.
+        seen: The estimated frame.
+        worst: Directions of its largest sigmas: offset, rotation.
+        views: (m,) the views that it was estimated from.
+        lost: Why other views were not used, by number.
     """
 
     kind: FrameKind
-    shown: Sighting
+    shown: SessionImages
     seen: TargetPose
     worst: tuple[Direction, Direction]
     views: tuple[View, ...]
@@ -84,10 +83,10 @@ def seen_frame(
     target: str | None = None,
     progress: Progress | None = None,
 ) -> Frame:
-    """Places a tool or a fixture by the target on it, as the calibrated camera sees it.
+    """Estimates a tool's or fixture's frame from images of the target on it.
 
-    The camera's calibration is a part of the frame's covariance. What a later pick by the same
-    camera has in common with that is counted twice there, on the safe side.
+    The camera's calibration is a part of the frame's covariance. A later pick by the same camera
+    counts that part twice, which is on the safe side.
 
     Args:
         session: The images, of the same camera; its target is the one on the tool or the fixture.
@@ -95,38 +94,39 @@ def seen_frame(
         kind: What the target is on.
         point_target_m: (3,) the frame's origin in the target's frame [m], such as the tool's tip;
             its axes are the target's.
-        options: Where doubt begins.
-        camera: Which camera is meant, where session or calibration is of a whole cell.
-        robot: Which robot, in whose base or on whose flange it is placed; likewise.
-        target: Which target of the session; likewise.
-        progress: Told of long work.
+        options: Limits of the verdict.
+        camera: Name of the camera, where session or calibration is of a whole cell.
+        robot: Name of the robot whose base or flange is the parent, likewise.
+        target: Name of the session's target, likewise.
+        progress: Called during long work.
 
     Returns:
         `flange_from_tool` or `base_from_fixture`.
 
     Raises:
-        DataError: No image serves, the target is elsewhere, or the session is of another camera.
+        DataError: No image is usable, the target is on another parent, or the session is of another
+            camera.
     """
     choice = Choice(camera, robot, target)
     session, calibration = picked(session, calibration, choice, EYE, parted=False)
     options = options or ImageFrameLimits()
     point = checked_point(point_target_m, "point_target_m")
     eye, parent = Eye.of(calibration), PARENTS[kind]
-    shown = session_looks(session, calibration, parent, among=for_fits(session), progress=progress)
-    views, looks, lost = _looks(eye, shown)
-    lost |= held_back(session)
+    shown = session_looks(session, calibration, parent, among=fit_views(session), progress=progress)
+    views, looks, lost = _measure(eye, shown)
+    lost |= held_out_views(session)
     sights = [sight for sight, view in zip(shown.sights, shown.views, strict=True) if view in views]
-    seen = place_looks(eye, sights, looks, parent).at(point)
+    seen = place_target(eye, sights, looks, parent).at(point)
     worst = worst_of(seen.matrix, seen.covariance, kind, parent)
     placed = _PlacedTarget(kind, shown, seen, worst, views, lost)
-    _check_still(eye, placed, sights, looks)
-    doubts = [
+    _check_parent(eye, placed, sights, looks)
+    findings = [
         *(
             replace(remark, is_fatal=remark.words in eye.warnings)
             for remark in remarks(seen.warnings)
         ),
-        *weak_directions(worst, options.sigma_mm, options.sigma_deg, _advice(seen)),
-        *view_doubts(session, lost),
+        *sigma_findings(worst, options.sigma_mm, options.sigma_deg, _advice(seen)),
+        *view_findings(session, lost),
         *remarks(shown.warnings),
     ]
     return Frame(
@@ -138,13 +138,15 @@ def seen_frame(
         seen.rms_mm,
         _noise_mm(seen),
         tuple(_observations(session, placed)),
-        Verdict.by(doubts, Finding(AGREEMENT, _praise(placed))),
+        Verdict.by(findings, Finding(AGREEMENT, _praise(placed))),
         _details(placed, point, calibration),
     )
 
 
-def _looks(eye: Eye, shown: Sighting) -> tuple[tuple[View, ...], list[SeenTarget], dict[int, str]]:
-    """What was seen in each image, and why some show nothing that fits."""
+def _measure(
+    eye: Eye, shown: SessionImages
+) -> tuple[tuple[View, ...], list[SeenTarget], dict[int, str]]:
+    """The usable views, their target poses, and why the other views were rejected."""
     views, looks, lost = [], [], dict(shown.lost)
     for sight, view in zip(shown.sights, shown.views, strict=True):
         try:
@@ -153,25 +155,25 @@ def _looks(eye: Eye, shown: Sighting) -> tuple[tuple[View, ...], list[SeenTarget
         except DataError as error:
             lost[view.number] = without_label(error, sight)
     if not views:
-        raise nothing_fits(shown, lost)
+        raise no_usable_image(shown, lost)
     return tuple(views), looks, lost
 
 
-def _check_still(
+def _check_parent(
     eye: Eye, placed: _PlacedTarget, sights: Sequence[Sight], looks: Sequence[SeenTarget]
 ) -> None:
-    """Refuses a target that moves where it should stand still, and stands still elsewhere."""
+    """Raises an error where the target is fixed to the other parent."""
     other: FrameKind = "fixture" if placed.kind == "tool" else "tool"
     parent, seen = PARENTS[other], placed.seen
     has_poses = all(sight.base_from_flange is not None for sight in sights)
     if seen.scatter < _WILD or (needs_robot(eye, parent) and not has_poses):
         return
-    found = place_looks(eye, sights, looks, parent)
-    if found.rms_mm < _STILL * seen.rms_mm:
+    alternative = place_target(eye, sights, looks, parent)
+    if alternative.rms_mm < _STILL * seen.rms_mm:
         raise DataError(
             f"session {placed.shown.source!r}: target {placed.shown.target.name} moves by "
             f"{figure(seen.rms_mm)} mm against the {PARENTS[placed.kind]}, and stands still to "
-            f"{figure(found.rms_mm)} mm against the {parent}: it is on a {other}, not on a "
+            f"{figure(alternative.rms_mm)} mm against the {parent}: it is on a {other}, not on a "
             f"{placed.kind}.",
             culprits=[placed.shown.source],
             next_step=f"Say visioncal {_COMMANDS[other]} for it.",
@@ -188,8 +190,8 @@ def _advice(seen: TargetPose) -> str:
     )
 
 
-def view_doubts(session: Session, lost: Mapping[int, str]) -> Iterator[Finding]:
-    """Doubts a session many of whose views were not used."""
+def view_findings(session: Session, lost: Mapping[int, str]) -> Iterator[Finding]:
+    """Finding on a session with many unused views."""
     missing = {view: why for view, why in lost.items() if why != HELD_BACK}
     if len(missing) > _LOST_SHARE * len(session.views):
         yield Finding(
@@ -201,7 +203,7 @@ def view_doubts(session: Session, lost: Mapping[int, str]) -> Iterator[Finding]:
 
 
 def camera_details(calibration: Calibration) -> dict[str, Any]:
-    """What the record says of a frame that a camera has placed, whatever it was placed by."""
+    """Details in the record of any frame that a camera has placed."""
     return {SEEN_BY: calibration.created, "note": _COUNTED_TWICE}
 
 
@@ -221,7 +223,7 @@ def _method(placed: _PlacedTarget, point: FloatArray) -> str:
 
 
 def _noise_mm(seen: TargetPose) -> float:
-    """Of one image, per axis: by how they scatter, or as predicted where there is only one."""
+    """Noise of one image per axis [mm]: from the scatter, or predicted for a single image."""
     count = int(seen.agrees.sum())
     if count > 1:
         return float(np.sqrt(np.sum(seen.away_mm[seen.agrees] ** 2) / (3 * (count - 1))))
@@ -229,15 +231,15 @@ def _noise_mm(seen: TargetPose) -> float:
 
 
 def _observations(session: Session, placed: _PlacedTarget) -> Iterator[Observation]:
-    places = {view.number: at for at, view in enumerate(placed.views)}
+    index_of = {view.number: at for at, view in enumerate(placed.views)}
     for number in (view.number for view in session.views):
-        if number not in places:
+        if number not in index_of:
             yield Observation(str(number), used=False, reason=placed.lost[number])
             continue
-        at = places[number]
+        at = index_of[number]
         away_mm, agrees = float(placed.seen.away_mm[at]), bool(placed.seen.agrees[at])
-        away = mm_and_deg(away_mm, float(placed.seen.away_deg[at]))
-        reason = "" if agrees else f"it puts the target {away} from where the others do"
+        words = mm_and_deg(away_mm, float(placed.seen.away_deg[at]))
+        reason = "" if agrees else f"it puts the target {words} from where the others do"
         yield Observation(str(number), agrees, reason, residual_mm=away_mm)
 
 
@@ -258,16 +260,16 @@ def _details(placed: _PlacedTarget, point: FloatArray, calibration: Calibration)
         **own,
         "rms_deg": seen.rms_deg,
         "scatter_over_expected": seen.scatter,
-        "sigma_by_images_mm": _length_mm(seen.independent),
-        "sigma_in_common_mm": _length_mm(seen.common),
+        "sigma_by_images_mm": _sigma_mm(seen.independent),
+        "sigma_in_common_mm": _sigma_mm(seen.common),
         **camera_details(calibration),
     }
 
 
-def _length_mm(covariance: FloatArray) -> float:
+def _sigma_mm(covariance: FloatArray) -> float:
     return float(1e3 * np.sqrt(np.trace(covariance[3:, 3:])))
 
 
 def rests_on_camera(frame: Frame) -> bool:
-    """Whether a frame was placed by a calibrated camera, and stands or falls with it."""
+    """Whether a frame was placed by a calibrated camera and depends on its calibration."""
     return SEEN_BY in frame.details

@@ -1,8 +1,8 @@
-"""Which images of a target put it in one place, and the mean of those.
+"""Outlier rejection among images of a target, and the mean pose of the inliers.
 
-The unit of rejection is the image as a whole: the 6-vector by which it puts the target away from
-where the others put it. The start is the one image about which most others gather (least median,
-Rousseeuw 1984), over all poses that each of them allows.
+The unit of rejection is the whole image: the 6-vector of its pose's difference from the mean. The
+search starts from the image pose with the smallest distances to half of the images (least median of
+squares, Rousseeuw 1984), over all candidate poses of each.
 """
 
 from collections.abc import Sequence
@@ -17,25 +17,25 @@ from visioncal.estimation.linalg import covariance_from, squared_lengths
 from visioncal.estimation.robust import Distances, settled
 from visioncal.frames.single_view import TargetPlace
 
-# A sound image is lost in one set of a thousand.
+# Probability that a set of images loses an inlier.
 _FALSE_ALARM = 1e-3
-# Poses farther apart than 95 % of what noise does are two different ones.
-_ANOTHER = float(chi2_limit(0.05, 6))
-# Scores that differ by a smaller share are equal.
+# Squared distance beyond which two poses differ significantly.
+_DIFFERENT = float(chi2_limit(0.05, 6))
+# Relative difference below which scores are equal.
 _SAME = 1e-6
-# The mean settles to the rounding of metres in a few steps: the places are near each other.
-_STEPS, _SETTLED = 10, 1e-12
+# The mean converges in a few steps, since the poses are near each other.
+_STEPS, _CONVERGED = 10, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class CandidateViews:
-    """The places of m images, each with the poses that it allows.
+    """Candidate poses of a target from m images.
 
     Attributes:
-        views: What each image allows, the best by reprojection first.
+        views: Candidates of each image, the best by reprojection first.
         flange_noise: (6, 6) covariance of the flange at one stop.
-        common: (c, c) covariance of what all images share.
-        freedom: Degrees of freedom of the noise's levels.
+        common: (c, c) covariance of the errors that all images share.
+        freedom: Degrees of freedom of the noise levels.
     """
 
     views: Sequence[Sequence[TargetPlace]]
@@ -43,16 +43,16 @@ class CandidateViews:
     common: FloatArray
     freedom: float
 
-    def own(self, place: TargetPlace) -> FloatArray:
-        """(6, 6) covariance of a place by what is its image's own: pixels, and robot."""
+    def independent(self, place: TargetPlace) -> FloatArray:
+        """(6, 6) covariance of a candidate by errors of its image alone: pixels and robot."""
         carried = place.flange_jacobian @ self.flange_noise @ place.flange_jacobian.T
         return np.asarray(place.pixels + carried)
 
     @property
     def limit(self) -> float:
-        """Largest squared distance that noise may give, corrected for the number of images.
+        """Outlier limit of the squared distance, corrected for the number of images.
 
-        The noise's levels are estimated, which gives it the tails of an F distribution.
+        F distributed, since the noise levels are estimated.
         """
         tail = _FALSE_ALARM / len(self.views)
         return 6.0 * float(f_limit(tail, 6, min(self.freedom, 1e6)))
@@ -60,83 +60,82 @@ class CandidateViews:
 
 @dataclass(frozen=True, eq=False)
 class Mean:
-    """Where images put a target together.
+    """Weighted mean pose of a target over images.
 
     Attributes:
         matrix: (4, 4) `parent_from_target`.
-        own: (6, 6) covariance by what is each image's own, which the mean averages.
-        gains: (m, 6, 6) share of each image; zero for one that has no part.
-        by_common: (6, c) how the mean moves with what all images share.
+        independent: (6, 6) covariance by the images' independent errors.
+        gains: (m, 6, 6) weight of each image; zero for outliers.
+        by_common: (6, c) Jacobian by the errors that all images share.
     """
 
     matrix: FloatArray
-    own: FloatArray
+    independent: FloatArray
     gains: FloatArray
     by_common: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class ImageInliers:
-    """The images that agree, and their mean.
+    """Inlier images and their mean pose.
 
     Attributes:
-        mean: Of those that agree.
-        picks: (m,) which of its poses each image has.
-        agrees: (m,) mask.
-        away: (m, 6) by how much each image puts the target away from the mean.
-        mahalanobis_sq: (m,) the same as a squared Mahalanobis distance; six on average where it is
-            noise.
-        limit: What it may be.
-        variance: Of what is each image's own, in units of what was expected; one at the least.
-        rival: Another place that all agreeing images allow; None where there is none.
+        mean: Mean of the inliers.
+        picks: (m,) index of each image's selected candidate.
+        agrees: (m,) inlier mask.
+        residuals: (m, 6) residual of each image's pose from the mean [rad, m].
+        mahalanobis_sq: (m,) its squared Mahalanobis distance; six on average under noise.
+        limit: Its outlier limit.
+        variance: Variance factor of the images' independent errors; at least one.
+        rival: Another pose that is a candidate of all inliers; None where there is none.
     """
 
     mean: Mean
     picks: IntArray
     agrees: Mask
-    away: FloatArray
+    residuals: FloatArray
     mahalanobis_sq: FloatArray
     limit: float
     variance: float
     rival: FloatArray | None
 
 
-def agreeing(sights: CandidateViews) -> ImageInliers:
-    """Finds the images that put the target in one place.
+def find_inliers(candidates: CandidateViews) -> ImageInliers:
+    """Finds the inlier images of a target.
 
-    Where no more than half agree, the right ones are unknown: all stay.
+    Where no more than half are inliers, the correct ones are unknown, and all are kept.
     """
-    picks, agrees = _core(sights)
-    search = _ImageSearch(sights, picks)
-    agrees, found = settled(search, agrees, _judged(sights, picks, agrees), fewest=2, suspect=0.0)
+    picks, agrees = _start(candidates)
+    search = _ImageSearch(candidates, picks)
+    agrees, fit = settled(search, agrees, _fit(candidates, picks, agrees), fewest=2, suspect=0.0)
     if 2 * int(agrees.sum()) <= len(picks):
-        return _judged(sights, picks, np.ones(len(picks), dtype=bool))
-    return found
+        return _fit(candidates, picks, np.ones(len(picks), dtype=bool))
+    return fit
 
 
 @dataclass(frozen=True, eq=False)
 class _ImageSearch:
-    """The search among images, each with one of its poses."""
+    """Inlier search over images, each with its selected candidate."""
 
-    sights: CandidateViews
+    candidates: CandidateViews
     picks: IntArray
 
     def fit(self, used: Mask, _: ImageInliers) -> ImageInliers:
-        return _judged(self.sights, self.picks, used)
+        return _fit(self.candidates, self.picks, used)
 
     def distances(self, _: Mask, fit: ImageInliers) -> Distances:
         six = np.full(len(self.picks), 6.0)
         return Distances(fit.mahalanobis_sq, six, fit.variance * fit.limit * np.ones_like(six))
 
 
-def _core(sights: CandidateViews) -> tuple[IntArray, Mask]:
-    """The half of the images that gather about one place, and the poses that take them there."""
+def _start(candidates: CandidateViews) -> tuple[IntArray, Mask]:
+    """Selected candidates, and the half of the images nearest to one pose (least median)."""
     best: tuple[float, IntArray, FloatArray] | None = None
-    half = len(sights.views) // 2 + 1
-    for seed in (place for view in sights.views for place in view):
-        nearest, picks = _nearest(sights, seed)
+    half = len(candidates.views) // 2 + 1
+    for seed in (place for view in candidates.views for place in view):
+        nearest, picks = _nearest(candidates, seed)
         score = float(np.sort(nearest)[:half].sum())
-        # Poses of a board that is turned fit alike, but for where their fits have stopped.
+        # Poses of a symmetric board fit equally, apart from rounding of their fits.
         if best is None or score < (1.0 - _SAME) * best[0] - 1e-9:
             best = (score, picks, nearest)
     if best is None:
@@ -147,80 +146,86 @@ def _core(sights: CandidateViews) -> tuple[IntArray, Mask]:
     return picks, agrees
 
 
-def _nearest(sights: CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
-    """Squared distance (m,) of each image's nearest pose from a place, and which one it is."""
-    own, found = sights.own(seed), []
-    for view in sights.views:
-        away = [log(invert(seed.matrix) @ place.matrix) for place in view]
+def _nearest(candidates: CandidateViews, seed: TargetPlace) -> tuple[FloatArray, IntArray]:
+    """Squared distance (m,) of each image's nearest candidate from a pose, and its index."""
+    independent, nearest = candidates.independent(seed), []
+    for view in candidates.views:
+        differences = [log(invert(seed.matrix) @ place.matrix) for place in view]
         squared = [
-            float(d @ np.linalg.solve(own + sights.own(place), d))
-            for d, place in zip(away, view, strict=True)
+            float(d @ np.linalg.solve(independent + candidates.independent(place), d))
+            for d, place in zip(differences, view, strict=True)
         ]
-        found.append((min(squared), int(np.argmin(squared))))
-    return np.array([item[0] for item in found]), np.array(
-        [item[1] for item in found], dtype=np.int64
+        nearest.append((min(squared), int(np.argmin(squared))))
+    return np.array([item[0] for item in nearest]), np.array(
+        [item[1] for item in nearest], dtype=np.int64
     )
 
 
-def _judged(sights: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
-    """The mean of some images, and how far all of them are from it."""
-    chosen = [view[at] for view, at in zip(sights.views, picks, strict=True)]
-    mean = _mean(sights, chosen, agrees)
-    away = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
-    own = np.array([sights.own(value) for value in chosen])
-    apart = np.array([value.by_common for value in chosen]) - mean.by_common
-    shared = apart @ sights.common @ np.swapaxes(apart, 1, 2)
-    inside, others = agrees[:, None, None], int(agrees.sum()) - 1
-    squared = np.einsum("mi,mi->m", away, np.linalg.solve(own + shared, away[..., None])[..., 0])
-    # Over six for each image beyond the first, which says nothing.
+def _fit(candidates: CandidateViews, picks: IntArray, agrees: Mask) -> ImageInliers:
+    """Mean over the inliers, and the distances of all images from it."""
+    chosen = [view[at] for view, at in zip(candidates.views, picks, strict=True)]
+    mean = _mean(candidates, chosen, agrees)
+    errors = log(invert(mean.matrix) @ np.array([value.matrix for value in chosen]))
+    independent = np.array([candidates.independent(value) for value in chosen])
+    common_difference = np.array([value.by_common for value in chosen]) - mean.by_common
+    shared = common_difference @ candidates.common @ np.swapaxes(common_difference, 1, 2)
+    is_inlier, others = agrees[:, None, None], int(agrees.sum()) - 1
+    squared = np.einsum(
+        "mi,mi->m", errors, np.linalg.solve(independent + shared, errors[..., None])[..., 0]
+    )
+    # Six degrees of freedom for each image beyond the first.
     variance = max(float(squared[agrees].sum()) / (6.0 * others), 1.0) if others else 1.0
-    # An image inside the mean has drawn it to itself; its share is taken out.
-    left = own + shared + np.where(inside, -1.0, 1.0) * mean.own
+    # The residual of an image that is part of the mean has a smaller covariance.
+    covariance = independent + shared + np.where(is_inlier, -1.0, 1.0) * mean.independent
     mahalanobis_sq = (
-        squared_lengths(away, left, own)[0] if others else np.where(agrees, 0.0, squared)
+        squared_lengths(errors, covariance, independent)[0]
+        if others
+        else np.where(agrees, 0.0, squared)
     )
     return ImageInliers(
         mean,
         picks,
         agrees,
-        away,
+        errors,
         mahalanobis_sq,
-        sights.limit,
+        candidates.limit,
         variance,
-        _rival(sights, mean.matrix, agrees, variance),
+        _rival(candidates, mean.matrix, agrees, variance),
     )
 
 
-def _mean(sights: CandidateViews, chosen: Sequence[TargetPlace], agrees: Mask) -> Mean:
-    """Weighs images by what is their own; what they share cannot be averaged by weights."""
+def _mean(candidates: CandidateViews, chosen: Sequence[TargetPlace], agrees: Mask) -> Mean:
+    """Mean pose weighted by the images' independent errors; common errors do not average out."""
     weights = np.array(
         [
-            np.linalg.inv(sights.own(place)) if ok else np.zeros((6, 6))
+            np.linalg.inv(candidates.independent(place)) if ok else np.zeros((6, 6))
             for place, ok in zip(chosen, agrees, strict=True)
         ]
     )
-    own = covariance_from(weights.sum(axis=0))
-    gains = own @ weights
+    independent = covariance_from(weights.sum(axis=0))
+    gains = independent @ weights
     matrices = np.array([place.matrix for place in chosen])
     matrix = matrices[int(np.flatnonzero(agrees)[0])]
     for _ in range(_STEPS):
         step = np.einsum("mij,mj->i", gains, log(invert(matrix) @ matrices))
         matrix = matrix @ exp(step)
-        if np.abs(step).max() < _SETTLED:
+        if np.abs(step).max() < _CONVERGED:
             break
     by_common = np.einsum("mij,mjk->ik", gains, np.array([place.by_common for place in chosen]))
-    return Mean(matrix, own, gains, by_common)
+    return Mean(matrix, independent, gains, by_common)
 
 
 def _rival(
-    sights: CandidateViews, matrix: FloatArray, agrees: Mask, variance: float
+    candidates: CandidateViews, matrix: FloatArray, agrees: Mask, variance: float
 ) -> FloatArray | None:
-    """Another place that all agreeing images allow: a mirrored or a turned target's."""
-    limit = variance * sights.limit
-    first = sights.views[int(np.flatnonzero(agrees)[0])]
+    """Another pose among the candidates of all inliers: of a mirrored or rotated target."""
+    limit = variance * candidates.limit
+    first = candidates.views[int(np.flatnonzero(agrees)[0])]
     for seed in first:
-        away = log(invert(matrix) @ seed.matrix)
-        is_other = float(away @ np.linalg.solve(2.0 * sights.own(seed), away)) > _ANOTHER
-        if is_other and bool(np.all(_nearest(sights, seed)[0][agrees] < limit)):
+        delta = log(invert(matrix) @ seed.matrix)
+        is_other = (
+            float(delta @ np.linalg.solve(2.0 * candidates.independent(seed), delta)) > _DIFFERENT
+        )
+        if is_other and bool(np.all(_nearest(candidates, seed)[0][agrees] < limit)):
             return seed.matrix
     return None

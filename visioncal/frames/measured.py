@@ -1,4 +1,4 @@
-"""Points of the cell as they were measured, with what is known of their errors."""
+"""Measured points of the cell with their covariance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ NO_TOOL = (
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """The tool that points were touched with.
+    """Tool that points were touched with.
 
     Attributes:
-        name: The transform's, as `flange_from_gripper`.
-        edge: That transform.
+        name: The transform's name, as `flange_from_gripper`.
+        edge: The transform.
         oriented: Whether its rotation was measured.
-        verdict: Whether to trust it.
+        verdict: Its verdict.
     """
 
     name: str
@@ -39,23 +39,18 @@ class Tool:
 
     @classmethod
     def among(cls, frames: Mapping[str, Frame], source: str, name: str | None) -> "Tool":
-        """Finds a tool among frames.
-
-        Args:
-            frames: By the transforms that place them.
-            source: Where they stand, for messages.
-            name: The tool's, or its transform's; the only tool where None.
+        """Selects a tool among frames by its name or its transform's; the only one where None.
 
         Raises:
-            DataError: There is none of that name, or which one is meant is not said.
+            DataError: There is none of that name, or no name is given and there is not one tool.
         """
         tools = {word: frame for word, frame in frames.items() if word.startswith("flange_from_")}
         if name is None and len(tools) == 1:
             name = next(iter(tools))
         if name is None or not tools:
-            there = f"has {len(tools)} tools: {some_of(list(tools))}" if tools else "has no tool"
+            state = f"has {len(tools)} tools: {some_of(list(tools))}" if tools else "has no tool"
             raise DataError(
-                f"{source} {there}; the one that the points were touched with is needed.",
+                f"{source} {state}; the one that the points were touched with is needed.",
                 culprits=list(tools) or [source],
                 next_step=f"Say --tool {next(iter(tools))}, or the like." if tools else NO_TOOL,
             )
@@ -72,16 +67,16 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPoints:
-    """n points, by whatever they were measured.
+    """Measured points, n in all, with their covariance.
 
     Attributes:
         source: What they were read from, for the record.
-        labels: (n,) the measurements' own names, such as the rows' view numbers.
-        places: (n,) where each stands, `touches.csv, line 3`; empty where that says nothing.
-        names: (n,) which point each is of; empty where nobody says.
+        labels: (n,) the measurements' names, such as the rows' view numbers.
+        places: (n,) their rows, `touches.csv, line 3`; empty where there are none.
+        names: (n,) names of the points; empty where unknown.
         points: (n, 3) in the base [m].
-        independent: (n, 3, 3) covariance of each by what is its own [m^2].
-        common: (3 n, 3 n) covariance of all by what they share, such as the tip's [m^2].
+        independent: (n, 3, 3) covariance of each by its independent errors [m^2].
+        common: (3 n, 3 n) covariance by common errors, such as the tip's [m^2].
         outward: (n, 3) unit directions in the base to where the tool came from; NaN where unknown.
     """
 
@@ -99,9 +94,10 @@ class MeasuredPoints:
 
     @property
     def scattered(self) -> FloatArray:
-        """(n, 3, 3) covariance by which points scatter: their own, and what they share unevenly.
+        """(n, 3, 3) covariance of the points relative to each other.
 
-        What all share alike moves the whole set, and no fit to it shows that.
+        The independent part and the common part about its mean: an equal shift of all points does
+        not show in the residuals of a fit.
         """
         count = len(self)
         centring = np.kron(np.eye(count) - 1.0 / count, np.eye(3))
@@ -110,18 +106,13 @@ class MeasuredPoints:
         return np.asarray(self.independent + uneven[at, :, at, :])
 
     def carried(self, by_points: FloatArray, noise_m: FloatArray) -> FloatArray:
-        """Carries all that is known of the points' errors to an answer.
+        """(p, p) covariance of a result with the (n, p, 3) Jacobian `by_points` by each point.
 
-        Args:
-            by_points: (n, p, 3) how the answer moves with each point.
-            noise_m: (n,) noise of each per axis, beyond what is known [m].
-
-        Returns:
-            (p, p) the answer's covariance.
+        `noise_m` is the (n,) additional noise of each per axis [m].
         """
-        own = self.independent + noise_m[:, None, None] ** 2 * np.eye(3)
-        slope = np.concatenate(list(by_points), axis=1)
-        return np.asarray(slope @ (block_diag(*own) + self.common) @ slope.T)
+        independent = self.independent + noise_m[:, None, None] ** 2 * np.eye(3)
+        jacobian = np.concatenate(list(by_points), axis=1)
+        return np.asarray(jacobian @ (block_diag(*independent) + self.common) @ jacobian.T)
 
 
 def touched_points(
@@ -131,48 +122,43 @@ def touched_points(
     robot: Robot | None = None,
     calibration: Calibration | None = None,
 ) -> MeasuredPoints:
-    """Finds where the tip was.
+    """Computes the touched points from the flange's poses and the tool.
 
-    Args:
-        rows: The touches.
-        tool: On the flange; None where the poses are of the tip itself.
-        noise: Errors of the flange, per axis.
-        robot: A model for joint angles, where the calibration has none; without a tool there is no
-            use for one.
-        calibration: What is known of the same robot.
+    Without a tool, the poses are of the tip itself. `robot` is the model for joint angles where the
+    calibration has none; `noise` is that of the flange, per axis.
 
     Raises:
         DataError: A row has no pose, or the same one as another.
     """
     if tool is None:
-        poses, away = _tip_poses(rows), np.zeros(3)
+        poses, tip = _tip_poses(rows), np.zeros(3)
         covariance, axis = np.zeros((3, 3)), np.array([0.0, 0.0, 1.0])
     else:
-        poses, away = flange_poses(rows, robot, calibration), tool.edge.matrix[:3, 3]
-        turn = tool.edge.matrix[:3, :3]
-        covariance = turn @ tool.edge.covariance[3:, 3:] @ turn.T
+        poses, tip = flange_poses(rows, robot, calibration), tool.edge.matrix[:3, 3]
+        tool_rotation = tool.edge.matrix[:3, :3]
+        covariance = tool_rotation @ tool.edge.covariance[3:, 3:] @ tool_rotation.T
         # A tool whose rotation was not measured points more or less along the flange's z.
-        axis = turn[:, 2] if tool.oriented else np.array([0.0, 0.0, 1.0])
+        axis = tool_rotation[:, 2] if tool.oriented else np.array([0.0, 0.0, 1.0])
     refuse_copies(poses, rows.places)
     turns = poses[:, :3, :3]
     turn_sq, shift_sq = noise.robots[0] ** 2
-    lever = shift_sq * np.eye(3) + turn_sq * skew(away) @ skew(away).T
-    there = np.where(np.isfinite(turns), turns, np.eye(3))
-    flat = np.concatenate(list(there), axis=0)
+    lever = shift_sq * np.eye(3) + turn_sq * skew(tip) @ skew(tip).T
+    rotations = np.where(np.isfinite(turns), turns, np.eye(3))
+    flat = np.concatenate(list(rotations), axis=0)
     return MeasuredPoints(
         rows.source,
         rows.labels,
         rows.places,
         tuple(point.strip() for point in rows.points),
-        there @ away + poses[:, :3, 3],
-        there @ lever @ np.swapaxes(there, 1, 2),
+        rotations @ tip + poses[:, :3, 3],
+        rotations @ lever @ np.swapaxes(rotations, 1, 2),
         flat @ covariance @ flat.T,
         -(turns @ axis),
     )
 
 
 def _tip_poses(rows: TouchRows) -> FloatArray:
-    """The poses (n, 4, 4) of the tip itself, of which positions are enough."""
+    """(n, 4, 4) poses of the tip itself; positions suffice."""
     missing = [
         rows.places[index]
         for index in np.flatnonzero(~np.isfinite(rows.base_from_flange[:, :3, 3]).all(axis=1))

@@ -1,4 +1,4 @@
-"""What tools and fixtures are called: `flange_from_gripper`, `base_from_jig_2`."""
+"""Transform names of tools and fixtures: `flange_from_gripper`, `base_from_jig_2`."""
 
 import re
 from typing import Literal, TypeAlias
@@ -8,20 +8,16 @@ from visioncal.core.errors import DataError
 FrameKind: TypeAlias = Literal["tool", "fixture"]
 
 PARENTS: dict[FrameKind, Literal["flange", "base"]] = {"tool": "flange", "fixture": "base"}
-# Frames that every cell has; another of the same name would hide them.
+# Names of frames that every cell has.
 _TAKEN = ("cell", "base", "flange", "cam", "target", "image", "instrument")
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}", re.ASCII)
 
 
 def transform_name(kind: FrameKind, name: str | None) -> str:
-    """Names the transform that places a tool or a fixture.
-
-    Args:
-        kind: Which of them it is.
-        name: What the user calls it; the kind's own name where None.
+    """Transform name of a tool or a fixture, by the user's name for it or else the kind's.
 
     Raises:
-        DataError: The name cannot stand in a transform's name, or is taken.
+        DataError: The name is invalid in a transform's name, or taken.
     """
     name = kind if name is None else name
     if not _NAME.fullmatch(name) or "_from_" in name:

@@ -1,4 +1,4 @@
-"""Picks from a session: where each of its views puts a point of the target in the base."""
+"""Picks from a session: position in the base of a point of the target, by each view."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from visioncal.core.types import FloatArray, Progress
 from visioncal.frames.camera_chain import checked_point
 from visioncal.frames.locate import locate_target
 from visioncal.frames.located import Located
-from visioncal.frames.session_observations import nothing_fits, session_looks, without_label
+from visioncal.frames.session_observations import no_usable_image, session_looks, without_label
 from visioncal.results import Calibration, picked
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
@@ -19,12 +19,12 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Picks:
-    """Where views put a point.
+    """Positions of a point by each view.
 
     Attributes:
-        found: The places, by their views' numbers.
-        lost: Why other views give none, by their numbers.
-        warnings: What is odd about the session, in sentences.
+        found: The positions, by view number.
+        lost: Why other views give none, by view number.
+        warnings: Warnings on the session, in sentences.
     """
 
     found: Mapping[int, Located]
@@ -45,34 +45,34 @@ def locate_views(
     target: str | None = None,
     progress: Progress | None = None,
 ) -> Picks:
-    """Places a point of the target in the base, by each view of a session alone.
+    """Positions in the base of a point of the target, by each view of a session alone.
 
-    What the views share, the camera's transform above all, is in every one of the places: their
-    mean is not as much better as their number says.
+    Errors that the views share, mainly the camera's transform, are in every position and do not
+    average out.
 
     Args:
         session: Of the same camera as the calibration; it names the target.
         calibration: The camera's.
         point_target_m: (3,) the point in the target's frame [m].
-        among: Those of its views to look at; all where None.
+        among: The views to use; all where None.
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
-        camera: Which camera is meant, where session or calibration is of a whole cell.
-        robot: Which robot, in whose base or on whose flange it is placed; likewise.
-        target: Which target of the session; likewise.
-        progress: Told after each image.
+        camera: Name of the camera, where session or calibration is of a whole cell.
+        robot: Name of the robot in whose base, likewise.
+        target: Name of the session's target, likewise.
+        progress: Called after each image.
 
     Raises:
-        DataError: No view shows the target and has what else it needs, or the point is none.
+        DataError: No view is usable, or the point is invalid.
     """
     point = checked_point(point_target_m, "point_target_m")
     choice = Choice(camera, robot, target)
     session, calibration = picked(session, calibration, choice, EYE, parted=False)
     shown = session_looks(session, calibration, "base", among=among, progress=progress)
-    found: dict[int, Located] = {}
+    located: dict[int, Located] = {}
     lost = dict(shown.lost)
     for view, sight in zip(shown.views, shown.sights, strict=True):
         try:
-            found[view.number] = locate_target(
+            located[view.number] = locate_target(
                 calibration,
                 sight.seen,
                 shown.target,
@@ -84,6 +84,6 @@ def locate_views(
             )
         except DataError as error:
             lost[view.number] = without_label(error, sight)
-    if not found:
-        raise nothing_fits(shown, lost)
-    return Picks(found, lost, shown.warnings)
+    if not located:
+        raise no_usable_image(shown, lost)
+    return Picks(located, lost, shown.warnings)

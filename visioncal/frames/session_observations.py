@@ -1,4 +1,4 @@
-"""What a session's images show of its target, beside where the robot stood at each."""
+"""A session's observations of its target: corners or images with the flange's poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,23 +19,22 @@ from visioncal.robot import Robot
 from visioncal.session import Session, View
 from visioncal.session.loads import loads_of
 
-# A stated lens that differs by more of its focal length is another camera's: an estimate is
-# nearer.
+# Largest difference of a stated lens from the calibrated one, as a share of the focal length.
 _OTHER_LENS = 0.03
 _NO_IMAGE = "it has no image"
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """The images of a session, as the calibrated camera took them.
+class SessionImages:
+    """Usable images of a session by the calibrated camera.
 
     Attributes:
         source: The session's name.
-        target: What the images are to show.
-        sights: Those that can be used, labelled `view 3`.
+        target: The target to look for.
+        sights: (m,) usable images, labelled `view 3`.
         views: (m,) their views.
-        lost: Why other views cannot, by their numbers.
-        warnings: What is odd about the session, in sentences.
+        lost: Why other views are unusable, by view number.
+        warnings: Warnings on the session, in sentences.
     """
 
     source: str
@@ -53,83 +52,74 @@ def session_looks(
     *,
     among: Sequence[View] | None = None,
     progress: Progress | None = None,
-) -> Sighting:
-    """Finds a session's target in its images.
+) -> SessionImages:
+    """Detects a session's target in its images.
 
     Args:
         session: Of the same camera as the calibration; it names the target.
         calibration: The camera's.
-        parent: The frame that the target is to be placed in. Where the robot stands between, each
-            view needs its pose.
-        among: Those of its views to look at; all where None.
-        progress: Told after each image.
+        parent: The frame to place the target in. Where the robot is between it and the target, each
+            view needs the robot's pose.
+        among: The views to use; all where None.
+        progress: Called after each image.
 
     Returns:
-        The corners of each view that shows the target and has what else it needs.
+        The corners and poses of the usable views.
 
     Raises:
-        DataError: No view does, or the session is of another camera.
+        DataError: No view is usable, or the session is of another camera.
     """
-    target = _checked(session, calibration)
-    asked = session.views if among is None else tuple(among)
-    poses, lost = _poses(session, calibration, parent, asked)
-    views = _usable(session, asked, target, lost)
-    seen = detect(session, progress=progress, among=views)
-    lost |= {rejection.view: rejection.reason for rejection in seen.rejections}
-    views = _usable(session, asked, target, lost)
-    check_resolution(session, calibration, seen.resolution)
-    sights = [_sight(view, seen.corners[view.number], poses, calibration) for view in views]
-    return Sighting(
+    target = _checked_target(session, calibration)
+    wanted = session.views if among is None else tuple(among)
+    poses, lost = _poses(session, calibration, parent, wanted)
+    views = _usable(session, wanted, target, lost)
+    detected = detect(session, progress=progress, among=views)
+    lost |= {rejection.view: rejection.reason for rejection in detected.rejections}
+    views = _usable(session, wanted, target, lost)
+    check_resolution(session, calibration, detected.resolution)
+    sights = [_sight(view, detected.corners[view.number], poses, calibration) for view in views]
+    return SessionImages(
         session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
     )
 
 
-def pictured(
+def session_images(
     session: Session, calibration: Calibration, *, among: Sequence[View] | None = None
-) -> Sighting:
-    """Reads a session's images as they are: of several markers, to be placed in the base.
+) -> SessionImages:
+    """Reads a session's images for detecting several markers, one of which is its target.
 
-    Args:
-        session: As for `session_looks`; its target is one of the markers.
-        calibration: The camera's.
-        among: Those of its views to look at; all where None.
-
-    Returns:
-        The images of each view that can be read and has what else it needs.
-
-    Raises:
-        DataError: None can, or the session is of another camera.
+    As `session_looks` with the base as parent, but without detection.
     """
-    target = _checked(session, calibration)
-    asked = session.views if among is None else tuple(among)
-    poses, lost = _poses(session, calibration, "base", asked)
+    target = _checked_target(session, calibration)
+    wanted = session.views if among is None else tuple(among)
+    poses, lost = _poses(session, calibration, "base", wanted)
     sights = []
-    lost |= {view.number: _NO_IMAGE for view in asked if not view.image}
-    for view in _usable(session, asked, target, lost):
+    lost |= {view.number: _NO_IMAGE for view in wanted if not view.image}
+    for view in _usable(session, wanted, target, lost):
         image = image_of(session, view)
         if isinstance(image, Rejection):
             lost[view.number] = image.reason
             continue
         check_resolution(session, calibration, (image.shape[1], image.shape[0]))
         sights.append(_sight(view, image, poses, calibration))
-    views = _usable(session, asked, target, lost)
-    return Sighting(
+    views = _usable(session, wanted, target, lost)
+    return SessionImages(
         session.name, target, tuple(sights), views, lost, _warnings(session, calibration)
     )
 
 
-def for_fits(session: Session) -> tuple[View, ...]:
-    """The views that a fit may use."""
+def fit_views(session: Session) -> tuple[View, ...]:
+    """The views that are not held out."""
     return tuple(view for view in session.views if not view.holdout)
 
 
-def held_back(session: Session) -> dict[int, str]:
-    """The views that none may use, by their numbers, with the reason."""
+def held_out_views(session: Session) -> dict[int, str]:
+    """The held-out views by number, with the reason."""
     return {view.number: HELD_BACK for view in session.views if view.holdout}
 
 
 def calibrated_joints(view: View, calibration: Calibration) -> FloatArray | None:
-    """(n,) joints by which a calibrated arm places a view's flange [rad]; None without one."""
+    """(n,) a view's joints [rad] where the arm is calibrated; else None."""
     arm, joints = calibration.calibrated_robot, view.joints_rad
     if arm is None or not calibration.arm_is_calibrated or joints is None:
         return None
@@ -137,18 +127,15 @@ def calibrated_joints(view: View, calibration: Calibration) -> FloatArray | None
 
 
 def _sight(
-    view: View,
-    seen: Corners | Image,
-    poses: Mapping[int, FloatArray],
-    calibration: Calibration,
+    view: View, seen: Corners | Image, poses: Mapping[int, FloatArray], calibration: Calibration
 ) -> Sight:
     pose = poses.get(view.number)
     joints_rad = None if pose is None else calibrated_joints(view, calibration)
-    return Sight(_label(view), seen, pose, view.stop, joints_rad)
+    return Sight(f"view {view.number}", seen, pose, view.stop, joints_rad)
 
 
 def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArray | None:
-    """Where the flange was at a view, (4, 4), by the robot's model if need be; None if not said.
+    """(4, 4) flange pose at a view, from its joints if need be; None where there is neither.
 
     Raises:
         DataError: The joints are not those of the model.
@@ -157,8 +144,8 @@ def pose_of(session: Session, view: View, calibration: Calibration) -> FloatArra
 
 
 def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
-    """What is odd about the session itself, or beside the calibration."""
-    known, stated = calibration.camera, session.camera
+    """Warnings on the session itself, and on differences from the calibration."""
+    lens, stated = calibration.camera, session.camera
     words = session.warnings
     if calibration.arm_is_calibrated and any(view.joints_rad is None for view in session.views):
         words = (
@@ -166,12 +153,12 @@ def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
             "The calibration is of a calibrated arm, but views come without joint angles: their "
             "poses are the nominal arm's, off by as much as its errors. Record q1_rad ... too.",
         )
-    if known is None or stated is None:
+    if lens is None or stated is None:
         return words
-    off = stated.matrix - known.camera.matrix
-    if np.abs(off).max() <= _OTHER_LENS * known.camera.matrix[0]:
+    difference = stated.matrix - lens.camera.matrix
+    if np.abs(difference).max() <= _OTHER_LENS * lens.camera.matrix[0]:
         return words
-    fx, cx, of_fx, of_cx = (camera.matrix[at] for camera in (stated, known.camera) for at in (0, 2))
+    fx, cx, of_fx, of_cx = (camera.matrix[at] for camera in (stated, lens.camera) for at in (0, 2))
     return (
         *words,
         f"The session states a lens of fx {fx:.0f} and cx {cx:.0f} px, and the camera was "
@@ -181,12 +168,12 @@ def _warnings(session: Session, calibration: Calibration) -> tuple[str, ...]:
 
 
 def without_label(error: DataError, sight: Sight) -> str:
-    """What is wrong with one image, as the reason that its view is not used."""
+    """An image's error as the reason why its view is not used."""
     return error.message.removeprefix(f"{sight.label}: ").rstrip(".")
 
 
-def nothing_fits(shown: Sighting, lost: Mapping[int, str]) -> DataError:
-    """The error that no image shows the target as it should be."""
+def no_usable_image(shown: SessionImages, lost: Mapping[int, str]) -> DataError:
+    """Error that no image is usable."""
     culprits = by_reason(lost)
     return DataError(
         f"session {shown.source!r}: no image shows target {shown.target.name} as it should be.",
@@ -195,7 +182,7 @@ def nothing_fits(shown: Sighting, lost: Mapping[int, str]) -> DataError:
     )
 
 
-def _checked(session: Session, calibration: Calibration) -> Target:
+def _checked_target(session: Session, calibration: Calibration) -> Target:
     check_mount(session, calibration)
     if session.robot_document is not None and calibration.robot is not None:
         check_robot(session, Robot.from_document(session.robot_document), calibration.robot)
@@ -223,23 +210,25 @@ def _checked(session: Session, calibration: Calibration) -> Target:
 
 
 def _poses(
-    session: Session, calibration: Calibration, parent: Parent, asked: tuple[View, ...]
+    session: Session, calibration: Calibration, parent: Parent, wanted: tuple[View, ...]
 ) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
-    """The robot's poses by view, and why views without one or without an image are of no use."""
-    lost = {view.number: _NO_IMAGE for view in asked if not (view.image or view.has_corners)}
+    """The robot's poses by view, and why views without pose or image are unusable."""
+    lost = {view.number: _NO_IMAGE for view in wanted if not (view.image or view.has_corners)}
     if needs_robot(Eye.of(calibration), parent):
-        reported = _flange(session, calibration, asked)
+        reported = _flange(session, calibration, wanted)
         lost = {rejection.view: rejection.reason for rejection in reported.rejections} | lost
         return reported.base_from_flange, lost
-    there = {view.number: pose for view in asked if (pose := view.base_from_flange()) is not None}
-    return {view: np.asarray(value.as_matrix()) for view, value in there.items()}, lost
+    poses = {view.number: pose for view in wanted if (pose := view.base_from_flange()) is not None}
+    return {view: np.asarray(value.as_matrix()) for view, value in poses.items()}, lost
 
 
-def _flange(session: Session, calibration: Calibration, asked: tuple[View, ...]) -> Reported:
-    """The robot's side of some views, through the calibrated arm where there is one."""
-    reported = reported_poses(replace(session, views=asked), _robot(session, calibration))
+def _flange(session: Session, calibration: Calibration, wanted: tuple[View, ...]) -> Reported:
+    """The flange's poses at some views, by the calibrated arm where there is one."""
+    document = session.robot_document
+    robot = calibration.robot if document is None else Robot.from_document(document)
+    reported = reported_poses(replace(session, views=wanted), robot)
     poses = dict(reported.base_from_flange)
-    for view in asked:
+    for view in wanted:
         joints = calibrated_joints(view, calibration)
         if joints is not None:
             loads = loads_of([view.numbers])
@@ -247,26 +236,16 @@ def _flange(session: Session, calibration: Calibration, asked: tuple[View, ...])
     return replace(reported, base_from_flange=poses)
 
 
-def _robot(session: Session, calibration: Calibration) -> Robot | None:
-    """The robot that the session's joints are of; the calibration's where it names none."""
-    document = session.robot_document
-    return calibration.robot if document is None else Robot.from_document(document)
-
-
 def _usable(
-    session: Session, asked: Sequence[View], target: Target, lost: Mapping[int, str]
+    session: Session, wanted: Sequence[View], target: Target, lost: Mapping[int, str]
 ) -> tuple[View, ...]:
-    """The views that nothing speaks against so far."""
-    views = tuple(view for view in asked if view.number not in lost)
+    """The views that are not rejected so far; an error where there are none."""
+    views = tuple(view for view in wanted if view.number not in lost)
     if views:
         return views
     culprits = by_reason(lost) or (f"all views: {HELD_BACK}",)
     raise DataError(
-        f"session {session.name!r}: no view of {len(asked)} serves to place target {target.name}.",
+        f"session {session.name!r}: no view of {len(wanted)} serves to place target {target.name}.",
         culprits=culprits,
         next_step=f"First: {culprits[0]}.",
     )
-
-
-def _label(view: View) -> str:
-    return f"view {view.number}"

@@ -1,12 +1,12 @@
-"""One image of a target on a tool or a fixture: where it puts the target, and what moves that.
+"""Pose of a target in base or flange from one image, with its Jacobians by all error sources.
 
 base_from_target = base_from_cam * cam_from_target                         eye-to-hand
 base_from_target = base_from_flange * flange_from_cam * cam_from_target    eye-in-hand
 flange_from_target = flange_from_base * base_from_cam * cam_from_target    eye-to-hand
 flange_from_target = flange_from_cam * cam_from_target                     eye-in-hand
 
-The robot counts where it stands between parent and target: in the second and the third. Images of
-one stop share its error there.
+In the second and third case the robot is between parent and target: its noise counts, and images of
+one stop share it.
 """
 
 from collections.abc import Sequence
@@ -31,13 +31,12 @@ class Sight:
     """One image of a target.
 
     Attributes:
-        label: What it is called in messages and results.
+        label: Its name in messages and results.
         seen: The target's corners, or the (h, w) grey image to find them in.
-        base_from_flange: (4, 4) where the robot stood at the image, as it reported it; None where
-            no robot stands between parent and target.
-        stop: Number of the robot's stop, where stops are numbered; else images with the same pose
-            are of one.
-        joints_rad: (n,) where the pose is the calibrated arm's by these joints [rad].
+        base_from_flange: (4, 4) the flange's pose at the image as reported; None where no robot is
+            between parent and target.
+        stop: Number of the robot's stop; where None, images with the same pose are of one stop.
+        joints_rad: (n,) joints [rad] where the pose is the calibrated arm's for these joints.
     """
 
     label: str
@@ -51,7 +50,7 @@ class Sight:
 
     @property
     def stop_key(self) -> object:
-        """The stop of the robot; of an image without a pose, its label."""
+        """Hashable identity of the robot's stop; the label for an image without a pose."""
         if self.stop is not None:
             return self.stop
         return self.label if self.base_from_flange is None else self.base_from_flange.tobytes()
@@ -59,15 +58,15 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class TargetPlace:
-    """Where one image puts a target, for one of the poses that it allows.
+    """Candidate pose of a target in the parent's frame, from one image.
 
     Attributes:
         matrix: (4, 4) `parent_from_target`.
-        pixels: (6, 6) covariance of its right perturbation by the pixels' noise.
-        flange_jacobian: (6, 6) how it moves with the flange at this stop; zero where none is
-            between. Of k images of one stop it is sqrt(k) times as much: their mean then has the
-            variance of the error that they share.
-        by_common: (6, c) how it moves with what all images share: see `common_covariance`.
+        pixels: (6, 6) covariance of its right perturbation by the pixel noise.
+        flange_jacobian: (6, 6) Jacobian by the flange's perturbation; zero where the robot is not
+            between. With k images of one stop it is multiplied by sqrt(k), so that their mean has
+            the variance of the error that they share.
+        by_common: (6, c) Jacobian by the errors that all images share: see `common_covariance`.
     """
 
     matrix: FloatArray
@@ -77,19 +76,19 @@ class TargetPlace:
 
 
 def common_covariance(eye: Eye, scale_sigma: float) -> FloatArray:
-    """(c, c) of what all images share: the camera's edge, its lens, the arm, the target's size."""
+    """(c, c) covariance of common errors: the camera's edge, its lens, arm, target size."""
     return np.asarray(block_diag(eye.shared_covariance, [[scale_sigma**2]]))
 
 
 def needs_robot(eye: Eye, parent: Parent) -> bool:
-    """Whether the robot stands between the parent and what the camera sees."""
+    """Whether the robot is between the parent and the target."""
     return (eye.mount == "eye-in-hand") == (parent == "base")
 
 
 def all_places(
     eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
 ) -> list[tuple[TargetPlace, ...]]:
-    """Carries what images of one target allow to the parent's frame; see `places`."""
+    """Candidate poses in the parent's frame, for each image; see `places`."""
     stops = [sight.stop_key for sight in sights]
     return [
         places(eye, sight, look, parent, stops.count(stop))
@@ -100,22 +99,17 @@ def all_places(
 def places(
     eye: Eye, sight: Sight, view: SeenTarget, parent: Parent, of_stop: int = 1
 ) -> tuple[TargetPlace, ...]:
-    """Carries the poses that one image allows to the parent's frame.
+    """Candidate poses of one image in the parent's frame.
 
-    Args:
-        eye: The calibrated camera.
-        sight: The image.
-        view: What was seen in it.
-        parent: The frame that the target is to be placed in.
-        of_stop: How many images are of its stop of the robot.
+    `view` has those in the camera's frame; `of_stop` is the number of images of the same stop.
 
     Raises:
-        DataError: The robot's pose is needed and missing, or it is none.
+        DataError: The robot's pose is needed and missing or invalid.
     """
     flange = sight.base_from_flange
     if not needs_robot(eye, parent):
-        still = np.zeros((len(view.turns), 6, 6))
-        return _carried(view, eye.edge, still, np.zeros((6, eye.arm_size)), of_stop)
+        zero = np.zeros((len(view.turns), 6, 6))
+        return _in_parent(view, eye.edge, zero, np.zeros((6, eye.arm_error_count)), of_stop)
     if flange is None:
         raise DataError(
             f"{sight.label}: the robot stands between the {parent} and what the camera "
@@ -127,13 +121,13 @@ def places(
     arm = eye.arm_basis(flange, sight.joints_rad)
     if parent == "base":
         flange_jacobian = adjoint(invert(eye.edge @ view.cam_from_target))
-        return _carried(view, flange @ eye.edge, flange_jacobian, arm, of_stop)
+        return _in_parent(view, flange @ eye.edge, flange_jacobian, arm, of_stop)
     flange_from_cam = invert(flange) @ eye.edge
     flange_jacobian = -adjoint(invert(flange_from_cam @ view.cam_from_target))
-    return _carried(view, flange_from_cam, flange_jacobian, arm, of_stop)
+    return _in_parent(view, flange_from_cam, flange_jacobian, arm, of_stop)
 
 
-def _carried(
+def _in_parent(
     view: SeenTarget,
     parent_from_cam: FloatArray,
     flange_jacobian: FloatArray,
@@ -161,10 +155,10 @@ def _carried(
 
 
 def check_labels(sights: Sequence[Sight]) -> None:
-    """Refuses no image at all, and two by one name.
+    """Checks that there are images with unique labels.
 
     Raises:
-        DataError: So it is.
+        DataError: There is no image, or two have one label.
     """
     if not sights:
         raise DataError("no image shows the target: at least one is needed.")

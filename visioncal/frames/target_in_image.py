@@ -1,4 +1,4 @@
-"""A look through a calibrated camera: a target's pose in one image, and what moves it."""
+"""Pose of a target in one image of a calibrated camera, with its Jacobians."""
 
 from dataclasses import dataclass, replace
 
@@ -22,28 +22,27 @@ from visioncal.vision.finders import NotFound, find_target
 from visioncal.vision.finders.imaging import GREY, blur_at_corners, why_hard_to_see
 from visioncal.vision.targets import corner_positions, rotations
 
-# Corners scatter more than this by chance in one look of ten thousand.
+# Significance of corners that scatter more than the noise.
 _FALSE_ALARM = 1e-4
-# Less than so many times the noise that was to be expected is counted without a word: light and
-# distance do that.
+# Ratio of scatter to expected noise that warrants a warning; light and distance explain less.
 _MENTIONED = 2.0
-# Wrong corners spoil the pose that they are judged by: so often it is made anew without them.
+# Largest number of refits without outlier corners.
 _ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class SeenTarget:
-    """A target as one image shows it: c poses that it allows, the best by reprojection first.
+    """Candidate poses of a target in one image, c in all, the best by reprojection first.
 
     Attributes:
         cam_from_target: (c, 4, 4).
-        covariance: (c, 6, 6) of the right perturbations, by the pixels' noise alone.
-        by_lens: (c, 6, k + m) how each moves with the camera's intrinsics, and with what its lens
-            does beyond them.
-        by_scale: (c, 6) how each moves with the target's size, as a share of it.
-        scale_sigma: How well the size is known, as a share of it.
-        turns: (c,) which of the target's own symmetries each has applied.
-        warnings: What is odd about the image, in sentences.
+        covariance: (c, 6, 6) of the right perturbations, by the pixel noise alone.
+        by_lens: (c, 6, k + m) Jacobians by the camera's intrinsics, and by the lens's field beyond
+            its model.
+        by_scale: (c, 6) Jacobians by the target's relative size.
+        scale_sigma: Standard deviation of the relative size.
+        turns: (c,) index of the target's symmetry that each has applied.
+        warnings: Warnings on the image, in sentences.
     """
 
     cam_from_target: FloatArray
@@ -58,47 +57,45 @@ class SeenTarget:
 def see(
     eye: Eye, seen: Corners | Image, target: Target, label: str, sigma_px: float | None = None
 ) -> SeenTarget:
-    """Finds the poses of a target in one image.
+    """Estimates the candidate poses of a target in one image.
 
     Args:
         eye: The calibrated camera.
         seen: The target's corners, or the (h, w) grey image to find them in.
-        target: What is seen.
-        label: What the image is called in messages.
-        sigma_px: Noise of a corner's coordinate [px]; where None, what is stated with the corners,
-            or else the calibration's. Corners that scatter significantly more count with what they
-            show, and a warning says so.
+        target: The target.
+        label: The image's name in messages.
+        sigma_px: Noise of a corner's coordinate [px]; where None, that stated with the corners, or
+            else the calibration's. Where corners scatter significantly more, their scatter is used,
+            with a warning.
 
     Raises:
         DataError: The target is not in the image, its corners do not determine a pose, or they do
             not fit any pose of it.
     """
-    corners = seen if isinstance(seen, Corners) else _found(eye, seen, target, label)
-    _check(corners, target, label)
+    corners = seen if isinstance(seen, Corners) else _detected(eye, seen, target, label)
+    _check_corners(corners, target, label)
     noise_px = eye.noise_px(corners.stated_px if sigma_px is None else sigma_px)
     with one_blas_thread():
-        straight = replace(corners, px=eye.lens.in_model(corners.px))
-        poses, kept, squares = _fitted(eye, straight, target, label, noise_px)
+        in_model = replace(corners, px=eye.lens.in_model(corners.px))
+        poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
         distance_m = _distance_m(poses, kept, target)
         if eye.breathes:
-            straight = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
-            poses, kept, squares = _fitted(eye, straight, target, label, noise_px)
-        looks = [
-            _jacobian(eye, poses, at, kept, target, noise_px, distance_m)
+            in_model = replace(corners, px=eye.lens.in_model(corners.px, distance_m))
+            poses, kept, squared_sum = _fit_poses(eye, in_model, target, label, noise_px)
+        fits = [
+            _with_jacobians(eye, poses, at, kept, target, noise_px, distance_m)
             for at in range(len(poses.turns))
         ]
-    noise_px, warnings = _noise(noise_px, squares, 2 * len(kept.ids) - 6, label)
-    # Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
+    noise_px, warnings = _noise(noise_px, squared_sum, 2 * len(kept.ids) - 6, label)
+    # Corners without noise get a millionth of a pixel, so that the covariance is not zero.
     variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
     return SeenTarget(
-        np.array([compressed.cam_from_target[0] for compressed, _ in looks]),
+        np.array([compressed.cam_from_target[0] for compressed, _ in fits]),
+        np.array([variance * covariance_from(compressed.information[0]) for compressed, _ in fits]),
         np.array(
-            [variance * covariance_from(compressed.information[0]) for compressed, _ in looks]
+            [np.hstack([compressed.by_shared[0, :, :lens], beyond]) for compressed, beyond in fits]
         ),
-        np.array(
-            [np.hstack([compressed.by_shared[0, :, :lens], beyond]) for compressed, beyond in looks]
-        ),
-        np.array([_by_scale(compressed.by_shared[0, :, lens:], target) for compressed, _ in looks]),
+        np.array([_by_scale(compressed.by_shared[0, :, lens:], target) for compressed, _ in fits]),
         target.square_sigma_m / target.square_m,
         poses.turns,
         warnings,
@@ -106,10 +103,10 @@ def see(
 
 
 def check_size(eye: Eye, image: Image, label: str) -> None:
-    """Refuses an image of another size than the camera's.
+    """Checks that an image is grey and of the camera's resolution.
 
     Raises:
-        DataError: So it is.
+        DataError: It is not.
     """
     width, height = eye.camera.resolution
     if image.shape != (height, width):
@@ -124,7 +121,7 @@ def check_size(eye: Eye, image: Image, label: str) -> None:
         )
 
 
-def _found(eye: Eye, image: Image, target: Target, label: str) -> Corners:
+def _detected(eye: Eye, image: Image, target: Target, label: str) -> Corners:
     check_size(eye, image, label)
     seen = find_target(image, target)
     if isinstance(seen, NotFound):
@@ -137,7 +134,7 @@ def _found(eye: Eye, image: Image, target: Target, label: str) -> Corners:
     return Corners(0, seen.ids, seen.px, blur, seen.weights)
 
 
-def _check(corners: Corners, target: Target, label: str) -> None:
+def _check_corners(corners: Corners, target: Target, label: str) -> None:
     positions = corner_positions(target)
     ids = corners.ids
     if len(ids) and not (int(ids.min()) >= 0 and int(ids.max()) < len(positions)):
@@ -155,15 +152,15 @@ def _check(corners: Corners, target: Target, label: str) -> None:
 
 
 def _distance_m(poses: ViewPoses, corners: Corners, target: Target) -> float:
-    """How far the corners are along the camera's axis, on average."""
+    """Mean depth of the corners in the camera's frame [m]."""
     stack = CornerStack.of({corners.view: corners}, corner_positions(target))
     return float(depths_m(stack, poses.cam_from_target[:1])[0])
 
 
-def _fitted(
+def _fit_poses(
     eye: Eye, corners: Corners, target: Target, label: str, noise_px: float
 ) -> tuple[ViewPoses, Corners, float]:
-    """The poses, the corners that fit the best of them, and the sum of their squares [px^2]."""
+    """Candidate poses, the inlier corners of the best, and their squared residuals' sum [px^2]."""
     positions = corner_positions(target)
     for _ in range(_ROUNDS):
         (poses,) = measure_poses({corners.view: corners}, [target], eye.camera, noise_px)
@@ -181,14 +178,14 @@ def _fitted(
 
 
 def _stack(eye: Eye, corners: Corners, positions: FloatArray, noise_px: float) -> CornerStack:
-    """The corners, which share a change of the focus."""
+    """Stack of the corners, with the common effect of focal length jitter."""
     stack = CornerStack.of({corners.view: corners}, positions)
     if eye.jitter == 0.0:
         return stack
     return replace(stack, zooms=eye.jitter / max(noise_px, 1e-6) * zooms(stack, eye.camera))
 
 
-def _jacobian(
+def _with_jacobians(
     eye: Eye,
     poses: ViewPoses,
     at: int,
@@ -197,21 +194,21 @@ def _jacobian(
     noise_px: float,
     distance_m: float,
 ) -> tuple[Compressed, FloatArray]:
-    """One of the poses with all that moves it, under the numbering that it stands for.
+    """One refined candidate with its Jacobians, with corners numbered by its symmetry.
 
     Returns:
-        Them, and (6, m) how it moves with what the lens does beyond its model.
+        The candidate, and its (6, m) Jacobian by the lens's field beyond its model.
     """
-    # Turned, corner i lies where corner p[i] was: what was seen as that one is i.
+    # With the rotation p applied, corner i lies where corner p[i] was: that id becomes i.
     ids = np.argsort(rotations(target)[poses.turns[at]])[corners.ids]
     turned = replace(corners, ids=ids).take(np.argsort(ids))
     stack = _stack(eye, turned, corner_positions(target), noise_px)
-    found = _compressed(eye.camera, stack, target, poses.cam_from_target[at : at + 1])
-    by_pose = reproject(stack, eye.camera, found.cam_from_target, lens=False).by_pose
-    beyond = eye.lens.displacements(stack.px, distance_m)
-    stack.weigh(beyond)
-    moved = stack.products_by_view(by_pose, beyond)
-    return found, -(covariance_from(found.information) @ moved)[0]
+    compressed = _compressed(eye.camera, stack, target, poses.cam_from_target[at : at + 1])
+    by_pose = reproject(stack, eye.camera, compressed.cam_from_target, lens=False).by_pose
+    by_field = eye.lens.displacements(stack.px, distance_m)
+    stack.weigh(by_field)
+    cross = stack.products_by_view(by_pose, by_field)
+    return compressed, -(covariance_from(compressed.information) @ cross)[0]
 
 
 def _compressed(
@@ -222,23 +219,23 @@ def _compressed(
 
 
 def _by_scale(by_shape: FloatArray, target: Target) -> FloatArray:
-    """How a pose moves with the target's size: a rig has the size that its table says."""
+    """(6,) Jacobian of a pose by the target's size; a rig's size is exact."""
     return np.zeros(6) if target.kind == "points" else by_shape[:, SCALE]
 
 
 def _noise(
     noise_px: float, squares: float, freedom: int, label: str
 ) -> tuple[float, tuple[str, ...]]:
-    """The noise to count with: what is known, or what the corners show where that is more."""
+    """Noise to use: the known one, or the corners' scatter where significantly larger; warnings."""
     limit = noise_px**2 * float(chi2_limit(_FALSE_ALARM, freedom))
-    shown = float(np.sqrt(squares / freedom))
+    scatter = float(np.sqrt(squares / freedom))
     # Rounding of exact corners is no scatter.
-    if squares <= limit or shown < 1e-6:
+    if squares <= limit or scatter < 1e-6:
         return noise_px, ()
-    if shown < _MENTIONED * noise_px:
-        return shown, ()
-    return shown, (
-        f"{label}: the corners scatter by {figure(shown)} px around the target's pose, and "
+    if scatter < _MENTIONED * noise_px:
+        return scatter, ()
+    return scatter, (
+        f"{label}: the corners scatter by {figure(scatter)} px around the target's pose, and "
         f"{figure(noise_px)} px was to be expected: look whether the image is sharp, and the "
         "target flat and of the size that is stated.",
     )

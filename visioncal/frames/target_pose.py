@@ -1,4 +1,4 @@
-"""A tool or a fixture placed by a target on it, as the calibrated camera sees it."""
+"""Pose of a target on a tool or fixture, estimated from images of a calibrated camera."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, compose, invert, pose_difference
 from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.frames.camera_chain import Eye
-from visioncal.frames.image_outliers import CandidateViews, ImageInliers, agreeing
+from visioncal.frames.image_outliers import CandidateViews, ImageInliers, find_inliers
 from visioncal.frames.single_view import (
     Parent,
     Sight,
@@ -26,27 +26,27 @@ from visioncal.frames.target_in_image import SeenTarget, see
 from visioncal.results import Calibration, Edge
 from visioncal.vision.targets import load_target
 
-# Images scatter more than this by chance in one set of ten thousand.
+# Significance of images that scatter more than the noise.
 _FALSE_ALARM = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class TargetPose:
-    """Where images put a target on a tool or a fixture.
+    """Pose of a target on a tool or fixture, estimated from images.
 
     Attributes:
         matrix: (4, 4) `parent_from_target`.
-        independent: (6, 6) covariance of its right perturbation by what is each image's own: the
-            pixels and, where it stands between, the robot. More images make it smaller.
-        common: (6, 6) covariance by what all images share: the camera's transform, its lens, the
-            target's size, the arm's errors. No number of images makes it smaller.
+        independent: (6, 6) covariance of its right perturbation by errors that average out over
+            images: the pixels and, where it is between, the robot.
+        common: (6, 6) covariance by errors that all images share: the camera's transform, its lens,
+            the target's size, the arm's errors.
         labels: (m,) the images.
-        agrees: (m,) which of them agree; the others have no part.
-        away_mm: (m,) how far each puts the target from the mean [mm].
+        agrees: (m,) inlier mask; outliers are not used.
+        away_mm: (m,) distance of each image's pose from the mean [mm].
         away_deg: (m,) the same in rotation [deg].
-        scatter: By how much the images differ, in units of what the calibration's noise lets them;
-            one where it explains them. `independent` is that much larger, squared.
-        warnings: What to know, in sentences.
+        scatter: Ratio of the images' scatter to the calibration's noise, at least one; its square
+            scales `independent`.
+        warnings: Sentences.
     """
 
     matrix: FloatArray
@@ -70,23 +70,19 @@ class TargetPose:
         return Edge(self.matrix, self.covariance)
 
     def at(self, point_m: FloatArray) -> Self:
-        """The same of a frame with the target's axes whose origin is a point of the target.
-
-        Args:
-            point_m: (3,) in the target's frame [m].
-        """
+        """Pose of the frame with the target's axes and its origin at a point (3,) of it [m]."""
         target_from_point = compose(np.eye(3), point_m)
-        carry = adjoint(invert(target_from_point))
+        transport = adjoint(invert(target_from_point))
         return replace(
             self,
             matrix=self.matrix @ target_from_point,
-            independent=carry @ self.independent @ carry.T,
-            common=carry @ self.common @ carry.T,
+            independent=transport @ self.independent @ transport.T,
+            common=transport @ self.common @ transport.T,
         )
 
     @property
     def rms_mm(self) -> float:
-        """Root mean square distance of the images that agree from their mean [mm]."""
+        """Root mean square distance of the inlier images from their mean [mm]."""
         return float(np.sqrt(np.mean(self.away_mm[self.agrees] ** 2)))
 
     @property
@@ -104,15 +100,15 @@ def place_seen(
     *,
     sigma_px: float | None = None,
 ) -> TargetPose:
-    """Places a target on a fixture in the base, or on a tool on the flange.
+    """Estimates the pose of a target on a fixture in the base, or on a tool on the flange.
 
-    The images are averaged with the weights of what is each one's own, and those that disagree are
-    left out and named. What all of them share is carried to the answer as it is.
+    The images are averaged, weighted by their independent errors, and outliers are left out and
+    named. Common errors add to the covariance in full.
 
     Args:
         calibration: The camera's.
-        sights: The images; one is enough, and then nothing checks it.
-        target: What they show, or its name or file as `load_target` takes it.
+        sights: The images; a single one is not checked by anything.
+        target: The target, or its name or file as `load_target` takes it.
         parent: `base` for a fixture, `flange` for a tool.
         sigma_px: Noise of a corner's coordinate [px]; the calibration's where None.
 
@@ -124,58 +120,53 @@ def place_seen(
     eye = Eye.of(calibration)
     board = target if isinstance(target, Target) else load_target(target)
     looks = [see(eye, sight.seen, board, sight.label, sigma_px) for sight in sights]
-    return place_looks(eye, sights, looks, parent)
+    return place_target(eye, sights, looks, parent)
 
 
-def place_looks(
+def place_target(
     eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
 ) -> TargetPose:
-    """Places a target by what was seen of it in each of the images; see `place_seen`."""
+    """Estimates a target's pose from its candidate poses in the images; see `place_seen`."""
     views = all_places(eye, sights, looks, parent)
     common = common_covariance(eye, looks[0].scale_sigma)
     stops = len({sight.stop_key for sight in sights}) if needs_robot(eye, parent) else None
-    found = agreeing(CandidateViews(views, eye.flange_noise, common, eye.freedom))
+    fit = find_inliers(CandidateViews(views, eye.flange_noise, common, eye.freedom))
     labels = tuple(sight.label for sight in sights)
     return TargetPose(
-        found.mean.matrix,
-        found.variance * found.mean.own,
-        found.mean.by_common @ common @ found.mean.by_common.T,
+        fit.mean.matrix,
+        fit.variance * fit.mean.independent,
+        fit.mean.by_common @ common @ fit.mean.by_common.T,
         labels,
-        found.agrees,
-        1e3 * np.linalg.norm(found.away[:, 3:], axis=1),
-        np.rad2deg(np.linalg.norm(found.away[:, :3], axis=1)),
-        float(np.sqrt(found.variance)),
+        fit.agrees,
+        1e3 * np.linalg.norm(fit.residuals[:, 3:], axis=1),
+        np.rad2deg(np.linalg.norm(fit.residuals[:, :3], axis=1)),
+        float(np.sqrt(fit.variance)),
         (
             *eye.warnings,
             *(words for look in looks for words in look.warnings),
-            *doubts(found, labels, looks, stops),
+            *inlier_warnings(fit, labels, looks, stops),
         ),
     )
 
 
-def doubts(
-    found: ImageInliers,
+def inlier_warnings(
+    fit: ImageInliers,
     labels: Sequence[str],
     looks: Sequence[SeenTarget],
     stops: int | None,
     thing: str = "target",
 ) -> Iterator[str]:
-    """Says what of an agreement of images is not as it should be.
+    """Warnings on the inliers of a target's images.
 
-    Args:
-        found: The agreement.
-        labels: The images' names.
-        looks: What was seen in them.
-        stops: At how many stops of the robot they were taken; None where it has no part.
-        thing: What was seen, in words.
+    `stops` is the number of the robot's stops, None where the robot is not between.
     """
     count = len(labels)
-    for at in np.flatnonzero(~found.agrees).tolist():
+    for at in np.flatnonzero(~fit.agrees).tolist():
         yield (
-            f"{labels[at]} puts the {thing} {_distance(found, at)} from where the others do, "
+            f"{labels[at]} puts the {thing} {_distance_words(fit, at)} from where the others do, "
             "and was left out: was it moved, or is the robot's pose that of another image?"
         )
-    inside = int(found.agrees.sum())
+    inliers = int(fit.agrees.sum())
     if count == 1:
         yield (
             f"One image places the {thing}: nothing checks it. Take another"
@@ -186,39 +177,39 @@ def doubts(
             f"All {count} images are of one stop of the robot, whose error they share: nothing "
             "checks it. Take others, from other sides."
         )
-    elif found.agrees.all() and np.any(found.mahalanobis_sq > found.limit):
-        # Images stayed in although they contradict each other.
-        worst = int(np.where(found.agrees, found.mahalanobis_sq, -1.0).argmax())
+    elif fit.agrees.all() and np.any(fit.mahalanobis_sq > fit.limit):
+        # Images were kept although they contradict each other.
+        worst = int(np.where(fit.agrees, fit.mahalanobis_sq, -1.0).argmax())
         yield (
-            f"The images disagree, by up to {_distance(found, worst)}, and with {count} of them "
-            "it is not known which are right: take more."
+            f"The images disagree, by up to {_distance_words(fit, worst)}, and with {count} of "
+            "them it is not known which are right: take more."
         )
-    elif found.variance * 6 * (inside - 1) > chi2_limit(_FALSE_ALARM, 6 * (inside - 1)):
+    elif fit.variance * 6 * (inliers - 1) > chi2_limit(_FALSE_ALARM, 6 * (inliers - 1)):
         yield (
-            f"The images scatter {figure(np.sqrt(found.variance))} times as much as the "
+            f"The images scatter {figure(np.sqrt(fit.variance))} times as much as the "
             "calibration's noise lets them; the sigmas are that much larger."
         )
-    if found.rival is not None:
-        yield _rival_words(found, looks, thing)
+    if fit.rival is not None:
+        yield _ambiguity_warning(fit, looks, thing)
 
 
-def _distance(found: ImageInliers, at: int) -> str:
-    away = found.away[at]
-    millimetres = 1e3 * float(np.linalg.norm(away[3:]))
-    degrees = float(np.rad2deg(np.linalg.norm(away[:3])))
+def _distance_words(fit: ImageInliers, at: int) -> str:
+    residual = fit.residuals[at]
+    millimetres = 1e3 * float(np.linalg.norm(residual[3:]))
+    degrees = float(np.rad2deg(np.linalg.norm(residual[:3])))
     return mm_and_deg(millimetres, degrees)
 
 
-def _rival_words(found: ImageInliers, looks: Sequence[SeenTarget], thing: str) -> str:
-    rival = np.eye(4) if found.rival is None else found.rival
-    millimetres, degrees = pose_difference(found.mean.matrix, rival)
-    away = f"{mm_and_deg(millimetres, degrees)} away"
+def _ambiguity_warning(fit: ImageInliers, looks: Sequence[SeenTarget], thing: str) -> str:
+    rival = np.eye(4) if fit.rival is None else fit.rival
+    millimetres, degrees = pose_difference(fit.mean.matrix, rival)
+    shift = f"{mm_and_deg(millimetres, degrees)} away"
     if any(len(set(look.turns)) > 1 for look in looks):
         return (
-            f"The {thing} looks the same when it is turned: it may as well be {away}. Use a board "
+            f"The {thing} looks the same when it is turned: it may as well be {shift}. Use a board "
             "without symmetry, or see to it that it is not turned."
         )
     return (
-        f"Seen so flat, the {thing} may as well be tilted the other way, {away}. Look from another "
-        "side, or from nearer."
+        f"Seen so flat, the {thing} may as well be tilted the other way, {shift}. Look from "
+        "another side, or from nearer."
     )

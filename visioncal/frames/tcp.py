@@ -1,4 +1,4 @@
-"""A tool from touches: the fit, the words for it, and whether to trust it."""
+"""Tool frame from touches (TCP calibration), with its verdict."""
 
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
@@ -20,27 +20,27 @@ from visioncal.estimation.touching import Touches, TouchKind
 from visioncal.frames.touches import (
     TouchRows,
     flange_poses,
-    nominal_poses,
+    nominal_pose_findings,
     numbered,
     refuse_copies,
     robot_noise,
 )
 from visioncal.frames.verdicts import (
     RENAMED,
-    disputed,
-    noisy,
+    noise_findings,
     off_words,
+    outlier_findings,
     placed_name,
-    weak_directions,
+    sigma_findings,
 )
 from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
 
 TOUCH_KINDS = ("point", "z", "xz")
-# Another reading closes twenty times better by chance less than once in a thousand times: so
-# likely it is meant (Sellke, Bayarri and Berger 2001, as of sessions' readings).
+# Probability that another reading that fits twenty times better, p < 0.001, is the right one
+# (Sellke, Bayarri and Berger 2001, as for sessions' readings).
 _MISREAD = 0.98
-# No tool is as short: poses whose own origin is so near to the tip are a tool's already.
+# A tip nearer to the poses' origin than any tool is long: the poses are a tool's already [m].
 _NO_TOOL_M = 2e-3
 
 
@@ -53,22 +53,22 @@ def touched_tool(
     touch_noise_m: float | None = None,
     options: ToolLimits | None = None,
 ) -> Frame:
-    """Finds a tool's tip, and its rotation where that was touched too.
+    """Estimates a tool's tip, and its rotation where touches determine it.
 
     Args:
         rows: The touches. Of kind `point`, the tip is at the point; of kind `z`, the point lies on
             the tool's positive z axis; of kind `xz`, in its xz plane on the side of positive x.
-        calibration: Of the same robot, where there is one: its noise and its arm are used.
-        robot: A model for joint angles, where the calibration has none.
-        touch_noise_m: What a touch is known to repeat to, per axis [m].
-        options: Where doubt begins.
+        calibration: Of the same robot, for its noise and arm; optional.
+        robot: The model for joint angles, where the calibration has none.
+        touch_noise_m: Known repeatability of a touch, per axis [m].
+        options: Limits of the verdict.
 
     Returns:
         `flange_from_tool`.
 
     Raises:
         DataError: Touches are missing, wrongly written, or contradict each other.
-        DegenerateError: They leave a direction of the tool open.
+        DegenerateError: They do not determine the tool in every direction.
     """
     rows = rows.of_kinds(TOUCH_KINDS, "point")
     poses = flange_poses(rows, robot, calibration)
@@ -79,8 +79,8 @@ def touched_tool(
     except (DataError, DegenerateError) as error:
         raise _with_reading(error, touches) from error
     assumed = assumed_words(fit.sigma_m, touch_noise_m)
-    doubts = list(_doubts(fit, touches, rows.places, options or ToolLimits(), assumed))
-    doubts += nominal_poses(rows, calibration)
+    findings = list(_findings(fit, touches, rows.places, options or ToolLimits(), assumed))
+    findings += nominal_pose_findings(rows, calibration)
     return Frame(
         Edge(fit.flange_from_tool, fit.covariance),
         fit.oriented,
@@ -90,7 +90,7 @@ def touched_tool(
         1e3 * fit.rms_m,
         1e3 * fit.sigma_m,
         tuple(_observations(fit, touches)),
-        Verdict.by(doubts, Finding(AGREEMENT, _praise(fit, touches))),
+        Verdict.by(findings, Finding(AGREEMENT, _praise(fit, touches))),
         _details(fit, touches),
     )
 
@@ -107,7 +107,7 @@ def _touches(rows: TouchRows, poses: FloatArray) -> Touches:
 
 
 def _with_reading(error: VisioncalError, touches: Touches) -> VisioncalError:
-    """Adds how the poses should be read, where that explains the error."""
+    """Adds a hint where another reading of the poses explains the error."""
     hint = _reading_hint(touches)
     if not hint:
         return error
@@ -116,12 +116,13 @@ def _with_reading(error: VisioncalError, touches: Touches) -> VisioncalError:
 
 
 def _reading_hint(touches: Touches) -> str:
-    found = readings_that_close(touches)
-    if not found:
+    readings = readings_that_close(touches)
+    if not readings:
         return ""
-    if found[0].options == "--robot-inverse":
-        return f"{_closing_words(found[0])}: do the columns hold it? Then add {found[0].options}."
-    return f"{_closing_words(found[0])}: are the columns in that order?"
+    words, options = _closing_words(readings[0]), readings[0].options
+    if options == "--robot-inverse":
+        return f"{words}: do the columns hold it? Then add {options}."
+    return f"{words}: are the columns in that order?"
 
 
 def _closing_words(best: PoseReading) -> str:
@@ -136,31 +137,28 @@ def _method(rows: TouchRows) -> str:
     points = len(
         {point for point, kind in zip(rows.points, rows.kinds, strict=True) if kind == "point"}
     )
-    tip = f"pivot of {counts['point']} touches of {_counted(points, 'point')}"
+    of = "one point" if points == 1 else f"{points} points"
+    tip = f"pivot of {counts['point']} touches of {of}"
     if not counts["z"]:
         return tip
     return f"{tip}; rotation from {counts['z']} along z and {counts['xz']} in the xz plane"
 
 
-def _counted(count: int, word: str) -> str:
-    return f"one {word}" if count == 1 else f"{count} {word}s"
-
-
 def _observations(fit: PivotFit, touches: Touches) -> Iterator[Observation]:
-    found = fit.agreement
+    agreement = fit.agreement
     for at, label in enumerate(touches.labels):
-        is_wrong = not found.agrees[at] or bool(found.doubtful[at])
+        is_suspect = not agreement.agrees[at] or bool(agreement.doubtful[at])
         yield Observation(
             label,
-            used=bool(found.agrees[at]),
-            reason=_wrong(fit, touches, at) if is_wrong else "",
+            used=bool(agreement.agrees[at]),
+            reason=_outlier_reason(fit, touches, at) if is_suspect else "",
             kind=touches.kinds[at],
-            residual_mm=1e3 * float(found.off_m[at]),
+            residual_mm=1e3 * float(agreement.off_m[at]),
         )
 
 
-def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
-    """Says what is wrong with a touch, or may be."""
+def _outlier_reason(fit: PivotFit, touches: Touches, at: int) -> str:
+    """Why a touch is an outlier or in doubt."""
     words = off_words(fit.agreement, at)
     if fit.agreement.doubtful[at]:
         return f"{words}: one of the touches that contradict each other"
@@ -170,7 +168,7 @@ def _wrong(fit: PivotFit, touches: Touches, at: int) -> str:
     return f"{words}: the tip had slipped, or the pose is of another moment"
 
 
-def _doubts(
+def _findings(
     fit: PivotFit, touches: Touches, places: Sequence[str], options: ToolLimits, assumed: str
 ) -> Iterator[Finding]:
     for best in readings_that_close(touches)[:1]:
@@ -179,13 +177,13 @@ def _doubts(
         words = f"{_closing_words(best)}."
         yield Finding("misread_poses", words, step, probability=_MISREAD, is_fatal=True)
     rows = range(len(touches))
-    yield from disputed(
+    yield from outlier_findings(
         [placed_name(f"Touch {touches.labels[row]}", places[row]) for row in rows],
-        [_wrong(fit, touches, row) for row in rows],
+        [_outlier_reason(fit, touches, row) for row in rows],
         fit.agreement,
         "Touch what is named once more, and write the new poses in its rows.",
     )
-    yield from noisy(
+    yield from noise_findings(
         1e3 * fit.sigma_m,
         options.noise_mm,
         "Touch again with a sharp tip; an arm that was never calibrated is off by a millimetre "
@@ -208,7 +206,7 @@ def _doubts(
             "and of that tool's tip.",
             Remedy("Set the controller's tool to zero, and write the poses of the flange."),
         )
-    yield from weak_directions(
+    yield from sigma_findings(
         fit.worst,
         options.sigma_mm,
         options.sigma_deg,

@@ -1,6 +1,6 @@
-"""The touch test: points that the camera locates, touched by the tool; the gaps against prediction.
+"""Touch test: measured gaps between the tool's tip and points that the camera locates.
 
-It is the proof that counts: everything between pixels and the tip has a part in the gap.
+The gaps contain the errors of the complete chain from pixels to the tip.
 """
 
 from collections.abc import Sequence
@@ -22,23 +22,23 @@ from visioncal.results.sections import TouchedPoint, TouchTest
 from visioncal.session import Session
 from visioncal.vision.targets import corner_positions
 
-# A gap is read to so much: by a feeler gauge, or by eye over a tip [mm].
+# Reading error of a gap, by a feeler gauge or by eye over a tip [mm].
 READING_MM = 0.1
-# So many gaps beyond what is predicted for 95 % are chance, of five.
+# Number of five gaps that may exceed their 95 % prediction by chance.
 _BY_CHANCE = 1
 
 
 @dataclass(frozen=True, eq=False)
 class TouchPoint:
-    """A point to be touched.
+    """Point of a board to be touched.
 
     Attributes:
-        name: Which point of the board it is.
-        board_m: (3,) where it is on the board [m].
-        base_m: (3,) where the camera locates it in the base [m].
-        base_from_flange: (4, 4) where the flange has the tip on it, the tool's z into the board.
-        radius95_mm: The tip comes as near as this with 95 % [mm].
-        normal: (3,) of the board there, in the base, into the board.
+        name: The point's name on the board.
+        board_m: (3,) position on the board [m].
+        base_m: (3,) position in the base by the camera [m].
+        base_from_flange: (4, 4) flange pose with the tip on it and the tool's z into the board.
+        radius95_mm: Predicted gap that 95 % do not exceed [mm].
+        normal: (3,) of the board in the base, into the board.
     """
 
     name: str
@@ -49,7 +49,7 @@ class TouchPoint:
     normal: FloatArray
 
     def above(self, height_m: float) -> FloatArray:
-        """(4, 4) the flange with the tip so high above the point, along the board's normal [m]."""
+        """(4, 4) flange pose with the tip `height_m` above the point along the board's normal."""
         lifted = self.base_from_flange.copy()
         lifted[:3, 3] -= height_m * self.normal
         return lifted
@@ -58,15 +58,12 @@ class TouchPoint:
 def touch_points(
     session: Session, calibration: Calibration, tool: Tool | None = None
 ) -> tuple[TouchPoint, ...]:
-    """Locates five points of a board, and says where the flange brings the tip onto each.
+    """Locates five points of a session's board, with the flange poses that bring the tip onto each.
 
-    Args:
-        session: Images of the board by the calibrated camera, where it lies now; one will do.
-        calibration: The camera's.
-        tool: What has the tip; None for the flange itself.
+    Without a tool, the tip is the flange's origin.
 
     Raises:
-        DataError: No image serves.
+        DataError: No image is usable.
     """
     board = next(iter(session.boards.values()), None)
     if board is None:
@@ -80,16 +77,16 @@ def touch_points(
     noise = calibration.noise
     turned = np.deg2rad(noise.get("robot_rotation_deg", 0.0)) * np.linalg.norm(tip.matrix[:3, 3])
     shifted = 1e-3 * noise.get("robot_translation_mm", 0.0)
-    # The robot stands at a point with its noise; the tip is where the tool was measured to have it.
-    own = (shifted**2 + turned**2) * np.eye(3) + tip.covariance[3:, 3:]
+    # The robot's noise at the stop and the tip's covariance.
+    independent = (shifted**2 + turned**2) * np.eye(3) + tip.covariance[3:, 3:]
     rotation = frame.edge.matrix[:3, :3]
     points = []
-    for name, at in _five(board).items():
+    for name, at in _five_corners(board).items():
         placed = frame.edge.matrix @ compose(np.eye(3), at)
         located = point_covariance(frame.edge.matrix, frame.edge.covariance, at)
-        spread = located + rotation @ own @ rotation.T
+        covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
-        radius_mm = float(np.hypot(1e3 * radius95(spread), READING_MM))
+        radius_mm = float(np.hypot(1e3 * radius95(covariance), READING_MM))
         points.append(TouchPoint(name, at, placed[:3, 3], flange, radius_mm, rotation[:, 2]))
     return tuple(points)
 
@@ -97,15 +94,10 @@ def touch_points(
 def judged(
     points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: Tool | None = None
 ) -> TouchTest:
-    """Compares the gaps that were measured with what was predicted.
-
-    Args:
-        points: The points, in order.
-        gaps_mm: The distance from tip to point at each [mm].
-        tool: What touched; None for the flange itself.
+    """Compares measured distances from tip to point [mm], in the points' order, with predictions.
 
     Raises:
-        DataError: There are as many gaps as points in no way, or one is no length.
+        DataError: The number of gaps is not that of the points, or one is no length.
     """
     if len(gaps_mm) != len(points) or not all(0.0 <= gap < np.inf for gap in gaps_mm):
         raise DataError(
@@ -120,7 +112,7 @@ def judged(
         )
         for point, gap in zip(points, gaps_mm, strict=True)
     )
-    beyond = sum(touched_point.gap_mm > touched_point.radius95_mm for touched_point in touched)
+    beyond = sum(point.gap_mm > point.radius95_mm for point in touched)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     return TouchTest(
         created=created,
@@ -131,7 +123,7 @@ def judged(
 
 
 def finding_of(test: TouchTest) -> Finding:
-    """What a touch test says, and what to do about it."""
+    """Finding of a touch test, with the remedy."""
     gaps = [point.gap_mm for point in test.points]
     radius = max(point.radius95_mm for point in test.points)
     words = (
@@ -146,8 +138,8 @@ def finding_of(test: TouchTest) -> Finding:
     return Finding("touch_test", f"{words} That is more than predicted.", step, is_fatal=True)
 
 
-def _five(board: Target) -> dict[str, FloatArray]:
-    """The corners farthest out and the one nearest to the middle, by what they are called."""
+def _five_corners(board: Target) -> dict[str, FloatArray]:
+    """The four outermost corners and the one nearest to the middle, by name."""
     places = corner_positions(board)
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

@@ -1,4 +1,4 @@
-"""Touches: where the flange stood when a point of the tool met a point of the cell."""
+"""Touches: flange poses at which the tool's tip touched a point of the cell."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,11 +17,11 @@ from visioncal.session import Session
 from visioncal.session.choosing import ARM, Choice
 from visioncal.session.selecting import check_one_of_each, select
 
-# No arm reaches this far [m], and no joint of one turns this far [rad].
+# Plausible limits: an arm's reach [m] and a joint's range [rad].
 _FAR_M, _WIDE_RAD = 20.0, 4 * np.pi
-# And none stays so near to its base's origin [m], nor repeats a pose to so many digits.
+# Smallest plausible distance from the base's origin [m], and largest difference of copied poses.
 _NEAR_M, _COPIED = 0.02, 1e-9
-# Poses and the model's, of one row: farther apart the model is of another arm or of another frame.
+# Largest difference between a row's reported pose and the model's for the same arm and frame.
 _SAME_ARM_M, _SAME_ARM_RAD = 0.05, 0.1
 
 
@@ -32,12 +32,12 @@ class TouchRows:
     Attributes:
         source: What they were read from, for messages and for the record.
         labels: (n,) the rows' view numbers, as text.
-        places: (n,) where each stands: `touches.csv, line 3`.
+        places: (n,) the rows' lines: `touches.csv, line 3`.
         base_from_flange: (n, 4, 4) as the controller reported it [m]; NaN in a row without a pose,
             and in the rotation where there are positions alone.
         joints_rad: (n, j) joint angles [rad], NaN in a row without; None where there are none.
-        kinds: (n,) what was touched; empty where the row does not say.
-        points: (n,) which point was touched; empty likewise.
+        kinds: (n,) kinds of the touches; empty where not stated.
+        points: (n,) names of the touched points; empty where not stated.
     """
 
     source: str
@@ -54,10 +54,8 @@ class TouchRows:
     def of_kinds(self, allowed: Sequence[str], default: str = "", hint: str = "") -> "TouchRows":
         """Returns the rows with every kind filled in.
 
-        Args:
-            allowed: The kinds that make sense here.
-            default: What a row without a kind is; empty where it has to say.
-            hint: What to do where a row is of another kind that resembles none of these.
+        `default` is the kind of a row without one, empty where a kind is required; `hint` is the
+        advice where a kind resembles no allowed one.
 
         Raises:
             DataError: A row is of another kind.
@@ -78,11 +76,7 @@ class TouchRows:
 
 
 def touches_of(session: Session, robot: str | None = None) -> TouchRows:
-    """Takes the rows of a session's views.csv for touches.
-
-    Args:
-        session: Of one robot, or of a whole cell.
-        robot: Which of a whole cell is meant.
+    """Reads the rows of a session's views.csv as touches, in a whole cell those of one robot.
 
     Raises:
         DataError: It is of several robots, and none is named, or there is none of that name.
@@ -90,20 +84,20 @@ def touches_of(session: Session, robot: str | None = None) -> TouchRows:
     if len(session.robots) > 1:
         session = select(session, Choice(robot=robot), ARM)
     check_one_of_each(session)
-    nowhere = np.full((4, 4), np.nan)
+    no_pose = np.full((4, 4), np.nan)
     poses, joints = [], []
     for view in session.views:
         pose = view.base_from_flange()
-        poses.append(nowhere if pose is None else np.asarray(pose.as_matrix()))
+        poses.append(no_pose if pose is None else np.asarray(pose.as_matrix()))
         joints.append(view.joints_rad)
     size = max((len(joint) for joint in joints if joint is not None), default=0)
-    missing = np.full(size, np.nan)
+    no_joints = np.full(size, np.nan)
     return TouchRows(
         session.name,
         tuple(str(view.number) for view in session.views),
         tuple(f"views.csv, view {view.number}" for view in session.views),
         np.array(poses),
-        np.array([missing if joint is None else joint for joint in joints]) if size else None,
+        np.array([no_joints if joint is None else joint for joint in joints]) if size else None,
         tuple(view.text.get("kind", "") for view in session.views),
         tuple(view.text.get("point", "") for view in session.views),
     )
@@ -112,15 +106,15 @@ def touches_of(session: Session, robot: str | None = None) -> TouchRows:
 def flange_poses(
     rows: TouchRows, robot: Robot | None, calibration: Calibration | None = None
 ) -> FloatArray:
-    """Collects where the flange was.
+    """Flange poses of the touches.
 
-    Joint angles come first where the arm was calibrated: what the controller reports is the nominal
-    arm's.
+    With a calibrated arm, joint angles take precedence: the controller reports poses of the nominal
+    arm.
 
     Args:
         rows: The touches.
         robot: The arm's model, where the calibration has none.
-        calibration: What is known of the same robot.
+        calibration: Of the same robot.
 
     Returns:
         (n, 4, 4) `base_from_flange` [m].
@@ -135,22 +129,22 @@ def flange_poses(
         robot = calibration.calibrated_robot
     reported = np.isfinite(rows.base_from_flange).all(axis=(1, 2))
     modelled, poses = _modelled(rows, robot, needed=not reported.all())
-    without = np.flatnonzero(~reported & ~modelled)
-    if len(without):
-        places = [rows.places[index] for index in without]
+    missing = np.flatnonzero(~reported & ~modelled)
+    if len(missing):
+        places = [rows.places[index] for index in missing]
         raise DataError(
             f"{some_of(places)}: no pose of the robot.",
             culprits=places,
             next_step="Fill in x_m to qw, or joint angles and --robot-model.",
         )
-    first = modelled if calibrated else modelled & ~reported
+    use_model = modelled if calibrated else modelled & ~reported
     if calibrated and calibration is not None and rows.joints_rad is not None:
         poses[modelled] = calibration.standing(rows.joints_rad[modelled])
-    return np.where(first[:, None, None], poses, rows.base_from_flange)
+    return np.where(use_model[:, None, None], poses, rows.base_from_flange)
 
 
-def nominal_poses(rows: TouchRows, calibration: Calibration | None) -> Iterator[Finding]:
-    """Says where a calibrated arm's touches come with the nominal arm's poses."""
+def nominal_pose_findings(rows: TouchRows, calibration: Calibration | None) -> Iterator[Finding]:
+    """Finding on touches of a calibrated arm that have no joint angles."""
     if calibration is None or not calibration.arm_is_calibrated:
         return
     joints = rows.joints_rad
@@ -164,22 +158,22 @@ def nominal_poses(rows: TouchRows, calibration: Calibration | None) -> Iterator[
 
 
 def check_lengths(rows: TouchRows) -> None:
-    """Refuses positions that no arm reaches: millimetres read as metres, or the other way round.
+    """Checks that positions are in metres: that they are within an arm's reach.
 
     Raises:
-        DataError: Naming the farthest row.
+        DataError: They look like millimetres, or like metres read as millimetres.
     """
     # Squares of the largest numbers overflow.
-    away = np.hypot.reduce(rows.base_from_flange[:, :3, 3], axis=1)
-    far = np.flatnonzero(away > _FAR_M)
+    distances = np.hypot.reduce(rows.base_from_flange[:, :3, 3], axis=1)
+    far = np.flatnonzero(distances > _FAR_M)
     if len(far):
         raise DataError(
-            f"{rows.places[far[0]]}: its position is {away[far[0]]:.4g} m from the base, and no "
-            f"arm reaches {_FAR_M:g} m: these look like millimetres.",
+            f"{rows.places[far[0]]}: its position is {distances[far[0]]:.4g} m from the base, and "
+            f"no arm reaches {_FAR_M:g} m: these look like millimetres.",
             culprits=[rows.places[index] for index in far],
             next_step="Say --robot-unit mm, or write metres.",
         )
-    farthest = float(np.max(away, initial=0.0, where=np.isfinite(away)))
+    farthest = float(np.max(distances, initial=0.0, where=np.isfinite(distances)))
     if 0.0 < farthest < _NEAR_M:
         raise DataError(
             f"{rows.source}: all positions are within {figure(1e3 * farthest)} mm of the base's "
@@ -190,14 +184,14 @@ def check_lengths(rows: TouchRows) -> None:
 
 
 def refuse_copies(poses: FloatArray, places: Sequence[str]) -> None:
-    """Refuses a pose (n, 4, 4) that is there twice: a copy of a row says nothing new.
+    """Checks that the poses (n, 4, 4) are unique.
 
     Raises:
-        DataError: Naming both rows.
+        DataError: Two are equal: one row is a copy.
     """
     numbers = np.nan_to_num(poses.reshape(len(poses), -1))
-    apart = np.abs(numbers[:, None] - numbers[None]).max(axis=2)
-    first, second = np.nonzero(np.triu(apart < _COPIED, 1))
+    differences = np.abs(numbers[:, None] - numbers[None]).max(axis=2)
+    first, second = np.nonzero(np.triu(differences < _COPIED, 1))
     if len(first):
         names = [places[first[0]], places[second[0]]]
         raise DataError(
@@ -209,23 +203,23 @@ def refuse_copies(poses: FloatArray, places: Sequence[str]) -> None:
 
 
 def robot_noise(calibration: Calibration | None) -> Noise:
-    """Errors of the flange from stop to stop, as calibrated; zero where nothing is known."""
-    found = {} if calibration is None else calibration.noise
+    """The calibrated noise of the flange from stop to stop; zero where unknown."""
+    noise = {} if calibration is None else calibration.noise
     return Noise.of_robot(
-        float(np.deg2rad(found.get("robot_rotation_deg", 0.0))),
-        1e-3 * found.get("robot_translation_mm", 0.0),
+        float(np.deg2rad(noise.get("robot_rotation_deg", 0.0))),
+        1e-3 * noise.get("robot_translation_mm", 0.0),
     )
 
 
 def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Mask, FloatArray]:
-    """Which rows the arm's model gives a pose of, and these."""
-    poses, there = rows.base_from_flange.copy(), np.zeros(len(rows), dtype=bool)
+    """Mask of the rows with a pose by the arm's model, and the poses."""
+    poses, has_joints = rows.base_from_flange.copy(), np.zeros(len(rows), dtype=bool)
     if rows.joints_rad is None:
-        return there, poses
-    there = np.asarray(np.isfinite(rows.joints_rad).all(axis=1))
-    _check_angles(rows, there)
+        return has_joints, poses
+    has_joints = np.asarray(np.isfinite(rows.joints_rad).all(axis=1))
+    _check_angles(rows, has_joints)
     if robot is None:
-        if needed and there.any():
+        if needed and has_joints.any():
             raise DataError(
                 f"{rows.source}: there are joint angles, but no model of the robot.",
                 culprits=[rows.source],
@@ -238,15 +232,15 @@ def _modelled(rows: TouchRows, robot: Robot | None, *, needed: bool) -> tuple[Ma
             f"has {robot.joint_count} joints.",
             culprits=[rows.source],
         )
-    poses[there] = robot.base_from_flange(rows.joints_rad[there])
-    _check_same_arm(rows, poses, there, robot)
-    return there, poses
+    poses[has_joints] = robot.base_from_flange(rows.joints_rad[has_joints])
+    _check_same_arm(rows, poses, has_joints, robot)
+    return has_joints, poses
 
 
-def _check_angles(rows: TouchRows, there: Mask) -> None:
+def _check_angles(rows: TouchRows, has_joints: Mask) -> None:
     if rows.joints_rad is None:
         return
-    largest = np.abs(np.where(there[:, None], rows.joints_rad, 0.0)).max(axis=1, initial=0.0)
+    largest = np.abs(np.where(has_joints[:, None], rows.joints_rad, 0.0)).max(axis=1, initial=0.0)
     wide = np.flatnonzero(largest > _WIDE_RAD)
     if len(wide):
         raise DataError(
@@ -257,19 +251,19 @@ def _check_angles(rows: TouchRows, there: Mask) -> None:
         )
 
 
-def _check_same_arm(rows: TouchRows, poses: FloatArray, there: Mask, robot: Robot) -> None:
-    both = np.flatnonzero(there & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
+def _check_same_arm(rows: TouchRows, poses: FloatArray, has_joints: Mask, robot: Robot) -> None:
+    both = np.flatnonzero(has_joints & np.isfinite(rows.base_from_flange).all(axis=(1, 2)))
     if not len(both):
         return
-    away = invert(poses[both]) @ rows.base_from_flange[both]
-    apart_m, apart_rad = np.linalg.norm(away[:, :3, 3], axis=1), rotation_angle(away)
-    odd = (apart_m > _SAME_ARM_M) | (apart_rad > _SAME_ARM_RAD)
+    delta = invert(poses[both]) @ rows.base_from_flange[both]
+    off_m, off_rad = (np.linalg.norm(delta[:, :3, 3], axis=1), rotation_angle(delta))
+    odd = (off_m > _SAME_ARM_M) | (off_rad > _SAME_ARM_RAD)
     if odd.any():
         at = int(np.argmax(odd))
         raise DataError(
             f"{rows.places[both[at]]}: the joints lead through {robot.name} to a flange "
-            f"{1e3 * apart_m[at]:.0f} mm and {np.rad2deg(apart_rad[at]):.1f} deg away from the "
-            "pose that is reported.",
+            f"{1e3 * off_m[at]:.0f} mm and {np.rad2deg(off_rad[at]):.1f} deg away from "
+            "the pose that is reported.",
             culprits=[rows.places[index] for index in both[odd]],
             next_step="Check the robot's model and its base, and whether the controller reports "
             "the flange without a tool.",
@@ -277,5 +271,5 @@ def _check_same_arm(rows: TouchRows, poses: FloatArray, there: Mask, robot: Robo
 
 
 def numbered(names: Collection[str]) -> dict[str, int]:
-    """Numbers names from 0, in the order of their first appearance."""
+    """Numbers of names from 0, in the order of first appearance."""
     return {name: at for at, name in enumerate(dict.fromkeys(names))}

@@ -1,4 +1,4 @@
-"""Whether a tool's or a fixture's frame can be trusted, in plain sentences."""
+"""Findings on a tool's or fixture's frame."""
 
 from collections.abc import Iterator, Sequence
 
@@ -10,25 +10,18 @@ from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 
-# How the reason ends of a touch that would be right by another name, and what to do about it.
+# End of the reason of an outlier that fits by another name, and its remedy.
 RENAMED = ": is its name exchanged?"
 _RENAME = "Correct the names of what is named; where they are right, touch it once more."
 
 
-def weak_directions(
+def sigma_findings(
     worst: Sequence[Direction],
     sigma_mm: tuple[float, float],
     sigma_deg: tuple[float, float],
     advice: str,
 ) -> Iterator[Finding]:
-    """Doubts the directions that are known worst.
-
-    Args:
-        worst: These directions.
-        sigma_mm: (check, bad) limits of an offset's sigma [mm].
-        sigma_deg: The same of a rotation's [deg].
-        advice: What to do about it, as a sentence.
-    """
+    """Findings on directions whose sigma exceeds (check, bad) limits of offset or rotation."""
     for direction in worst:
         scale, unit = (np.rad2deg(1.0), "deg") if direction.is_rotation else (1e3, "mm")
         check, bad = sigma_deg if direction.is_rotation else sigma_mm
@@ -42,28 +35,24 @@ def weak_directions(
             )
 
 
-def disputed(
-    names: Sequence[str], reasons: Sequence[str], found: GroupInliers[State], again: str
+def outlier_findings(
+    names: Sequence[str], reasons: Sequence[str], inliers: GroupInliers[State], again: str
 ) -> Iterator[Finding]:
-    """Doubts for what was left out, and for what stayed although it contradicts.
+    """Findings on outliers, and on contradicting measurements that were kept.
 
-    Args:
-        names: (n,) what messages call the touches, points or images.
-        reasons: (n,) what is wrong with each.
-        found: Which of them agree.
-        again: What to do about either, as a sentence.
+    `names` and `reasons` are (n,); `again` is the remedy, as a sentence.
     """
-    for at in np.flatnonzero(~found.agrees).tolist():
+    for at in np.flatnonzero(~inliers.agrees).tolist():
         renamed = reasons[at].endswith(RENAMED)
         words = f"{names[at]} was left out: {reasons[at]}{'' if renamed else '.'}"
         yield Finding("left_out", words, Remedy(_RENAME if renamed else again, AGAIN))
-    if found.doubtful.any():
-        some = some_of([names[at] for at in np.flatnonzero(found.doubtful).tolist()])
+    if inliers.doubtful.any():
+        some = some_of([names[at] for at in np.flatnonzero(inliers.doubtful).tolist()])
         words = f"{some} contradict each other, and which is wrong is not known: all are used."
         yield Finding("contradicting", words, Remedy(again))
 
 
-def noisy(
+def noise_findings(
     noise_mm: float,
     limits_mm: tuple[float, float],
     cause: str,
@@ -71,14 +60,9 @@ def noisy(
     explained: bool,
     things: str = "touches",
 ) -> Iterator[Finding]:
-    """Doubts for touches that agree badly, or worse than they are stated to.
+    """Findings on noise per axis above (check, bad) limits, or else unexplained by the stated one.
 
-    Args:
-        noise_mm: Noise of a touch per axis [mm].
-        limits_mm: (check, bad) limits of it [mm].
-        cause: What may have caused it or what to do, as a sentence.
-        explained: Whether what is stated of a touch explains it.
-        things: What agrees or does not, in words.
+    `cause` is a probable cause or remedy, as a sentence; `things` names the measurements.
     """
     check, bad = limits_mm
     if noise_mm > check:
@@ -101,13 +85,13 @@ def noisy(
         )
 
 
-def off_words(found: GroupInliers[State], at: int) -> str:
-    """Says how far off something is that does not agree: `2.1 mm off, 5 times what ... allow`."""
-    off = f"{figure(1e3 * float(found.off_m[at]))} mm off"
-    over = float(np.sqrt(float(found.mahalanobis_sq[at]) / float(found.limit[at])))
-    return f"{off}, {figure(over)} times what the others allow" if over > 1.0 else off
+def off_words(inliers: GroupInliers[State], at: int) -> str:
+    """Words for a residual: `2.1 mm off, 5 times what the others allow`."""
+    off = f"{figure(1e3 * float(inliers.off_m[at]))} mm off"
+    ratio = float(np.sqrt(float(inliers.mahalanobis_sq[at]) / float(inliers.limit[at])))
+    return f"{off}, {figure(ratio)} times what the others allow" if ratio > 1.0 else off
 
 
 def placed_name(name: str, place: str) -> str:
-    """Names a row so that it is found: `Touch 3 (touches.csv, line 5)`."""
+    """Name with the row's place: `Touch 3 (touches.csv, line 5)`."""
     return f"{name} ({place})" if place else name

@@ -1,4 +1,4 @@
-"""The result of a calibration, its frames, and how they stand on disk."""
+"""Results of calibrations, tool and fixture frames, and their files."""
 
 from visioncal.core.verdict import Finding, Remedy, Verdict, VerdictStatus
 from visioncal.results.cell import CellResult, Moved, Untied
@@ -11,7 +11,7 @@ from visioncal.results.picking import picked
 from visioncal.results.result import Calibration
 from visioncal.results.views import HELD_BACK, Rms, Validation, ViewResult
 
-# What results of whole cells were once read into.
+# Former name of a whole cell's result.
 Alignment = Calibration
 
 __all__ = [

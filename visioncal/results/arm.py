@@ -1,4 +1,4 @@
-"""Sections of a result that are of an arm: its kinematics, errors, springs and drift."""
+"""Sections of a result on an arm: kinematics, errors, joint compliance and thermal drift."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from visioncal.robot import Robot
 from visioncal.robot.thermal import Heating, Kind, ThermalModel
 
 NOMINAL = "nominal"
-# Departures of fewer standard deviations may be chance.
+# Number of standard deviations beyond which a change is significant.
 _SURE = 3.0
 
 StoredRobot = Annotated[
@@ -27,16 +27,16 @@ StoredRobot = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class ArmLevel:
-    """A level of the arm's model that was tried.
+    """Fit of one level of the arm's model.
 
     Attributes:
-        level: Its name; `nominal` is the arm as stated.
-        unknowns: How many values it frees.
-        rms_mm: Residual of the target's place in the fit [mm].
-        rms_deg: Residual of its orientation [deg]; None where places alone were read.
-        held_out_mm: Residual of the place at stops that were left out of the fit [mm].
-        held_out_deg: Residual of the orientation there [deg]; None where places alone were read.
-        likelihood_ratio: Twice the gain in log-likelihood over the arm as stated.
+        level: Its name; `nominal` is the nominal arm.
+        unknowns: Number of free parameters.
+        rms_mm: Residual of the target's position in the fit [mm].
+        rms_deg: Residual of its orientation [deg]; None where only positions were read.
+        held_out_mm: Residual of the position at stops that were left out of the fit [mm].
+        held_out_deg: Residual of the orientation there [deg]; None where only positions were read.
+        likelihood_ratio: Twice the gain in log-likelihood over the nominal arm.
     """
 
     level: str
@@ -50,13 +50,13 @@ class ArmLevel:
 
 @dataclass(frozen=True)
 class JointBacklash:
-    """The play of a joint.
+    """Backlash of a joint.
 
     Attributes:
-        joint: Its name.
-        deadband_rad: How far apart the joint stands when it is approached from its two sides at the
-            same reading of its encoder [rad]. Negative where it alone overshoots.
-        sigma_rad: Its standard deviation [rad].
+        joint: The joint's name.
+        deadband_rad: Difference of the joint's angle between approaches from its two sides at the
+            same encoder reading [rad]; negative where the joint overshoots.
+        sigma_rad: Standard deviation of the deadband [rad].
     """
 
     joint: str
@@ -65,21 +65,21 @@ class JointBacklash:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it is beyond chance."""
+        """Whether it is significant."""
         return abs(self.deadband_rad) > _SURE * self.sigma_rad
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArmParameter:
-    """A number of the arm's table.
+    """Identified parameter of the arm's kinematic table.
 
     Attributes:
         joint: The joint that it belongs to.
-        name: What it is, with its unit: `theta_rad`, `a_m`; `ratio` has none.
-        nominal: As stated [rad or m].
-        identified: As found.
-        change: The latter less the former.
-        sigma: Standard deviation of the change; None where that is not known.
+        name: The parameter with its unit: `theta_rad`, `a_m`; `ratio` has none.
+        nominal: Nominal value [rad or m].
+        identified: Identified value [rad or m].
+        change: Identified minus nominal value [rad or m].
+        sigma: Standard deviation of the change [rad or m]; None where unknown.
     """
 
     joint: str
@@ -91,13 +91,13 @@ class ArmParameter:
 
     @property
     def is_sure(self) -> bool:
-        """Whether its change is beyond chance."""
+        """Whether its change is significant."""
         return self.sigma is not None and abs(self.change) > _SURE * self.sigma > 0.0
 
 
 @dataclass(frozen=True)
 class WorkspaceSigma:
-    """The predicted sigma of a tool's place over the workspace: median and 95 % quantile [mm]."""
+    """Predicted sigma of the tool's position over the workspace: median, 95 % quantile [mm]."""
 
     median: float
     p95: float
@@ -105,7 +105,7 @@ class WorkspaceSigma:
 
 @dataclass(frozen=True)
 class WorkspacePlace:
-    """A place of the flange in the base [m], and the predicted sigma of what it carries [mm]."""
+    """Position of the flange in the base [m], and predicted sigma of the tool there [mm]."""
 
     x_m: float
     y_m: float
@@ -115,12 +115,12 @@ class WorkspacePlace:
 
 @dataclass(frozen=True)
 class JointFunction:
-    """How far a joint turns beyond its offset and ratio, by its angle.
+    """Angle-dependent error of a joint, beyond offset and ratio.
 
     Attributes:
-        joint: Its name.
-        error_mrad: At equal steps from -180 degrees on, all around [mrad].
-        sigma_mrad: The standard deviation of that [mrad].
+        joint: The joint's name.
+        error_mrad: Error at equal steps of one turn from -180 degrees [mrad].
+        sigma_mrad: Its standard deviation [mrad].
     """
 
     joint: str
@@ -130,12 +130,12 @@ class JointFunction:
 
 @dataclass(frozen=True, kw_only=True)
 class JointFunctions:
-    """Repeatable errors of the joints by their angles.
+    """Angle-dependent errors of the joints, as functions with a Gaussian process prior.
 
     Attributes:
-        size_mrad: Their typical size [mrad].
-        length_deg: Over which change of its angle a joint's error changes [deg].
-        joints: Joint by joint.
+        size_mrad: Their standard deviation [mrad].
+        length_deg: Their correlation length in the joint's angle [deg].
+        joints: One entry for each joint.
     """
 
     size_mrad: float
@@ -154,14 +154,14 @@ _WHERE = {
 
 @dataclass(frozen=True)
 class CarriedRegion:
-    """A part of the workspace, as the calibrated arm and the arm as stated are predicted there.
+    """Predicted errors of calibrated and nominal arm in a region of the workspace.
 
     Attributes:
-        region: The box of the stops' flanges; beside it what is before, beside or behind the base,
-            the stops being before it.
-        sigma_mm: What the calibrated arm errs by there in another session (rms) [mm].
-        nominal_mm: The same of the arm as stated [mm].
-        better: Whether the former is clearly less.
+        region: The box of the stops' flange positions; outside it, the part ahead of, beside or
+            behind the base, the stops being ahead.
+        sigma_mm: Predicted error of the calibrated arm in another session (rms) [mm].
+        nominal_mm: The same of the nominal arm [mm].
+        better: Whether the calibrated arm's is significantly smaller.
     """
 
     region: Region
@@ -172,17 +172,17 @@ class CarriedRegion:
 
 @dataclass(frozen=True, kw_only=True)
 class CarriesOver:
-    """Where a calibrated arm is better than the arm as stated.
+    """Comparison of calibrated and nominal arm over the workspace.
 
     Attributes:
-        measured_mm: What it errs by at stops that were left out of the fit (rms) [mm].
-        measured_nominal_mm: The same of the arm as stated [mm].
-        sigma_mm: What it is predicted to err by outside the box of the stops in another session,
-            noise among it (rms over the workspace) [mm].
-        nominal_mm: The same of the arm as stated [mm].
-        session_mm: The share of another session in that, as it is taken of arms of this size [mm].
-        better_share: In which share of the workspace it is clearly better.
-        regions: Part by part.
+        measured_mm: Error of the calibrated arm at stops left out of the fit (rms) [mm].
+        measured_nominal_mm: The same of the nominal arm [mm].
+        sigma_mm: Predicted error of the calibrated arm outside the box of the stops in another
+            session, with noise (rms over the workspace) [mm].
+        nominal_mm: The same of the nominal arm [mm].
+        session_mm: Part of that for another session, as assumed for arms of this size [mm].
+        better_share: Share of the workspace where the calibrated arm is significantly better.
+        regions: One entry for each region.
     """
 
     measured_mm: float
@@ -195,7 +195,7 @@ class CarriesOver:
 
     @property
     def words(self) -> str:
-        """All this in a sentence or two."""
+        """The comparison in sentences."""
         worse = [_WHERE[region.region] for region in self.regions if not region.better]
         where = f"; {listed(worse)} it is not clearly better than as stated" if worse else ""
         return (
@@ -209,12 +209,12 @@ class CarriesOver:
 
 @dataclass(frozen=True)
 class JointRange:
-    """Between which positions a joint stood at the stops of the fit.
+    """Range of a joint's positions at the stops of the fit.
 
     Attributes:
-        joint: Its name.
-        lower: The least [rad or m].
-        upper: The greatest [rad or m].
+        joint: The joint's name.
+        lower: Smallest position [rad or m].
+        upper: Largest position [rad or m].
     """
 
     joint: str
@@ -224,18 +224,18 @@ class JointRange:
 
 @dataclass(frozen=True, kw_only=True)
 class Observability:
-    """How well the stops determine the arm.
+    """Observability of the arm's parameters at the stops.
 
     Attributes:
-        columns: How many values the fit carries, redundant ones among them.
-        identifiable: How many directions any stops could determine.
-        determined: How many these stops do.
-        condition: The best determined over the worst, scaled; None where none is.
-        o1: Geometric mean of the singular values over the root of the stops' number.
-        o2: The smallest over the largest.
-        o3: The smallest.
-        o4: The square of the smallest over the largest.
-        o5: The inverse of the sum of their inverses.
+        columns: Number of the fit's parameters, redundant ones included.
+        identifiable: Number of identifiable directions, with any stops.
+        determined: Number of directions that these stops determine.
+        condition: Condition number of the scaled Jacobian; None where no direction is determined.
+        o1: Geometric mean of the singular values over the root of the number of stops.
+        o2: Smallest over largest singular value.
+        o3: Smallest singular value.
+        o4: Square of the smallest over the largest singular value.
+        o5: Inverse of the sum of the inverse singular values.
     """
 
     columns: int
@@ -251,7 +251,7 @@ class Observability:
 
 @dataclass(frozen=True)
 class StopInfluence:
-    """A stop by its view, and by which share the mean variance would grow without it."""
+    """A stop by its view, and the relative growth of the mean variance without it."""
 
     view: int
     influence: Annotated[float, Key("worth")]
@@ -259,14 +259,14 @@ class StopInfluence:
 
 @dataclass(frozen=True, kw_only=True)
 class UnseenView:
-    """How far a view that the fit left out is off, by the arm as stated and as calibrated.
+    """Residual of a view that the fit left out, by nominal and calibrated arm.
 
     Attributes:
-        view: Its number.
-        nominal_mm: By the arm as stated [mm].
-        mm: By the calibrated one [mm].
-        nominal_deg: The former in rotation [deg]; None where places alone were read.
-        deg: The latter in rotation [deg]; likewise.
+        view: The view's number.
+        nominal_mm: By the nominal arm [mm].
+        mm: By the calibrated arm [mm].
+        nominal_deg: Rotation by the nominal arm [deg]; None where only positions were read.
+        deg: Rotation by the calibrated arm [deg]; None where only positions were read.
     """
 
     view: int
@@ -280,27 +280,28 @@ class UnseenView:
 class ArmResult(Section):
     """The calibrated arm: `kinematics` in calibration.json.
 
-    What follows the levels is there where one was taken, and its parameters where it frees some.
+    What follows the levels is present where one other than `nominal` was chosen, `parameters` where
+    that frees some.
 
     Attributes:
-        level: The level that was taken; `nominal` where none explains more than chance.
-        levels: All that were tried, the arm as stated first.
-        robot: The calibrated arm; None where it stays as stated.
-        backlash: The play of each joint, where stops were approached from both sides.
-        convention: Of the table that the parameters are in.
-        parameters: The table's numbers that were free.
-        workspace_sigma_mm: The predicted sigma of a tool's place over the workspace.
-        workspace_map: The same, place by place.
+        level: The chosen level; `nominal` where no level improves the fit significantly.
+        levels: All fitted levels, the nominal arm first.
+        robot: The calibrated arm; None at level `nominal`.
+        backlash: Backlash of each joint, where stops were approached from both sides.
+        convention: Convention of the kinematic table.
+        parameters: The identified parameters of the table.
+        workspace_sigma_mm: Predicted sigma of a tool's position over the workspace.
+        workspace_map: The same at each position.
         measured_map: The same at postures within the ranges of the joints at the stops, where the
-            stops determine more than at other postures of the same places.
-        carries_over: Where it is better than the arm as stated.
-        functions: Repeatable errors of its joints by their angles, at level `functions`.
-        measured: Over which ranges of its joints it was measured.
-        observability: How well the stops determine the arm.
-        not_determined: What they do not determine, in words.
-        stops: The stops by their influence, most first.
-        left_out: Views that were left out of the fit in turn.
-        holdout: Views that the session keeps from every fit.
+            stops determine more than at other postures with the same flange position.
+        carries_over: Comparison with the nominal arm over the workspace.
+        functions: Angle-dependent errors of the joints, at level `functions`.
+        measured: Ranges of the joints at the stops.
+        observability: Observability of the parameters at the stops.
+        not_determined: Undetermined directions, in words.
+        stops: The stops by influence, largest first.
+        left_out: Residuals of views that were left out of the fit in turn.
+        holdout: Residuals of views that the session holds out of every fit.
     """
 
     level: str
@@ -322,32 +323,27 @@ class ArmResult(Section):
     holdout: tuple[UnseenView, ...] = ()
 
     def __post_init__(self) -> None:
-        """Checks that the level that was taken is among those that were tried.
-
-        Raises:
-            ValueError: It is not.
-        """
         if self.is_calibrated and self.level not in [level.level for level in self.levels]:
             raise ValueError(f"level {self.level!r} is not among the levels")
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether a level was taken."""
+        """Whether a level other than `nominal` was chosen."""
         return self.level != NOMINAL
 
     @property
     def nominal(self) -> ArmLevel:
-        """The arm as stated, as a level."""
+        """The nominal arm's level."""
         return self.levels[0]
 
     @property
     def chosen(self) -> ArmLevel:
-        """The level that was taken."""
+        """The chosen level."""
         return next(level for level in self.levels if level.level == self.level)
 
     @cached_property
     def map_places_m(self) -> FloatArray:
-        """(k, 3) places of `workspace_map` in the base [m]."""
+        """(k, 3) positions of `workspace_map` in the base [m]."""
         return np.array(
             [(place.x_m, place.y_m, place.z_m) for place in self.workspace_map]
         ).reshape(-1, 3)
@@ -360,20 +356,20 @@ class ArmResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class ArmErrorsResult(Section):
-    """Errors that follow the arm's posture: `arm_errors` in calibration.json.
+    """Posture-dependent arm errors: `arm_errors` in calibration.json.
 
     Attributes:
-        sigma_mm: Typical error of a link's lengths, or of the flange's place an axis [mm].
-        sigma_deg: Typical error of the link's angles, or of the flange's rotation an axis [deg].
-        likelihood_ratio: By how much they explain the residuals better than white noise.
-        estimated: Whether they were estimated along with the transforms.
-        of: The `flange` where joints are not known: by so much, beside its noise, it errs from
-            posture to posture. None where the sizes are those of links.
-        away_mm: What looks at postures away from the views err by, in place (rms), as parts of the
-            postures that were left out in turn show it; None where that is not known [mm].
+        sigma_mm: Standard deviation of a link's lengths, or of the flange's position per axis [mm].
+        sigma_deg: The same of a link's angles, or of the flange's rotation per axis [deg].
+        likelihood_ratio: Twice the gain in log-likelihood over white noise.
+        estimated: Whether they were estimated together with the transforms.
+        of: `flange` where joints are unknown and the sizes are those of the flange's errors, beside
+            its noise; None where they are those of links.
+        away_mm: Position error at postures away from the views (rms), from leaving out parts of the
+            postures in turn; None where unknown [mm].
         away_deg: The same in rotation [deg].
-        away_predicted_mm: What was predicted of that [mm].
-        away_predicted_deg: The same in rotation [deg].
+        away_predicted_mm: Prediction of `away_mm` [mm].
+        away_predicted_deg: Prediction of `away_deg` [deg].
     """
 
     sigma_mm: float
@@ -389,17 +385,16 @@ class ArmErrorsResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class JointSpring:
-    """A joint as a spring.
+    """Compliance of a joint.
 
     Attributes:
-        joint: Its name.
-        compliance_rad_per_nm: Its compliance, zero or more [rad/(N m)].
-        sigma_rad_per_nm: The standard deviation of that; where the stops do not determine it, that
-            of springs at large.
-        determined: Whether the stops determine it; others stay rigid.
-        torque_nm: Least and greatest torque on it at the stops [N m].
-        stiffness_nm_per_rad: Its stiffness [N m/rad]; None where it is as good as rigid.
-        stiffness_sigma_nm_per_rad: The standard deviation of that, to first order [N m/rad].
+        joint: The joint's name.
+        compliance_rad_per_nm: Compliance, zero or more [rad/(N m)].
+        sigma_rad_per_nm: Its standard deviation; the prior's where the stops do not determine it.
+        determined: Whether the stops determine it; else the joint stays rigid.
+        torque_nm: Smallest and largest torque on it at the stops [N m].
+        stiffness_nm_per_rad: Stiffness [N m/rad]; None where practically rigid.
+        stiffness_sigma_nm_per_rad: Its standard deviation, to first order [N m/rad].
     """
 
     joint: str
@@ -413,7 +408,7 @@ class JointSpring:
 
 @dataclass(frozen=True)
 class Sag:
-    """How far the loads of the stops move the flange: in the median and at most [mm]."""
+    """Flange deflection under the loads of the stops: median and maximum [mm]."""
 
     median: float
     most: float
@@ -421,14 +416,14 @@ class Sag:
 
 @dataclass(frozen=True, kw_only=True)
 class LoadedStop:
-    """A stop as its load bends the arm.
+    """Load and deflection at one stop.
 
     Attributes:
-        view: The view that it goes by.
-        payload_kg: What the flange carried [kg].
-        sag_mm: How far the load moves the flange [mm].
+        view: Number of its first view.
+        payload_kg: Payload on the flange [kg].
+        sag_mm: Flange deflection under the load [mm].
         torque_nm: Torques on the joints [N m].
-        bend_mrad: How far this stop alone shows each joint to bend [mrad], where it does.
+        bend_mrad: Deflection by joint from this stop alone [mrad], where it determines it.
     """
 
     view: int
@@ -440,19 +435,19 @@ class LoadedStop:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ElasticResult(Section):
-    """The joints as springs: `elastic` in calibration.json.
+    """Joint compliance: `elastic` in calibration.json.
 
     Attributes:
-        joints: Joint by joint.
-        not_determined: The joints whose compliance the loads do not determine.
-        weight: Whether the weight of the links is of the model's masses, or unknown.
-        payload_kg: Least and greatest payload [kg].
-        sag_mm: How far the loads of the stops move the flange.
-        stops: The stops with torques and bends.
+        joints: One entry for each joint.
+        not_determined: Joints whose compliance the loads do not determine.
+        weight: Whether the links' weight is from the model's masses, or unknown.
+        payload_kg: Smallest and largest payload [kg].
+        sag_mm: Flange deflection under the loads of the stops.
+        stops: The stops with torques and deflections.
         weight_moments: (n, 4 n) compliance times unknown masses and first moments of links (see
-            `robot.bent_joints`); None where the masses are known, or hardly bend the arm.
-        payload_factor: By which factor payload and force bend the arm beyond what is stated; None
-            where nothing hung on the flange.
+            `robot.bent_joints`); None where the masses are known, or have little effect.
+        payload_factor: Ratio of the effective payload and force to the stated ones; None where
+            there was no payload.
     """
 
     joints: tuple[JointSpring, ...]
@@ -470,7 +465,7 @@ class ElasticResult(Section):
         return np.array([joint.compliance_rad_per_nm for joint in self.joints])
 
     def bends(self, joint: int) -> list[tuple[float, float]]:
-        """The torque [N m] on a joint and its bend [mrad], at the stops that show it."""
+        """A joint's torque [N m] and deflection [mrad], at the stops that determine the latter."""
         name = self.joints[joint].joint
         return [
             (stop.torque_nm[joint], stop.bend_mrad[name])
@@ -481,15 +476,15 @@ class ElasticResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class JointDrift:
-    """How a joint and the link behind it follow their temperature.
+    """Thermal drift of a joint and the link behind it.
 
     Attributes:
         joint: The joint's name.
-        reference_c: Temperature at which the arm is as calibrated [deg C].
+        reference_c: Temperature of the calibrated arm [deg C].
         growth_per_k: Relative growth of the link [1/K].
         drift_rad_per_k: Drift of the joint's zero [rad/K].
         tau_s: Time constant of the link's temperature [s].
-        gain_k_per_a2: Rise over the air for a squared motor current [K/A^2]; None where
+        gain_k_per_a2: Temperature rise over the air per squared motor current [K/A^2]; None where
             temperatures were measured.
         growth_sigma_per_k: Standard deviation of the growth [1/K].
         drift_sigma_rad_per_k: Standard deviation of the drift [rad/K].
@@ -511,7 +506,7 @@ class JointDrift:
 
 @dataclass(frozen=True, kw_only=True)
 class DriftResidual:
-    """Residuals of the views without drift, and with it [mm]."""
+    """Residuals of the views without and with the drift model [mm]."""
 
     without: float
     with_drift: Annotated[float, Key("with")]
@@ -519,13 +514,13 @@ class DriftResidual:
 
 @dataclass(frozen=True)
 class DriftPoint:
-    """How far the flange had moved at a time, in one posture of the session.
+    """Predicted drift of the flange at a time, in one posture of the session.
 
     Attributes:
-        stamp_s: The time, on the session's clock [s].
-        drift_mm: How far it had moved [mm].
-        sigma_mm: The standard deviation of that [mm].
-        rise_k: The largest rise of a link's temperature [K].
+        stamp_s: Time on the session's clock [s].
+        drift_mm: Drift of the flange [mm].
+        sigma_mm: Its standard deviation [mm].
+        rise_k: Largest rise of a link's temperature [K].
     """
 
     stamp_s: float
@@ -536,7 +531,7 @@ class DriftPoint:
 
 @dataclass(frozen=True)
 class ObservedDrift:
-    """How far a stop in that posture shows the flange to have moved [mm], and when [s]."""
+    """Drift of the flange observed at a stop in that posture [mm], with its time [s]."""
 
     view: int
     stamp_s: float
@@ -545,7 +540,7 @@ class ObservedDrift:
 
 @dataclass(frozen=True)
 class ViewDrift:
-    """How far the flange had drifted at a view [mm], and the largest rise of a link [K]."""
+    """Drift of the flange at a view [mm], and the largest temperature rise of a link [K]."""
 
     view: int
     drift_mm: float
@@ -554,21 +549,21 @@ class ViewDrift:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ThermalResult(Section):
-    """The arm's drift with its temperature: `thermal` in calibration.json.
+    """Thermal drift of the arm: `thermal` in calibration.json.
 
     Attributes:
-        heated_by: Whether joints' temperatures or motors' currents were recorded.
-        joints: Joint by joint.
+        heated_by: Whether joint temperatures or motor currents were recorded.
+        joints: One entry for each joint.
         covariance: (p, p) of growth and drift of all joints, then tau, and gain where there is one.
         lengths_m: (n + 1, 3) from each joint's frame to the next, in the earlier one [m].
-        not_determined: Coefficients that the views do not determine: what was known before counts.
+        not_determined: Coefficients that the views do not determine: they are the prior's.
         residual_mm: Residuals without and with drift.
-        likelihood_ratio: Twice the gain in log-likelihood over an arm that does not drift.
+        likelihood_ratio: Twice the gain in log-likelihood over an arm without drift.
         rises_k: (n,) range of each link's temperature over the views [K].
-        trained_s: How long the views took [s].
-        course: The predicted drift over time.
-        seen: The drift that stops in the same posture show; None in files of earlier versions.
-        views: The drift at each view.
+        trained_s: Duration of the views [s].
+        course: Predicted drift over time.
+        seen: Drift observed at stops in the same posture; None in files of earlier versions.
+        views: Drift at each view.
     """
 
     heated_by: Kind
@@ -585,11 +580,7 @@ class ThermalResult(Section):
     views: tuple[ViewDrift, ...]
 
     def model(self, robot: Robot) -> ThermalModel:
-        """The drifting arm.
-
-        Args:
-            robot: The arm at its reference temperatures.
-        """
+        """Thermal model of the arm; `robot` is the arm at its reference temperatures."""
         rows = self.joints
         gains = [1.0 if row.gain_k_per_a2 is None else row.gain_k_per_a2 for row in rows]
         return ThermalModel(
@@ -605,13 +596,13 @@ class ThermalResult(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmSections:
-    """What was found of an arm; None where it was not computed.
+    """Sections on an arm; None where not computed.
 
     Attributes:
-        arm_errors: Errors that follow its posture.
-        thermal: Its drift with temperature.
-        arm: Its kinematics, and how the level of its model was chosen.
-        elastic: Its joints as springs.
+        arm_errors: Posture-dependent errors.
+        thermal: Thermal drift.
+        arm: Kinematics, and the choice of the model's level.
+        elastic: Joint compliance.
     """
 
     arm_errors: ArmErrorsResult | None = None

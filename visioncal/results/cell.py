@@ -1,4 +1,4 @@
-"""What a result of a whole cell has by name, where one camera with one robot has one of each."""
+"""Result of a whole cell: cameras, robots and targets by name."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from visioncal.session.frames import CELL, frame_called, frames_of_kind, robots_
 
 @dataclass(frozen=True)
 class Moved:
-    """A frame that moved while the session was taken.
+    """A frame that moved during the session.
 
     Attributes:
-        frame: The frame; its transform in the result is where it stood last.
-        before: Its name in the result until then.
-        last_stop: The last stop at which it was seen where it stood before.
-        first_stop: The first stop at which it stands elsewhere.
-        shift_mm: How far its origin moved [mm].
-        turn_deg: How far it turned [deg].
-        rivals: Frames that may have moved in its place: the session does not show which.
+        frame: The frame; its transform in the result is the last one.
+        before: Name in the result of its earlier pose.
+        last_stop: Last stop at the earlier pose.
+        first_stop: First stop at the last pose.
+        shift_mm: Displacement of its origin [mm].
+        turn_deg: Rotation angle [deg].
+        rivals: Frames whose motion would explain the observations as well.
     """
 
     frame: str
@@ -38,7 +38,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class Untied:
-    """A frame that nothing ties to the rest, and what would, in a sentence."""
+    """A frame that no observation connects to the rest, and a remedy in a sentence."""
 
     frame: str
     remedy: str
@@ -46,21 +46,22 @@ class Untied:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CellResult:
-    """What was found of a whole cell beside its transforms and views.
+    """Result of a whole cell beside its transforms and views.
 
     Attributes:
-        reference: The frame that stands for the cell: the cell's frame is its.
-        tree: What each frame hangs on, by its name.
-        cameras: The cameras by name; one that has no name goes by `camera`.
-        robots: The robots by name, likewise: the nominal model, and what was found of the arm.
-        targets: What was printed, by name and as it is described.
+        reference: The frame that defines the cell's frame.
+        tree: Parent of each frame, by name.
+        cameras: The cameras by name; one without a name is `camera`.
+        robots: The robots by name, with nominal model and arm sections; one without a name is
+            `robot`.
+        targets: Documents of the targets, by name.
         noise: Estimated standard deviations, by frame or robot and by name.
-        moved: What moved while the session was taken.
-        untied: Frames that nothing ties to the rest.
-        weakest: The weakest link, in words.
+        moved: Frames that moved during the session.
+        untied: Frames that no observation connects to the rest.
+        weakest: The weakest connection, in words.
         details: Further figures.
-        joint_fit: The unknowns of the fit and their covariance, for a later check.
-        uncertainty: How well the cell is known.
+        joint_fit: Parameters of the fit and their covariance, for verification.
+        uncertainty: Uncertainty of the cell.
     """
 
     reference: str
@@ -78,19 +79,19 @@ class CellResult:
 
     @property
     def flanges(self) -> dict[str, str]:
-        """The robot of each flange, by the flange's frame."""
+        """Robot of each flange, by the flange's frame."""
         return {name: thing_name(name, "robot") for name in frames_of_kind(self.tree, "flange")}
 
     @property
     def mount(self) -> Mount:
-        """Where the cameras are; those of which some stand still, beside the robots."""
+        """`eye-in-hand` where all cameras are on robots, else `eye-to-hand`."""
         cameras = frames_of_kind(self.tree, "camera")
         carried = [bool(robots_between(self.tree, camera, CELL)) for camera in cameras]
         return "eye-in-hand" if carried and all(carried) else "eye-to-hand"
 
     @cached_property
     def lenses(self) -> dict[str, CameraResult]:
-        """The cameras by their frames."""
+        """Cameras by frame."""
         return {
             frame_called(self.tree, "camera", name): camera for name, camera in self.cameras.items()
         }

@@ -1,4 +1,4 @@
-"""Two calibrations of one cell, side by side: what changed between them, and what is noise."""
+"""Comparison of two calibrations of one cell: tests of changes against noise."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,20 +17,20 @@ from visioncal.results.edge import PoseSigmas
 from visioncal.session.choosing import ANY, Choice
 from visioncal.vision.camera import intrinsics
 
-# How often two calibrations of an unchanged cell may count as changed, over all tests of a pair.
+# Significance level of a pair of calibrations over all tests.
 FALSE_ALARMS = 0.01
-# No cell is known better [rad and m]; exact data would otherwise measure rounding by zero.
+# Smallest standard deviation in a test [rad, m], for exact data.
 _LEAST_SIGMA = 1e-9
-# Focusing changes a focal length by less than this share.
+# Largest relative change of the focal length by focusing.
 _OTHER_LENS = 0.05
 
 
 @dataclass(frozen=True)
 class Significance:
-    """Whether a difference is more than noise.
+    """Result of a significance test of a difference.
 
     Attributes:
-        p_value: How often noise alone makes a difference at least as large.
+        p_value: Probability of a difference at least as large by noise alone.
         limit: A smaller `p_value` is a change.
     """
 
@@ -39,24 +39,23 @@ class Significance:
 
     @property
     def is_change(self) -> bool:
-        """Whether noise does not explain the difference."""
+        """Whether the difference is significant."""
         return self.p_value < self.limit
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeChange(PoseSigmas):
-    """How one transform differs between two calibrations.
+    """Difference of one transform between two calibrations.
 
     Attributes:
-        name: Its name, such as `flange_from_cam`. That of a camera is compared in the frame of its
-            centre ray, where both calibrations have that (`Calibration.ray_frame`).
-        twist: (6,) of (rotation [rad], translation [m]) that leads from the first to the second,
-            on the right: `second = first * exp(twist)`.
-        covariance: (6, 6) of the twist, where nothing changed.
+        name: Its name, such as `flange_from_cam`. A camera's is compared in the frame of its centre
+            ray, where both calibrations have that (`Calibration.ray_frame`).
+        twist: (6,) rotation [rad] and translation [m] with `second = first * exp(twist)`.
+        covariance: (6, 6) of the twist if nothing changed.
         moved_mm: Distance between the two origins [mm].
         moved_deg: Angle between the two orientations [deg].
-        translation: Whether the distance is more than noise.
-        rotation: Whether the angle is more than noise.
+        translation: Test of the translation.
+        rotation: Test of the rotation.
     """
 
     name: str
@@ -69,20 +68,20 @@ class EdgeChange(PoseSigmas):
 
     @property
     def is_change(self) -> bool:
-        """Whether noise does not explain the difference."""
+        """Whether the difference is significant."""
         return self.translation.is_change or self.rotation.is_change
 
 
 @dataclass(frozen=True, eq=False)
 class LensChange:
-    """How the intrinsics differ between two calibrations.
+    """Difference of the intrinsics between two calibrations.
 
     Attributes:
         names: fx, fy, cx, cy and the names of the distortion's coefficients.
-        a: (k,) their values in the first.
-        b: (k,) their values in the second.
+        a: (k,) values in the first.
+        b: (k,) values in the second.
         sigmas: (k,) standard deviations of the differences; None where not both were estimated.
-        significance: Whether they differ by more than noise, all together; None likewise.
+        significance: Joint test of the differences; None where not both were estimated.
     """
 
     names: tuple[str, ...]
@@ -93,7 +92,7 @@ class LensChange:
 
     @property
     def is_change(self) -> bool:
-        """Whether the camera is another one: by more than noise, or as it was given."""
+        """Whether the intrinsics differ: significantly, or at all where not both were estimated."""
         if self.significance is None:
             return self.sigmas is None and not np.array_equal(self.a, self.b)
         return self.significance.is_change
@@ -101,7 +100,7 @@ class LensChange:
 
 @dataclass(frozen=True)
 class NoiseChange:
-    """One noise level of both calibrations; None where one of them has it not."""
+    """One noise level in both calibrations; None where absent."""
 
     name: str
     a: float | None
@@ -110,19 +109,19 @@ class NoiseChange:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two calibrations, side by side.
+    """Comparison of two calibrations.
 
     Attributes:
-        mounts: How the camera is mounted in each; `whole cell` of one.
+        mounts: The camera's mount in each; `whole cell` for one.
         verdicts: The verdict of each.
-        same_session: Whether both come from the same recorded facts, so that they share their
-            noise and are no independent measurements.
+        same_session: Whether both are of the same session, so that they share its noise and are not
+            independent.
         edges: The transforms that both have.
-        only_in_a: Names of those that only the first has.
-        only_in_b: Names of those that only the second has.
-        lens: The intrinsics, where both have a camera of one model and resolution.
+        only_in_a: Names of transforms that only the first has.
+        only_in_b: Names of transforms that only the second has.
+        lens: The intrinsics, where both cameras have the same model and resolution.
         noise: The noise levels.
-        findings: What it means, in plain sentences.
+        findings: Conclusions, in sentences.
     """
 
     mounts: tuple[str, str]
@@ -137,7 +136,7 @@ class Comparison:
 
     @property
     def is_change(self) -> bool:
-        """Whether anything changed by more than noise."""
+        """Whether a transform or the lens changed significantly."""
         return any(edge.is_change for edge in self.edges) or (
             self.lens is not None and self.lens.is_change
         )
@@ -154,41 +153,37 @@ def compare(
 ) -> Comparison:
     """Compares two calibrations as independent measurements of one cell.
 
-    Each transform has two tests, of its rotation and of its translation, on the components of
-    `log(a^-1 * b)`. Their covariances rest on scatter that few views show, so the squared distance
-    of Mahalanobis over three follows F (Hotelling 1931) with the degrees of freedom of both
-    noises together (Welch 1947). Intrinsics that both have estimated have one test, by chi-square:
-    thousands of corners show their noise. `FALSE_ALARMS` is divided among the tests (Bonferroni).
+    Rotation and translation of each transform are tested separately, on the components of
+    `log(a^-1 * b)`. Their covariances are estimated from few views, so the squared Mahalanobis
+    distance over three is F distributed (Hotelling 1931) with the combined degrees of freedom of
+    both noise estimates (Welch 1947). Intrinsics that both have estimated have one chi-square test,
+    since thousands of corners determine their noise. `FALSE_ALARMS` is divided among the tests
+    (Bonferroni).
 
-    What both calibrations share is no noise here, and cancels: the same given intrinsics, the same
-    board. The errors of an arm that stands at other stops do not cancel, and no covariance holds
-    them: they look like a change.
+    Errors that both calibrations share cancel: the same given intrinsics, the same board. Arm
+    errors at other stops do not cancel and are in no covariance: they look like a change.
 
     Args:
-        a: The first, against which the second is measured.
-        b: The second.
-        camera: Which camera is meant, of a whole cell's. Two whole cells of which nothing is named
+        a: The first calibration.
+        b: The second calibration.
+        camera: Name of the camera in a whole cell's calibration. Without any name, two whole cells
             are compared by all transforms that both have.
-        robot: Which robot, likewise.
-        target: Which target, likewise.
-
-    Returns:
-        What differs, by how much, and whether noise explains it.
+        robot: Name of the robot, likewise.
+        target: Name of the target, likewise.
 
     Raises:
-        DataError: There is no such thing, or one is of a whole cell and it is not clear what of it
-            is meant.
+        DataError: There is none of that name, or a name is needed.
     """
     choice = Choice(camera, robot, target)
     if choice or a.cell is None or b.cell is None:
-        # The names are of what is of a whole cell; where neither is, they are refused.
+        # Names select from whole cells; where neither is one, `chosen` refuses them.
         neither = a.cell is None and b.cell is None
         a, b = (
             calibration.chosen(choice if neither or calibration.cell is not None else ANY)
             for calibration in (a, b)
         )
     names = [name for name in a.edges if name in b.edges]
-    # Two tests a transform, and one of the lens.
+    # Two tests for each transform, and one for the lens.
     limit = FALSE_ALARMS / (2 * len(names) + 1)
     freedom = (_freedom(a), _freedom(b))
     edges = tuple(_edge_change(name, *_comparable(a, b, name), freedom, limit) for name in names)
@@ -211,8 +206,8 @@ def compare(
 
 
 def _comparable(a: Calibration, b: Calibration, name: str) -> tuple[Edge, Edge]:
-    """A transform of both; a camera's in the frame of its centre ray, where both have that."""
-    # Where an optical axis points is a convention that lenses take up: a ray is where it is.
+    """A transform in both; a camera's in the frame of its centre ray, where both have that."""
+    # The optical axis depends on the lens model's parameters; the direction of a ray does not.
     first, second = a.ray_frame, b.ray_frame
     if name != edge_names(a.mount)[0] or first is None or second is None:
         return a.edges[name], b.edges[name]
@@ -226,7 +221,7 @@ def _mount(calibration: Calibration) -> str:
 
 
 def _levels(calibration: Calibration) -> Mapping[str, float]:
-    """The noise by name; of a whole cell, with what it is of before it."""
+    """Noise levels by name; in a whole cell, prefixed by the frame or robot."""
     return {
         f"{of} {name}".strip(): level
         for of, levels in calibration.by_name.noise.items()
@@ -235,7 +230,7 @@ def _levels(calibration: Calibration) -> Mapping[str, float]:
 
 
 def _freedom(calibration: Calibration) -> int:
-    """Degrees of freedom of each noise: three residuals a view, and half of twelve unknowns."""
+    """Degrees of freedom of a noise level: three residuals a view less half of twelve unknowns."""
     used = sum(view.used for view in calibration.views)
     return max(3 * used - 6, 1)
 
@@ -243,35 +238,31 @@ def _freedom(calibration: Calibration) -> int:
 def _edge_change(name: str, a: Edge, b: Edge, freedom: tuple[int, int], limit: float) -> EdgeChange:
     first, second = a.matrix, b.matrix
     twist = log(invert(first) @ second)
-    # log(exp(-error_a) * exp(twist) * exp(error_b)) to first order: both errors are carried into
-    # the twist's own space before their covariances are added.
-    of_a, of_b = inverse_right_jacobian(-twist), inverse_right_jacobian(twist)
-    spreads = (of_a @ a.covariance @ of_a.T, of_b @ b.covariance @ of_b.T)
+    # First order of log(exp(-error_a) * exp(twist) * exp(error_b)) in both errors.
+    by_a, by_b = inverse_right_jacobian(-twist), inverse_right_jacobian(twist)
+    covariances = (by_a @ a.covariance @ by_a.T, by_b @ b.covariance @ by_b.T)
     moved_mm, moved_deg = pose_difference(first, second)
     rotation, translation = (
-        _hotelling(twist[part], [spread[part, part] for spread in spreads], freedom, limit)
+        _hotelling(twist[part], [each[part, part] for each in covariances], freedom, limit)
         for part in (slice(0, 3), slice(3, 6))
     )
     return EdgeChange(
-        name, twist, spreads[0] + spreads[1], moved_mm, moved_deg, translation, rotation
+        name, twist, covariances[0] + covariances[1], moved_mm, moved_deg, translation, rotation
     )
 
 
 def _hotelling(
-    difference: FloatArray,
-    spreads: Sequence[FloatArray],
-    freedom: Sequence[int],
-    limit: float,
+    difference: FloatArray, covariances: Sequence[FloatArray], freedom: Sequence[int], limit: float
 ) -> Significance:
-    """Tests a difference whose covariance is the sum of two, each of an estimated scale."""
-    sizes = np.array([np.trace(spread) for spread in spreads]) + _LEAST_SIGMA**2
-    together = sizes.sum() ** 2 / np.sum(sizes**2 / np.array(freedom))
-    squared, count = _squared_distance(difference, spreads[0] + spreads[1]), len(difference)
-    return Significance(float(fdtrc(count, together, squared / count)), limit)
+    """Tests a difference whose covariance is the sum of two of estimated scale."""
+    sizes = np.array([np.trace(covariance) for covariance in covariances]) + _LEAST_SIGMA**2
+    combined = sizes.sum() ** 2 / np.sum(sizes**2 / np.array(freedom))
+    squared, count = _squared_distance(difference, covariances[0] + covariances[1]), len(difference)
+    return Significance(float(fdtrc(count, combined, squared / count)), limit)
 
 
 def _squared_distance(difference: FloatArray, covariance: FloatArray) -> float:
-    """Squared distance of Mahalanobis, scaled: intrinsics are many powers of ten apart."""
+    """Squared Mahalanobis distance, scaled, since intrinsics differ by many powers of ten."""
     sigmas = np.sqrt(np.diag(covariance) + _LEAST_SIGMA**2)
     correlation = covariance / np.outer(sigmas, sigmas)
     np.fill_diagonal(correlation, 1.0)
@@ -311,11 +302,11 @@ def _findings(
             "the difference."
         )
     changed = [edge.name for edge in edges if edge.is_change]
-    longer = 1.0 if lens is None else float(lens.b[0] / lens.a[0])
-    is_other = abs(longer - 1.0) > _OTHER_LENS
-    if is_other:
+    ratio = 1.0 if lens is None else float(lens.b[0] / lens.a[0])
+    is_other_lens = abs(ratio - 1.0) > _OTHER_LENS
+    if is_other_lens:
         yield (
-            f"The focal length differs by {100.0 * abs(longer - 1.0):.0f} %: another camera, lens "
+            f"The focal length differs by {100.0 * abs(ratio - 1.0):.0f} %: another camera, lens "
             "or zoom. Where they are is then compared below, and nothing need have moved."
         )
     if a.cell is not None:
@@ -324,7 +315,7 @@ def _findings(
         yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
     else:
         yield _edge_finding(a.mount, changed)
-    if lens is not None and lens.is_change and not is_other:
+    if lens is not None and lens.is_change and not is_other_lens:
         yield (
             "The intrinsics differ: another camera, focus or zoom."
             if lens.significance is not None
@@ -355,7 +346,7 @@ _BOARD_MOVED = {
 
 
 def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
-    """Says which of the two bodies moved; an edge is named by the body at its end."""
+    """Sentence that says whether camera, board or both moved."""
     ends = [name.rpartition("_from_")[2] for name in changed]
     camera = any(end.startswith(("cam", "instrument")) for end in ends)
     board = any(end.startswith(("target", "probe")) for end in ends)
@@ -371,7 +362,7 @@ def _edge_finding(mount: Mount, changed: Sequence[str]) -> str:
 
 
 def _whole_finding(changed: Sequence[str]) -> str:
-    """Says which frames of a whole cell moved."""
+    """Sentence that says which frames of a whole cell moved."""
     if not changed:
         return "No transform changed: noise explains what differs."
     frames = [name.partition("_from_")[2] for name in changed]
@@ -379,7 +370,7 @@ def _whole_finding(changed: Sequence[str]) -> str:
 
 
 def to_document(comparison: Comparison) -> dict[str, Any]:
-    """Builds what `visioncal diff --json` prints; what was not computed is absent."""
+    """Document of `visioncal diff --json`; what was not computed is absent."""
     document: dict[str, Any] = {
         "is_change": comparison.is_change,
         "findings": list(comparison.findings),
@@ -440,13 +431,13 @@ def _present(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EdgeError:
-    """How far an edge is from the truth, beside what the calibration says of it.
+    """True error of an edge, and the calibration's sigma.
 
     Attributes:
-        mm: Its place [mm].
-        deg: Its rotation [deg].
-        sigma_mm: The calibration's sigma [mm].
-        sigma_deg: Likewise [deg].
+        mm: Error of its translation [mm].
+        deg: Error of its rotation [deg].
+        sigma_mm: Sigma of its translation [mm].
+        sigma_deg: Sigma of its rotation [deg].
     """
 
     mm: float
@@ -458,14 +449,9 @@ class EdgeError:
 def edge_errors(
     calibration: Calibration, transforms: Mapping[str, FloatArray]
 ) -> dict[str, EdgeError]:
-    """How far each edge is from its truth.
-
-    Args:
-        calibration: The result.
-        transforms: (4, 4) true edges by name.
-    """
-    found = {}
+    """True error of each edge, by the true transforms (4, 4) by name."""
+    errors = {}
     for name, edge in calibration.edges.items():
         mm, deg = pose_difference(transforms[name], edge.matrix)
-        found[name] = EdgeError(mm, deg, edge.sigma_mm, edge.sigma_deg)
-    return found
+        errors[name] = EdgeError(mm, deg, edge.sigma_mm, edge.sigma_deg)
+    return errors

@@ -1,4 +1,4 @@
-"""calibration.json, of one camera and one robot or of a whole cell, and alignment.json."""
+"""Forms of calibration.json (one camera and robot, or a whole cell) and of alignment.json."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from visioncal.results.result import Calibration
 
 
-# The file of a whole cell in an older form.
+# Former name of a whole cell's file.
 ALIGNMENT = "alignment.json"
 # The estimated transforms by name.
 Edges = Annotated[Mapping[str, StoredEdge], Key("transforms")]
@@ -38,27 +38,27 @@ Edges = Annotated[Mapping[str, StoredEdge], Key("transforms")]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationForm:
-    """calibration.json of one camera and one robot, but for its further sections.
+    """calibration.json of one camera and one robot, without its optional sections.
 
     Attributes:
-        schema: The version of this form.
-        visioncal: The version of the program.
-        created: When, in ISO 8601.
+        schema: Version of the file's form.
+        visioncal: Version of the program.
+        created: Time of creation, ISO 8601.
         session: The session.
         mount: How the camera is mounted.
-        edges: The estimated transforms by name.
-        joint_covariance: Their covariance together.
-        solvers: What every solver made of it.
+        edges: Estimated transforms by name.
+        joint_covariance: Joint covariance of all transforms.
+        solvers: Result of every solver.
         camera: The camera.
-        ray_frame: Its transform in the frame of its image's centre ray.
+        ray_frame: Its transform with z along the ray of the image's centre.
         robot: The nominal robot model.
         noise: Estimated standard deviations per axis, by name.
         views: One entry for each view of the session.
         rms: Residuals over the used views.
         validation: Residuals of views that were left out.
-        verdict: Whether to trust it.
-        need: What the task needs, and how likely picks meet it.
-        frames: Tools and fixtures by the transform that places them.
+        verdict: Verdict with its reasons.
+        need: Required accuracy of picks, and the probability of meeting it.
+        frames: Tools and fixtures by transform name.
     """
 
     schema: Literal[1]
@@ -81,11 +81,6 @@ class CalibrationForm:
     frames: Mapping[str, Frame] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Checks that there is a transform.
-
-        Raises:
-            ValueError: There is none.
-        """
         if not self.edges:
             raise ValueError("transforms is empty")
 
@@ -95,22 +90,22 @@ class CellForm:
     """calibration.json of a whole cell.
 
     Attributes:
-        schema: The version of this form.
-        visioncal: The version of the program.
-        created: When, in ISO 8601.
+        schema: Version of the file's form.
+        visioncal: Version of the program.
+        created: Time of creation, ISO 8601.
         session: The session.
-        cell: What it has by name.
-        edges: The estimated transforms by name.
-        joint_covariance: Their covariance together.
+        cell: Cameras, robots and targets by name.
+        edges: Estimated transforms by name.
+        joint_covariance: Joint covariance of all transforms.
         views: One entry for each observation.
-        rms: Residuals over the used ones.
-        verdict: Whether to trust it.
-        need: What the task needs, and how likely picks meet it.
-        validation: Residuals of what was left out.
-        frames: Tools and fixtures by the transform that places them.
-        boards: The boards by name, as they were found to be.
-        rigs: The rigs of points by name.
-        further: Sections that this version does not know.
+        rms: Residuals over the used observations.
+        verdict: Verdict with its reasons.
+        need: Required accuracy of picks, and the probability of meeting it.
+        validation: Residuals of left-out observations.
+        frames: Tools and fixtures by transform name.
+        boards: Estimated shapes of the boards by name.
+        rigs: Estimated shapes of the rigs of points by name.
+        further: Unknown sections, kept as they are.
     """
 
     schema: Literal[1]
@@ -133,7 +128,7 @@ class CellForm:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlignmentForm:
-    """alignment.json: a whole cell in an older form, with fewer sections and other names."""
+    """alignment.json: former file of a whole cell, with fewer sections and other names."""
 
     schema: Literal[1]
     visioncal: str = __version__
@@ -155,20 +150,20 @@ class AlignmentForm:
     details: CellDetails
 
 
-# Fields that a calibration has under the same names, and those that its cell has.
-_OTHERS = "schema visioncal session joint_covariance"
-_OF_PAIR = names_but(CalibrationForm, f"{_OTHERS} ray_frame")
-_OF_CELL = names_but(CellForm, f"{_OTHERS} views validation")
+# Fields of the forms that a calibration, or its cell, has under the same names.
+_CONVERTED = "schema visioncal session joint_covariance"
+_OF_PAIR = names_but(CalibrationForm, f"{_CONVERTED} ray_frame")
+_OF_CELL = names_but(CellForm, f"{_CONVERTED} views validation")
 _ALIGNED = ("created", "edges", "views", "verdict", "need")
-_IN_CELL = names_but(AlignmentForm, " ".join((_OTHERS, "flanges lenses", *_ALIGNED)))
+_IN_CELL = names_but(AlignmentForm, " ".join((_CONVERTED, "flanges lenses", *_ALIGNED)))
 
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
-    """Builds the content of calibration.json; what was not computed is absent."""
+    """Content of calibration.json; what was not computed is absent."""
     if calibration.cell is not None:
         return write(CellForm, _cell_form(calibration, calibration.cell))
     form = CalibrationForm(
-        # It follows from transform and camera, and is written for other readers.
+        # Derived from transform and camera; written for other readers.
         ray_frame=calibration.ray_frame,
         **_head(calibration),
         **{name: getattr(calibration, name) for name in _OF_PAIR},
@@ -187,7 +182,7 @@ def _cell_form(calibration: "Calibration", cell: CellResult) -> CellForm:
 
 
 def to_alignment(calibration: "Calibration", cell: CellResult) -> dict[str, Any]:
-    """Builds the content of alignment.json of a whole cell."""
+    """Content of alignment.json of a whole cell."""
     form = AlignmentForm(
         flanges=cell.flanges,
         lenses=cell.lenses,
@@ -199,7 +194,7 @@ def to_alignment(calibration: "Calibration", cell: CellResult) -> dict[str, Any]
 
 
 def _head(calibration: "Calibration") -> dict[str, Any]:
-    """What all forms have in other shapes."""
+    """Fields of all forms that a calibration holds in other types."""
     return {
         "schema": SCHEMA,
         "session": SessionForm(calibration.session_name, calibration.session_sha256),
@@ -208,26 +203,26 @@ def _head(calibration: "Calibration") -> dict[str, Any]:
 
 
 def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Reads the fields of a calibration from what `to_document` or `to_alignment` built.
+    """Fields of a calibration, read from a document of `to_document` or `to_alignment`.
 
     Raises:
-        DataError: It is of another schema, or no calibration; the message names the place.
+        DataError: It is of another schema, or no calibration; the message names the field.
     """
     check_schema(document)
     if "tree" in document:
-        return _of_cell(read(CellForm, document, ""))
+        return _cell_fields(read(CellForm, document, ""))
     if {"reference", "transforms"} <= document.keys():
-        return _of_alignment(read(AlignmentForm, document, ""))
+        return _alignment_fields(read(AlignmentForm, document, ""))
     form = read(CalibrationForm, document, "")
     _check_camera(form)
-    own = set().union(*(entry.keys for entry in entries(CalibrationForm)))
-    rest = {key: value for key, value in document.items() if key not in own}
-    found = {name: getattr(form, name) for name in _OF_PAIR}
-    return _of_head(form) | found | read_fields(CalibrationSections, rest, "")
+    known_keys = set().union(*(entry.keys for entry in entries(CalibrationForm)))
+    rest = {key: value for key, value in document.items() if key not in known_keys}
+    fields = {name: getattr(form, name) for name in _OF_PAIR}
+    return _head_fields(form) | fields | read_fields(CalibrationSections, rest, "")
 
 
-def _of_head(form: CalibrationForm | CellForm | AlignmentForm) -> dict[str, Any]:
-    """Reads what `_head` wrote."""
+def _head_fields(form: CalibrationForm | CellForm | AlignmentForm) -> dict[str, Any]:
+    """Inverse of `_head`."""
     return {
         "session_name": form.session.name,
         "session_sha256": form.session.sha256,
@@ -236,10 +231,10 @@ def _of_head(form: CalibrationForm | CellForm | AlignmentForm) -> dict[str, Any]
 
 
 def _check_camera(form: CalibrationForm) -> None:
-    """Refuses a result without the transform from which all begins that looks through the camera.
+    """Checks that the camera's transform is present.
 
     Raises:
-        DataError: So it is.
+        DataError: It is not.
     """
     camera = edge_names(form.mount)[0]
     if camera not in form.edges:
@@ -250,27 +245,27 @@ def _check_camera(form: CalibrationForm) -> None:
         )
 
 
-def _of_cell(form: CellForm) -> dict[str, Any]:
+def _cell_fields(form: CellForm) -> dict[str, Any]:
     views = tuple(view.result(form.cell.tree) for view in form.views)
-    found = _of_head(form) | _that_follow(form.cell, views)
+    fields = _head_fields(form) | _derived_fields(form.cell, views)
     if form.validation is not None:
-        found["validation"] = form.validation
-    return found | {name: getattr(form, name) for name in _OF_CELL}
+        fields["validation"] = form.validation
+    return fields | {name: getattr(form, name) for name in _OF_CELL}
 
 
-def _of_alignment(form: AlignmentForm) -> dict[str, Any]:
+def _alignment_fields(form: AlignmentForm) -> dict[str, Any]:
     cell = CellResult(
         cameras={thing_name(name, "camera"): lens for name, lens in form.lenses.items()},
         robots={},
         targets={},
         **{name: getattr(form, name) for name in _IN_CELL},
     )
-    found = _of_head(form) | _that_follow(cell, form.views)
-    return found | {name: getattr(form, name) for name in _ALIGNED}
+    fields = _head_fields(form) | _derived_fields(cell, form.views)
+    return fields | {name: getattr(form, name) for name in _ALIGNED}
 
 
-def _that_follow(cell: CellResult, views: tuple[ViewResult, ...]) -> dict[str, Any]:
-    """Fields of a whole cell's calibration that need not be on disk."""
+def _derived_fields(cell: CellResult, views: tuple[ViewResult, ...]) -> dict[str, Any]:
+    """Fields of a whole cell's calibration that are derived and not on disk."""
     return {
         "cell": cell,
         "mount": cell.mount,

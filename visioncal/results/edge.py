@@ -1,4 +1,4 @@
-"""A transform with its covariance, and how both stand on disk."""
+"""Transform with covariance, and their form in files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray
 
-# Forms of one pose that were rounded to six places agree to this [m, rad]; no cell is known better.
+# Largest difference between the forms of one pose, rounded to six places [m, rad].
 _SAME = 5e-6
-# What rounding leaves of a symmetric product: millionths of its correlations, where a rotation is
-# known a million times better than the levers that it is carried by [m].
+# Tolerance of correlations for symmetry and definiteness: rounding of J C J^T is amplified where a
+# rotation is known much better than the translation.
 _ROUNDING = 1e-3
 
 
 class PoseSigmas:
-    """What has the covariance of a pose, of its (rotation [rad], translation [m])."""
+    """Sigmas of a pose from its covariance of (rotation [rad], translation [m])."""
 
     covariance: FloatArray
 
@@ -37,10 +37,10 @@ class PoseSigmas:
 
 @dataclass(frozen=True, eq=False)
 class Edge(PoseSigmas):
-    """An edge of the tree of frames that was estimated.
+    """Estimated edge of the tree of frames.
 
     Attributes:
-        matrix: (4, 4) the edge, named `a_from_b` by its owner, exactly as it stands on disk.
+        matrix: (4, 4) the transform, named `a_from_b` by its owner, exactly as on disk.
         covariance: (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
     """
 
@@ -49,28 +49,28 @@ class Edge(PoseSigmas):
 
     @property
     def transform(self) -> RigidTransform:
-        """The edge as a transform; scipy makes it orthonormal anew, to the last digit."""
+        """The edge as a transform; scipy makes the matrix orthonormal, to the last digit."""
         return RigidTransform.from_matrix(self.matrix)
 
     @property
     def oriented(self) -> bool:
-        """Whether its rotation was measured; else it is chosen, and has no covariance."""
+        """Whether its rotation was estimated; else it is declared, and has no covariance."""
         return bool(self.covariance[:3, :3].any())
 
     @property
     def sigma_words(self) -> str:
-        """How well it is known, in words."""
+        """Its sigmas in words."""
         turned = f" and {figure(self.sigma_deg)} deg" if self.oriented else ""
         return f"sigma {figure(self.sigma_mm)} mm{turned}"
 
     def place_words(self, decimals: int = 2) -> str:
-        """Where it is, in millimetres with so many decimals."""
+        """Its translation in words, in millimetres with `decimals` decimals."""
         x, y, z = (f"{1e3 * value:.{decimals}f}" for value in self.transform.translation)
         return f"({x}, {y}, {z}) mm"
 
 
 def _covariance_fault(matrix: FloatArray) -> str:
-    """Says where a matrix is no covariance; empty for one."""
+    """Why a matrix is no covariance; empty for one."""
     variance = np.diagonal(matrix)
     scale = np.sqrt(np.where(variance > 0.0, variance, 1.0))
     if matrix.shape[0] != matrix.shape[1] or (variance < 0.0).any():
@@ -91,7 +91,7 @@ Covariance = Annotated[FloatArray, Array((-1, -1), _covariance_fault)]
 
 @dataclass(frozen=True, eq=False)
 class PoseForm:
-    """A transform in the forms that readers ask for.
+    """Transform in several redundant forms for readers.
 
     Attributes:
         matrix: (4, 4), its translation in metres.
@@ -105,15 +105,15 @@ class PoseForm:
 
     @classmethod
     def of(cls, matrix: FloatArray) -> "PoseForm":
-        """Writes a (4, 4) transform."""
+        """Form of a (4, 4) transform."""
         transform = RigidTransform.from_matrix(matrix)
         return cls(matrix, transform.rotation.as_quat(), matrix[:3, 3])
 
     def pose(self, path: str) -> FloatArray:
-        """(4, 4) the transform.
+        """(4, 4) the checked transform.
 
         Raises:
-            DataError: It is none, or its forms are of different ones.
+            DataError: The matrix is not rigid, or the forms are of different poses.
         """
         matrix, rotation = self.matrix, self.matrix[:3, :3]
         if (
@@ -124,14 +124,14 @@ class PoseForm:
         ):
             raise DataError(f"{path}.matrix is not a rigid transform.", culprits=[path])
         turned = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
-        said, name = self.translation_m, path.rpartition(".")[2]
-        for form, there, same in (
-            ("translation_m", said, np.allclose(said, matrix[:3, 3], 0.0, _SAME)),
+        stated, name = self.translation_m, path.rpartition(".")[2]
+        for form, value, same in (
+            ("translation_m", stated, np.allclose(stated, matrix[:3, 3], 0.0, _SAME)),
             ("quaternion_xyzw", self.quaternion_xyzw, np.allclose(turned, rotation, 0.0, _SAME)),
         ):
             if not same:
                 raise DataError(
-                    f"{name}: {form} is {there.tolist()}, and its matrix is that of another pose: "
+                    f"{name}: {form} is {value.tolist()}, and its matrix is that of another pose: "
                     f"{matrix.tolist()}.",
                     culprits=[f"{name}: {form}", f"{name}: matrix"],
                     next_step="Somebody changed one of them: take the file as calibrate wrote it.",
@@ -141,7 +141,7 @@ class PoseForm:
 
 @dataclass(frozen=True, eq=False)
 class EdgeForm(PoseForm):
-    """A transform with its covariance.
+    """Transform with its covariance.
 
     Attributes:
         covariance: (6, 6) of its (rotation [rad], translation [m]) perturbation on the right.
@@ -170,12 +170,12 @@ StoredEdge = Annotated[
 
 @dataclass(frozen=True, eq=False)
 class JointCovariance:
-    """The covariance of all transforms together, and their names in its order."""
+    """Joint covariance of all transforms, and their names in its order."""
 
     order: tuple[str, ...]
     matrix: Covariance
 
     @classmethod
     def of(cls, edges: Mapping[str, Edge], matrix: FloatArray) -> "JointCovariance":
-        """Writes the covariance of some transforms."""
+        """Form of the joint covariance of some transforms."""
         return cls(tuple(edges), matrix)

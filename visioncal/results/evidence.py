@@ -1,4 +1,4 @@
-"""What was seen and computed of each view, for the report and the recording."""
+"""Observations and predictions of each view, for report and recording."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ import numpy as np
 from visioncal.core.types import Corners, FloatArray
 
 _STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-# Residuals of ordinary size are drawn about this share of the image's width long.
+# Drawn length of an rms residual, as a share of the image's width.
 _SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class ExplainedImage:
-    """How far a calibration, with blur and light as measured, explains an image.
+    """An image compared with its rendering by the calibration, with measured blur and light.
 
     Attributes:
-        drawn: The image with the board as it should look in its place, as JPEG.
-        rest: What that leaves of the image, magnified, about a middle grey, as JPEG.
-        words: What blurs the image, and how much is left, in Markdown.
+        drawn: The image with the board rendered in its place, as JPEG.
+        rest: The magnified difference, about a middle grey, as JPEG.
+        words: Description of blur and difference, in Markdown.
     """
 
     drawn: bytes
@@ -29,17 +29,16 @@ class ExplainedImage:
 
 @dataclass(frozen=True, eq=False)
 class ViewEvidence:
-    """What was seen and computed of one view, for the report and the recording.
+    """Observations and predictions of one view, for report and recording.
 
     Attributes:
         view: The view's number.
-        corners: The corners that were found, if any.
-        predicted_px: (n, 2) where the calibrated chain puts these corners [px].
-        base_from_flange: (4, 4) as the controller reported it, or as the calibrated arm has it
-            where there is one.
-        cam_from_target: (4, 4) as this view alone shows it.
-        explained: How far its image is explained, where that was looked at; it is drawn, and not
-            read back.
+        corners: The detected corners, if any.
+        predicted_px: (n, 2) projection of these corners by the calibrated chain [px].
+        base_from_flange: (4, 4) as reported by the controller, or by the calibrated arm where there
+            is one.
+        cam_from_target: (4, 4) as estimated from this view alone.
+        explained: Comparison of image and rendering, where computed; not read back.
     """
 
     view: int
@@ -51,15 +50,14 @@ class ViewEvidence:
 
 
 def magnification(evidence: Iterable[ViewEvidence], image_width: int) -> int:
-    """Chooses a round factor that makes residuals visible in an image.
+    """Chooses a round magnification of residuals that makes them visible in an image.
 
     Args:
-        evidence: The views that are drawn with this factor; those without predictions count not.
+        evidence: The views to draw; those without predictions are ignored.
         image_width: Width of their images [px].
 
     Returns:
-        The factor, such that the root mean square residual is drawn at most a fiftieth of the
-        image's width long.
+        A factor by which the rms residual is at most a fiftieth of the image's width long.
     """
     errors = [
         view.predicted_px - view.corners.px

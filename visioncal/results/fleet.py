@@ -1,4 +1,4 @@
-"""Results of many sessions as rows: what stands out among them, and what changed since a time."""
+"""Results of many sessions as rows: outliers among them, and changes since earlier results."""
 
 import math
 from collections import Counter, defaultdict
@@ -14,60 +14,60 @@ from visioncal.results.result import Calibration
 
 State: TypeAlias = Literal["done", "kept", "failed"]
 
-# Of fewer robots of one model there is no usual one.
+# Smallest number of results that are compared with each other.
 _FEWEST = 5
-# Robust standard scores beyond which a value is none of its fleet's (Iglewicz and Hoaglin 1993).
+# Robust standard score beyond which a value is an outlier (Iglewicz and Hoaglin 1993).
 _LIMIT = 3.5
-# Levels of noise of sound cells differ by so much (of their logarithm), even where all that are
-# compared agree better; focal lengths of lenses of one type by so much.
+# Smallest standard deviations of logarithms in the score: of noise levels, and of focal lengths of
+# one type of lens.
 _SPREAD, _LENS_SPREAD = 0.2, 0.01
-# Of a normal distribution, the standard deviation in median absolute deviations.
+# Ratio of standard deviation to median absolute deviation of a normal distribution.
 _MAD = 1.4826
-# A model that so few sessions have, beside one that most have, is the odd one.
+# Largest share of an outlying robot model, smallest share of the usual one, and the former's score.
 _FEW, _MOST = 0.2, 0.5
-_ODD_MODEL = 100.0
+_MODEL_SCORE = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class FleetRow:
-    """What became of one session of a batch; texts are empty and figures None where there is none.
+    """Result of one session of a batch; absent texts are empty and absent figures None.
 
     Attributes:
-        name: Of the session, and of its result's folder.
-        session: Its path.
+        name: Name of the session and of its result's folder.
+        session: Path of the session.
         state: `done`, `kept` of an earlier run, or `failed`.
         verdict: good, check or bad.
         words: The verdict's first sentence, or why there is no result.
-        error: The class of the error.
-        next_step: What to do about it.
-        session_sha256: Digest of its facts.
-        visioncal: The version that calibrated it.
-        created: When, in ISO 8601.
-        robot: Its model.
-        mount: Where the camera is.
-        camera: The image's size.
-        views: How many there are.
-        used: How many the fit used.
-        residual_mm: Root mean square over these.
-        residual_deg: Likewise.
-        residual_px: Likewise.
-        noise_mm: Standard deviation of the robot's place, per axis; of poses, both noises together.
-        noise_deg: Of its rotation.
-        noise_px: Of a corner.
-        sigma_mm: Of the camera's place.
-        sigma_deg: Of its rotation.
-        radius95_mm: Within which 95 % of points are placed where the views look.
-        arm_mm: Typical error of the arm's links.
-        drift_mm: How far the arm's drift with temperature went.
-        focal_px: Mean focal length.
-        error_mm: How far the camera's place is from the truth, of a simulated cell.
-        seconds: How long it took.
-        has_picture: Whether there is a picture of it in its folder.
-        has_report: Whether there is a report.
-        score: How far it is from its fleet, in robust standard deviations; 0 within the limit.
-        stands_out: By what.
+        error: Class of the error.
+        next_step: Remedy of the error.
+        session_sha256: Digest of the session.
+        visioncal: Version that calibrated it.
+        created: Time of creation, ISO 8601.
+        robot: Model of the robot.
+        mount: Mount of the camera.
+        camera: Size of its images.
+        views: Number of views.
+        used: Number of views in the fit.
+        residual_mm: Root mean square residual of these [mm].
+        residual_deg: The same in rotation [deg].
+        residual_px: The same of corners [px].
+        noise_mm: Noise of the robot's position per axis, or of robot and camera combined [mm].
+        noise_deg: The same in rotation [deg].
+        noise_px: Noise of a corner [px].
+        sigma_mm: Sigma of the camera's position [mm].
+        sigma_deg: Sigma of its rotation [deg].
+        radius95_mm: Error of located points that 95 % do not exceed, where the views look [mm].
+        arm_mm: Standard deviation of the arm's link errors [mm].
+        drift_mm: Largest thermal drift of the arm [mm].
+        focal_px: Mean focal length [px].
+        error_mm: True error of the camera's position, in a simulated cell [mm].
+        seconds: Duration of the calibration [s].
+        has_picture: Whether its folder has a picture.
+        has_report: Whether its folder has a report.
+        score: Largest robust standard score among its fleet; 0 within the limit.
+        stands_out: What the score is of, in words.
         changed: Whether its result differs from an earlier one by more than that one's sigmas.
-        change: By what.
+        change: What differs, in words.
     """
 
     name: str
@@ -108,40 +108,40 @@ class FleetRow:
 
     @property
     def group(self) -> str:
-        """The folder that it shares with other sessions, as those of one robot; empty for none."""
+        """Parent folder that it shares with other sessions, as those of one robot; or empty."""
         return self.name.rpartition("/")[0]
 
 
-def row_of(name: str, session: str, found: Calibration, version: str) -> FleetRow:
-    """The row of a result."""
-    size = None if found.camera is None else found.camera.camera.resolution
-    matrix = None if found.camera is None else found.camera.camera.matrix
-    known, arm, drift = found.budget, found.arm_errors, found.thermal
-    edge = found.edges[camera_edge(found)]
-    noise = {key: value for key, value in found.noise.items() if math.isfinite(value)}
+def row_of(name: str, session: str, calibration: Calibration, version: str) -> FleetRow:
+    """Row of a result."""
+    size = None if calibration.camera is None else calibration.camera.camera.resolution
+    matrix = None if calibration.camera is None else calibration.camera.camera.matrix
+    budget, arm, drift = calibration.budget, calibration.arm_errors, calibration.thermal
+    edge = calibration.edges[camera_edge(calibration)]
+    noise = {key: value for key, value in calibration.noise.items() if math.isfinite(value)}
     return FleetRow(
         name=name,
         session=session,
         state="done",
-        verdict=found.verdict.status,
-        words=next(iter(found.verdict.reasons), found.verdict.headline),
-        session_sha256=found.session_sha256,
+        verdict=calibration.verdict.status,
+        words=next(iter(calibration.verdict.reasons), calibration.verdict.headline),
+        session_sha256=calibration.session_sha256,
         visioncal=version,
-        created=found.created,
-        robot="" if found.robot is None else found.robot.name,
-        mount=found.mount,
+        created=calibration.created,
+        robot="" if calibration.robot is None else calibration.robot.name,
+        mount=calibration.mount,
         camera="" if size is None else f"{size[0]} x {size[1]}",
-        views=len(found.views),
-        used=sum(view.used for view in found.views),
-        residual_mm=found.rms.mm,
-        residual_deg=found.rms.deg,
-        residual_px=found.rms.px,
+        views=len(calibration.views),
+        used=sum(view.used for view in calibration.views),
+        residual_mm=calibration.rms.mm,
+        residual_deg=calibration.rms.deg,
+        residual_px=calibration.rms.px,
         noise_mm=noise.get("robot_translation_mm", noise.get("combined_translation_mm")),
         noise_deg=noise.get("robot_rotation_deg", noise.get("combined_rotation_deg")),
         noise_px=noise.get("pixel_px"),
         sigma_mm=edge.sigma_mm,
         sigma_deg=edge.sigma_deg if edge.oriented else None,
-        radius95_mm=None if known is None else known.radius95_mm,
+        radius95_mm=None if budget is None else budget.radius95_mm,
         arm_mm=None if arm is None else arm.sigma_mm,
         drift_mm=None
         if drift is None
@@ -150,24 +150,24 @@ def row_of(name: str, session: str, found: Calibration, version: str) -> FleetRo
     )
 
 
-def camera_edge(found: Calibration) -> str:
-    """The name of the transform that places the camera, or what is observed in its place."""
-    placed = (edge for edge in found.edges if edge.rpartition("_from_")[2].startswith("cam"))
-    return next(placed, next(iter(found.edges)))
+def camera_edge(calibration: Calibration) -> str:
+    """Name of the camera's transform, or else of the first one."""
+    placed = (edge for edge in calibration.edges if edge.rpartition("_from_")[2].startswith("cam"))
+    return next(placed, next(iter(calibration.edges)))
 
 
 @dataclass(frozen=True)
 class CellFigures:
-    """What many simulated cells of one kind came to; figures are None where none has a result.
+    """Statistics of simulated cells of one group; None where none has a result.
 
     Attributes:
-        name: What they have in common.
-        count: How many there are.
-        results: How many have a result.
-        good: How many of them are good.
-        radius95_mm: Predicted: within which 95 % of points are placed; the median.
-        sigma_mm: Predicted: of the camera's place; the median.
-        error_mm: True: how far 95 % of the cameras' places are off at most.
+        name: The group.
+        count: Number of cells.
+        results: Number with a result.
+        good: Number with the verdict good.
+        radius95_mm: Median of the predicted 95 % radius [mm].
+        sigma_mm: Median of the camera position's sigma [mm].
+        error_mm: 95 % quantile of the camera position's true error [mm].
     """
 
     name: str
@@ -180,38 +180,38 @@ class CellFigures:
 
 
 def cell_figures(rows: Sequence[FleetRow]) -> list[CellFigures]:
-    """The figures of simulated cells by what they have in common."""
+    """Statistics of simulated cells by group."""
     groups: dict[str, list[FleetRow]] = defaultdict(list)
     for item in sorted(rows, key=lambda row: row.name):
         groups[item.group].append(item)
 
-    def share(some: Sequence[FleetRow], field: str, percent: float) -> float | None:
-        values = [value for row in some if (value := getattr(row, field)) is not None]
+    def quantile(members: Sequence[FleetRow], field: str, percent: float) -> float | None:
+        values = [value for row in members if (value := getattr(row, field)) is not None]
         return float(np.percentile(values, percent)) if values else None
 
     return [
         CellFigures(
             name,
-            len(some),
-            sum(row.state != "failed" for row in some),
-            sum(row.verdict == "good" for row in some),
-            share(some, "radius95_mm", 50.0),
-            share(some, "sigma_mm", 50.0),
-            share(some, "error_mm", 95.0),
+            len(members),
+            sum(row.state != "failed" for row in members),
+            sum(row.verdict == "good" for row in members),
+            quantile(members, "radius95_mm", 50.0),
+            quantile(members, "sigma_mm", 50.0),
+            quantile(members, "error_mm", 95.0),
         )
-        for name, some in groups.items()
+        for name, members in groups.items()
     ]
 
 
 @dataclass(frozen=True)
 class _Measure:
-    """Something that the sessions of one fleet have in common.
+    """Figure that is compared among the sessions of a fleet.
 
     Attributes:
-        words: What it is.
+        words: Its name in messages.
         unit: Its unit.
-        spread: What sound ones differ by, of the logarithm.
-        is_worse_above: Whether only more of it is odd.
+        spread: Smallest standard deviation of its logarithm.
+        is_worse_above: Whether only large values are outliers.
     """
 
     words: str
@@ -232,23 +232,23 @@ _MEASURES: Mapping[str, _Measure] = {
 
 
 def with_outliers(rows: Sequence[FleetRow]) -> list[FleetRow]:
-    """The rows with what stands out of each, those first that stand out the most.
+    """The rows with their outlier scores, largest scores first.
 
-    Sessions of one robot's model are compared, lenses also by the image's size: the logarithm of
-    each figure by its median and median absolute deviation, which half of a fleet cannot shift.
+    Sessions of one robot model are compared (lenses also of one image size): the score is that of
+    each figure's logarithm by median and median absolute deviation, robust to half of a fleet.
     """
     scores: dict[str, float] = defaultdict(float)
     words: dict[str, list[str]] = defaultdict(list)
-    for name, score, sentence in [*_odd_models(rows), *_odd_figures(rows)]:
+    for name, score, sentence in [*_model_outliers(rows), *_figure_outliers(rows)]:
         scores[name] = max(scores[name], score)
         words[name].append(sentence)
-    found = [replace(row, score=scores[row.name], stands_out="; ".join(words[row.name]))
+    scored = [replace(row, score=scores[row.name], stands_out="; ".join(words[row.name]))
              for row in rows]  # fmt: skip
     order = {"": 0, "bad": 1, "check": 2, "good": 3}
-    return sorted(found, key=lambda value: (-value.score, order.get(value.verdict, 0), value.name))
+    return sorted(scored, key=lambda value: (-value.score, order.get(value.verdict, 0), value.name))
 
 
-def _odd_models(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
+def _model_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
     counts = Counter(row.robot for row in rows if row.robot)
     if not counts:
         return []
@@ -257,14 +257,14 @@ def _odd_models(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
     if total < _FEWEST or most < _MOST * total:
         return []
     return [
-        (row.name, _ODD_MODEL, f"its robot is a {row.robot}, where {most} of {total} are {usual}")
+        (row.name, _MODEL_SCORE, f"its robot is a {row.robot}, where {most} of {total} are {usual}")
         for row in rows
         if row.robot and row.robot != usual and counts[row.robot] <= _FEW * total
     ]
 
 
-def _odd_figures(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
-    found = []
+def _figure_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
+    outliers = []
     for field, measure in _MEASURES.items():
         groups: dict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)
         for row in rows:
@@ -274,20 +274,20 @@ def _odd_figures(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
                 groups[row.robot, camera].append((row.name, value))
         for members in groups.values():
             if len(members) >= _FEWEST:
-                found += _beyond(members, measure)
-    return found
+                outliers += _outliers(members, measure)
+    return outliers
 
 
-def _beyond(
+def _outliers(
     members: Sequence[tuple[str, float]], measure: _Measure
 ) -> list[tuple[str, float, str]]:
     logs = np.log([value for _, value in members])
-    middle = float(np.median(logs))
-    spread = max(_MAD * float(np.median(np.abs(logs - middle))), measure.spread)
-    scores = (logs - middle) / spread
+    median = float(np.median(logs))
+    spread = max(_MAD * float(np.median(np.abs(logs - median))), measure.spread)
+    scores = (logs - median) / spread
     if not measure.is_worse_above:
         scores = np.abs(scores)
-    usual = float(np.exp(middle))
+    usual = float(np.exp(median))
     return [
         (
             name,
@@ -305,26 +305,23 @@ def with_changes(
     before: Callable[[str], Calibration | None],
     after: Callable[[str], Calibration | None],
 ) -> list[FleetRow]:
-    """The rows with how each result differs from an earlier one of the same session.
+    """The rows with each result's difference from an earlier one of the same session.
 
-    Args:
-        rows: The rows.
-        before: The earlier result by name; None where there is none.
-        after: The present one; likewise.
+    `before` and `after` give the earlier and the present result by name, None where there is none.
     """
-    found = []
+    compared = []
     for row in rows:
         old, new = before(row.name), after(row.name)
         if old is None and new is None:
-            found.append(row)
+            compared.append(row)
             continue
         change = _change(old, new)
-        found.append(replace(row, changed=bool(change), change=change))
-    return found
+        compared.append(replace(row, changed=bool(change), change=change))
+    return compared
 
 
 def _change(old: Calibration | None, new: Calibration | None) -> str:
-    """What differs by more than the earlier result's sigmas; empty for nothing."""
+    """Differences larger than the earlier result's sigmas, in words; empty for none."""
     if old is None:
         return "there was no result"
     if new is None:

@@ -1,4 +1,4 @@
-"""A tool's or a fixture's frame, and the file of frames that belong to no calibration."""
+"""Frame of a tool or fixture, and the file of frames without a calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,14 +17,14 @@ _SCHEMA = 1
 
 @dataclass(frozen=True)
 class Observation:
-    """One touch, point or view that a frame was placed by; what is unknown is None.
+    """One touch, point or view of a frame's fit.
 
     Attributes:
-        name: Which it is: the row's view number, or the point's name.
+        name: The row's view number, or the point's name.
         used: Whether the fit used it.
-        reason: What is wrong with it, in words; empty where nothing is.
-        kind: What was touched, as `point`, `z`, `xz`; empty where it has no kinds.
-        residual_mm: How far it is off from the frame [mm].
+        reason: Why it is an outlier or in doubt, in words; else empty.
+        kind: Kind of the touch, as `point`, `z`, `xz`; else empty.
+        residual_mm: Its residual [mm]; None where unknown.
     """
 
     name: str
@@ -36,20 +36,20 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where a tool sits on the flange, or a fixture in the base.
+    """Pose of a tool on the flange, or of a fixture in the base.
 
     Attributes:
-        edge: `flange_from_tool` or `base_from_fixture`, by its owner's name for it.
-        oriented: Whether the rotation was measured; else it is the parent's own, by declaration,
-            and has no covariance.
-        method: How it was obtained, in words.
-        source: What it was obtained from: a file's or a session's name.
-        created: When, in ISO 8601.
-        rms_mm: Root mean square of what the used observations are off [mm].
+        edge: `flange_from_tool` or `base_from_fixture`.
+        oriented: Whether the rotation was measured; else it is declared as the parent's, and has no
+            covariance.
+        method: Description of the method.
+        source: Name of the file or session it was estimated from.
+        created: Time of creation, ISO 8601.
+        rms_mm: Root mean square residual of the used observations [mm].
         noise_mm: Estimated standard deviation of one observation, per axis [mm].
         observations: One entry for each touch, point or view.
-        verdict: Whether to trust it.
-        details: Further figures of the method, as they stand on disk.
+        verdict: Verdict with its reasons.
+        details: Further figures of the method.
     """
 
     edge: Annotated[StoredEdge, INLINE]
@@ -66,16 +66,16 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FrameFile:
-    """Frames that belong to no calibration: of a robot without a camera.
+    """File of frames without a calibration, for a robot without a camera.
 
     Attributes:
-        frames: The frames by the transform that places them.
+        frames: The frames by transform name.
     """
 
     frames: Mapping[str, Frame]
 
     def save(self, path: Path | str) -> None:
-        """Writes the file, whole or not at all."""
+        """Writes the file atomically."""
         document = {
             "schema": _SCHEMA,
             "visioncal": __version__,
@@ -85,17 +85,17 @@ class FrameFile:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Reads such a file.
+        """Reads a file of frames.
 
         Raises:
-            DataError: It is missing, or no file of frames of a known schema.
+            DataError: It is missing, or not a file of frames of a known schema.
         """
         with reading(str(path), "frames", "Run visioncal tcp or visioncal fixture again."):
             return cls(_read_file(parse_stored(read_bytes(path), str(path))))
 
 
 def frames_document(frames: Mapping[str, Frame]) -> dict[str, Any]:
-    """Writes frames as JSON has them."""
+    """JSON form of frames."""
     return write(FrameFile, FrameFile(frames))["frames"]  # type: ignore[no-any-return]
 
 

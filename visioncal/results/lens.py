@@ -1,9 +1,9 @@
-"""A camera in a result, how it stands on disk, and as far as coefficients alone can say it.
+"""Camera in a result: intrinsics, field beyond the lens model, and the frame of its centre ray.
 
-A lens that is decentered, or a thin prism, looks like one that is turned: residuals show no
-difference, and where its optical axis points is a convention. Where the ray of a pixel points is
-none: two calibrations of one camera agree about it, whatever models their lenses have. So the
-camera's transform is given in the frame of one ray, too.
+A decentered lens or a thin prism cannot be distinguished from a rotation of the camera, so the
+direction of the optical axis depends on the lens model. The direction of a pixel's ray does not:
+two calibrations of one camera agree about it with any lens models. Therefore the camera's transform
+is also given in the frame of one ray.
 """
 
 from dataclasses import dataclass, replace
@@ -25,13 +25,13 @@ from visioncal.vision.camera import (
     with_intrinsics,
 )
 
-# Pixels along the image's width and height to which coefficients are fitted, and steps of that.
+# Grid of pixels along the image's width and height for fitting coefficients, and iterations.
 _GRID, _STEPS = (40, 32), 5
-# A field of less where it was seen changes nothing [px].
+# Smallest rms of a field that is fitted [px].
 _NOTICED_PX = 0.01
-# What counts as seen: where the field is known to better than so much of its variance.
+# Share of the prior variance by which the field must be determined to count as observed.
 _SEEN = 0.5
-# Combinations of coefficients that move no pixel stay.
+# Relative singular value below which a combination of coefficients is undetermined.
 _DETERMINED = 1e-8
 
 # Steps of central differences [rad], whose truncation is their square.
@@ -40,22 +40,23 @@ _STEP = 1e-5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LensField(Section):
-    """What a lens does beyond its model: `field` of a camera in calibration.json.
+    """Displacement field beyond the lens model: `field` of a camera in calibration.json.
 
-    A pixel is displaced by m coefficients of variance one beforehand, those of the field first and
-    then that of breathing: see `estimation.lens_field`.
+    A pixel's displacement is linear in m coefficients with unit prior variance, those of the smooth
+    field first, then that of breathing: see `estimation.lens_field`.
 
     Attributes:
-        field_px: Standard deviation of a smooth field over the image, an axis [px].
-        length: Its length, as a share of the image's width.
-        breathing: Standard deviation of the focal length's change as the distance doubles, as a
-            share of it.
-        jitter: And from view to view.
-        distance_m: The mean distance of the views, about which the lens breathes [m].
-        coefficients: (m,) as they were found.
-        root: (m, r) of their covariance, `root root^T`.
-        intrinsics_covariance: (m, k) with matrix and distortion.
-        edge_covariance: (m, 6 e) with the transforms, in the order of `joint_covariance`.
+        field_px: Prior standard deviation of the smooth field, per axis [px].
+        length: Its correlation length, as a share of the image's width.
+        breathing: Standard deviation of the relative change of the focal length as the distance
+            doubles.
+        jitter: Standard deviation of its relative change from view to view.
+        distance_m: Mean distance of the views, the reference of breathing [m].
+        coefficients: (m,) estimated coefficients.
+        root: (m, r) square root of their covariance, `root root^T`.
+        intrinsics_covariance: (m, k) cross-covariance with matrix and distortion.
+        edge_covariance: (m, 6 e) cross-covariance with the transforms in the order of
+            `joint_covariance`.
     """
 
     field_px: float
@@ -69,21 +70,21 @@ class LensField(Section):
     edge_covariance: Matrix
 
     def columns(self, camera: Camera, px: FloatArray, distance_m: float | None) -> FloatArray:
-        """(n, 2, m) by how much the coefficients displace (n, 2) pixels [px].
+        """(n, 2, m) Jacobian of pixel displacements by the coefficients [px].
 
         Args:
-            camera: The lens.
-            px: The pixels.
-            distance_m: How far along the camera's axis that is which they show; None for the mean.
+            camera: The intrinsics.
+            px: (n, 2) the pixels.
+            distance_m: Depth of the imaged points; None for the mean distance.
         """
         levels = LensLevels(self.field_px, self.length, self.breathing, self.jitter)
-        far = 0.0 if distance_m is None else distance_m / self.distance_m - 1.0
-        return displacements(px, camera, far, levels)
+        relative_distance = 0.0 if distance_m is None else distance_m / self.distance_m - 1.0
+        return displacements(px, camera, relative_distance, levels)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraForm:
-    """The intrinsics of a camera.
+    """Intrinsics of a camera.
 
     Attributes:
         model: `brown` or `fisheye`.
@@ -111,15 +112,15 @@ _StoredCamera = Annotated[
 
 @dataclass(frozen=True, eq=False)
 class CameraResult:
-    """The camera that the result was obtained with.
+    """Camera of a result.
 
     Attributes:
         camera: The intrinsics.
         estimated: Whether they were estimated from this session's images.
         covariance: (k, k) of fx, fy, cx, cy and the distortion, where estimated.
-        edge_covariance: (k, 6 e) of these with the calibration's edges in the order of its
-            `joint_covariance`, where both were estimated together.
-        field: What the lens does beyond its model; None where nothing shows that.
+        edge_covariance: (k, 6 e) cross-covariance of these with the calibration's edges in the
+            order of `joint_covariance`, where both were estimated together.
+        field: Displacement field beyond the lens model; None where it is not significant.
     """
 
     camera: _StoredCamera
@@ -129,11 +130,6 @@ class CameraResult:
     field: LensField | None = None
 
     def __post_init__(self) -> None:
-        """Checks that the covariances are of its intrinsics, and of its field.
-
-        Raises:
-            ValueError: They are not.
-        """
         size = 4 + len(self.camera.distortion)
         for array in (self.covariance, self.edge_covariance):
             if array is not None and len(array) != size:
@@ -146,41 +142,40 @@ class CameraResult:
                     raise ValueError(f"field.{name} has {rows} rows; {count} are needed")
 
     def covariance_with(self, edge: FloatArray) -> FloatArray:
-        """The (6 + k + m,) squared covariance of the camera's edge, its lens, and its field.
+        """Joint covariance of the camera's edge, lens and field; 6 + k + m rows and columns.
 
-        A calibration of an older version does not hold what edge and lens have in common: they
-        count as independent then.
+        Calibrations of older versions have no cross-covariance of edge and lens: it is zero then.
 
         Args:
             edge: (6, 6) of the edge, the first of the calibration's.
         """
         size, field = 4 + len(self.camera.distortion), self.field
         lens, fields = slice(6, 6 + size), slice(6 + size, None)
-        found = np.zeros((6 + size + (0 if field is None else len(field.coefficients)),) * 2)
-        found[:6, :6] = edge
+        covariance = np.zeros((6 + size + (0 if field is None else len(field.coefficients)),) * 2)
+        covariance[:6, :6] = edge
         if self.covariance is not None:
-            found[lens, lens] = self.covariance
+            covariance[lens, lens] = self.covariance
             if self.edge_covariance is not None:
-                found[lens, :6] = self.edge_covariance[:, :6]
+                covariance[lens, :6] = self.edge_covariance[:, :6]
         if field is not None and len(field.coefficients):
-            found[fields, fields] = field.root @ field.root.T
-            found[fields, lens] = field.intrinsics_covariance
-            found[fields, :6] = field.edge_covariance[:, :6]
-        low = np.tril(found, -1)
-        return np.asarray(low + low.T + np.diag(np.diag(found)))
+            covariance[fields, fields] = field.root @ field.root.T
+            covariance[fields, lens] = field.intrinsics_covariance
+            covariance[fields, :6] = field.edge_covariance[:, :6]
+        low = np.tril(covariance, -1)
+        return np.asarray(low + low.T + np.diag(np.diag(covariance)))
 
     def displacements(self, px: FloatArray, distance_m: float | None = None) -> FloatArray:
-        """(n, 2, m) by how much coefficients beyond the model displace pixels [px]."""
+        """(n, 2, m) Jacobian of pixel displacements by the field's coefficients [px]."""
         if self.field is None:
             return np.zeros((len(px), 2, 0))
         return self.field.columns(self.camera, px, distance_m)
 
     def in_model(self, px: FloatArray, distance_m: float | None = None) -> FloatArray:
-        """(n, 2) where the lens, were it what its model says, would show what is at pixels [px].
+        """(n, 2) pixels without the displacement field, as the lens model has them [px].
 
         Args:
             px: (n, 2) the pixels.
-            distance_m: How far along the camera's axis that is which they show; None for the mean.
+            distance_m: Depth of the imaged points; None for the mean distance.
         """
         if self.field is None:
             return px
@@ -189,29 +184,29 @@ class CameraResult:
     def rays_by_lens(
         self, px: FloatArray, rays: FloatArray, distance_m: float | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """How points on rays move at their depth: with pixels, (n, 3, 2), and with the lens.
+        """Jacobians of points on rays at constant depth, by pixels and by the lens.
 
         Args:
             px: (n, 2) the pixels.
             rays: (n, 3) points on their rays.
-            distance_m: As `in_model` has it.
+            distance_m: Depth of the points; None for the mean distance.
 
         Returns:
-            Both; the latter (n, 3, k + m) by the intrinsics and by what is beyond them.
+            (n, 3, 2) by the pixels, and (n, 3, k + m) by the intrinsics and the field.
         """
-        seen = project_with_jacobian(self.camera, rays)
+        projected = project_with_jacobian(self.camera, rays)
         inverse = np.zeros((len(px), 3, 2))
-        inverse[:, :2] = np.linalg.inv(seen.by_point[:, :, :2])
-        beyond = self.displacements(px, distance_m)
-        return inverse, -inverse @ np.concatenate([seen.by_intrinsics, beyond], axis=2)
+        inverse[:, :2] = np.linalg.inv(projected.by_point[:, :, :2])
+        by_field = self.displacements(px, distance_m)
+        return inverse, -inverse @ np.concatenate([projected.by_intrinsics, by_field], axis=2)
 
     def carried(self, jacobian: FloatArray) -> "CameraResult":
-        """The same beside other edges, by how these move with those that it has."""
+        """The camera beside other edges, given their Jacobian by the present ones."""
         if self.edge_covariance is None and self.field is None:
             return self
         edges, field = self.edge_covariance, self.field
         if field is not None:
-            # Of no coefficients, a file does not say how many edges there were.
+            # Without coefficients, the number of edges is not in the file.
             beside = field.edge_covariance.reshape(-1, jacobian.shape[1])
             field = replace(field, edge_covariance=beside @ jacobian.T)
         edges = None if edges is None else edges @ jacobian.T
@@ -220,12 +215,12 @@ class CameraResult:
 
 @dataclass(frozen=True, eq=False)
 class RefittedLens:
-    """The lens that readers of matrix and coefficients alone are given.
+    """Matrix and coefficients that approximate a lens with its field.
 
     Attributes:
-        camera: Matrix and coefficients that see rays as the lens and its field do.
-        rms_px: What they leave of the field, an axis, where it was seen [px].
-        most_px: The largest of it there, an axis [px].
+        camera: The approximating intrinsics.
+        rms_px: Remaining displacement where the field was observed (rms), per axis [px].
+        most_px: Largest remaining displacement there, per axis [px].
     """
 
     camera: Camera
@@ -236,48 +231,45 @@ class RefittedLens:
 def refitted(lens: CameraResult) -> RefittedLens:
     """Fits matrix and coefficients to a lens and its field, at the views' mean distance.
 
-    Where nothing was seen the field is not known, and nothing is fitted. The camera's frame stays,
-    so that its transform goes with the lens.
+    Only pixels where the field was observed are fitted. The camera's frame is kept, so that its
+    transform remains valid.
     """
     camera = lens.camera
     if lens.field is None or not len(lens.field.coefficients):
         return RefittedLens(camera)
     axes = (np.linspace(0.0, at - 1.0, n) for at, n in zip(camera.resolution, _GRID, strict=True))
     px = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    straight = lens.in_model(px)
-    rays, weights = normalise(camera, straight), _known(lens, px)
+    in_model = lens.in_model(px)
+    rays, weights = normalise(camera, in_model), _determined_share(lens, px)
     seen = np.isfinite(rays).all(axis=1) & (weights > 0.0)
-    px, straight, rays, weights = px[seen], straight[seen], rays[seen], weights[seen]
+    px, in_model, rays, weights = px[seen], in_model[seen], rays[seen], weights[seen]
     size = len(intrinsics(camera))
-    if len(px) < size or _rms(px - straight, weights) < _NOTICED_PX:
+    if len(px) < size or _rms(px - in_model, weights) < _NOTICED_PX:
         return RefittedLens(camera)
-    found, points = camera, np.column_stack([rays, np.ones(len(rays))])
-    roots, moved = np.sqrt(weights)[:, None], np.arange(_last(camera))
+    fitted, points = camera, np.column_stack([rays, np.ones(len(rays))])
+    roots, free = np.sqrt(weights)[:, None], np.arange(_fitted_count(camera))
     for _ in range(_STEPS):
-        there = project_with_jacobian(found, points)
-        columns = (roots[:, :, None] * there.by_intrinsics[:, :, moved]).reshape(-1, len(moved))
+        projected = project_with_jacobian(fitted, points)
+        columns = (roots[:, :, None] * projected.by_intrinsics[:, :, free]).reshape(-1, len(free))
         scale = np.linalg.norm(columns, axis=0)
-        away = (roots * (px - there.px)).ravel()
-        step = np.linalg.lstsq(columns / scale, away, rcond=_DETERMINED)[0] / scale
-        found = with_intrinsics(found, intrinsics(found) + np.pad(step, (0, size - len(step))))
-    left = px - project(found, points)
-    # Where little is known anywhere, what is known best counts.
-    well = weights > min(_SEEN, 0.5 * weights.max())
-    most_px = float(np.abs(left[well]).max())
-    return RefittedLens(found, _rms(left, weights), most_px)
+        residuals = (roots * (px - projected.px)).ravel()
+        step = np.linalg.lstsq(columns / scale, residuals, rcond=_DETERMINED)[0] / scale
+        fitted = with_intrinsics(fitted, intrinsics(fitted) + np.pad(step, (0, size - len(step))))
+    remaining = px - project(fitted, points)
+    # Where the field is poorly determined everywhere, its best determined part counts.
+    observed = weights > min(_SEEN, 0.5 * weights.max())
+    most_px = float(np.abs(remaining[observed]).max())
+    return RefittedLens(fitted, _rms(remaining, weights), most_px)
 
 
-def _last(camera: Camera) -> int:
-    """How many intrinsics are fitted: coefficients at the end that are zero are none of the model.
-
-    Without any, all of them are.
-    """
+def _fitted_count(camera: Camera) -> int:
+    """Number of fitted intrinsics: without trailing zero coefficients, unless all are zero."""
     used = np.flatnonzero(camera.distortion)
     return len(intrinsics(camera)) if not len(used) else 4 + int(used[-1]) + 1
 
 
-def _known(lens: CameraResult, px: FloatArray) -> FloatArray:
-    """(n,) by which share of its variance the field is known at (n, 2) pixels."""
+def _determined_share(lens: CameraResult, px: FloatArray) -> FloatArray:
+    """(n,) share of the field's prior variance that the views removed at (n, 2) pixels."""
     if lens.field is None:
         return np.zeros(len(px))
     columns = lens.displacements(px)
@@ -287,7 +279,7 @@ def _known(lens: CameraResult, px: FloatArray) -> FloatArray:
 
 
 def _rms(px: FloatArray, weights: FloatArray) -> float:
-    """The weighted RMS of (n, 2) displacements, an axis [px]."""
+    """Weighted rms of (n, 2) displacements, per axis [px]."""
     return float(np.sqrt(np.sum(weights * np.mean(px**2, axis=1)) / np.sum(weights)))
 
 
@@ -295,15 +287,14 @@ def _rms(px: FloatArray, weights: FloatArray) -> float:
 class RayFrame(Section):
     """The camera's transform with z along the ray of the image's centre: `ray_frame`.
 
-    With another lens in the same place, the camera's transform is `transform` times the inverse of
-    that lens's `cam_from_ray`.
+    For another lens model of the same camera, the camera's transform is `transform` times the
+    inverse of that model's `cam_from_ray`.
 
     Attributes:
-        name: Of the transform, such as `flange_from_ray`.
+        name: Name of the transform, such as `flange_from_ray`.
         px: (2,) the image's centre [px].
-        cam_from_ray: (4, 4) the least turn of the camera's z axis into that pixel's ray, by its own
-            lens.
-        transform: The camera's transform times that, with the covariance of transform and lens.
+        cam_from_ray: (4, 4) the smallest rotation of the camera's z axis into that pixel's ray.
+        transform: The camera's transform times `cam_from_ray`, with covariance of both.
     """
 
     name: str
@@ -313,7 +304,7 @@ class RayFrame(Section):
 
 
 def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:
-    """Carries a camera's transform into the frame of its centre ray.
+    """The camera's transform in the frame of its centre ray.
 
     Args:
         name: The transform's name, as `flange_from_cam`.
@@ -321,18 +312,18 @@ def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:
         lens: The camera.
 
     Returns:
-        It; None where the lens's distortion cannot be inverted there.
+        The transform; None where the lens's distortion cannot be inverted there.
     """
     px = (np.array(lens.camera.resolution) - 1.0) / 2.0
     ray = normalise(lens.camera, lens.in_model(px[None]))[0]
     if not np.isfinite(ray).all():
         return None
     turn = np.eye(4)
-    turn[:3, :3] = _turn(ray)
+    turn[:3, :3] = _to_ray(ray)
     _, by_lens = lens.rays_by_lens(px[None], np.append(ray, 1.0)[None])
     by_ray = np.array(
         [
-            Rotation.from_matrix(_turn(ray - step).T @ _turn(ray + step)).as_rotvec()
+            Rotation.from_matrix(_to_ray(ray - step).T @ _to_ray(ray + step)).as_rotvec()
             for step in _STEP * np.eye(2)
         ]
     ).T / (2.0 * _STEP)
@@ -345,8 +336,8 @@ def ray_frame(name: str, edge: Edge, lens: CameraResult) -> RayFrame | None:
     return RayFrame(name=f"{parent}_from_ray", px=px, cam_from_ray=turn, transform=placed)
 
 
-def _turn(ray: FloatArray) -> FloatArray:
-    """(3, 3) the least turn of z into the ray of a point (2,) at unit depth."""
-    away = float(np.hypot(*ray))
-    about = np.array([-ray[1], ray[0], 0.0]) / max(away, np.finfo(float).tiny)
-    return np.asarray(Rotation.from_rotvec(np.arctan(away) * about).as_matrix())
+def _to_ray(ray: FloatArray) -> FloatArray:
+    """(3, 3) the smallest rotation of z into the ray of a point (2,) at unit depth."""
+    tangent = float(np.hypot(*ray))
+    axis = np.array([-ray[1], ray[0], 0.0]) / max(tangent, np.finfo(float).tiny)
+    return np.asarray(Rotation.from_rotvec(np.arctan(tangent) * axis).as_matrix())

@@ -1,4 +1,4 @@
-"""What a calibration is made of, beside its transforms, and how its verdict stands on disk."""
+"""Parts of a calibration beside its transforms, and the form of its verdict in files."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from visioncal.results.arm import ArmSections
 from visioncal.results.edge import StoredPose
 from visioncal.robot import Robot
 
-# Of all results of a calibration.
+# Version of the form of all results.
 SCHEMA: Literal[1] = 1
 
 
-_OF_ROBOT = WrittenForm(
+_ROBOT_FORM = WrittenForm(
     lambda item: dict(item.document), lambda item, _: Robot.from_document(item) if item else None
 )
 
@@ -29,11 +29,11 @@ def check_schema(document: Mapping[str, Any]) -> None:
     Raises:
         DataError: It is of another.
     """
-    found = document.get("schema")
-    if found != SCHEMA:
-        is_newer = isinstance(found, int) and found > SCHEMA
+    schema = document.get("schema")
+    if schema != SCHEMA:
+        is_newer = isinstance(schema, int) and schema > SCHEMA
         raise DataError(
-            f"schema is {found!r}, this version reads {SCHEMA}.",
+            f"schema is {schema!r}, this version reads {SCHEMA}.",
             culprits=["schema"],
             next_step="A newer visioncal reads it." if is_newer else "Calibrate the session again.",
         )
@@ -41,7 +41,7 @@ def check_schema(document: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class SessionForm:
-    """The session that a result is of: its name, and the sha256 of its canonical content."""
+    """The session of a result: its name, and the sha256 of its canonical content."""
 
     name: str
     sha256: str
@@ -49,13 +49,12 @@ class SessionForm:
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """What one solver made of the used views.
+    """Result of one solver with the used views.
 
     Attributes:
         matrices: (4, 4) both edges by name.
         rms_mm: Scatter of the target's position over the used views [mm].
-        rms_deg: Scatter of the target's orientation over the used views [deg]; None where places
-            alone were read.
+        rms_deg: Scatter of its orientation [deg]; None where only positions were read.
     """
 
     matrices: Annotated[Mapping[str, StoredPose], REST]
@@ -70,18 +69,18 @@ class SolverResult:
 
 @dataclass(frozen=True, eq=False)
 class RobotResult(ArmSections):
-    """A robot of a whole cell, with what was found of its arm.
+    """A robot of a whole cell, with the sections on its arm.
 
     Attributes:
-        model: Its nominal model, where that is known.
+        model: Its nominal model, where known.
     """
 
-    model: Annotated[Robot | None, _OF_ROBOT, REST] = None
+    model: Annotated[Robot | None, _ROBOT_FORM, REST] = None
 
 
 @dataclass(frozen=True)
 class Picker:
-    """How likely picks by one robot of what one camera sees land within what is needed."""
+    """Probability that picks by one robot with one camera meet the need."""
 
     camera: str
     robot: str
@@ -90,12 +89,12 @@ class Picker:
 
 @dataclass(frozen=True)
 class NeedMet:
-    """What the task needs, and how likely a pick lands within it.
+    """Required accuracy of picks, and the probability of meeting it.
 
     Attributes:
-        need: What it needs.
-        probability: How likely a pick lands within it; of a whole cell, by the worst of its pairs.
-        pairs: Each camera and robot of a whole cell that pick together; empty elsewhere.
+        need: The required accuracy.
+        probability: Probability that a pick meets it; in a whole cell, of the worst pair.
+        pairs: The pairs of camera and robot of a whole cell; else empty.
     """
 
     need: Annotated[Need, INLINE]
@@ -103,21 +102,21 @@ class NeedMet:
     pairs: tuple[Picker, ...] = ()
 
     def of(self, camera: str, robot: str) -> "NeedMet":
-        """What is said of one camera and robot; of those that are no pair, of all."""
+        """The probability of one camera and robot; of all where they are no pair."""
         mine = [pair for pair in self.pairs if (pair.camera, pair.robot) == (camera, robot)]
         return NeedMet(self.need, mine[0].probability) if mine else self
 
 
 @dataclass(frozen=True, kw_only=True)
 class CauseForm:
-    """What may be why a result is not good.
+    """Probable cause why a result is not good.
 
     Attributes:
-        cause: What it is, as a short name that stays.
-        probability: How likely it is.
-        sentence: What it is, with its figures.
-        without_it: What the result would be without it, in a sentence; absent where not computed.
-        do: What to do about it, with a command where one does it.
+        cause: Its short, stable name.
+        probability: Its probability.
+        sentence: Description with figures.
+        without_it: The result without this cause, in a sentence; absent where not computed.
+        do: Remedy, with a command where there is one.
     """
 
     cause: str
@@ -127,18 +126,18 @@ class CauseForm:
     do: Annotated[str, DROPPED] = ""
 
     @classmethod
-    def of(cls, found: Finding) -> "CauseForm":
-        """Writes a finding that may be the cause."""
+    def of(cls, finding: Finding) -> "CauseForm":
+        """Form of a finding that may be the cause."""
         return cls(
-            cause=found.kind,
-            probability=found.probability,
-            sentence=found.words,
-            without_it=found.without_it,
-            do="" if found.do is None else str(found.do),
+            cause=finding.kind,
+            probability=finding.probability,
+            sentence=finding.words,
+            without_it=finding.without_it,
+            do="" if finding.do is None else str(finding.do),
         )
 
     def finding(self, words: str) -> Finding:
-        """Reads it, with the words of a reason that begins with its sentence."""
+        """The finding, with the words of a reason that begins with its sentence."""
         step = Remedy(self.do) if self.do else None
         return Finding(
             self.cause, words, step, probability=self.probability, without_it=self.without_it
@@ -147,15 +146,14 @@ class CauseForm:
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictForm:
-    """Whether a result can be trusted.
+    """Verdict of a result.
 
     Attributes:
-        status: In one word.
-        reasons: Why, in plain sentences.
-        good_for_mm: The least need that it would be good for [mm]; absent where it is good for
-            none.
-        causes: What may be why it is not good, likeliest first.
-        findings: The reasons one by one; absent in files of earlier versions.
+        status: good, check or bad.
+        reasons: Its reasons, in sentences.
+        good_for_mm: Smallest need that it would be good for [mm]; absent where there is none.
+        causes: Probable causes why it is not good, most probable first.
+        findings: The findings behind the reasons; absent in files of earlier versions.
     """
 
     status: VerdictStatus
@@ -166,7 +164,7 @@ class VerdictForm:
 
     @classmethod
     def of(cls, verdict: Verdict) -> "VerdictForm":
-        """Writes a verdict."""
+        """Form of a verdict."""
         return cls(
             status=verdict.status,
             reasons=verdict.reasons,
@@ -176,19 +174,19 @@ class VerdictForm:
         )
 
     def verdict(self, _: str) -> Verdict:
-        """Reads it."""
-        found = tuple(self._earlier()) if self.findings is None else self.findings
-        return Verdict(self.status, found, self.good_for_mm)
+        """The verdict."""
+        findings = tuple(self._earlier_findings()) if self.findings is None else self.findings
+        return Verdict(self.status, findings, self.good_for_mm)
 
-    def _earlier(self) -> Iterator[Finding]:
-        """Findings of reasons and causes, of which a reason may begin with a cause's sentence."""
+    def _earlier_findings(self) -> Iterator[Finding]:
+        """Findings from reasons and causes; a reason may begin with a cause's sentence."""
         causes = {cause.sentence: cause for cause in self.causes}
         for reason in self.reasons:
-            begun = next((cause for cause in causes if reason.startswith(cause)), None)
-            if begun is None:
+            matching = next((cause for cause in causes if reason.startswith(cause)), None)
+            if matching is None:
                 yield Finding("remark", reason)
             else:
-                yield causes.pop(begun).finding(reason)
+                yield causes.pop(matching).finding(reason)
         yield from (cause.finding(sentence) for sentence, cause in causes.items())
 
 

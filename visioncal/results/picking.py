@@ -1,4 +1,4 @@
-"""A calibration and a session that go together: of one camera, and cut down to one pair alike."""
+"""Selection of the same camera, robot and target from a session and a calibration, with checks."""
 
 from collections.abc import Collection
 
@@ -23,41 +23,41 @@ def picked(
     *,
     parted: bool = True,
 ) -> tuple[Session, Calibration]:
-    """Takes one camera, one robot and one target out of what is of a whole cell.
+    """Selects one camera, one robot and one target from a session and a calibration.
 
     Args:
-        session: Of a whole cell, or of one of each already.
-        calibration: Likewise.
-        choice: What is meant; names are for what is of a whole cell.
-        needs: What of the calibration has to be clear.
-        parted: Whether this robot is to move camera and target of the session before each other.
+        session: Of a whole cell, or of one of each.
+        calibration: Of a whole cell, or of one of each.
+        choice: Names of the parts; for whole cells only.
+        needs: Parts of the calibration that must be unambiguous.
+        parted: Whether the robot must be between the session's camera and target.
 
     Raises:
-        DataError: There is no such thing, or several are meant.
+        DataError: There is none of that name, or the choice is ambiguous.
     """
     several = is_to_be_parted(session, choice) if parted else has_several(session)
-    by_rows = dict[Part, str]()
+    of_session = dict[Part, str]()
     if several:
         chosen = chosen_of(session, choice, parted=parted)
-        by_rows = {part: chosen.frame_of(part) for part in PARTS}
+        of_session = {part: chosen.frame_of(part) for part in PARTS}
         session = select(session, choice, parted=parted)
     if calibration.cell is None:
-        # The names have served for the session.
+        # The names were those of the session.
         return session, calibration if several else calibration.chosen(choice)
-    # What the session's rows make clear needs no name, if the calibration has it.
-    known = calibration.tree.parents
+    # A part that the session's rows determine needs no name, if the calibration has it.
+    parents = calibration.tree.parents
     named = {
-        part: choice.of(part) or (frame if (frame := by_rows.get(part)) in known else None)
+        part: choice.of(part) or (frame if (frame := of_session.get(part)) in parents else None)
         for part in needs
     }
     return session, calibration.chosen(Choice(**named), needs)
 
 
 def check_mount(session: Session, calibration: Calibration) -> None:
-    """Refuses the session of a camera that is mounted elsewhere than the calibrated one.
+    """Checks that the session's camera is mounted as the calibrated one.
 
     Raises:
-        DataError: So it is.
+        DataError: It is not.
     """
     check_one_of_each(session)
     if session.mount != calibration.mount:
@@ -72,10 +72,10 @@ def check_mount(session: Session, calibration: Calibration) -> None:
 def check_resolution(
     session: Session, calibration: Calibration, resolution: tuple[int, int]
 ) -> None:
-    """Refuses images of another size than those of the calibrated camera.
+    """Checks that images have the calibrated camera's resolution.
 
     Raises:
-        DataError: So they are.
+        DataError: They do not.
     """
     camera = calibration.camera
     if camera is None or resolution == camera.camera.resolution:

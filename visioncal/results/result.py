@@ -1,4 +1,4 @@
-"""The result of a calibration."""
+"""Result of a calibration."""
 
 import json
 from collections.abc import Collection, Mapping, Sequence
@@ -43,37 +43,37 @@ from visioncal.session.frames import CELL
 if TYPE_CHECKING:
     from visioncal.present.report.drawing import Drawing
 
-# So many transforms are shown at once.
+# Number of transforms in a card.
 _SHOWN = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration(CalibrationSections):
-    """The result of calibrating one session; `save` writes it as calibration.json.
+    """Result of calibrating one session; `save` writes it as calibration.json.
 
-    One camera, one robot and their targets have no names; what several have stands in `cell`.
+    One camera, one robot and their targets have no names; those of a whole cell are in `cell`.
 
-    See also `CalibrationSections` and `ArmSections`, of which it has all attributes.
+    It also has all attributes of `CalibrationSections` and `ArmSections`.
 
     Attributes:
         session_name: The session's name.
         session_sha256: Digest of the session's canonical content.
-        created: When, in ISO 8601.
-        mount: How the camera is mounted.
-        edges: The estimated transforms by name, in the order of `joint_covariance`.
-        joint_covariance: (6 k, 6 k) covariance of all edges together, in that order.
-        solvers: What every solver made of it.
+        created: Time of creation, ISO 8601.
+        mount: Mount of the camera.
+        edges: Estimated transforms by name, in the order of `joint_covariance`.
+        joint_covariance: (6 k, 6 k) joint covariance of all edges, in that order.
+        solvers: Result of every solver.
         noise: Estimated standard deviations by name.
         views: One entry for each view of the session.
         rms: Residuals over the used views.
-        validation: Residuals of views that were left out.
-        verdict: Whether to trust it.
+        validation: Residuals of left-out views.
+        verdict: Verdict with its reasons.
         camera: The camera, where the session has one.
         robot: The nominal robot model, where the session names a known one.
-        frames: Tools and fixtures by the transform that places them, as `flange_from_tool`.
-        cell: What a whole cell has by name; None for one camera, one robot and their targets. What
-            is of one camera or robot, `of` takes out of it.
-        need: What the task needs, and how likely picks meet it; None where that is not said.
+        frames: Tools and fixtures by transform name, as `flange_from_tool`.
+        cell: Cameras, robots and targets of a whole cell by name; None for one camera and robot.
+            `of` selects one of each.
+        need: Required accuracy of picks, and the probability of meeting it; None where not stated.
     """
 
     session_name: str
@@ -104,10 +104,10 @@ class Calibration(CalibrationSections):
 
     @cached_property
     def by_name(self) -> CellResult:
-        """What it has by name; one camera, one robot and their targets have empty ones."""
+        """Cameras, robots and targets by name, which is empty for one camera and one robot."""
         if self.cell is not None:
             return self.cell
-        ends, known = (name.partition("_from_") for name in self.edges), self.uncertainty
+        ends = (name.partition("_from_") for name in self.edges)
         placed = {child: parent for parent, _, child in ends}
         arm = {section.name: getattr(self, section.name) for section in entries(ArmSections)}
         return CellResult(
@@ -122,13 +122,13 @@ class Calibration(CalibrationSections):
             weakest="",
             details=CellDetails({} if self.clock is None else {"": self.clock}),
             uncertainty=None
-            if known is None
-            else CellUncertainty(budget_mm={}, noise_95={"": known.noise_95}),
+            if self.uncertainty is None
+            else CellUncertainty(budget_mm={}, noise_95={"": self.uncertainty.noise_95}),
         )
 
     @cached_property
     def tree(self) -> FrameTree:
-        """Its frames: what hangs on what, and how."""
+        """Tree of its frames."""
         cell = self.by_name
         return FrameTree(
             cell.reference,
@@ -144,16 +144,16 @@ class Calibration(CalibrationSections):
     def between(
         self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
     ) -> Edge:
-        """Places any frame in any other, with the covariance that the whole cell gives it.
+        """Transform between any two frames, with its covariance.
 
-        That of tools and fixtures counts as independent of it; one whose rotation was not measured
-        has that of what it was placed in, without covariance.
+        The covariance of tools and fixtures is taken as independent of the calibration. A frame
+        without measured rotation has that of its parent, without covariance.
 
         Args:
-            first: The one: a frame of the cell, a tool or a fixture.
-            second: The other; likewise.
-            poses: (4, 4) `base_from_flange` by robot, where the two move before each other by it;
-                they count as exact. A robot that has no name goes by `robot`.
+            first: A frame of the cell, a tool or a fixture.
+            second: Another one.
+            poses: (4, 4) `base_from_flange` by robot, for robots between the two; taken as exact. A
+                robot without a name is `robot`.
 
         Returns:
             `first_from_second`.
@@ -165,7 +165,7 @@ class Calibration(CalibrationSections):
 
     @property
     def next_steps(self) -> tuple[Remedy, ...]:
-        """What to do about what was found, of tools and fixtures, too; the most pressing first."""
+        """Remedies for the findings, also on tools and fixtures; the most urgent first."""
         doubtful = (name for name, frame in self.frames.items() if frame.verdict.status != "good")
         frames = (Remedy(f"Read what was found of {name} before it is used.") for name in doubtful)
         return (*self.verdict.next_steps, *frames)
@@ -174,27 +174,28 @@ class Calibration(CalibrationSections):
     def of(
         self, camera: str | None = None, robot: str | None = None, target: str | None = None
     ) -> Self:
-        """Returns the calibration of one camera, one robot and one target of a whole cell.
+        """Selects one camera, one robot and one target of a whole cell.
 
-        Both transforms follow through the cell's frames, with the covariance that all of it gives
-        them. Where there is one of each, it is the calibration itself.
+        Both transforms are composed along the cell's frames, with covariance. A calibration of one
+        camera and robot is returned as it is.
 
         Args:
-            camera: Its name, or its frame's; may be left out where only one fits.
-            robot: The robot that moves camera and target before each other; likewise.
-            target: The target; likewise.
+            camera: Name of the camera or its frame; optional where unambiguous.
+            robot: Name of the robot between camera and target; optional where unambiguous.
+            target: Name of the target; optional where unambiguous.
 
         Raises:
-            DataError: There is no such thing, several are meant, or this robot does not part these.
+            DataError: There is none of that name, the choice is ambiguous, or this robot is not
+                between camera and target.
         """
         return self.chosen(Choice(camera, robot, target))
 
     def chosen(self, choice: Choice, needs: Collection[Part] = PARTS) -> Self:
-        """As `of`, for what needs to know no more than some of the three.
+        """Selects as `of`, where only some of the three must be unambiguous.
 
         Args:
-            choice: What is named.
-            needs: What has to be clear; of the rest, any that fits is taken, or none.
+            choice: Names of the parts.
+            needs: Parts that must be unambiguous; for the others, any that fits is taken, or none.
 
         Raises:
             DataError: See `of`.
@@ -212,12 +213,12 @@ class Calibration(CalibrationSections):
 
     @property
     def transforms(self) -> ByName[RigidTransform]:
-        """The estimated transforms by name, those of tools and fixtures among them."""
+        """Estimated transforms by name, with those of tools and fixtures."""
         return ByName({name: edge.transform for name, edge in self.placed.items()})
 
     @property
     def placed(self) -> ByName[Edge]:
-        """The estimated transforms by name with their covariances, frames among them."""
+        """Estimated transforms with covariance by name, with those of tools and fixtures."""
         return ByName({**self.edges, **{name: frame.edge for name, frame in self.frames.items()}})
 
     def __repr__(self) -> str:
@@ -245,7 +246,7 @@ class Calibration(CalibrationSections):
         }
 
     def views_table(self) -> Any:  # noqa: ANN401 - a frame of pandas, or records
-        """What became of each view: a pandas.DataFrame with the extra pandas, else records.
+        """Table of the views' results: a pandas.DataFrame with the extra pandas, else records.
 
         Columns are the attributes of `ViewResult`; what was not computed is None (NaN in a frame).
         """
@@ -256,23 +257,23 @@ class Calibration(CalibrationSections):
 
     @typed
     def plot(self, what: str = "residuals") -> "Drawing":
-        """Draws a figure of the report, which a notebook shows and `save` writes as .svg.
+        """Draws a figure of the report, for a notebook; its `save` writes an .svg.
 
         Args:
-            what: `residuals` of each view, the `budget` of a pick's error, or the `directions` of
-                the transforms and how well each is known.
+            what: `residuals` of each view, the `budget` of a pick's error, or the sigmas of the
+                principal `directions` of the transforms.
 
         Raises:
             DataError: There is no such figure.
         """
-        # Figures are built on results; only this one call goes the other way.
+        # Imported here, since figures depend on results.
         from visioncal.present.report.drawing import draw
 
         return draw(self, what)
 
     @property
     def noise_dof(self) -> float:
-        """Degrees of freedom of the noise's levels; see `estimation.intervals.freedom_of`."""
+        """Degrees of freedom of the noise levels; see `estimation.intervals.freedom_of`."""
         intervals = {} if self.uncertainty is None else self.uncertainty.noise_95
         return freedom_of(intervals.values()) if intervals else np.inf
 
@@ -301,39 +302,39 @@ class Calibration(CalibrationSections):
         force_n: FloatArray | Sequence[float] = (0.0, 0.0, 0.0),
         temperatures_c: FloatArray | None = None,
     ) -> RigidTransform:
-        """Forward kinematics of the calibrated robot, which bends where that was calibrated.
+        """Forward kinematics of the calibrated robot, with joint compliance where calibrated.
 
         Args:
             q: (m, n) joint angles [rad].
-            payload_kg: Mass on the flange beside the arm's own weight; one for all, or (m,) [kg].
+            payload_kg: Mass of the payload on the flange; one for all, or (m,) [kg].
             payload_m: (3,) or (m, 3) its centre in the flange's frame [m].
             force_n: (3,) or (m, 3) external force on the flange's origin, in the base's frame [N].
-            temperatures_c: (m, n) of the links behind the joints, or (n,) for all [deg C]; None for
-                those at which the views began. `OnlineCompensator` gives them.
+            temperatures_c: (m, n) temperatures of the links behind the joints, or (n,) for all
+                [deg C], as from `OnlineCompensator`; None for those at the start of the views.
 
         Returns:
             m transforms, as one batched RigidTransform.
 
         Raises:
             DataError: The session named no known robot, q has another number of joints or is not
-                finite, a load is none, or temperatures are given and none were calibrated.
+                finite, a load is invalid, or temperatures are given without calibrated drift.
         """
         q = np.atleast_2d(np.asarray(q, dtype=float))
         wrong = np.flatnonzero(~np.isfinite(q).all(axis=1))
         if wrong.size:
             raise DataError(f"q[{wrong[0]}] is not finite.", culprits=[f"q[{wrong[0]}]"])
         loads = Loads.alike(len(q), payload_kg, payload_m, force_n)
-        standing = self.standing(q, loads)
+        poses = self.standing(q, loads)
         if temperatures_c is not None:
-            standing = standing @ self.drift.motion(q, np.asarray(temperatures_c, dtype=float))
-        return RigidTransform.from_matrix(standing)
+            poses = poses @ self.drift.motion(q, np.asarray(temperatures_c, dtype=float))
+        return RigidTransform.from_matrix(poses)
 
     def standing(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
-        """What `base_from_flange` gives, as (m, 4, 4).
+        """Forward kinematics as `base_from_flange`, as (m, 4, 4).
 
         Args:
             q: (m, n) joint angles [rad].
-            loads: What the flange carries; the arm's own weight alone where None.
+            loads: Loads on the flange; the arm's own weight alone where None.
 
         Raises:
             DataError: The session named no known robot, or q has another number of joints.
@@ -352,17 +353,17 @@ class Calibration(CalibrationSections):
 
     @property
     def compliance(self) -> FloatArray:
-        """(n,) what each joint yields to a torque [rad/(N m)]; zero where that is not known."""
+        """(n,) compliance of each joint [rad/(N m)]; zero where unknown."""
         if self.elastic is None:
             return np.zeros(0 if self.robot is None else self.robot.joint_count)
         return self.elastic.compliance
 
     @cached_property
     def drift(self) -> ThermalModel:
-        """How the arm drifts with its temperature.
+        """Thermal model of the arm.
 
         Raises:
-            DataError: That was not calibrated.
+            DataError: Its drift was not calibrated.
         """
         arm = self.calibrated_robot
         if arm is None or self.thermal is None:
@@ -377,10 +378,10 @@ class Calibration(CalibrationSections):
 
     @typed
     def at_temperatures(self, temperatures_c: FloatArray) -> Self:
-        """Returns the calibration of the arm as it is with its links at (n,) temperatures [deg C].
+        """Calibration with the arm at (n,) temperatures of its links [deg C].
 
         Raises:
-            DataError: It does not say how the arm drifts, or has another number of joints.
+            DataError: Its drift was not calibrated, or it has another number of joints.
         """
         warm = self.drift.robot_at(np.asarray(temperatures_c, dtype=float))
         return replace(
@@ -389,30 +390,30 @@ class Calibration(CalibrationSections):
 
     @property
     def arm_is_calibrated(self) -> bool:
-        """Whether the transforms go with a calibrated arm, and not with the controller's."""
+        """Whether the transforms are for the calibrated arm, not for the controller's."""
         return self.arm is not None and self.arm.robot is not None
 
     @property
     def calibrated_robot(self) -> Robot | None:
-        """The arm as it was calibrated, or else its nominal model, where there is one."""
+        """The calibrated arm, else its nominal model, where there is one."""
         return self.robot if self.arm is None or self.arm.robot is None else self.arm.robot
 
     @property
     def weight_moments(self) -> FloatArray | None:
-        """(n, 4 n) compliance times unknown masses and first moments; None where none were found.
+        """(n, 4 n) compliance times unknown masses and first moments; None where not estimated.
 
-        What `bent_joints` takes of an arm whose model does not state the masses of its links.
+        For `bent_joints` of an arm whose model does not state the masses of its links.
         """
         return None if self.elastic is None else self.elastic.weight_moments
 
     @typed
     def save(self, path: Path | str) -> None:
-        """Writes calibration.json, whole or not at all."""
+        """Writes calibration.json atomically."""
         write_atomically(Path(path), self.text + "\n")
 
     @cached_property
     def text(self) -> str:
-        """The content of calibration.json, which recordings hold, too."""
+        """Content of calibration.json, which recordings also contain."""
         return json.dumps(to_document(self), indent=2, allow_nan=False)
 
     @classmethod
@@ -427,7 +428,7 @@ class Calibration(CalibrationSections):
         if file.is_dir():
             before = file / ALIGNMENT
             file = file / "calibration.json"
-            # A cell that was aligned by an older version.
+            # A folder written by an older version.
             file = before if before.is_file() and not file.exists() else file
             if not file.exists() and (file.parent / DYNAMICS_FILE).is_file():
                 raise DataError(
@@ -451,7 +452,7 @@ class Calibration(CalibrationSections):
 
         Args:
             text: The content.
-            label: What it came from, for messages.
+            label: Name of its source, for messages.
 
         Raises:
             DataError: It is not a calibration of a known schema.

@@ -1,4 +1,4 @@
-"""Sections of a result beside those of arms: clock, boards, uncertainty, and what a check needs."""
+"""Sections of a result beside those on arms: clock, boards, uncertainty, fit for verification."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,25 +15,25 @@ from visioncal.results.edge import Covariance
 from visioncal.vision.targets import corner_positions
 
 _BEND = "bow_"
-# Files of earlier versions are without it.
+# Absent in files of earlier versions.
 _LATER = "shear"
-# Names of levels with their 95 % intervals.
+# 95 % intervals by name of the noise level.
 Intervals = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClockResult(Section):
-    """How far the camera's clock is ahead of the robot's: `clock` in calibration.json.
+    """Clock offset between camera and robot: `clock` in calibration.json.
 
     Attributes:
         camera_minus_robot_s: The offset [s].
-        method: Estimated from the motion, or from its turning alone; stated by the session; of no
-            consequence, for views at rest.
-        sigma_s: The standard deviation [s]; None for views at rest.
-        stated_s: What the session states [s]; None where it states nothing.
-        frames: How many frames in motion it was estimated from; None where from none.
-        correlation: Of the angles by which camera and robot turned; None where none was found.
-        shutter: When the rows of an image are taken; None where that was not looked for.
+        method: `motion`: estimated; `turning`: estimated from rotations alone; `stated` by the
+            session; `rest`: without effect, since the robot stood still.
+        sigma_s: Its standard deviation [s]; None for views at rest.
+        stated_s: The stated offset [s]; None where there is none.
+        frames: Number of frames in motion that it was estimated from; None for none.
+        correlation: Correlation of the rotation angles of camera and robot; None where unknown.
+        shutter: Readout times of an image's rows; None where not estimated.
     """
 
     camera_minus_robot_s: float
@@ -47,14 +47,14 @@ class ClockResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class InstrumentResult(Section):
-    """The instrument as it was taken: `instrument` in calibration.json.
+    """Instrument of the session: `instrument` in calibration.json.
 
     Attributes:
-        words: What it is.
-        reads: Whether it reads `poses` or `places`.
-        sigma_m: Standard deviation of a place at zero distance [m].
-        sigma_per_m: Its growth with the distance.
-        sigma_rad: Standard deviation of a rotation [rad]; None where places were read.
+        words: Description of the instrument.
+        reads: `poses`, or `places` for positions.
+        sigma_m: Standard deviation of a coordinate at zero distance [m].
+        sigma_per_m: Its growth with the distance [m/m].
+        sigma_rad: Standard deviation of a rotation [rad]; None where positions were read.
     """
 
     words: str
@@ -66,7 +66,7 @@ class InstrumentResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class PointResult(Section):
-    """A point that an instrument read, in the flange's frame [m], with its sigma [mm]."""
+    """Point that an instrument measured, in the flange's frame [m], with its sigma [mm]."""
 
     point: str
     x_m: float
@@ -77,15 +77,15 @@ class PointResult(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BoardResult(Section):
-    """A board as it was found to be: `board`, or an entry of `boards`, in calibration.json.
+    """Estimated shape of a board: `board`, or an entry of `boards`, in calibration.json.
 
     Attributes:
-        shape: Its departure from the stated one, by the names of `estimation.BOARD_NAMES`: `scale`
-            and `aspect` are relative, `shear` is by how much its rows and columns meet at less than
-            a right angle [rad], bows are of the board's edge [m].
-        sigma: Standard deviations of those that were free.
-        estimated: Those that the fit moved.
-        bend_mm: The depth within which its corners lie [mm].
+        shape: Deviation from the stated shape by the names of `estimation.BOARD_NAMES`: `scale` and
+            `aspect` are relative, `shear` is the deficit of the angle between rows and columns from
+            a right angle [rad], bows are at the board's edge [m].
+        sigma: Standard deviations of the free parameters.
+        estimated: Names of the parameters that were estimated.
+        bend_mm: Range of its corners' depths [mm].
     """
 
     shape: Mapping[str, float]
@@ -94,23 +94,18 @@ class BoardResult(Section):
     bend_mm: float
 
     def __post_init__(self) -> None:
-        """Checks that the shape is whole.
-
-        Raises:
-            ValueError: It is not.
-        """
         for name in BOARD_NAMES:
             if name not in self.shape and name != _LATER:
                 raise ValueError(f"shape.{name} is missing")
 
     @property
     def values(self) -> FloatArray:
-        """(10,) the shape in the order of `BOARD_NAMES`."""
+        """(10,) shape parameters in the order of `BOARD_NAMES`."""
         return np.array([self.shape.get(name, 0.0) for name in BOARD_NAMES])
 
     @property
     def is_bent(self) -> bool:
-        """Whether its bend was estimated; else it was taken as flat."""
+        """Whether its bend was estimated; else it is taken as flat."""
         return any(name.startswith(_BEND) for name in self.estimated)
 
     def squares_m(self, target: Target) -> tuple[float, float]:
@@ -119,17 +114,17 @@ class BoardResult(Section):
         return target.square_m * (scale - half), target.square_m * (scale + half)
 
     def corners(self, target: Target) -> FloatArray:
-        """(c, 3) where the corners lie in the target's frame, whose z points into the board [m]."""
+        """(c, 3) corner positions in the target's frame, whose z points into the board [m]."""
         flat = corner_positions(target)
         return np.asarray(flat + board_basis(flat) @ self.values)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RigResult(Section):
-    """A rig of points as it was found to be: `rig`, or an entry of `rigs`, in calibration.json.
+    """Estimated shape of a rig of points: `rig`, or an entry of `rigs`, in calibration.json.
 
     Attributes:
-        shape: (n, 3) departures of its points from where they are stated [m].
+        shape: (n, 3) deviations of its points from the stated positions [m].
         sigma: (n, 3) their standard deviations [m].
     """
 
@@ -138,22 +133,22 @@ class RigResult(Section):
 
     @property
     def values(self) -> FloatArray:
-        """(3 n,) the shape, point by point."""
+        """(3 n,) the flattened shape."""
         return self.shape.ravel()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UncertaintyResult(Section):
-    """How well a point is placed where the views look: `uncertainty` in calibration.json.
+    """Uncertainty of a point located where the views look: `uncertainty` in calibration.json.
 
     Attributes:
-        point_cam_m: (3,) that point in the camera's frame [m].
-        budget_mm: Standard deviation by source, and of all as `total` [mm].
-        radius95_mm: The point is right to within this in 95 % of cases [mm].
-        noise_95: 95 % intervals of the noise's levels, by their names in `Calibration.noise`.
+        point_cam_m: (3,) the point in the camera's frame [m].
+        budget_mm: Standard deviation by source, and their `total` [mm].
+        radius95_mm: Radius that 95 % of errors do not exceed [mm].
+        noise_95: 95 % intervals of the noise levels, by their names in `Calibration.noise`.
         spectrum: (12,) standard deviations along the principal directions of both transforms,
-            ascending, in units of the largest that are accepted.
-        inflation: By how much the covariance grew because neighbouring stops err alike.
+            ascending, in units of the largest accepted ones.
+        inflation: Factor on the covariance for the correlation of neighbouring stops' errors.
     """
 
     point_cam_m: Annotated[FloatArray, Array((3,))]
@@ -164,17 +159,12 @@ class UncertaintyResult(Section):
     inflation: float = 1.0
 
     def __post_init__(self) -> None:
-        """Checks that the budget has a source and their total.
-
-        Raises:
-            ValueError: It has not.
-        """
         if "total" not in self.budget_mm or len(self.budget_mm) < 2:
             raise ValueError("budget_mm has no total, or no source")
 
     @property
     def distance_m(self) -> float:
-        """Of the point from the camera [m]."""
+        """Distance of the point from the camera [m]."""
         return float(np.linalg.norm(self.point_cam_m))
 
     @property
@@ -189,7 +179,7 @@ class UncertaintyResult(Section):
         return self.budget_mm["total"]
 
     def percent(self, source: str) -> str:
-        """Writes a source's share of the variance."""
+        """A source's share of the variance, in words."""
         part_mm = self.budget_mm[source]
         share = (part_mm / self.total_mm) ** 2 if self.total_mm > 0.0 else 0.0
         return "<1 %" if part_mm > 0.0 and share < 0.005 else f"{100 * share:.0f} %"
@@ -197,7 +187,7 @@ class UncertaintyResult(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseIntervals(Section):
-    """What `uncertainty` is of a part of a whole cell.
+    """`uncertainty` of a part of a whole cell.
 
     Attributes:
         noise_95: See `UncertaintyResult`.
@@ -208,12 +198,12 @@ class NoiseIntervals(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class CellUncertainty(Section):
-    """How well a whole cell is known: its `uncertainty` in calibration.json.
+    """Uncertainty of a whole cell: its `uncertainty` in calibration.json.
 
     Attributes:
-        budget_mm: By transform, the standard deviation of its frame's place by source, and of all
-            as `total` [mm].
-        noise_95: 95 % intervals of the noise's levels by robot, and by name.
+        budget_mm: By transform, the standard deviation of its frame's position by source, and their
+            `total` [mm].
+        noise_95: 95 % intervals of the noise levels, by robot and by name.
     """
 
     budget_mm: Mapping[str, Mapping[str, float]]
@@ -222,17 +212,18 @@ class CellUncertainty(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FittedArm:
-    """What the errors of an arm are among the unknowns of a fit.
+    """Arm error parameters of a fit.
 
     Attributes:
-        of: What they are of: the reported `poses`, all `links`, or the calibrated `model`.
-        values: (k,) what they were found to be beside the arm that is stated.
-        weights: Of a model: by its blocks, the standard deviations of their errors.
-        flange_from_reported: (4, 4) of a model: what was reported, in its flange's frame.
-        by_stop: (k,) of a model: errors that go by the loads of a stop.
-        torque_nm: The torque that these are for [N m].
-        yielding: (n,) the joints that bend.
-        weight_functions: (4 n, r) a joint: what the weight of its links can be (see
+        of: Kind of the parameters: errors of the reported `poses`, of all `links`, or parameters of
+            the calibrated `model`.
+        values: (k,) estimates, zero for the nominal arm.
+        weights: For a model, prior standard deviations by parameter block.
+        flange_from_reported: (4, 4) for a model, the reported frame in its flange's frame.
+        by_stop: (k,) for a model, parameters of errors by the loads of a stop.
+        torque_nm: Torque that `by_stop` is for [N m].
+        yielding: (n,) mask of joints with compliance.
+        weight_functions: (4 n, r) for each joint, a basis of the effect of its links' weight (see
             `robot.WeightFunctions`).
     """
 
@@ -248,15 +239,15 @@ class FittedArm:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointFit(Section):
-    """The unknowns of the fit and their covariance, for a later check: `joint_fit`.
+    """Parameters of the fit and their covariance, for verification: `joint_fit`.
 
     Attributes:
-        targets: What was printed, by name and as it is described.
-        boards: The names of the targets that the fit places; none of a camera and robot alone.
-        looks: Which values of lens and targets are among the unknowns.
-        arm: The errors of the arm; None where none were found.
-        covariance: (k, k) of both transforms, of lens and targets, of where further targets lie
-            from the first, and of the arm's errors.
+        targets: Documents of the targets, by name.
+        boards: Names of the targets that the fit places; empty without a target.
+        looks: Indices of the free parameters of lens and targets.
+        arm: The arm's errors; None where none were estimated.
+        covariance: (k, k) of both transforms, of lens and targets, of further targets' poses
+            relative to the first, and of the arm's errors.
     """
 
     targets: Mapping[str, Any]
@@ -268,13 +259,13 @@ class JointFit(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CellJointFit(Section):
-    """The unknowns of the fit of a whole cell and their covariance: its `joint_fit`.
+    """Parameters of a whole cell's fit and their covariance: its `joint_fit`.
 
     Attributes:
-        cameras: By name, which values of a camera's lens are among the unknowns.
-        targets: By name, which values of a target's shape are.
-        arms: By name, the errors of each robot's arm that was calibrated along.
-        covariance: (k, k) of the transforms, then of these.
+        cameras: Indices of each camera's free lens parameters, by name.
+        targets: Indices of each target's free shape parameters, by name.
+        arms: Errors of each calibrated arm, by robot.
+        covariance: (k, k) of the transforms, then of cameras, targets and arms.
     """
 
     cameras: Mapping[str, tuple[int, ...]]
@@ -285,7 +276,7 @@ class CellJointFit(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class CornerResiduals:
-    """Residuals of views that were left out [mm, px]; None where they have none."""
+    """Residuals of left-out views [mm, px]; None where there are none."""
 
     mm: float
     px: float | None = None
@@ -293,15 +284,15 @@ class CornerResiduals:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageBlur:
-    """How an image is blurred.
+    """Blur of an image.
 
     Attributes:
         view: The view's number.
-        sigma_px: Standard deviation of the lens' blur [px].
-        disc_px: Radius of the disc of what is out of focus [px].
-        motion_px: How far the camera moved while it was taken [px].
-        motion_deg: In which direction, from the image's x [deg].
-        tone: How far its tones are from linear (see `vision.dense.fit`).
+        sigma_px: Standard deviation of the lens's blur [px].
+        disc_px: Radius of the defocus disc [px].
+        motion_px: Length of the motion blur [px].
+        motion_deg: Its direction, from the image's x [deg].
+        tone: Nonlinearity of its tones (see `vision.dense.fit`).
         pixel_noise: Standard deviation of a pixel [grey levels].
     """
 
@@ -316,12 +307,12 @@ class ImageBlur:
 
 @dataclass(frozen=True, kw_only=True)
 class DenseResult(Section):
-    """What corners of dense image fits brought: `dense` in calibration.json.
+    """Comparison of corners by dense image fits with template corners: `dense`.
 
     Attributes:
-        kept: Whether they were kept.
-        held_out: Residuals of views that were left out, of corners by `template` and `dense`.
-        images: How each image is blurred.
+        kept: Whether the dense corners were used.
+        held_out: Residuals of left-out views, with corners by `template` and `dense`.
+        images: Blur of each image.
     """
 
     kept: bool
@@ -331,13 +322,13 @@ class DenseResult(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TouchedPoint(Section):
-    """A point that the camera located and the tool touched.
+    """Point that the camera located and the tool touched.
 
     Attributes:
-        name: Which point of the board.
-        base_m: (3,) where it was located, in the base [m].
-        radius95_mm: How near the tip comes with 95 %, as predicted [mm].
-        gap_mm: How far the tip was from it [mm].
+        name: Name of the point on the board.
+        base_m: (3,) its located position in the base [m].
+        radius95_mm: Predicted gap that 95 % do not exceed [mm].
+        gap_mm: Measured gap between tip and point [mm].
     """
 
     name: str
@@ -348,13 +339,13 @@ class TouchedPoint(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TouchTest(Section):
-    """The touch test that joined the result: `touch_test` in calibration.json.
+    """Result of a touch test: `touch_test` in calibration.json.
 
     Attributes:
-        created: When, in ISO 8601.
-        tool: With which tool.
+        created: Time of creation, ISO 8601.
+        tool: Name of the touching tool.
         passed: Whether the gaps are as small as predicted.
-        points: What was touched.
+        points: The touched points.
     """
 
     created: str
@@ -365,22 +356,22 @@ class TouchTest(Section):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationSections(ArmSections):
-    """What was found beside transforms, cameras and views; None or empty where not computed.
+    """Optional sections of a result; None or empty where not computed.
 
     Attributes:
-        clock: How far the camera's clock is ahead of the robot's.
-        instrument: The instrument that read the flange.
-        points: The points on the flange that it read.
-        board: The board as it was found to be, where there is one without a name.
-        boards: The boards by name.
-        rig: The rig of points, likewise.
-        rigs: The rigs by name.
-        uncertainty: How well a point is placed where the views look.
+        clock: Clock offset between camera and robot.
+        instrument: The instrument that measured the flange.
+        points: The points on the flange that it measured.
+        board: Estimated shape of the only board, which has no name.
+        boards: Estimated shapes of the boards by name.
+        rig: Estimated shape of the only rig of points, which has no name.
+        rigs: Estimated shapes of the rigs by name.
+        uncertainty: Uncertainty of a point located where the views look.
         conditions: Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
-        joint_fit: The unknowns of the fit and their covariance, for a later check.
-        dense: What corners of dense image fits brought.
-        touch_test: What was touched to prove it.
-        further: Sections that this version does not know, as the file has them.
+        joint_fit: Parameters of the fit and their covariance, for verification.
+        dense: Comparison of corners by dense image fits with template corners.
+        touch_test: Result of a touch test.
+        further: Unknown sections, kept as they are.
     """
 
     clock: ClockResult | None = None
@@ -399,12 +390,12 @@ class CalibrationSections(ArmSections):
 
     @property
     def budget(self) -> UncertaintyResult | None:
-        """`uncertainty`, where it is of the fit itself; None of a part of a whole cell."""
+        """`uncertainty` of the fit itself; None for a part of a whole cell."""
         return self.uncertainty if isinstance(self.uncertainty, UncertaintyResult) else None
 
     @property
     def named_boards(self) -> dict[str, BoardResult]:
-        """The boards by name, which is empty where there is one without."""
+        """The boards by name, which is empty for the only board."""
         return dict(self.boards) if self.board is None else {"": self.board}
 
 
@@ -413,7 +404,7 @@ class CellDetails(Section):
     """Further figures of a whole cell: its `details` in calibration.json.
 
     Attributes:
-        clocks: The clocks, by the camera and the robot whose they are, in words.
+        clocks: Clock offsets by camera and robot, as `CAMERA and robot ROBOT`.
     """
 
     clocks: Mapping[str, ClockResult] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""The calibration of one camera, one robot and one target out of that of a whole cell."""
+"""Calibration of one camera, one robot and one target from that of a whole cell."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -15,7 +15,7 @@ from visioncal.results.cell import CellResult
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.parts import RobotResult
-from visioncal.results.sections import ClockResult, JointFit, NoiseIntervals
+from visioncal.results.sections import JointFit, NoiseIntervals
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, rms_of
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
@@ -28,23 +28,18 @@ if TYPE_CHECKING:
 def selected_fields(
     whole: "Calibration", cell: CellResult, choice: Choice, needs: Collection[Part]
 ) -> dict[str, Any]:
-    """The fields in which the calibration of one camera, robot and target is another.
-
-    Args:
-        whole: That of the whole cell.
-        cell: What it has by name.
-        choice: See `Calibration.chosen`.
-        needs: Likewise.
+    """Fields of the calibration of one camera, robot and target that differ from the cell's.
 
     Raises:
-        DataError: There is no such thing, several are meant, or no robot parts these.
+        DataError: See `Calibration.of`.
     """
     chosen = _chosen(whole, choice, needs)
-    chain = _chain(whole.tree, chosen)
-    nothing = np.zeros((0, len(whole.joint_covariance)))
-    jacobian = np.concatenate([nothing, *(pair[1] for pair in chain.values())])
+    chain = _transforms(whole.tree, chosen)
+    empty = np.zeros((0, len(whole.joint_covariance)))
+    jacobian = np.concatenate([empty, *(pair[1] for pair in chain.values())])
     covariance = jacobian @ whole.joint_covariance @ jacobian.T
-    arm = cell.robots.get(chosen.robot or "robot", RobotResult())
+    camera_name, robot = thing_name(chosen.camera, "camera"), chosen.robot or "robot"
+    arm = cell.robots.get(robot, RobotResult())
     views = [
         view
         for view in whole.views
@@ -67,9 +62,9 @@ def selected_fields(
         "verdict": _verdict(whole.verdict, cell),
         "camera": None if camera is None else camera.carried(jacobian),
         "robot": arm.model,
-        "frames": _placed(whole.tree, chosen),
+        "frames": _frames(whole.tree, chosen),
         **{entry.name: getattr(arm, entry.name) for entry in entries(ArmSections)},
-        "clock": _clock(cell, chosen),
+        "clock": cell.details.clocks.get(f"{chosen.camera} and robot {robot}"),
         "uncertainty": _intervals(cell, chosen),
         "board": whole.boards.get(target),
         "boards": {},
@@ -77,13 +72,13 @@ def selected_fields(
         "rigs": {},
         "joint_fit": _joint_fit(cell, chosen, jacobian),
         "cell": None,
-        "need": None if whole.need is None else whole.need.of(*_pair(chosen)),
+        "need": None if whole.need is None else whole.need.of(camera_name, robot),
         "further": {},
     }
 
 
 def placed_name(whole: "Calibration", choice: Choice, needs: Collection[Part], name: str) -> str:
-    """What a transform of the smaller calibration is called in the whole cell's."""
+    """Name in the whole cell of a transform of the selected calibration."""
     if whole.cell is None:
         return name
     chosen = _chosen(whole, choice, needs)
@@ -93,7 +88,7 @@ def placed_name(whole: "Calibration", choice: Choice, needs: Collection[Part], n
 
 
 def boards_before(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> dict[str, Edge]:
-    """The targets that stand still before a robot's base in a cell: `base_from_target_floor`."""
+    """Poses of the cell's targets that are fixed to a robot's base: `base_from_target_floor`."""
     if whole.cell is None:
         return {}
     base, tree = _chosen(whole, choice, needs).base, whole.tree
@@ -105,7 +100,7 @@ def boards_before(whole: "Calibration", choice: Choice, needs: Collection[Part])
 
 
 def _chosen(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> Chosen:
-    """What is meant, where all stood last; of what is neither needed nor named, nothing."""
+    """The chosen parts in the last poses; parts neither needed nor named are empty."""
     chosen = choose(whole.tree.last, choice, needs, label=f"the cell {whole.session_name!r}")
     kept = {*needs, *(part for part in PARTS if choice.of(part))}
     return replace(
@@ -115,108 +110,97 @@ def _chosen(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> Ch
     )
 
 
-def _pair(chosen: Chosen) -> tuple[str, str]:
-    """Camera and robot by the names of their tables."""
-    return thing_name(chosen.camera, "camera"), chosen.robot or "robot"
-
-
-def _chain(tree: FrameTree, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Both transforms by name, as far as they are there, each with its slopes by all edges."""
+def _transforms(tree: FrameTree, chosen: Chosen) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Transforms of camera and target by name, each with its Jacobian by all edges."""
     in_hand = chosen.mount == "eye-in-hand"
-    of_camera, of_target = ("flange", "base") if in_hand else ("base", "flange")
+    camera_parent, target_parent = ("flange", "base") if in_hand else ("base", "flange")
     frames = {"flange": chosen.flange, "base": chosen.base}
     ends = {
-        f"{of_camera}_from_cam": (frames[of_camera], chosen.camera),
-        f"{of_target}_from_target": (frames[of_target], chosen.target),
+        f"{camera_parent}_from_cam": (frames[camera_parent], chosen.camera),
+        f"{target_parent}_from_target": (frames[target_parent], chosen.target),
     }
-    return {name: tree.way(*pair) for name, pair in ends.items() if pair[1]}
+    return {name: tree.compose(*pair) for name, pair in ends.items() if pair[1]}
 
 
 def _noise(cell: CellResult, chosen: Chosen, rms: Rms) -> dict[str, float]:
-    """The noise of corners and of the robot."""
-    # Of poses that were measured without corners, that of camera and robot together is as this pair
-    # scatters: the camera's own level is a mean over all that it sees, near and far.
+    """Noise levels of corners and robot."""
+    # For measured poses without corners, the combined noise is from this pair's scatter: the
+    # camera's own level is a mean over all targets, near and far.
     robot, camera = (cell.noise.get(name, {}) for name in (chosen.robot or "robot", chosen.camera))
-    found = {"pixel_px": camera["pixel_px"]} if "pixel_px" in camera else {}
+    levels = {"pixel_px": camera["pixel_px"]} if "pixel_px" in camera else {}
     names = ("translation_mm", "rotation_deg")
-    found |= {f"robot_{name}": robot[name] for name in names if name in robot}
+    levels |= {f"robot_{name}": robot[name] for name in names if name in robot}
     if chosen.camera and chosen.target and "pixel_px" not in camera:
-        each = (rms.mm, rms.deg or 0.0)
-        found |= {
+        scatter = (rms.mm, rms.deg or 0.0)
+        levels |= {
             f"combined_{name}": value / np.sqrt(3.0)
-            for name, value in zip(names, each, strict=True)
+            for name, value in zip(names, scatter, strict=True)
         }
-    return found
+    return levels
 
 
 def _verdict(verdict: Verdict, cell: CellResult) -> Verdict:
     if "arms" not in cell.details.further:
         return verdict
-    found = Finding(
+    finding = Finding(
         "arm_left_out",
         "The whole cell was fitted with errors of its arms, which this part of it does not have: "
         "by the poses as they are reported it is off by as much.",
     )
     status = "check" if verdict.status == "good" else verdict.status
-    return replace(verdict, status=status, findings=(found, *verdict.findings))
+    return replace(verdict, status=status, findings=(finding, *verdict.findings))
 
 
-def _placed(tree: FrameTree, chosen: Chosen) -> dict[str, Frame]:
-    """Tools and fixtures of the robot, and in its base the fixtures of others beside it."""
-    found: dict[str, Frame] = {}
+def _frames(tree: FrameTree, chosen: Chosen) -> dict[str, Frame]:
+    """Tools and fixtures of the robot, and fixtures of other bases that are fixed to its base."""
+    frames: dict[str, Frame] = {}
     for name, frame in tree.placed.items():
         parent, _, child = name.partition("_from_")
         if parent == chosen.flange:
-            found[f"flange_from_{child}"] = frame
+            frames[f"flange_from_{child}"] = frame
         elif parent == chosen.base:
-            found[f"base_from_{child}"] = frame
+            frames[f"base_from_{child}"] = frame
         elif parent.startswith("base") and not robots_between(tree.parents, chosen.base, parent):
-            found[f"base_from_{child}"] = replace(frame, edge=tree.between(chosen.base, child))
-    return found
-
-
-def _clock(cell: CellResult, chosen: Chosen) -> ClockResult | None:
-    """How far the camera's clock is ahead of the robot's."""
-    return cell.details.clocks.get(f"{chosen.camera} and robot {chosen.robot or 'robot'}")
+            frames[f"base_from_{child}"] = replace(frame, edge=tree.between(chosen.base, child))
+    return frames
 
 
 def _intervals(cell: CellResult, chosen: Chosen) -> NoiseIntervals | None:
-    """How well the robot's noise is known."""
-    known = {} if cell.uncertainty is None else cell.uncertainty.noise_95
-    found = known.get(chosen.robot or "robot", {})
-    named = {f"robot_{name}": pair for name, pair in found.items()}
-    return NoiseIntervals(noise_95=named) if named else None
+    """Intervals of the robot's noise levels."""
+    by_robot = {} if cell.uncertainty is None else cell.uncertainty.noise_95
+    intervals = by_robot.get(chosen.robot or "robot", {})
+    prefixed = {f"robot_{name}": pair for name, pair in intervals.items()}
+    return NoiseIntervals(noise_95=prefixed) if prefixed else None
 
 
 def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointFit | None:
-    """What `verify` predicts with: both edges, lens and board as far as they are free, the arm."""
+    """Fit for `verify`: both edges, free parameters of lens and board, the arm's errors."""
     fit = cell.joint_fit
     if fit is None or not chosen.camera:
         return None
     target = thing_name(chosen.target, "target") if chosen.target else ""
     camera = thing_name(chosen.camera, "camera")
-    lens_count = 0
-    if (known := cell.lenses.get(chosen.camera)) is not None:
-        lens_count = 4 + len(known.camera.distortion)
+    lens = cell.lenses.get(chosen.camera)
+    lens_count = 0 if lens is None else 4 + len(lens.camera.distortion)
     looks: list[int] = []
     columns: list[int] = []
     at = jacobian.shape[1]
-    for part, name, first in ((fit.cameras, camera, 0), (fit.targets, target, lens_count)):
-        for word, places in part.items():
-            if word == name:
-                looks += [first + place for place in places]
-                columns += range(at, at + len(places))
-            at += len(places)
-    own = chosen.robot or "robot"
-    for word, arm in fit.arms.items():
-        if word == own:
+    for parts, name, first in ((fit.cameras, camera, 0), (fit.targets, target, lens_count)):
+        for part_name, indices in parts.items():
+            if part_name == name:
+                looks += [first + index for index in indices]
+                columns += range(at, at + len(indices))
+            at += len(indices)
+    robot = chosen.robot or "robot"
+    for part_name, arm in fit.arms.items():
+        if part_name == robot:
             columns += range(at, at + len(arm.values))
         at += len(arm.values)
-    carried = block_diag(jacobian, np.eye(at)[columns][:, jacobian.shape[1] :])
+    selection = block_diag(jacobian, np.eye(at)[columns][:, jacobian.shape[1] :])
     return JointFit(
         targets={"": cell.targets[target]} if target in cell.targets else {},
         boards=("",) if chosen.target else (),
         looks=tuple(looks),
-        arm=fit.arms.get(own),
-        covariance=carried @ fit.covariance @ carried.T,
+        arm=fit.arms.get(robot),
+        covariance=selection @ fit.covariance @ selection.T,
     )

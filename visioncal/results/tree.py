@@ -1,4 +1,4 @@
-"""The frames of a result: where any of them is in any other, with its covariance."""
+"""Tree of a result's frames: transforms between any two, with covariance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from visioncal.session.frames import CELL
 
 @dataclass(frozen=True, eq=False)
 class FrameTree:
-    """What hangs on what, and how.
+    """Tree of frames with the estimated transforms.
 
     Attributes:
-        reference: The frame that stands for the cell: the cell's frame is its.
-        parents: What each frame hangs on, by its name.
-        flanges: The robot of each flange, by the flange's frame.
-        edges: The estimated transforms by name, as `cell_from_base_b`.
-        joint_covariance: (6 k, 6 k) covariance of all of them together, in their order.
-        placed: Tools and fixtures by the transform that places them, as `flange_a_from_tool`.
-        former: Frames as they hung before they moved.
+        reference: The frame that defines the cell's frame.
+        parents: Parent of each frame, by name.
+        flanges: Robot of each flange, by the flange's frame.
+        edges: Estimated transforms by name, as `cell_from_base_b`.
+        joint_covariance: (6 k, 6 k) joint covariance of these, in their order.
+        placed: Tools and fixtures by transform name, as `flange_a_from_tool`.
+        former: Frames at the poses before they moved.
     """
 
     reference: str
@@ -40,11 +40,11 @@ class FrameTree:
 
     @property
     def last(self) -> dict[str, str]:
-        """What each frame hangs on, as they hung last."""
-        return {name: on for name, on in self.parents.items() if name not in self.former}
+        """Parent of each frame without the former ones."""
+        return {name: parent for name, parent in self.parents.items() if name not in self.former}
 
     def edge_of(self, frame: str) -> Edge:
-        """How a frame hangs on its parent; the reference, exactly in the cell's place."""
+        """Transform of a frame in its parent; identity for the reference."""
         if frame == self.reference:
             return Edge(np.eye(4), np.zeros((6, 6)))
         return self.edges[f"{self.parents[frame]}_from_{frame}"]
@@ -52,38 +52,40 @@ class FrameTree:
     def between(
         self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
     ) -> Edge:
-        """Places any frame in any other; see `Calibration.between`.
+        """Transform between any two frames; see `Calibration.between`.
 
         Raises:
             DataError: There is no such frame, or a robot's pose is needed.
         """
         near, far = self.placement(first), self.placement(second)
-        matrix, slope = self.way(near[0] if near else first, far[0] if far else second, poses)
-        covariance = slope @ self.joint_covariance @ slope.T
+        matrix, jacobian = self.compose(
+            near[0] if near else first, far[0] if far else second, poses
+        )
+        covariance = jacobian @ self.joint_covariance @ jacobian.T
         if far:
-            carry = adjoint(invert(far[1].edge.matrix))
+            transport = adjoint(invert(far[1].edge.matrix))
             matrix = matrix @ far[1].edge.matrix
-            covariance = carry @ covariance @ carry.T + far[1].edge.covariance
+            covariance = transport @ covariance @ transport.T + far[1].edge.covariance
         if near:
             matrix = invert(near[1].edge.matrix) @ matrix
-            carry = adjoint(invert(matrix))
-            covariance = covariance + carry @ near[1].edge.covariance @ carry.T
+            transport = adjoint(invert(matrix))
+            covariance = covariance + transport @ near[1].edge.covariance @ transport.T
         if not all(pair[1].oriented for pair in (near, far) if pair):
             covariance[:3], covariance[:, :3] = 0.0, 0.0
         return Edge(matrix, covariance)
 
     def placement(self, name: str) -> tuple[str, Frame] | None:
-        """The frame in which a tool or a fixture was placed, and its place; None for no such."""
+        """Parent and frame of a tool or fixture; None where there is none of that name."""
         for transform, frame in self.placed.items():
             parent, _, child = transform.partition("_from_")
             if child == name:
                 return parent, frame
         return None
 
-    def way(
+    def compose(
         self, first: str, second: str, poses: Mapping[str, FloatArray] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """The transform of `between`, (4, 4), and (6, 6 k) how it moves with all edges."""
+        """Transform of `between` without tools and fixtures, (4, 4), and its Jacobian (6, 6 k)."""
         tree, poses = self._tree, poses or {}
         for frame in (first, second):
             if frame != tree.root and frame not in tree.branches:
@@ -94,17 +96,17 @@ class FrameTree:
                     culprits=[frame],
                     next_step=did_you_mean(frame, known),
                 )
-        way, places = tree.path(first, second), {edge: at for at, edge in enumerate(self.edges)}
-        rest, slope = np.eye(4), np.zeros((6, 6 * len(places)))
-        for step in reversed(way):
+        index_of = {edge: at for at, edge in enumerate(self.edges)}
+        rest, jacobian = np.eye(4), np.zeros((6, 6 * len(index_of)))
+        for step in reversed(tree.path(first, second)):
             edge = self._matrix(step, poses)
             before = invert(edge) @ rest if step.is_up else edge @ rest
-            moved = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
-            at = places.get(f"{self.parents[step.frame]}_from_{step.frame}")
+            by_edge = -adjoint(invert(before)) if step.is_up else adjoint(invert(rest))
+            at = index_of.get(f"{self.parents[step.frame]}_from_{step.frame}")
             if at is not None:
-                slope[:, 6 * at : 6 * at + 6] += moved
+                jacobian[:, 6 * at : 6 * at + 6] += by_edge
             rest = before
-        return rest, slope
+        return rest, jacobian
 
     @cached_property
     def _tree(self) -> Tree:

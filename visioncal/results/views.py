@@ -1,4 +1,4 @@
-"""What became of the views, and how large their residuals are."""
+"""Results of views, and their residuals."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,10 +10,10 @@ from visioncal.core.codec import DROPPED, INLINE, KEPT
 from visioncal.core.number_format import figure
 from visioncal.session.frames import frame_called, frames_of_kind, robots_between, thing_name
 
-# Why a view is in no fit although nothing is wrong with it.
+# Reason of a view with the role holdout.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
 _NOT_LEFT_OUT = "none was left out: the residuals of the whole cell's fit"
-# What may see, and what may be seen.
+# Kinds of observers and of observed frames.
 _KINDS = ("camera", "instrument", "target", "point")
 
 
@@ -21,7 +21,7 @@ _KINDS = ("camera", "instrument", "target", "point")
 class Rms:
     """Root mean square residuals.
 
-    `deg` is None where an instrument read places alone, `px` where no image was used.
+    `deg` is None where an instrument read only positions, `px` where no image was used.
     """
 
     mm: float
@@ -30,31 +30,30 @@ class Rms:
 
     @property
     def words(self) -> str:
-        """In position and, where that is known, in rotation."""
+        """Residuals of position and, where known, of rotation in words."""
         turned = "" if self.deg is None else f" and {figure(self.deg)} deg"
         return f"{figure(self.mm)} mm{turned}"
 
 
 @dataclass(frozen=True)
 class ViewResult:
-    """What became of one view. A figure that could not be computed is None, and absent on disk.
+    """Result of one view. A figure that could not be computed is None, and absent on disk.
 
     Attributes:
         view: The view's number.
         used: Whether the fit used it.
         reason: Why it was not used, in words; empty for a used view.
-        corners: How many corners were found.
+        corners: Number of detected corners.
         rms_px: Reprojection error through the whole chain of frames [px].
-        residual_mm: Distance of the target, as this view places it, from its mean place, or of a
-            whole cell from where the rest of the cell predicts it [mm].
-        residual_deg: The same in rotation [deg]; None where a place alone was read.
-        seer: The frame of the camera or instrument; empty where there is one alone.
-        seen: The frame of the target or point, likewise.
-        stop: Of a whole cell, its stop, or the view's number where the session has none.
-        left_out_mm: Of a whole cell, how far it is from what a fit predicts that was made without
-            its stop [mm].
+        residual_mm: Distance of the target's position by this view from its mean, or in a whole
+            cell from its prediction by the rest of the cell [mm].
+        residual_deg: The same in rotation [deg]; None where only a position was read.
+        seer: Frame of the camera or instrument; empty where there is only one.
+        seen: Frame of the target or point; empty where there is only one.
+        stop: In a whole cell, its stop, or the view's number where stops are not numbered.
+        left_out_mm: In a whole cell, position residual by a fit without its stop [mm].
         left_out_deg: The same in rotation [deg].
-        left_out_px: Reprojection error by such a fit [px].
+        left_out_px: Reprojection error by that fit [px].
     """
 
     view: int
@@ -73,27 +72,21 @@ class ViewResult:
 
     @property
     def of_pair(self) -> "ViewResult":
-        """The same where one camera saw one target by one robot, which need no names."""
+        """The result as one of a single camera, robot and target, without names."""
         return replace(
-            self,
-            seer="",
-            seen="",
-            stop=None,
-            left_out_mm=None,
-            left_out_deg=None,
-            left_out_px=None,
+            self, seer="", seen="", stop=None, left_out_mm=None, left_out_deg=None, left_out_px=None
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeerAndSeen:
-    """What saw and what was seen, by their kinds and names.
+    """Observer and observed object of an observation, by kind and name.
 
     Attributes:
-        camera: The camera that saw it; or else an instrument did.
-        instrument: The instrument that read it.
-        target: The target that was seen; or else a point was.
-        point: The point that was read.
+        camera: Name of the camera; None for an instrument.
+        instrument: Name of the instrument; None for a camera.
+        target: Name of the observed target; None for a point.
+        point: Name of the measured point; None for a target.
     """
 
     camera: str | None = None
@@ -102,17 +95,12 @@ class SeerAndSeen:
     point: str | None = None
 
     def __post_init__(self) -> None:
-        """Checks that something was seen by something.
-
-        Raises:
-            ValueError: It was not.
-        """
         if (self.camera or self.instrument) is None or (self.target or self.point) is None:
             raise ValueError("camera or instrument, or target or point, is missing")
 
 
 def _names(view: ViewResult) -> dict[str, Any]:
-    """What saw, and what was seen, by their kinds."""
+    """Names of observer and observed object, by kind."""
     seer = "camera" if frames_of_kind([view.seer], "camera") else "instrument"
     seen = "target" if frames_of_kind([view.seen], "target") else "point"
     return {seer: thing_name(view.seer, seer), seen: thing_name(view.seen, seen)}
@@ -120,11 +108,11 @@ def _names(view: ViewResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class CellView(SeerAndSeen):
-    """What became of one observation of a whole cell, with names in the place of frames.
+    """Result of one observation of a whole cell, with names instead of frames.
 
     Attributes:
-        robots: The robots that move both before each other.
-        figures: The rest of it.
+        robots: The robots between observer and observed object.
+        figures: The other fields.
     """
 
     robots: Annotated[tuple[str, ...], KEPT] = ()
@@ -132,19 +120,14 @@ class CellView(SeerAndSeen):
 
     @classmethod
     def of(cls, tree: Mapping[str, str], view: ViewResult) -> "CellView":
-        """Writes an observation.
-
-        Args:
-            tree: What each frame hangs on.
-            view: The observation.
-        """
-        are_tied = {view.seer, view.seen} <= tree.keys()
-        robots = robots_between(tree, view.seer, view.seen) if are_tied else ()
+        """Form of an observation; `tree` has the parent of each frame."""
+        connected = {view.seer, view.seen} <= tree.keys()
+        robots = robots_between(tree, view.seer, view.seen) if connected else ()
         named = tuple(robot or "robot" for robot in robots)
         return cls(robots=named, figures=replace(view, seer="", seen=""), **_names(view))
 
     def result(self, tree: Mapping[str, str]) -> ViewResult:
-        """Reads it; see `of`."""
+        """The observation; inverse of `of`."""
         names = ((kind, getattr(self, kind)) for kind in _KINDS)
         seer, seen = (frame_called(tree, kind, name) for kind, name in names if name is not None)
         return replace(self.figures, seer=seer, seen=seen)
@@ -152,7 +135,7 @@ class CellView(SeerAndSeen):
 
 @dataclass(frozen=True, kw_only=True)
 class PairResiduals(SeerAndSeen):
-    """Residuals of views of a target by a camera that were left out [mm, deg, px]."""
+    """Residuals of left-out views of one target by one camera [mm, deg, px]."""
 
     views: int
     rms: Annotated[Rms, INLINE]
@@ -160,13 +143,13 @@ class PairResiduals(SeerAndSeen):
 
 @dataclass(frozen=True)
 class Validation:
-    """Residuals of views that the fit had not seen.
+    """Residuals of views that were not in the fit.
 
     Attributes:
         method: How views were left out, in words.
-        held_out: Their residuals, over all used views in turn.
+        held_out: Residuals of all used views, left out in turn.
         holdout: Residuals of the views that the session declares as `holdout`.
-        pairs: Of a whole cell, the residuals of those that were left out by camera and target.
+        pairs: In a whole cell, residuals of left-out views by camera and target.
     """
 
     method: str
@@ -176,26 +159,26 @@ class Validation:
 
     @classmethod
     def of(cls, method: str, views: Sequence[ViewResult], *, by_pair: bool = False) -> "Validation":
-        """What fits without some observations of a whole cell say of these.
+        """Validation of a whole cell from the residuals of its observations.
 
         Args:
             method: How they were left out; empty where they were not.
             views: The observations.
-            by_pair: Whether to say it of each camera and target, too.
+            by_pair: Whether to list pairs of camera and target.
         """
         if not method:
             return cls(_NOT_LEFT_OUT, rms_of(views), holdout_rms(views))
-        pairs = _pairs(views) if by_pair else ()
+        pairs = _pair_residuals(views) if by_pair else ()
         return cls(method, left_out_rms(views), holdout_rms(views), pairs)
 
     @property
     def is_of_unseen(self) -> bool:
-        """Whether any were left out; else these are residuals of the fit."""
+        """Whether views were left out; else these are residuals of the fit."""
         return self.method != _NOT_LEFT_OUT
 
 
-def _pairs(views: Iterable[ViewResult]) -> tuple[PairResiduals, ...]:
-    """Residuals of what was left out of fits in turn, by camera and target."""
+def _pair_residuals(views: Iterable[ViewResult]) -> tuple[PairResiduals, ...]:
+    """Residuals of left-out views by camera and target."""
     pairs: dict[tuple[str, str], list[ViewResult]] = {}
     for view in views:
         if view.left_out_mm is not None:
@@ -207,7 +190,7 @@ def _pairs(views: Iterable[ViewResult]) -> tuple[PairResiduals, ...]:
 
 
 def rms_of(views: Iterable[ViewResult]) -> Rms:
-    """Root mean square residuals over the used ones of some views; zero of none."""
+    """Root mean square residuals over the used views; zero without any."""
     used = [view for view in views if view.used]
 
     def rms(values: list[float | None]) -> float | None:
@@ -222,7 +205,7 @@ def rms_of(views: Iterable[ViewResult]) -> Rms:
 
 
 def left_out_rms(views: Iterable[ViewResult]) -> Rms:
-    """Root mean square residuals of views by fits that were made without them."""
+    """Root mean square residuals of views by fits without them."""
     unseen = (
         replace(
             view,
@@ -236,7 +219,7 @@ def left_out_rms(views: Iterable[ViewResult]) -> Rms:
 
 
 def holdout_rms(views: Iterable[ViewResult]) -> Rms | None:
-    """Root mean square residuals of what the session holds back; None where that is nothing."""
+    """Root mean square residuals of the session's holdout views; None without any."""
     held = [
         replace(view, used=True)
         for view in views
@@ -246,20 +229,16 @@ def holdout_rms(views: Iterable[ViewResult]) -> Rms | None:
 
 
 def worst_view(views: Sequence[ViewResult], rms: Rms) -> int | None:
-    """The number of the view that is farthest off, used or not; None where none is known.
+    """Number of the view with the largest relative residual, used or not; None without any.
 
     Args:
-        views: What became of each.
-        rms: Residuals of the used ones, in units of which millimetres, degrees and pixels compare.
+        views: Results of the views.
+        rms: Residuals of the used views, as units of millimetres, degrees and pixels.
     """
 
-    def off(view: ViewResult) -> float:
-        pairs = (
-            (view.residual_mm, rms.mm),
-            (view.residual_deg, rms.deg),
-            (view.rms_px, rms.px),
-        )
+    def relative(view: ViewResult) -> float:
+        pairs = ((view.residual_mm, rms.mm), (view.residual_deg, rms.deg), (view.rms_px, rms.px))
         return max((value / typical for value, typical in pairs if value and typical), default=0.0)
 
-    worst = max(views, key=off, default=None)
-    return worst.view if worst is not None and off(worst) else None
+    worst = max(views, key=relative, default=None)
+    return worst.view if worst is not None and relative(worst) else None

@@ -1,7 +1,7 @@
-"""Sessions: what was recorded of a cell, as a folder of session.toml, views.csv and images.
+"""Sessions: recordings of a cell, as folders of session.toml, views.csv and images.
 
-A folder may come from a stranger. What its tables name lies inside it, wherever links lead; what
-session.toml names itself, boards and robots, may lie outside, which `kinds` says to the user.
+A folder may be untrusted. Files that its tables name must be inside it, links followed. Boards and
+robots that session.toml names may be outside, of which `kinds` warns.
 """
 
 from visioncal.session.document import Declaration

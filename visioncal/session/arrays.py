@@ -1,4 +1,4 @@
-"""Sessions of what a program has in memory: arrays of images, corners and poses."""
+"""Sessions from arrays in memory: images, corners and poses."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias, TypedDict, Unpack
@@ -18,7 +18,7 @@ from visioncal.vision.finders.imaging import encode_png
 from visioncal.vision.targets import target_document
 
 Poses: TypeAlias = RigidTransform | FloatArray | Sequence[RigidTransform]
-# Entries of a rotation that were written with three decimals are off by half of that.
+# Tolerance of a rotation matrix, for entries rounded to three decimals.
 _ROUGH = 5e-3
 _KEPT_PLACE = (
     "A view in which nothing was found keeps its place: give (None, None) for its corners."
@@ -26,11 +26,11 @@ _KEPT_PLACE = (
 
 
 class CellArguments(TypedDict, total=False):
-    """What else is known of a cell.
+    """Optional arguments that describe a cell.
 
     Attributes:
-        mount: Where the camera is; eye-in-hand where left out.
-        camera: Its intrinsics, as a table of session.toml has them; left out, they are estimated.
+        mount: Mount of the camera; eye-in-hand by default.
+        camera: Its intrinsics, as in session.toml; estimated by default.
         robot: The robot's model, by a built-in name.
         q: (n, j) joint angles [rad].
         name: The session's name.
@@ -44,7 +44,7 @@ class CellArguments(TypedDict, total=False):
 
 
 class AssembleArguments(TypedDict):
-    """What `Session.assemble` takes."""
+    """Arguments of `Session.assemble`."""
 
     document: Mapping[str, Any]
     columns: Sequence[str]
@@ -60,14 +60,14 @@ def of_images(
     board: Target | str,
     **cell: Unpack[CellArguments],
 ) -> AssembleArguments:
-    """The facts of a session of images; see `Session.from_arrays`."""
+    """Content of a session of images; see `Session.from_arrays`."""
     matrices = _matrices(poses, "images", len(images))
     paths = [f"images/{at:03d}.png" for at in range(len(images))]
     files = {
         path: image if isinstance(image, bytes) else encode_png(image)
         for path, image in zip(paths, images, strict=True)
     }
-    return _facts(matrices, board, cell, {"image": paths}, MemoryImages(files))
+    return _content(matrices, board, cell, {"image": paths}, MemoryImages(files))
 
 
 def of_corners(
@@ -77,23 +77,23 @@ def of_corners(
     resolution: tuple[int, int],
     **cell: Unpack[CellArguments],
 ) -> AssembleArguments:
-    """The facts of a session of corners; see `Session.from_corners`."""
+    """Content of a session of corners; see `Session.from_corners`."""
     matrices = _matrices(poses, "corners", len(corners))
-    read = [_corners(at, *corner) for at, corner in enumerate(corners)]
-    counts = [len(ids) for ids, _ in read]
+    checked = [_corners(at, *corner) for at, corner in enumerate(corners)]
+    counts = [len(ids) for ids, _ in checked]
     table = CornerTable(
-        np.repeat(np.arange(len(read)), counts),
-        np.concatenate([np.zeros(0, dtype=np.int64), *(ids for ids, _ in read)]),
-        np.concatenate([np.zeros((0, 2)), *(px for _, px in read)]),
+        np.repeat(np.arange(len(checked)), counts),
+        np.concatenate([np.zeros(0, dtype=np.int64), *(ids for ids, _ in checked)]),
+        np.concatenate([np.zeros((0, 2)), *(px for _, px in checked)]),
         ("",) * sum(counts),
         is_file=False,
     )
-    facts = _facts(matrices, board, cell, {}, MemoryImages({}), resolution)
-    return {**facts, "corners": table}
+    content = _content(matrices, board, cell, {}, MemoryImages({}), resolution)
+    return {**content, "corners": table}
 
 
 def _corners(view: int, ids: npt.ArrayLike, px: npt.ArrayLike) -> tuple[IntArray, FloatArray]:
-    """The numbers and places of a view's corners, checked; detectors give None for no corners."""
+    """Checked numbers (k,) and positions (k, 2) of a view's corners; None counts as no corners."""
     name = f"corners[{view}]"
     numbers = np.asarray([] if ids is None else ids)
     places = np.asarray([] if px is None else px, dtype=float)
@@ -121,7 +121,7 @@ def _corners(view: int, ids: npt.ArrayLike, px: npt.ArrayLike) -> tuple[IntArray
 
 
 def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
-    """The (n, 4, 4) poses of as many views, checked."""
+    """(n, 4, 4) the checked poses of the views."""
     given = poses.as_matrix() if isinstance(poses, RigidTransform) else poses
     matrices = [
         np.array(value.as_matrix() if isinstance(value, RigidTransform) else value, float)
@@ -156,7 +156,7 @@ def _matrices(poses: Poses, what: str, count: int) -> FloatArray:
     return stacked
 
 
-def _facts(
+def _content(
     matrices: FloatArray,
     board: Target | str,
     cell: CellArguments,
@@ -187,10 +187,7 @@ def _facts(
         "mount": cell.get("mount", "eye-in-hand"),
         "camera": _camera(cell.get("camera"), resolution),
     }
-    if isinstance(board, Target):
-        document["target"] = "target.toml"
-    else:
-        document["target"] = board
+    document["target"] = "target.toml" if isinstance(board, Target) else board
     transforms = RigidTransform.from_matrix(matrices)
     numbers = np.hstack([transforms.translation, transforms.rotation.as_quat()])
     names = ["view", *columns, *POSE]
@@ -201,13 +198,12 @@ def _facts(
         [str(at), *(column[at] for column in columns.values()), *map(repr, [*pose, *joints])]
         for at, (pose, joints) in enumerate(zip(numbers.tolist(), q.tolist(), strict=True))
     ]
-    content = target_document(board) if isinstance(board, Target) else None
     return {
         "document": document,
         "columns": names,
         "cells": rows,
         "images": images,
-        "target_document": content,
+        "target_document": target_document(board) if isinstance(board, Target) else None,
         "corners": None,
     }
 

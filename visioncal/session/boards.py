@@ -1,4 +1,4 @@
-"""The printed targets of a session: one, or several named by the column `target`."""
+"""Printed targets of a session: one, or several named by the column `target`."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,34 +21,34 @@ def read_targets(
     """Reads the targets that a session declares.
 
     Args:
-        declaration: What it declares.
-        folder: Relative paths start here; the working directory where None.
-        document: The content of the target's file, where that is known already; of several
-            targets, the contents by their names.
+        declaration: The typed session.toml.
+        folder: Base of relative paths; the working directory where None.
+        document: Content of the target's file, if already read; with several targets, contents by
+            name.
 
     Returns:
-        The targets by name, the name of an only one being empty, and their document in the form of
-        the argument; None where there is none.
+        The targets by name, which is empty for the only one, and their document in the form of the
+        argument; None without targets.
 
     Raises:
         DataError: There is no such target, or its description is wrong.
     """
-    places = _declared_targets(declaration)
-    if not places:
+    paths = _declared_targets(declaration)
+    if not paths:
         return {}, document
-    if len(places) == 1:
-        (place,) = places.values()
+    if len(paths) == 1:
+        (path,) = paths.values()
         if document is None:
-            target, document = _load(place, folder)
+            target, document = _load(path, folder)
         else:
-            target = target_from_document(document, Path(place).stem)
+            target = target_from_document(document, Path(path).stem)
         return {"": target}, document
     targets, contents = {}, {}
-    for name, place in places.items():
+    for name, path in paths.items():
         if document is None:
-            targets[name], contents[name] = _load(place, folder)
+            targets[name], contents[name] = _load(path, folder)
         elif name in document:
-            targets[name] = target_from_document(document[name], Path(place).stem)
+            targets[name] = target_from_document(document[name], Path(path).stem)
             contents[name] = document[name]
         else:
             raise DataError(
@@ -58,35 +58,30 @@ def read_targets(
     return targets, contents
 
 
-def _load(place: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
-    with without_content(place, "target", folder):
+def _load(path: str, folder: Path | None) -> tuple[Target, dict[str, Any]]:
+    with without_content(path, "target", folder):
         try:
-            return read_target(place, folder)
+            return read_target(path, folder)
         except DataError as error:
             if "metres, such as" not in error.message:
                 raise
-            # Sizes in millimetres are all read so at once.
+            # All sizes in millimetres can be converted at once.
             raise type(error)(
                 error.message, culprits=error.culprits, next_step=str(READ_AGAIN)
             ) from error
 
 
 def target_warnings(declaration: Declaration, document: Mapping[str, Any] | None) -> Iterator[str]:
-    """Words what in the targets' descriptions looks like a known key misspelt.
-
-    Args:
-        declaration: What the session declares.
-        document: The descriptions, in the form of `read_targets`.
-    """
-    places = _declared_targets(declaration)
-    for name, place in places.items():
-        described = document if len(places) == 1 else (document or {}).get(name)
+    """Warnings of misspelt keys in the targets' descriptions, in the form of `read_targets`."""
+    paths = _declared_targets(declaration)
+    for name, path in paths.items():
+        described = document if len(paths) == 1 else (document or {}).get(name)
         for words in misspelt_keys(described or {}):
-            yield f"{place}: {words}"
+            yield f"{path}: {words}"
 
 
 def _declared_targets(declaration: Declaration) -> dict[str, str]:
-    """The targets' built-in names or paths, by the names that rows give them."""
+    """Built-in names or paths of the targets, by their names in rows."""
     if declaration.target is not None:
         return {"": declaration.target}
     return {name: table.target for name, table in declaration.targets.items()}

@@ -1,4 +1,4 @@
-"""What a session's parts say about each other: contradictions, and what looks like a mistake."""
+"""Checks of a session's parts against each other: contradictions, and probable mistakes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.document import Declaration
 from visioncal.session.table import View
 
-# No arm reaches this far [m], and no joint of one turns this far [rad].
+# Plausible limits: an arm's reach [m] and a joint's range [rad].
 _FAR_M, _WIDE_RAD = 20.0, 7.0
-# Positions in inches or centimetres are under this number, those in millimetres mostly beyond.
+# Median position above which the unit is millimetres, not inches or centimetres.
 _SURELY_MM = 200.0
 
 
 def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) -> None:
-    """An image says nothing without the target that it shows and the camera that took it.
+    """Checks that target and camera are declared where there are images.
 
     Raises:
-        DataError: One of these is not declared, and a view has an image, or corners of one.
+        DataError: One is not declared, and a view has an image or corners.
     """
     with_image = [view for view in views if view.image or view.has_corners]
     for field, declared, example in (
@@ -49,30 +49,25 @@ def check_images_can_be_used(declaration: Declaration, views: Sequence[View]) ->
 
 
 def _as_written(key: str, value: object) -> str:
-    """How session.toml has a key: that of a table in brackets."""
+    """A key as written in session.toml: that of a table in brackets."""
     return f"[{key}]" if isinstance(value, Mapping) else key
 
 
 def check_times(views: Sequence[View]) -> None:
-    """No time of a recording is beyond what its stamps can resolve.
+    """Checks that times are plausible, so that their stamps resolve microseconds.
 
     Raises:
-        DataError: One is; it names the view.
+        DataError: One is not; it names the view.
     """
     for view in views:
-        wrong = "" if view.stamp_s is None else known.no_size("stamp_s", np.array([view.stamp_s]))
+        wrong = "" if view.stamp_s is None else cols.no_size("stamp_s", np.array([view.stamp_s]))
         if wrong:
             place = f"views.csv, view {view.number}, column stamp_s"
             raise DataError(f"{place}: {wrong}.", culprits=[place])
 
 
 def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
-    """What looks like another unit than metres in most rows; empty where nothing does.
-
-    Args:
-        views: The rows.
-        names: The columns of a position.
-    """
+    """Warning that most positions, in columns `names`, seem to be in another unit than metres."""
     norms = [
         float(np.linalg.norm([view.numbers[name] for name in names]))
         for view in views
@@ -81,20 +76,20 @@ def unit_warning(views: Sequence[View], names: Sequence[str]) -> str:
     far = [norm for norm in norms if norm > _FAR_M]
     if 2 * len(far) <= len(norms):
         return ""
-    away, some = float(np.median(far)), ""
+    size, share = float(np.median(far)), ""
     if len(far) < len(norms):
-        some = f" in {len(far)} of {len(norms)} rows"
+        share = f" in {len(far)} of {len(norms)} rows"
     unit = (
-        f"It looks like millimetres: multiply these columns by 0.001{some and ' there'}."
-        if away > _SURELY_MM
+        f"It looks like millimetres: multiply these columns by 0.001{share and ' there'}."
+        if size > _SURELY_MM
         else "Metres are needed, and these are inches, centimetres or millimetres."
     )
-    return f"views.csv: the median length of ({', '.join(names)}) is {away:.4g} m{some}. {unit}"
+    return f"views.csv: the median length of ({', '.join(names)}) is {size:.4g} m{share}. {unit}"
 
 
 def view_warnings(views: Sequence[View]) -> Iterator[str]:
-    """Words what looks like another unit, or like a row that was copied."""
-    for names in (known.POSITION, known.MEASURED_CAM_POSE[:3]):
+    """Warnings of positions and angles in another unit."""
+    for names in (cols.POSITION, cols.MEASURED_CAM_POSE[:3]):
         if words := unit_warning(views, names):
             yield words
     angles = [float(np.abs(q).max()) for view in views if (q := view.joints_rad) is not None]

@@ -1,4 +1,4 @@
-"""Which camera, robot and target of a whole cell are meant, and whether one robot parts them."""
+"""Choice of one camera, robot and target of a whole cell, with the robot between the other two."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from visioncal.session.frames import frame_name, frames_of_kind, robots_between,
 
 Part: TypeAlias = Literal["camera", "robot", "target"]
 PARTS: tuple[Part, ...] = get_args(Part)
-# What has to be clear where a camera looks at things of any kind, and where none looks.
+# Parts that must be unambiguous for a camera with any target, and without a camera.
 EYE: tuple[Part, ...] = ("camera", "robot")
 ARM: tuple[Part, ...] = ("robot",)
 LENS: tuple[Part, ...] = ("camera",)
@@ -19,7 +19,7 @@ LENS: tuple[Part, ...] = ("camera",)
 
 @dataclass(frozen=True)
 class Choice:
-    """A camera, a robot and a target by name; None where any will do or there is only one.
+    """Names of a camera, a robot and a target; None for any.
 
     A name is that of the session's table, as `left`, or of the frame, as `cam_left`.
     """
@@ -32,11 +32,11 @@ class Choice:
         return any(name is not None for name in (self.camera, self.robot, self.target))
 
     def of(self, part: Part) -> str | None:
-        """The name that was given of a part."""
+        """The given name of a part."""
         return {"camera": self.camera, "robot": self.robot, "target": self.target}[part]
 
 
-# What is meant where there is one of each.
+# The choice without names.
 ANY = Choice()
 
 
@@ -48,7 +48,7 @@ class Chosen:
         mount: Whether this robot carries the camera.
         camera: The camera's frame; empty where none is needed.
         robot: The robot's name in the session.
-        target: The target's frame; empty likewise.
+        target: The target's frame; empty where none is needed.
     """
 
     mount: Mount
@@ -67,7 +67,7 @@ class Chosen:
         return frame_name("flange", self.robot)
 
     def frame_of(self, part: Part) -> str:
-        """The frame that a part is named by: the robot's is its flange."""
+        """Frame that identifies a part: the robot's is its flange."""
         return {"camera": self.camera, "robot": self.flange, "target": self.target}[part]
 
 
@@ -80,41 +80,44 @@ def choose(
     parted: bool = True,
     seen: Collection[tuple[str, str]] = (),
 ) -> Chosen:
-    """Finds the one camera, robot and target that are meant.
+    """Finds the chosen camera, robot and target.
 
     Args:
-        frames: What each frame of the cell hangs on.
-        choice: What is named.
-        needs: What has to be clear; of the rest, any that fits is taken, or none.
-        label: What the cell is called in messages.
-        parted: Whether the robot is to move camera and target before each other.
-        seen: Which cameras saw which targets, by frame; where targets are needed, others are meant
-            only where none of these fits.
+        frames: Parent of each frame of the cell.
+        choice: The given names.
+        needs: Parts that must be unambiguous; for the others, any that fits is taken, or none.
+        label: Name of the cell in messages.
+        parted: Whether the robot must be between camera and target.
+        seen: Observed pairs of camera and target frames; where targets are needed, other pairs are
+            options only where none of these fits.
 
     Raises:
-        DataError: There is no such thing, several are meant, or this robot does not part these.
+        DataError: There is none of that name, the choice is ambiguous, or this robot is not between
+            camera and target.
     """
-    known = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
+    by_part = {part: frames_of_kind(frames, _KINDS[part]) for part in PARTS}
     named = {
-        part: _named(known[part], part, name, label) for part in PARTS if (name := choice.of(part))
+        part: _frame(by_part[part], part, name, label)
+        for part in PARTS
+        if (name := choice.of(part))
     }
     options = [
         option
-        for option in _options(frames, known, parted=parted)
+        for option in _combinations(frames, by_part, parted=parted)
         if all(map(option.frame_of, needs))
     ]
     fitting = [
         option for option in options if all(option.frame_of(p) == at for p, at in named.items())
     ]
     if not fitting:
-        raise _none_fits(frames, known, named, needs, label)
+        raise _none_fits(frames, by_part, named, needs, label)
     if "target" in needs:
         observed = [option for option in fitting if (option.camera, option.target) in seen]
         fitting = observed or fitting
     for part in PARTS:
-        meant = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
-        if part in needs and len(meant) > 1:
-            names = [thing_name(name, part) for name in meant]
+        remaining = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
+        if part in needs and len(remaining) > 1:
+            names = [thing_name(name, part) for name in remaining]
             raise DataError(
                 f"{label} has several {part}s ({some_of(names)}), and which is meant is not said.",
                 culprits=[f"--{part}"],
@@ -123,16 +126,16 @@ def choose(
     return fitting[0]
 
 
-# What a part's frame begins with: a robot is known by its flange.
+# Kind of a part's frame: a robot is identified by its flange.
 _KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "target"}
 
 
-def _named(known: Collection[str], part: Part, name: str, label: str) -> str:
-    """The frame of what is named."""
-    for frame in known:
+def _frame(frames: Collection[str], part: Part, name: str, label: str) -> str:
+    """Frame of a named part."""
+    for frame in frames:
         if name in (frame, thing_name(frame, part)):
             return frame
-    names = [thing_name(word, part) for word in known]
+    names = [thing_name(word, part) for word in frames]
     raise DataError(
         f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
         culprits=[f"--{part}"],
@@ -140,18 +143,18 @@ def _named(known: Collection[str], part: Part, name: str, label: str) -> str:
     )
 
 
-def _options(
-    frames: Mapping[str, str], known: Mapping[Part, Collection[str]], *, parted: bool
+def _combinations(
+    frames: Mapping[str, str], by_part: Mapping[Part, Collection[str]], *, parted: bool
 ) -> Iterator[Chosen]:
-    """All that go together, what has a target or a camera before what has none."""
-    for flange in known["robot"]:
+    """All valid combinations, those with target and camera first."""
+    for flange in by_part["robot"]:
         robot = flange.partition("_")[2]
-        for camera in (*known["camera"], ""):
+        for camera in (*by_part["camera"], ""):
             between = robots_between(frames, camera, frames[flange]) if camera else ()
             if between not in ((), (robot,)):
                 continue
             mount: Mount = "eye-in-hand" if between else "eye-to-hand"
-            for target in (*known["target"], ""):
+            for target in (*by_part["target"], ""):
                 both = camera and target and parted
                 if not both or robots_between(frames, camera, target) == (robot,):
                     yield Chosen(mount if camera else "instrument", camera, robot, target)
@@ -159,18 +162,18 @@ def _options(
 
 def _none_fits(
     frames: Mapping[str, str],
-    known: Mapping[Part, Collection[str]],
+    by_part: Mapping[Part, Collection[str]],
     named: Mapping[Part, str],
     needs: Collection[Part],
     label: str,
 ) -> DataError:
-    """Says why nothing goes with what is named."""
+    """Error that no combination fits the names."""
     culprits = [f"--{name}" for name in named]
     for part in needs:
-        if not known[part]:
+        if not by_part[part]:
             return DataError(f"{label} has no {part}.", culprits=[f"--{part}"])
     only = {
-        part: next(iter(collection)) for part, collection in known.items() if len(collection) == 1
+        part: next(iter(collection)) for part, collection in by_part.items() if len(collection) == 1
     } | dict(named)
     camera, target, flange = (only.get(name) for name in ("camera", "target", "robot"))
     robot = None if flange is None else thing_name(flange, "robot")
@@ -199,7 +202,7 @@ def _none_fits(
     pairs = [
         f"{thing_name(option.camera, 'camera')} and {thing_name(option.target, 'target')} by robot "
         f"{thing_name(option.flange, 'robot')}"
-        for option in _options(frames, known, parted=True)
+        for option in _combinations(frames, by_part, parted=True)
         if option.camera and option.target
     ]
     return DataError(

@@ -1,4 +1,4 @@
-"""The columns of views.csv: which are known, and which belong together."""
+"""Columns of views.csv: known ones, and groups of them."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,17 +18,17 @@ MEASURED_CAM_POSE = tuple(f"cft_{name}" for name in POSE)
 INSTRUMENT_POSITION = tuple(f"meas_{name}" for name in POSITION)
 INSTRUMENT_QUATERNION = tuple(f"meas_{name}" for name in QUATERNION)
 
-# Columns of which a row fills all or none.
+# Groups of columns that a row fills completely or not at all.
 WHOLE_GROUPS = (POSE, MEASURED_CAM_POSE, INSTRUMENT_POSITION, INSTRUMENT_QUATERNION)
 QUATERNION_GROUPS = (QUATERNION, MEASURED_CAM_POSE[3:], INSTRUMENT_QUATERNION)
 
-# What the flange carries, and what pushes at it.
+# Payload on the flange and external force.
 LOAD = (
     "payload_kg",
     *(f"payload_{axis}_m" for axis in "xyz"),
     *(f"force_{axis}_n" for axis in "xyz"),
 )
-# Columns of rotations that are no quaternions, and the forms that they usually have.
+# Columns of rotations other than quaternions, and their usual forms.
 ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
     ("rx", "ry", "rz"): ("rotation-vector", "euler-xyz-deg"),
     ("a", "b", "c"): ("euler-ZYX-deg",),
@@ -41,7 +41,7 @@ ROTATIONS: Mapping[tuple[str, str, str], tuple[str, ...]] = {
     ("roll_deg", "pitch_deg", "yaw_deg"): ("euler-xyz-deg",),
     ("roll_rad", "pitch_rad", "yaw_rad"): ("euler-xyz-rad",),
 }
-# Columns of positions in a unit that their names do not state.
+# Names of position columns other than in metres.
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("x_mm", "y_mm", "z_mm"))
 _PLAIN_NUMBERS = frozenset(
     {
@@ -60,12 +60,11 @@ _TEXTS = frozenset(
     {"view", "stop", "role", "image", "point", "group", "approach"}
     | {"camera", "robot", "target", "instrument"}
 )
-# No robot works below the one, and motors are switched off below the other [deg C]; every
-# temperature of a robot in kelvin is above them.
+# Plausible range of temperatures [deg C]; every plausible temperature in kelvin is above it.
 _COLDEST_C, _HOTTEST_C, _ZERO_K = -60.0, 200.0, 273.15
-# The largest numbers by their column or its unit, with what a larger one is called. Poses in
-# micrometres stay under so many metres, and turns in degrees under so many radians. Beyond the year
-# 2286 a stamp resolves no microsecond, and is in milliseconds or less. What drives do is far below.
+# Largest plausible numbers by unit, with the message for a larger one. The limits of metres and
+# radians admit poses in micrometres and turns in degrees. Stamps beyond the year 2286 do not
+# resolve microseconds, and are in milliseconds or less.
 _SIZES: Mapping[str, tuple[float, str]] = {
     "m": (1e7, "{0:g} m is no place in a robot cell; write metres ({0:g} mm?)"),
     "rad": (1e4, "{0:g} rad is no angle of a joint; write radians"),
@@ -76,21 +75,23 @@ _SIZES: Mapping[str, tuple[float, str]] = {
     "a": (1e6, "{0:g} A is no current of a motor"),
 }
 _RATE = re.compile(r"d{1,2}q[1-9]\d*_(rad_s2?)", re.ASCII)
-# Squares and products of larger numbers in other columns leave what floats hold.
+# Limit in other columns, so that squares and products do not overflow.
 _LARGEST = 1e60
-# How alike a name is to the one that it may be, misspelt; `status` and `stamp_s` are 0.62 alike.
+# Smallest similarity of a misspelt name; that of `status` and `stamp_s` is 0.62.
 _MISSPELT = 0.76
+# What cells look like, and column names do not: a number, or a file's name.
+_CELL = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?|.*\.(png|jpe?g|tiff?)", re.I)
 # Columns that name one of several cameras, robots or instruments.
 SELECTORS = ("camera", "robot", "instrument")
 
 
 def is_number(column: str) -> bool:
-    """Tells whether a column is known and holds numbers."""
+    """Whether a column is a known one of numbers."""
     return column in _PLAIN_NUMBERS or _NUMBERED.fullmatch(column) is not None
 
 
 def no_celsius(values: FloatArray) -> str:
-    """Says what is wrong with temperatures [deg C]; empty where nothing is."""
+    """Message for implausible temperatures [deg C]; empty for none."""
     beyond = values[(values < _COLDEST_C) | (values > _HOTTEST_C)]
     if not len(beyond):
         return ""
@@ -104,12 +105,7 @@ def no_celsius(values: FloatArray) -> str:
 
 
 def no_size(column: str, values: FloatArray) -> str:
-    """Says which number of a column no cell has; empty where all may be, and in other columns.
-
-    Args:
-        column: Its name, which ends in its unit.
-        values: (n,) its numbers; NaN where a cell is empty.
-    """
+    """Message for an implausibly large number among a column's values (n,); empty for none."""
     rate = _RATE.fullmatch(column)
     unit = rate[1] if rate else column.rpartition("_")[2] if is_number(column) else ""
     most, words = _SIZES.get(unit, (_LARGEST, "{0:g} is no number that a cell has"))
@@ -118,13 +114,13 @@ def no_size(column: str, values: FloatArray) -> str:
 
 
 def joint_columns(columns: Sequence[str]) -> tuple[str, ...]:
-    """Lists the columns of joint angles that are there, q1_rad first."""
+    """The columns of joint angles, q1_rad first."""
     numbers = sorted(int(match[1]) for name in columns if (match := _JOINT.fullmatch(name)))
     return tuple(f"q{number}_rad" for number in numbers)
 
 
 def pose_row(pose: FloatArray) -> dict[str, float]:
-    """The values of the columns of a pose (4, 4)."""
+    """Values of a pose (4, 4) by column."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
     return dict(zip(POSE, map(float, [*pose[:3, 3], *quaternion]), strict=True))
 
@@ -133,10 +129,10 @@ def check_header(columns: Sequence[str], where: str) -> None:
     """Checks the header row of a views.csv; `where` names it in messages.
 
     Raises:
-        DataError: A name is empty or there twice, `view` is missing, the joints have gaps, or a
-            pose lacks some of its columns.
+        DataError: A name is empty or duplicate, `view` is missing, the joints have gaps, or a pose
+            lacks some of its columns.
     """
-    if sum(_is_cell(name) for name in columns) > len(columns) / 2:
+    if sum(_CELL.fullmatch(name) is not None for name in columns) > len(columns) / 2:
         raise DataError(
             f"{where}: its first line has numbers, {', '.join(columns)[:80]!r}, and the names of "
             "the columns are needed.",
@@ -144,25 +140,27 @@ def check_header(columns: Sequence[str], where: str) -> None:
             next_step=f"Begin it with a line of names, as view,image,{','.join(POSE)}.",
         )
     problems = list(_header_problems(columns))
-    spelt = {name.lower(): name for name in columns}
-    places = position_columns(columns)
-    turned = next((rotation for rotation in ROTATIONS if spelt.keys() >= set(rotation)), None)
-    # Columns of a program's own are no poses where those that are needed are there, too.
+    lower = {name.lower(): name for name in columns}
+    positions = position_columns(columns)
+    rotation_names = next(
+        (rotation for rotation in ROTATIONS if lower.keys() >= set(rotation)), None
+    )
+    # Additional columns beside complete poses or joints are not meant as poses.
     has_state = bool(set(POSE) & set(columns) or joint_columns(columns))
-    if not problems and (has_state or places is None or turned is None):
+    if not problems and (has_state or positions is None or rotation_names is None):
         return
-    if turned is not None and not set(QUATERNION) & set(columns):
-        names = ",".join(spelt[word] for word in turned)
+    if rotation_names is not None and not set(QUATERNION) & set(columns):
+        names = ",".join(lower[word] for word in rotation_names)
         raise DataError(
             f"{where}: the rotations are in {names}, and quaternions qx, qy, qz, qw are needed.",
             culprits=[where],
-            next_step=f"They may be {' or '.join(ROTATIONS[turned])}, which the images show. "
-            f"{READ_AGAIN}",
+            next_step=f"They may be {' or '.join(ROTATIONS[rotation_names])}, which the images "
+            f"show. {READ_AGAIN}",
         )
-    if places is not None:
+    if positions is not None:
         raise DataError(
-            f"{where}: the positions are in {','.join(places)}, and {', '.join(POSITION)} [m] are "
-            "needed.",
+            f"{where}: the positions are in {','.join(positions)}, and {', '.join(POSITION)} [m] "
+            "are needed.",
             culprits=[where],
             next_step=f"The images show their unit. {READ_AGAIN}",
         )
@@ -170,19 +168,12 @@ def check_header(columns: Sequence[str], where: str) -> None:
 
 
 def position_columns(columns: Sequence[str]) -> tuple[str, ...] | None:
-    """The columns of positions by the names that others give them; None where there are none."""
-    spelt = {name.lower(): name for name in columns}
-    found = next((position for position in _POSITIONS if spelt.keys() >= set(position)), None)
-    return (
-        None
-        if found is None or set(POSITION) & set(columns)
-        else tuple(spelt[word] for word in found)
-    )
-
-
-def _is_cell(name: str) -> bool:
-    """Whether a name is a number or a file's, as cells are, and names of columns are not."""
-    return re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?|.*\.(png|jpe?g|tiff?)", name, re.I) is not None
+    """Columns of positions with other names; None where there are none."""
+    lower = {name.lower(): name for name in columns}
+    group = next((position for position in _POSITIONS if lower.keys() >= set(position)), None)
+    if group is None or set(POSITION) & set(columns):
+        return None
+    return tuple(lower[word] for word in group)
 
 
 def _header_problems(columns: Sequence[str]) -> Iterator[str]:
@@ -212,14 +203,14 @@ def _header_problems(columns: Sequence[str]) -> Iterator[str]:
 
 
 def _spelt_otherwise(columns: Sequence[str], missing: Sequence[str]) -> str:
-    """Names the columns that are missing ones in capitals or with a unit behind them."""
+    """Hint at columns that differ from missing ones by capitals or an appended unit."""
     plain = {re.sub(r"[ _]*[\[(].*", "", name).lower(): name for name in columns}
-    found = [plain[word] for word in missing if word in plain]
-    return f"; {', '.join(found)} may be meant: names are plain and small" if found else ""
+    similar = [plain[word] for word in missing if word in plain]
+    return f"; {', '.join(similar)} may be meant: names are plain and small" if similar else ""
 
 
 def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
-    """Words a hint for every unknown column that looks like a known one misspelt."""
+    """Warnings of unknown columns that look like misspelt known ones."""
     known = _TEXTS | _PLAIN_NUMBERS | {f"q{number}_rad" for number in range(1, 8)}
     degrees = [name for name in columns if _JOINT_DEG.fullmatch(name)]
     if degrees:
@@ -228,10 +219,10 @@ def column_warnings(columns: Sequence[str], where: str) -> Iterator[str]:
             "radians, as q1_rad, q2_rad and so on. Multiply by pi / 180."
         )
     for name in columns:
-        # Not target_id: more words are another thing.
+        # A known word with a suffix, as target_id, is not misspelt.
         is_other = (
             name in (*known, *degrees) or is_number(name) or re.split(r"[_.]", name)[0] in known
         )
-        meant = name.replace("_deg", "_rad")
-        if hint := "" if is_other else did_you_mean(meant, known, _MISSPELT):
+        in_radians = name.replace("_deg", "_rad")
+        if hint := "" if is_other else did_you_mean(in_radians, known, _MISSPELT):
             yield f"{where}: column {name} is not a known one and is kept as text. {hint}"

@@ -1,4 +1,4 @@
-"""corners.csv: where images show known points of the targets, as another detector found them."""
+"""corners.csv: image points of the targets' known points, found by another detector."""
 
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -22,23 +22,23 @@ from visioncal.vision.targets import point_numbers
 FILE = "corners.csv"
 _NEEDED = ("view", "point", "u_px", "v_px")
 _SIGMA = "sigma_px"
-# Five hundred corners of each of two thousand views: a gigabyte of memory.
+# Largest number of rows: 500 corners in 2000 views take a gigabyte of memory.
 _MOST_CORNERS = 1_000_000
-# Fewer corners show no pose.
+# Smallest number of corners that determine a pose.
 _FEWEST = 4
 
 
 @dataclass(frozen=True, eq=False)
 class CornerTable:
-    """The rows of corners.csv, n in all, with their numbers as they were read.
+    """Rows of corners.csv, n in all.
 
     Attributes:
-        views: (n,) the view of each.
-        points: (n,) its number on the target.
-        px: (n, 2) where it was seen [px].
-        targets: (n,) the target's name; empty where the row does not say it.
-        sigmas_px: (n,) standard deviation per axis [px]; None where it is not stated.
-        is_file: Whether they are the lines of a corners.csv; else they are arrays of a program.
+        views: (n,) view numbers.
+        points: (n,) point numbers on the target.
+        px: (n, 2) image points [px].
+        targets: (n,) names of the targets; empty where not stated.
+        sigmas_px: (n,) standard deviation per axis [px]; None where not stated.
+        is_file: Whether they are lines of a corners.csv; else they are arrays of a program.
     """
 
     views: IntArray
@@ -52,7 +52,7 @@ class CornerTable:
         return len(self.views)
 
     def place(self, row: int) -> str:
-        """Where a row is, for messages."""
+        """Place of a row, for messages."""
         if self.is_file:
             return f"{FILE}, line {row + 2}"
         view = int(self.views[row])
@@ -71,11 +71,11 @@ class CornerTable:
         )
 
     def without_targets(self) -> "CornerTable":
-        """The same corners, whose one target needs no name."""
+        """The corners without names of targets."""
         return replace(self, targets=("",) * len(self))
 
     def fact(self) -> dict[str, object]:
-        """What of it counts for the session's digest, free of how the numbers are spelt."""
+        """Content for the session's digest, independent of the numbers' formatting."""
         sigmas = np.zeros(0) if self.sigmas_px is None else self.sigmas_px
         # Adding zero turns -0.0 into 0.0.
         numbers = np.concatenate([self.views, self.points, (self.px + 0.0).ravel(), sigmas])
@@ -87,7 +87,7 @@ def read_corners(folder: Path) -> CornerTable | None:
     """Reads the corners of a session's folder; None where there are none.
 
     Raises:
-        DataError: A column is missing or a cell is wrong; it is named.
+        DataError: A column is missing or a cell is wrong.
     """
     return parse_corners(read_text_inside(folder, FILE)) if (folder / FILE).exists() else None
 
@@ -96,9 +96,9 @@ def parse_corners(text: str) -> CornerTable:
     """Reads the text of a corners.csv.
 
     Raises:
-        DataError: A column is missing or a cell is wrong; it is named.
+        DataError: A column is missing or a cell is wrong.
     """
-    # Rows are numbered by their lines: between them no line may be blank.
+    # Row numbers are line numbers: no blank lines between rows.
     rows = numbered_rows(text.rstrip(), FILE, 1, separator_of(text.partition("\n")[0]))
     columns = [name.strip() for name in next(rows, (1, []))[1]]
     known = (*_NEEDED, COLUMN, _SIGMA)
@@ -152,7 +152,7 @@ class _Line:
 def _line(
     columns: Sequence[str], cells: Sequence[str], place: str, problems: list[TableProblem]
 ) -> _Line:
-    """Reads one row; what is wrong with it is added to the problems."""
+    """Reads one row; appends its problems to `problems`."""
     row = dict(zip(columns, (cell.strip() for cell in cells), strict=False))
     numbers: dict[str, float] = {}
     if len(cells) != len(columns):
@@ -176,7 +176,7 @@ def _line(
 
 
 def write_corners(table: CornerTable) -> str:
-    """Writes corners as the text of a corners.csv that reads as the same numbers."""
+    """Text of a corners.csv that reads back to the same numbers."""
     columns = [*_NEEDED, *([COLUMN] if any(table.targets) else [])]
     rows = [
         [str(view), str(point), repr(u_px), repr(v_px), *([target] if len(columns) > 4 else [])]
@@ -198,27 +198,28 @@ def write_corners(table: CornerTable) -> str:
 def with_corners(
     columns: tuple[str, ...], views: Sequence[View], table: CornerTable, names: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[View, ...], CornerTable]:
-    """Marks the views that corners are of; one that shows several targets gets a row for each.
+    """Marks the views that have corners; splits those that show several targets.
 
     Args:
         columns: The columns of views.csv.
         views: Its rows.
         table: The corners.
-        names: The session's several targets; empty where there is one.
+        names: Names of the session's targets; empty where there is only one.
 
     Returns:
-        Columns and rows, with further rows behind the others, and the corners as they belong to
-        them. Rows that one was made into share its stop. Corners of a view whose row was deleted
-        are left aside.
+        Columns, rows with those for further targets appended, and the corners with their view
+        numbers. The rows of a split view share its stop. Corners of deleted rows are dropped.
 
     Raises:
-        DataError: A view is unknown, or the target of a row is unknown, not said, or another than
-            its view shows.
+        DataError: A view is unknown, or the target of a row is unknown, missing, or contradicts its
+            view.
     """
     rows = {view.number: view for view in views}
-    table = _of_rows(table, rows)
-    own = [rows[view].text.get(COLUMN, "").strip() if view in rows else "" for view in table.views]
-    problems = list(_target_problems(table, rows, own, names))
+    table = _without_deleted(table, rows)
+    named = [
+        rows[view].text.get(COLUMN, "").strip() if view in rows else "" for view in table.views
+    ]
+    problems = list(_target_problems(table, rows, named, names))
     if problems:
         raise problems_error(problems)
     if not names:
@@ -228,67 +229,67 @@ def with_corners(
             tuple(replace(view, has_corners=view.number in has) for view in views),
             table,
         )
-    shown = [said or of_view for said, of_view in zip(table.targets, own, strict=True)]
+    shown = [stated or by_view for stated, by_view in zip(table.targets, named, strict=True)]
     numbers = table.views.copy()
-    made: list[View] = []
+    added: list[View] = []
     new, stop = (1 + max([0, *mapping]) for mapping in (rows, (view.stop or 0 for view in views)))
     for number in list(rows):
-        mine = np.flatnonzero(table.views == number)
-        boards = list(dict.fromkeys(shown[at] for at in mine))
+        own_rows = np.flatnonzero(table.views == number)
+        boards = list(dict.fromkeys(shown[at] for at in own_rows))
         if not boards:
             continue
         if len(boards) > 1 and rows[number].stop is None:
             rows[number], stop = replace(rows[number], stop=stop), stop + 1
-        rows[number] = _showing(rows[number], boards[0])
+        rows[number] = _with_board(rows[number], boards[0])
         for board in boards[1:]:
-            made.append(replace(_showing(rows[number], board), number=new))
-            numbers[[at for at in mine if shown[at] == board]] = new
+            added.append(replace(_with_board(rows[number], board), number=new))
+            numbers[[at for at in own_rows if shown[at] == board]] = new
             new += 1
     more = [name for name in ("stop", COLUMN) if name not in columns]
     wanted = {"stop": any(row.stop is not None for row in rows.values()), COLUMN: True}
     return (
         (*columns, *(name for name in more if wanted[name])),
-        (*rows.values(), *made),
+        (*rows.values(), *added),
         replace(table, views=numbers, targets=tuple(shown)),
     )
 
 
-def _showing(view: View, board: str) -> View:
+def _with_board(view: View, board: str) -> View:
     return replace(view, has_corners=True, text={**view.text, COLUMN: board})
 
 
-def _of_rows(table: CornerTable, rows: Mapping[int, View]) -> CornerTable:
-    """The corners without those of views whose rows were deleted; as they are where some lack."""
-    # Where a row has neither corners nor an image, views are numbered otherwise, not deleted; and a
-    # number with fewer corners than show a pose is a mistyped one.
-    there, counts = np.unique(table.views, return_counts=True)
-    others = {value for value in there.tolist() if value not in rows}
-    few = {*there[counts < _FEWEST].tolist()}
-    if not others or others & few or any(row not in there and not rows[row].image for row in rows):
+def _without_deleted(table: CornerTable, rows: Mapping[int, View]) -> CornerTable:
+    """The corners without those of deleted rows; unchanged where view numbers seem wrong."""
+    # A row with neither corners nor an image means that views are numbered differently; a view
+    # number with fewer corners than determine a pose is mistyped.
+    seen, counts = np.unique(table.views, return_counts=True)
+    lost = {value for value in seen.tolist() if value not in rows}
+    few = {*seen[counts < _FEWEST].tolist()}
+    if not lost or lost & few or any(row not in seen and not rows[row].image for row in rows):
         return table
     return table.of_views(list(rows))
 
 
 def _target_problems(
-    table: CornerTable, rows: Mapping[int, View], own: Sequence[str], names: Sequence[str]
+    table: CornerTable, rows: Mapping[int, View], named: Sequence[str], names: Sequence[str]
 ) -> Iterator[TableProblem]:
-    """What is wrong with the rows' views and targets."""
+    """Problems of the rows' views and targets."""
     first = next((target for target in table.targets if target), "")
-    there = sorted(set(table.views.tolist()))
-    if len(there) == len(rows) and there != sorted(rows):
-        (by, *others) = {b - a for a, b in zip(there, sorted(rows), strict=True)}
+    numbers = sorted(set(table.views.tolist()))
+    if len(numbers) == len(rows) and numbers != sorted(rows):
+        (offset, *others) = {b - a for a, b in zip(numbers, sorted(rows), strict=True)}
         if not others:
             yield TableProblem(
                 f"{FILE}, column view",
-                f"it goes from {there[0]} to {there[-1]}, and that of views.csv from {min(rows)} "
-                f"to {max(rows)}: one of them is numbered otherwise",
-                step=f"Add {by} to the views of {FILE}, if both tables have the same order.",
+                f"it goes from {numbers[0]} to {numbers[-1]}, and that of views.csv from "
+                f"{min(rows)} to {max(rows)}: one of them is numbered otherwise",
+                step=f"Add {offset} to the views of {FILE}, if both tables have the same order.",
             )
             return
     for view in dict.fromkeys(view for view in table.views.tolist() if view not in rows):
-        mine = np.flatnonzero(table.views == view)
-        more = f" and {len(mine) - 1} more" if len(mine) > 1 else ""
-        place = f"{table.place(int(mine[0]))}{more}, column view"
+        own_rows = np.flatnonzero(table.views == view)
+        more = f" and {len(own_rows) - 1} more" if len(own_rows) > 1 else ""
+        place = f"{table.place(int(own_rows[0]))}{more}, column view"
         yield TableProblem(place, f"views.csv has no view {view}")
     for at, (view, target) in enumerate(zip(table.views.tolist(), table.targets, strict=True)):
         place = f"{FILE}, line {at + 2}"
@@ -297,42 +298,37 @@ def _target_problems(
         if not names and target not in ("", first):
             words = f"{target!r} beside {first!r}, but session.toml declares one target"
             yield TableProblem(f"{place}, column {COLUMN}", words)
-        elif names and not (target or own[at]):
+        elif names and not (target or named[at]):
             words = f"it is empty, and so is view {view}'s; one of {', '.join(names)} is needed"
             yield TableProblem(f"{place}, column {COLUMN}", words)
         elif names and target and target not in names:
             words = f"{target!r} is not declared; session.toml declares {', '.join(names)}"
             yield TableProblem(f"{place}, column {COLUMN}", words)
-        elif names and target and own[at] not in ("", target):
+        elif names and target and named[at] not in ("", target):
             words = (
-                f"{target!r}, but views.csv says that view {view} shows {own[at]!r}; a view that "
-                "shows both has a row for each there, or names none"
+                f"{target!r}, but views.csv says that view {view} shows {named[at]!r}; a "
+                "view that shows both has a row for each there, or names none"
             )
             yield TableProblem(f"{place}, column {COLUMN}", words)
 
 
-# A number that is mistyped is one, and those of another target are many.
+# Smallest number of foreign points of an exchanged target; fewer are mistyped.
 _FEWEST_EXCHANGED = 4
 
 
 def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str, Target]) -> None:
-    """Checks that the points are the targets', and each there once a view.
-
-    Args:
-        table: The corners.
-        names: (n,) the target that each is of, by the session's name.
-        targets: The session's targets by name.
+    """Checks that points exist on their targets, with (n,) `names`, and are unique in each view.
 
     Raises:
-        DataError: They are not; it names them.
+        DataError: A point is unknown or duplicate.
     """
     boards, file = [targets[name] for name in names], FILE if table.is_file else "corners"
     numbers = {board: frozenset(point_numbers(board)) for board in dict.fromkeys(boards)}
     for target, known in numbers.items():
-        mine = {
+        used = {
             point for point, of in zip(table.points.tolist(), boards, strict=True) if of is target
         }
-        _check_first_number(mine, known, target, file)
+        _check_first_number(used, known, target, file)
     by_name: dict[str, set[int]] = {}
     for name, point in zip(names, table.points.tolist(), strict=True):
         by_name.setdefault(name, set()).add(point)
@@ -354,7 +350,7 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
 
 
 def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: str) -> None:
-    """Refuses corners that all count from one number higher or lower than the target's points."""
+    """Checks that corners are not numbered from one higher or lower than the target's points."""
     for more, sign in ((-1, "-"), (1, "+")):
         if not seen <= known and {index + more for index in seen} <= known:
             first = min(known) - more
@@ -371,7 +367,7 @@ def _check_first_number(seen: Set[int], known: Set[int], target: Target, file: s
 def _check_exchanged(
     seen: Mapping[str, Set[int]], known: Mapping[str, Set[int]], file: str
 ) -> None:
-    """Refuses two targets of which each has the points that the corners of the other have."""
+    """Checks that no two targets are exchanged: each with the other's point numbers."""
     for one, other in combinations(seen, 2):
         wrong, right = (other, one) if seen[one] <= known[one] else (one, other)
         if len(seen[wrong] - known[wrong]) < _FEWEST_EXCHANGED:
@@ -399,47 +395,42 @@ def corners_by_view(
     declaration: Declaration,
     board_of: Mapping[int, Target],
 ) -> dict[int, Corners]:
-    """The corners of views, each numbered as its target's corners are.
+    """Corners of views, numbered by index on the target.
 
-    Stated standard deviations are taken relative to that of the typical corner of their camera.
-
-    Args:
-        table: The corners.
-        views: The views to take them of.
-        declaration: What the session declares.
-        board_of: The target that each view shows, by its number.
+    Weights are the ratio of the camera's median stated sigma to each corner's. `board_of` has the
+    target of each view, by view number.
     """
     order = np.argsort(table.views, kind="stable")
     cuts = np.flatnonzero(np.diff(table.views[order])) + 1
     rows_of = {int(table.views[part[0]]): part for part in np.split(order, cuts) if len(part)}
     camera_of = {view.number: name_of(declaration, "camera", view) for view in views}
-    typical = _typical_px(table, rows_of, camera_of)
-    index = {
+    medians_px = _median_sigmas_px(table, rows_of, camera_of)
+    index_of = {
         target: {number: at for at, number in enumerate(point_numbers(target))}
         for target in dict.fromkeys(board_of.values())
     }
-    found = {}
+    corners = {}
     for view in (view.number for view in views if view.number in rows_of):
         rows = rows_of[view]
         ids = np.array(
-            [index[board_of[view]][int(point)] for point in table.points[rows]], np.int64
+            [index_of[board_of[view]][int(point)] for point in table.points[rows]], np.int64
         )
         order = np.argsort(ids)
-        rows, stated_px = rows[order], typical.get(camera_of[view])
+        rows, stated_px = rows[order], medians_px.get(camera_of[view])
         sigmas = table.sigmas_px
         weights = None if sigmas is None or stated_px is None else stated_px / sigmas[rows]
-        found[view] = Corners(view, ids[order], table.px[rows], 0.0, weights, stated_px)
-    return found
+        corners[view] = Corners(view, ids[order], table.px[rows], 0.0, weights, stated_px)
+    return corners
 
 
-def _typical_px(
+def _median_sigmas_px(
     table: CornerTable, rows_of: Mapping[int, IntArray], camera_of: Mapping[int, str]
 ) -> dict[str, float]:
-    """The median of the standard deviations that are stated of each camera's corners [px]."""
+    """Median of the stated standard deviations of each camera's corners [px]."""
     if table.sigmas_px is None:
         return {}
-    mine: dict[str, list[FloatArray]] = {}
+    by_camera: dict[str, list[FloatArray]] = {}
     for view, camera in camera_of.items():
         if view in rows_of:
-            mine.setdefault(camera, []).append(table.sigmas_px[rows_of[view]])
-    return {camera: float(np.median(np.concatenate(group))) for camera, group in mine.items()}
+            by_camera.setdefault(camera, []).append(table.sigmas_px[rows_of[view]])
+    return {camera: float(np.median(np.concatenate(group))) for camera, group in by_camera.items()}

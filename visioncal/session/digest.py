@@ -1,4 +1,4 @@
-"""The digest of a session's facts, free of how they are stored."""
+"""Digest of a session's content, independent of its storage."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -24,10 +24,9 @@ def digest_facts(
 ) -> str:
     """Computes the SHA-256 digest of a session's canonical content.
 
-    It is equal for every storage of the same facts: folders, their formatting, the spelling of
-    numbers and the names of a target's or a robot's file do not enter, their contents do. How thick
-    and heavy the robot's links are, how strong its drives, and what the task needs, is no fact of
-    what was recorded.
+    It depends on the contents of target and robot files, not on their names, nor on folders,
+    formatting and the spelling of numbers. The robot's link dimensions, masses and drives, and the
+    task's need, are not part of it.
     """
     digests = {path: images.sha256(path) for path in sorted({view.image for view in views} - {""})}
     facts: dict[str, object] = {
@@ -35,7 +34,7 @@ def digest_facts(
         "target": target_document,
         "robot": None if robot_document is None else _robots(document, robot_document),
         "columns": columns,
-        # A cell's value is free of its spelling.
+        # Values of numbers, independent of their spelling.
         "rows": [
             [
                 view.numbers[column] if column in view.numbers else view.cell(column)
@@ -53,13 +52,12 @@ def digest_facts(
 
 
 def is_file(name: object) -> bool:
-    """Tells a path from a name that comes with visioncal."""
+    """Whether a name is a path, not a built-in name."""
     return isinstance(name, str) and name.lower().endswith(ROBOT_SUFFIXES)
 
 
 def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
-    """Leaves out where the target's and the robot's files lie; what they hold counts instead."""
-    # So it does with the need, which is of the task.
+    """The document without the paths of target and robot files, and without the need."""
     kept = {name: value for name, value in document.items() if name != "need"}
     if is_file(kept.get("target")):
         del kept["target"]
@@ -78,7 +76,7 @@ def _without_paths(document: Mapping[str, object]) -> dict[str, object]:
 def _robots(
     document: Mapping[str, object], robot_document: Mapping[str, object]
 ) -> dict[str, object]:
-    """The robot's model, or those of several by name."""
+    """The robot's model, or several by name."""
     several = document.get("robots")
     if not isinstance(several, Mapping) or len(several) < 2:
         return _without_bodies(robot_document)
@@ -87,7 +85,7 @@ def _robots(
 
 
 def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
-    """Leaves out what the links are like: what the arm was asked to do and what was seen stays."""
+    """A robot's document without dimensions, masses and drives of the links."""
     joints = document.get("joint")
     if not isinstance(joints, list | tuple):
         return dict(document)
@@ -101,7 +99,7 @@ def _without_bodies(document: Mapping[str, object]) -> dict[str, object]:
 
 
 def _pathless(entry: object, field: str) -> object:
-    """One of several targets or robots, in its short form or as a table, without its file."""
+    """Entry of one of several targets or robots without its path."""
     table = {field: entry} if isinstance(entry, str) else entry
     if isinstance(table, Mapping) and is_file(table.get(field)):
         return {key: value for key, value in table.items() if key != field}
@@ -109,7 +107,7 @@ def _pathless(entry: object, field: str) -> object:
 
 
 def _canonical(value: object) -> object:
-    """Writes equal facts equally: 1 and 1.0, lists and tuples, -0.0 and 0.0; dates as text."""
+    """Canonical form: equal for 1 and 1.0, lists and tuples, -0.0 and 0.0; dates as text."""
     if isinstance(value, Mapping):
         return {str(key): _canonical(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

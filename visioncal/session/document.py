@@ -1,4 +1,4 @@
-"""The fields of session.toml: their types, their ranges, and what is wrong when they are not."""
+"""Fields of session.toml: types, ranges, contradictions, and their error messages."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,12 +25,12 @@ Kind: TypeAlias = Literal["camera", "robot", "target", "instrument"]
 KINDS: tuple[Kind, ...] = ("camera", "robot", "target", "instrument")
 
 _COEFFICIENTS: Mapping[str, tuple[int, ...]] = {"brown": (5, 8), "fisheye": (4,)}
-# Of a matrix of 3 x 3, and their places where it is written column by column.
+# Number of entries of a 3 x 3 matrix, and their indices if it is written column by column.
 _ENTRIES, _TRANSPOSED = 9, (0, 3, 6, 1, 4, 7, 2, 5, 8)
-# Names become parts of the names of frames: base_from_target_NAME.
+# Names that can be part of a frame's name: base_from_target_NAME.
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
-# No arm carries a camera or a board farther out, and no cell is larger [m]; offsets written in
-# millimetres are beyond, from 4 mm on a flange and 101 mm in a cell.
+# Largest plausible offsets on a flange and in a cell [m]; offsets of more than 3 mm and 100 mm that
+# are written in millimetres exceed them.
 _MOST_ON_FLANGE_M, _MOST_M = 3.0, 100.0
 _EDGES = (
     *("flange_from_cam", "base_from_target", "base_from_cam", "flange_from_target"),
@@ -39,16 +39,16 @@ _EDGES = (
 
 
 def _short(field: str) -> BeforeValidator:
-    """Takes the short form `floor = "..."` for the table `[targets.floor]` with one field."""
+    """Validator that accepts `floor = "..."` for the table `[targets.floor]` with one field."""
     return BeforeValidator(lambda value: {field: value} if isinstance(value, str) else value)
 
 
 class Declaration(TableModel):
-    """session.toml, typed. Unknown keys stay in `model_extra`.
+    """Typed content of session.toml. Unknown keys are kept in `model_extra`.
 
-    Of each kind there is one, in the table of the singular, or there are several by name, in those
-    of the plural. frames: what each frame hangs on, as far as that is said; see `frames`.
-    corrected: what `convert --guess` changed of what was recorded, in sentences.
+    Of each kind there is one, in the singular table, or several by name, in the plural ones.
+    frames: declared parents of frames; see `frames`. corrected: changes that `convert --guess`
+    made, in sentences.
     """
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -70,7 +70,7 @@ class Declaration(TableModel):
     corrected: list[str] = Field(default_factory=list)
 
     def named(self, kind: Kind) -> dict[str, TableModel]:
-        """The tables of a kind by the names that rows give them; that of a singular is empty."""
+        """Tables of a kind by name, which is empty for the singular table."""
         several: Mapping[str, TableModel] = getattr(self, f"{kind}s")
         if several:
             return dict(several)
@@ -81,7 +81,7 @@ class Declaration(TableModel):
 
     @property
     def is_network(self) -> bool:
-        """Whether frames need names: several cameras, robots or instruments, or said."""
+        """Whether frames need names: several cameras, robots or instruments, or `[frames]`."""
         several = (self.cameras, self.robots, self.instruments)
         return bool(self.frames) or any(len(mapping) > 1 for mapping in several)
 
@@ -92,12 +92,12 @@ class Declaration(TableModel):
 
     @property
     def only_camera(self) -> CameraTable | None:
-        """The camera where there is one; None without, or with several."""
+        """The only camera; None without or with several."""
         return self.camera if len(self.cameras) != 1 else next(iter(self.cameras.values()))
 
     @property
     def only_robot(self) -> RobotTable | None:
-        """The robot where there is one; None without, or with several."""
+        """The only robot; None without or with several."""
         return self.robot if len(self.robots) != 1 else next(iter(self.robots.values()))
 
 
@@ -109,13 +109,13 @@ def read_declaration(
     Args:
         document: The content, as TOML or JSON gives it.
         label: The file's name, for messages.
-        observed: Whether there are views, which something observed.
+        observed: Whether there are views, which need something that observed them.
 
     Raises:
         DataError: A field is missing, of another type, out of range, or contradicts another; the
             message names all of them by their dotted paths.
     """
-    # Before the fields: those of another schema would be reported one by one, and wrongly.
+    # Checked first: fields of another schema would be reported wrongly.
     schema = document.get("schema")
     if schema is not None and (schema != 1 or isinstance(schema, bool)):
         is_newer = isinstance(schema, int) and schema > 1
@@ -128,7 +128,7 @@ def read_declaration(
     try:
         declaration = Declaration.model_validate(dict(document))
     except ValidationError as error:
-        problems = list(_misfits(error.errors(), document))
+        problems = list(_type_errors(error.errors(), document))
     else:
         problems = list(_contradictions(declaration, observed))
         hints = [key for key in _unknown_keys(declaration, "", label) if "Did you mean" in key]
@@ -142,32 +142,32 @@ def read_declaration(
 
 
 def _nearest_mount(document: Mapping[str, Any], label: str) -> str:
-    """What to write for a mount that is spelt otherwise; empty where that is not it."""
+    """Remedy for a mount in another spelling; else empty."""
     given = str(document.get("mount", ""))
     spelt = given.lower().replace("_", "-").replace(" ", "-")
-    is_meant = spelt in get_args(CameraMount) and spelt != given
-    return f'In {label}, write mount = "{spelt}".' if is_meant else ""
+    is_misspelt = spelt in get_args(CameraMount) and spelt != given
+    return f'In {label}, write mount = "{spelt}".' if is_misspelt else ""
 
 
-def _misfits(
+def _type_errors(
     errors: Sequence[Mapping[str, Any]], document: Mapping[str, Any]
 ) -> Iterator[tuple[str, str]]:
-    """Words pydantic's errors, by dotted paths; a list that is nested wrong once."""
+    """Messages for pydantic's errors by dotted path; one for each wrongly nested list."""
     lists: dict[str, str] = {}
     for entry in errors:
         place = tuple(entry["loc"])
         at = next((at for at, value in enumerate(place) if value in ("matrix", "distortion")), None)
         field = () if at is None else place[: at + 1]
         value = reduce(lambda table, key: table[key], field, document) if field else None
-        words = _of_list(str(field[-1]), value) if isinstance(value, list) else ""
+        words = _list_message(str(field[-1]), value) if isinstance(value, list) else ""
         if not words:
-            yield _dotted(place), _in_words(entry)
+            yield _dotted(place), _error_message(entry)
         elif lists.setdefault(_dotted(field), words) is words:
             yield _dotted(field), words
 
 
-def _of_list(name: str, value: list[Any]) -> str:
-    """What is wrong with a lens's matrix of 3 x 3, or a list in a list; empty for neither."""
+def _list_message(name: str, value: list[Any]) -> str:
+    """Message for a 3 x 3 camera matrix, or a nested list; else empty."""
     flat = [number for part in value for number in (part if isinstance(part, list) else [part])]
     if not all(type(number) in (int, float) for number in flat):
         return ""
@@ -181,13 +181,13 @@ def _of_list(name: str, value: list[Any]) -> str:
 
 
 def _dotted(location: Sequence[int | str]) -> str:
-    """Writes a place in the document as a dotted path: `camera.matrix[2]`."""
+    """Dotted path of a place in the document: `camera.matrix[2]`."""
     path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     return path.removeprefix(".")
 
 
-def _in_words(entry: Mapping[str, Any]) -> str:
-    """Says what is wrong with a field, from an entry of pydantic's list of errors."""
+def _error_message(entry: Mapping[str, Any]) -> str:
+    """Message for a field, from an entry of pydantic's list of errors."""
     context = entry.get("ctx", {})
     needed = {
         "int_type": "a whole number",
@@ -224,7 +224,7 @@ _MISSING = {
 
 
 def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[str, str]]:
-    """Finds fields that are well typed but do not fit together: (dotted path, words)."""
+    """Contradictions between well-typed fields: (dotted path, message)."""
     camera = declaration.camera
     reads = declaration.instrument is not None or bool(declaration.instruments) or not observed
     implied = declaration.is_network or (reads and not declaration.named("camera"))
@@ -235,7 +235,7 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
     for name, one in declaration.cameras.items():
         yield from _camera_contradictions(one, f"cameras.{name}")
     for kind in KINDS:
-        yield from _several_contradictions(declaration, kind)
+        yield from _plural_contradictions(declaration, kind)
     yield from _prior_contradictions(declaration)
     need = declaration.need
     if need is not None and need.mm is None and need.deg is None:
@@ -261,10 +261,10 @@ def _prior_contradictions(declaration: Declaration) -> Iterator[tuple[str, str]]
             yield f"prior.{edge}", "needs quaternion_xyzw and sigma_rad together, or neither"
         if turn is not None and not 0.9 < sum(value * value for value in turn) < 1.1:
             yield f"prior.{edge}.quaternion_xyzw", f"is {turn}, but its length must be 1"
-        yield from _far_components(edge, prior)
+        yield from _prior_range_errors(edge, prior)
 
 
-def _far_components(edge: str, prior: PriorTable) -> Iterator[tuple[str, str]]:
+def _prior_range_errors(edge: str, prior: PriorTable) -> Iterator[tuple[str, str]]:
     on_flange = any(part.partition("_")[0] == "flange" for part in edge.split("_from_"))
     most, where = (_MOST_ON_FLANGE_M, "on a flange") if on_flange else (_MOST_M, "in a cell")
     for name in ("x_m", "y_m", "z_m"):
@@ -277,7 +277,7 @@ def _far_components(edge: str, prior: PriorTable) -> Iterator[tuple[str, str]]:
             )
 
 
-def _several_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:
+def _plural_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tuple[str, str]]:
     plural, one = f"{kind}s", "target = ..." if kind == "target" else f"[{kind}]"
     several: Mapping[str, TableModel] = getattr(declaration, plural)
     if several and getattr(declaration, kind) is not None:
@@ -287,8 +287,8 @@ def _several_contradictions(declaration: Declaration, kind: Kind) -> Iterator[tu
             yield f"{plural}.{name}", "is a name of other than letters, digits and _ after a letter"
 
 
-def _coefficients_hint(model: str, distortion: Sequence[float]) -> str:
-    """What to write in the place of coefficients that are too many or too few for a model."""
+def _coefficients_remedy(model: str, distortion: Sequence[float]) -> str:
+    """Remedy for a wrong number of distortion coefficients."""
     counts, count = _COEFFICIENTS[model], len(distortion)
     other = next((name for name in _COEFFICIENTS if count in _COEFFICIENTS[name]), None)
     if count < max(counts):
@@ -308,7 +308,7 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
         yield (
             f"{path}.distortion",
             f'has {len(camera.distortion)} coefficients, but the "{camera.model}" model needs '
-            f"{needed}{_coefficients_hint(camera.model, camera.distortion)}",
+            f"{needed}{_coefficients_remedy(camera.model, camera.distortion)}",
         )
     if camera.matrix is not None:
         if camera.distortion is None:
@@ -326,7 +326,7 @@ def _camera_contradictions(camera: CameraTable, path: str) -> Iterator[tuple[str
 
 
 def declaration_warnings(declaration: Declaration, label: str) -> Iterator[str]:
-    """Words what is allowed but suspicious: unknown keys, a principal point off the image."""
+    """Warnings: unknown keys, unknown priors, a principal point outside the image."""
     yield from _unknown_keys(declaration, "", label)
     edges = [*_EDGES, *(f"{edge}_{name}" for edge in _EDGES for name in declaration.targets)]
     for edge in declaration.prior:

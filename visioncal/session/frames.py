@@ -1,7 +1,8 @@
-"""What hangs on what: the tree of a cell's frames, as `[frames]` says it or as it follows.
+"""Tree of a cell's frames: each frame's parent, as declared in `[frames]` or inferred.
 
-The cell is the root. Bases, fixed cameras, instruments and boards on the floor or on fixtures hang
-on it; each flange hangs on its base by the robot; cameras, boards and points may hang on a flange.
+The cell is the root. Bases, fixed cameras, instruments and boards on the floor or on fixtures are
+its children; each flange is a child of its base, through the robot; cameras, boards and points may
+be children of a flange.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,14 +19,14 @@ from visioncal.session.tables import RobotTable
 CELL = "cell"
 _WHERE = "session.toml: frames"
 _FRAME: Mapping[str, str] = {"camera": "cam"}
-# Names a place on which boards and cameras are fixed; it hangs in the cell unless that is said.
+# Kind of a place that boards and cameras are fixed to; by default fixed in the cell.
 _FIXTURE = "fixture"
 
 
 def frame_name(kind: str, name: str) -> str:
-    """Names the frame of a camera, target, instrument, point, base or flange: `cam_left`.
+    """Name of the frame of a camera, target, instrument, point, base or flange: `cam_left`.
 
-    Of the only one of its kind, that has no name, it is the kind alone: `cam`.
+    An object without a name has its kind's: `cam`.
     """
     frame = _FRAME.get(kind, kind)
     return f"{frame}_{name}" if name else frame
@@ -34,73 +35,66 @@ def frame_name(kind: str, name: str) -> str:
 def robots_of(
     declaration: Declaration, views: Sequence[View], *, in_streams: bool = False
 ) -> dict[str, RobotTable]:
-    """The robots by name; one without a name where poses are given and none is declared.
-
-    Args:
-        declaration: What the session declares.
-        views: Its rows.
-        in_streams: Whether a stream has poses or joints.
-    """
-    found = declaration.named("robot")
-    if not found and (in_streams or any(has_robot_state(view) for view in views)):
+    """Robots by name; one without a name where rows or streams have poses and none is declared."""
+    declared = declaration.named("robot")
+    if not declared and (in_streams or any(has_robot_state(view) for view in views)):
         return {"": RobotTable()}
-    return {name: table for name, table in found.items() if isinstance(table, RobotTable)}
+    return {name: table for name, table in declared.items() if isinstance(table, RobotTable)}
 
 
 def resolve_frames(
     declaration: Declaration, views: Sequence[View], robots: Iterable[str]
 ) -> dict[str, str]:
-    """Works out what each frame hangs on.
+    """Determines the parent of each frame.
 
-    What hangs on a fixture, or on another thing that does not move before it, is given as hanging
-    on the same flange, base or cell.
+    Fixtures and other frames without own motion are skipped: parents are flanges, bases or the
+    cell.
 
     Returns:
         The parent of every frame but `cell`, by the frame's name.
 
     Raises:
-        DataError: What is said contradicts itself, or something is neither said nor follows.
+        DataError: The declaration contradicts itself, or a parent is neither declared nor inferred.
     """
     return _DeclaredTree(declaration, tuple(views), tuple(robots)).resolved()
 
 
 def check_frames(declaration: Declaration, views: Sequence[View]) -> None:
-    """Checks what `[frames]` says: names, circles, and `mount`.
+    """Checks `[frames]`: names, cycles, and `mount`.
 
     Raises:
-        DataError: A frame is unknown, hangs on two others or on itself, or elsewhere than `mount`
-            has it.
+        DataError: A frame is unknown, has two parents, is its own ancestor, or contradicts `mount`.
     """
     if declaration.frames:
-        _ = _DeclaredTree(declaration, tuple(views), tuple(robots_of(declaration, views))).said
+        _ = _DeclaredTree(declaration, tuple(views), tuple(robots_of(declaration, views))).declared
 
 
 def frames_of_kind(frames: Iterable[str], kind: str) -> tuple[str, ...]:
-    """The frames of a kind among some: `cam` and `cam_left` of cameras."""
+    """The frames of a kind among others: `cam` and `cam_left` of cameras."""
     bare = frame_name(kind, "")
     return tuple(frame for frame in frames if frame == bare or frame.startswith(f"{bare}_"))
 
 
 def thing_name(frame: str, kind: str) -> str:
-    """What a frame's thing is called: `left` of `cam_left`; its kind, where it has no name."""
+    """Name of a frame's object: `left` for `cam_left`; its kind where it has no name."""
     return frame.partition("_")[2] or kind
 
 
 def frame_called(frames: Iterable[str], kind: str, name: str) -> str:
-    """The frame of what `thing_name` calls so, which need not be among the frames."""
+    """Frame of the object with a name, inverse of `thing_name`; it need not be among the frames."""
     known = (word for word in frames_of_kind(frames, kind) if thing_name(word, kind) == name)
     return next(known, frame_name(kind, "" if name == kind else name))
 
 
 def robots_between(frames: Mapping[str, str], first: str, second: str) -> tuple[str, ...]:
-    """Names the robots by whose motion two frames move before each other."""
-    chains = [set(_upwards(frames, frame)) for frame in (first, second)]
-    apart = chains[0] ^ chains[1]
-    flanges = sorted(name for name in apart if _is_flange(name))
+    """Names of the robots between two frames, whose motion moves them relative to each other."""
+    ancestors = [set(_ancestors(frames, frame)) for frame in (first, second)]
+    not_shared = ancestors[0] ^ ancestors[1]
+    flanges = sorted(name for name in not_shared if _is_flange(name))
     return tuple(flange.removeprefix("flange").removeprefix("_") for flange in flanges)
 
 
-def _upwards(frames: Mapping[str, str], frame: str) -> Iterator[str]:
+def _ancestors(frames: Mapping[str, str], frame: str) -> Iterator[str]:
     while frame != CELL:
         yield frame
         frame = frames[frame]
@@ -112,7 +106,7 @@ def _is_flange(frame: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _DeclaredTree:
-    """What a session says of its frames, and what follows from it."""
+    """Declared frames of a session, and the inference of the others."""
 
     declaration: Declaration
     views: tuple[View, ...]
@@ -138,7 +132,7 @@ class _DeclaredTree:
 
     @cached_property
     def fixtures(self) -> tuple[str, ...]:
-        """Places that `[frames]` names itself."""
+        """Fixtures that `[frames]` introduces."""
         words = [*self.declaration.frames, *map(str, self.declaration.frames.values())]
         return tuple(
             dict.fromkeys(
@@ -147,10 +141,10 @@ class _DeclaredTree:
         )
 
     @cached_property
-    def said(self) -> dict[str, str]:
-        """What `[frames]` says, checked, with what needs no saying: flanges, bases and fixtures."""
+    def declared(self) -> dict[str, str]:
+        """Checked parents by `[frames]`, with those of flanges, bases and fixtures."""
         known = [CELL, *self.frames, *self.fixtures]
-        said: dict[str, str] = {}
+        declared: dict[str, str] = {}
         for child, parent in self.declaration.frames.items():
             if isinstance(parent, list | tuple) and len(parent) > 1:
                 on = " and ".join(map(str, parent))
@@ -159,74 +153,74 @@ class _DeclaredTree:
                 )
             for frame in (child, parent):
                 if frame not in known:
-                    raise _unknown(frame, child, known)
-            said[child] = parent
+                    raise _unknown_frame(frame, child, known)
+            declared[child] = parent
         for robot in self.robots:
             base, flange = frame_name("base", robot), frame_name("flange", robot)
-            if said.setdefault(flange, base) != base:
-                words = f"{flange} hangs on {said[flange]}, but it hangs on {base} by its robot"
+            if declared.setdefault(flange, base) != base:
+                words = f"{flange} hangs on {declared[flange]}, but it hangs on {base} by its robot"
                 raise _contradiction(words, flange)
-            said.setdefault(base, CELL)
+            declared.setdefault(base, CELL)
         for frame in self.fixtures:
-            said.setdefault(frame, CELL)
-        if CELL in said:
+            declared.setdefault(frame, CELL)
+        if CELL in declared:
             raise _contradiction(
-                f"{CELL} hangs on {said[CELL]}, but all else stands in it: it hangs on nothing",
+                f"{CELL} hangs on {declared[CELL]}, but all else stands in it: it hangs on nothing",
                 CELL,
             )
-        _check_circles(said)
-        self._check_mount(said)
-        return said
+        _check_cycles(declared)
+        self._check_mount(declared)
+        return declared
 
-    def _check_mount(self, said: Mapping[str, str]) -> None:
+    def _check_mount(self, declared: Mapping[str, str]) -> None:
         mount = self.declaration.mount
         for child in self.declaration.frames if mount is not None else ():
-            on = _carrier(said, child, self)
-            if self.frames.get(child, ("", ""))[0] != "camera" or on is None:
+            parent = _carrier(declared, child, self)
+            if self.frames.get(child, ("", ""))[0] != "camera" or parent is None:
                 continue
-            if _is_flange(on) != (mount == "eye-in-hand"):
+            if _is_flange(parent) != (mount == "eye-in-hand"):
                 where = "on a flange" if mount == "eye-in-hand" else "beside the robots"
                 raise _contradiction(
-                    f'{child} hangs on {on}, but mount = "{mount}" has the cameras {where}',
+                    f'{child} hangs on {parent}, but mount = "{mount}" has the cameras {where}',
                     child,
                     "Leave mount out where [frames] says what cameras hang on, or correct one of "
                     "the two.",
                 )
 
     def resolved(self) -> dict[str, str]:
-        """The parent of each frame; see `resolve_frames`."""
-        parents = dict(self.said)
-        unsaid = [frame for frame in self.frames if frame not in parents]
-        # Where a thing is may follow from where that is which it sees, or is seen by.
+        """Parent of each frame; see `resolve_frames`."""
+        parents = dict(self.declared)
+        undeclared = [frame for frame in self.frames if frame not in parents]
+        # Two passes, since a frame may be inferred from those that it observes or is observed by.
         for _ in range(2):
-            for frame in [name for name in unsaid if name not in parents]:
-                parent = self._follows(frame, parents)
+            for frame in [name for name in undeclared if name not in parents]:
+                parent = self._inferred_parent(frame, parents)
                 if parent is not None:
                     parents[frame] = parent
-        missing = [name for name in unsaid if name not in parents]
+        missing = [name for name in undeclared if name not in parents]
         if missing:
-            raise self._unclear(missing)
+            raise self._undetermined_error(missing)
         return {frame: _carrier(parents, frame, self) or CELL for frame in self.frames}
 
-    def _follows(self, frame: str, parents: Mapping[str, str]) -> str | None:
-        """What a frame hangs on though it is not said; None where that is not clear."""
+    def _inferred_parent(self, frame: str, parents: Mapping[str, str]) -> str | None:
+        """Inferred parent of a frame; None where ambiguous."""
         kind, _ = self.frames[frame]
         if kind == "instrument":
             return CELL
         if kind == "point":
-            return self._of_point(frame)
+            return self._parent_of_point(frame)
         moves = {"eye-in-hand": "camera", "eye-to-hand": "target"}.get(self.declaration.mount or "")
         if moves is not None:
             return self._flange_of(frame) if kind == moves else CELL
         if len(self.robots) == 1:
-            flange, others = frame_name("flange", self.robots[0]), self._across(frame)
+            flange, others = frame_name("flange", self.robots[0]), self._observation_partners(frame)
             carriers = {_carrier(parents, other, self) for other in others if other in parents}
-            # A board on the flange of the camera that looks at it would never move before it.
+            # Camera and board are not on the same flange: they would not move relatively.
             return CELL if flange in carriers else None
         return None
 
-    def _of_point(self, frame: str) -> str | None:
-        """A point moves with the robot that its rows name; where they have no pose, it is fixed."""
+    def _parent_of_point(self, frame: str) -> str | None:
+        """Parent of a point: the flange of the robot in its rows; fixed where rows have no pose."""
         _, name = self.frames[frame]
         rows = [view for view in self.views if is_read(view) and view.point == name]
         moved = [row for row in rows if has_robot_state(row)]
@@ -237,7 +231,7 @@ class _DeclaredTree:
         return self._flange_of(frame) if len(moved) == len(rows) else None
 
     def _flange_of(self, frame: str) -> str | None:
-        """The flange of the only robot, or of the only one that rows about a thing name."""
+        """Flange of the only robot, or of the only one in the rows of a frame."""
         if len(self.robots) == 1:
             return frame_name("flange", self.robots[0])
         named = {
@@ -247,8 +241,8 @@ class _DeclaredTree:
         }
         return frame_name("flange", named.pop()) if len(named) == 1 else None
 
-    def _across(self, frame: str) -> set[str]:
-        """What a camera sees, or which cameras see a target."""
+    def _observation_partners(self, frame: str) -> set[str]:
+        """Frames that a camera observes, or that observe a target."""
         pairs = [
             observed(self.declaration, view)
             for view in self.views
@@ -256,7 +250,7 @@ class _DeclaredTree:
         ]
         return {other for pair in pairs if frame in pair for other in pair if other != frame}
 
-    def _unclear(self, missing: Sequence[str]) -> DataError:
+    def _undetermined_error(self, missing: Sequence[str]) -> DataError:
         mount = self.declaration.mount
         if mount is not None and not self.robots:
             return DataError(
@@ -278,7 +272,7 @@ class _DeclaredTree:
 
 
 def observed(declaration: Declaration, view: View) -> tuple[str, str]:
-    """The frames of what sees and of what is seen in a row; empty for a row without either."""
+    """Frames of observer and observed object in a row; empty for a row without observation."""
     if is_seen(view):
         camera = name_of(declaration, "camera", view)
         return frame_name("camera", camera), frame_name(
@@ -291,29 +285,25 @@ def observed(declaration: Declaration, view: View) -> tuple[str, str]:
 
 
 def _carrier(parents: Mapping[str, str], frame: str, tree: _DeclaredTree) -> str | None:
-    """The cell, base or flange before which a frame never moves; None where it is not known."""
-    on = parents.get(frame)
+    """The cell, base or flange that a frame is fixed to; None where unknown."""
+    parent = parents.get(frame)
     while (
-        on is not None
-        and on != CELL
-        and tree.frames.get(on, ("", ""))[0]
-        not in (
-            "base",
-            "flange",
-        )
+        parent is not None
+        and parent != CELL
+        and tree.frames.get(parent, ("", ""))[0] not in ("base", "flange")
     ):
-        on = parents.get(on)
-    return on
+        parent = parents.get(parent)
+    return parent
 
 
-def _check_circles(parents: Mapping[str, str]) -> None:
+def _check_cycles(parents: Mapping[str, str]) -> None:
     for start in parents:
         chain = [start]
-        while (on := parents.get(chain[-1])) is not None:
-            if on in chain:
-                circle = [*chain[chain.index(on) :], on]
-                raise _contradiction(f"it goes round in a circle: {' on '.join(circle)}", on)
-            chain.append(on)
+        while (parent := parents.get(chain[-1])) is not None:
+            if parent in chain:
+                cycle = [*chain[chain.index(parent) :], parent]
+                raise _contradiction(f"it goes round in a circle: {' on '.join(cycle)}", parent)
+            chain.append(parent)
 
 
 def _contradiction(words: str, frame: str, next_step: str = "") -> DataError:
@@ -324,7 +314,7 @@ def _contradiction(words: str, frame: str, next_step: str = "") -> DataError:
     )
 
 
-def _unknown(frame: object, child: str, known: Sequence[str]) -> DataError:
+def _unknown_frame(frame: object, child: str, known: Sequence[str]) -> DataError:
     what = f"{frame!r}" if frame == child else f"{child} hangs on {frame!r}, which"
     return DataError(
         f"session.toml, [frames]: {what} is no frame of this session; those are "

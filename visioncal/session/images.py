@@ -1,4 +1,4 @@
-"""Where the bytes of a session's images come from."""
+"""Sources of a session's image files."""
 
 import os
 import re
@@ -26,20 +26,20 @@ class ImageStore(ABC):
 
     @abstractmethod
     def absence(self, path: str) -> str:
-        """Says why there is no such image to read, after its name; empty where there is one."""
+        """Why an image cannot be read, worded to follow its name; empty where it can."""
 
     def exists(self, path: str) -> bool:
-        """Tells whether there is such an image to read."""
+        """Whether an image can be read."""
         return not self.absence(path)
 
     def sha256(self, path: str) -> str:
-        """Digest of the bytes of an image, also of one that is elsewhere; empty of one unknown."""
+        """Digest of an image file, also of one whose bytes are elsewhere; empty where unknown."""
         return sha256(self.read(path)) if self.exists(path) else ""
 
 
 @dataclass(frozen=True)
 class FolderImages(ImageStore):
-    """Images below a session's folder; links that lead out of it are not followed."""
+    """Images in a session's folder; links that lead out of it are not followed."""
 
     folder: Path
 
@@ -51,7 +51,7 @@ class FolderImages(ImageStore):
         return read_bytes(self.folder / inside_path(path), MOST_IMAGE_BYTES)
 
     def absence(self, path: str) -> str:
-        """Says why there is no such image to read, after its name; empty where there is one."""
+        """Why an image cannot be read, worded to follow its name; empty where it can."""
         file = self.folder / inside_path(path)
         why_not = absence(file)
         if why_not:
@@ -79,12 +79,12 @@ class MemoryImages(ImageStore):
         return self.files[path]
 
     def absence(self, path: str) -> str:
-        """Says why there is no such image; empty where there is one."""
+        """Why there is no such image; empty where there is one."""
         return "" if path in self.files else "is missing"
 
 
 def image_path(path: str) -> str:
-    """Checks the path of an image: inside the session's folder, and of a kind that is read.
+    """Checks the path of an image: inside the session's folder, with a known ending.
 
     Raises:
         DataError: It leaves the folder, or its ending is none of `.png`, `.jpg`, `.tif`.
@@ -100,10 +100,10 @@ def image_path(path: str) -> str:
 
 
 def inside_path(path: str) -> str:
-    """Checks that a path stays inside the session's folder, and writes it with forward slashes.
+    """Checks that a path stays inside the session's folder; returns it with forward slashes.
 
     Raises:
-        DataError: It is absolute, has a drive, or climbs out with `..`.
+        DataError: It is absolute, has a drive, or contains `..`.
     """
     slashed = path.replace("\\", "/")
     parts = [part for part in slashed.split("/") if part not in ("", ".")]

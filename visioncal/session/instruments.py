@@ -1,4 +1,4 @@
-"""Measuring instruments: how noisy their readings are, by a table of known systems."""
+"""Measuring instruments and the noise of their readings, with a table of known systems."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ class Instrument:
     """Noise of an instrument's readings, as standard deviations.
 
     Attributes:
-        words: What it is, for people.
-        sigma_m: Of each coordinate of a place, at the instrument's origin [m].
-        sigma_per_m: What that grows by with the distance from there [m/m].
-        sigma_rad: Of a probe's rotation about each axis; None where it is not known [rad].
+        words: Description of the instrument.
+        sigma_m: Of each coordinate of a position, at the instrument's origin [m].
+        sigma_per_m: Its growth with the distance from there [m/m].
+        sigma_rad: Of a probe's rotation about each axis; None where unknown [rad].
     """
 
     words: str
@@ -32,23 +32,23 @@ class Instrument:
     sigma_rad: float | None = None
 
     def sigmas_m(self, places: FloatArray) -> FloatArray:
-        """Standard deviations (m,) of each coordinate of (m, 3) places that it reads [m]."""
+        """Standard deviations (m,) of each coordinate of (m, 3) measured positions [m]."""
         distance = np.linalg.norm(places, axis=-1)
         return np.asarray(self.sigma_m + self.sigma_per_m * distance)
 
 
 def instrument_names() -> tuple[str, ...]:
-    """Lists the instruments whose noise is known."""
-    return tuple(sorted(_shipped()))
+    """Names of the instruments in the table."""
+    return tuple(sorted(_table()))
 
 
 def known_instrument(name: str) -> Instrument | None:
     """Finds an instrument in the table; None where it is not there.
 
     Raises:
-        DataError: It measures lengths or turns alone, and no places.
+        DataError: It measures only lengths or angles, no positions.
     """
-    row = _shipped().get(name.strip().lower())
+    row = _table().get(name.strip().lower())
     if row is None:
         return None
     words = row.text("words")
@@ -69,19 +69,13 @@ def known_instrument(name: str) -> Instrument | None:
 def stated_instrument(
     name: str, sigma_m: float | None, sigma_per_m: float | None, sigma_rad: float | None
 ) -> Instrument:
-    """Puts together what a session says of its instrument; what it states comes before the table.
-
-    Args:
-        name: Its name, in the table or any other.
-        sigma_m: See `Instrument`; needed where the table does not have the name.
-        sigma_per_m: See `Instrument`.
-        sigma_rad: See `Instrument`.
+    """Instrument of a session: stated values, with those of the table for the others.
 
     Raises:
-        DataError: The name is unknown and nothing is stated, or what is stated is no noise.
+        DataError: The name is unknown and no noise is stated, or the stated noise is not positive.
     """
-    known = known_instrument(name)
-    if sigma_m is None and known is None:
+    in_table = known_instrument(name)
+    if sigma_m is None and in_table is None:
         raise DataError(
             f"session.toml: the instrument {name!r} is not in the table of known ones, and its "
             "noise is not stated.",
@@ -89,7 +83,7 @@ def stated_instrument(
             next_step=f"{did_you_mean(name, instrument_names())} State sigma_m (and sigma_per_m) "
             f"in [instrument], or name one of {', '.join(instrument_names())}.".strip(),
         )
-    base = Instrument(name, 0.0) if known is None else known
+    base = Instrument(name, 0.0) if in_table is None else in_table
     stated = Instrument(
         base.words,
         base.sigma_m if sigma_m is None else sigma_m,
@@ -107,6 +101,6 @@ def stated_instrument(
 
 
 @cache
-def _shipped() -> Mapping[str, DocumentTable]:
+def _table() -> Mapping[str, DocumentTable]:
     rows = parse_toml(read_text(_FILE), _FILE.name)["instrument"]
     return {row["name"]: DocumentTable(row, f"{_FILE.name}, {row['name']}") for row in rows}

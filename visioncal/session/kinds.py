@@ -1,8 +1,8 @@
-"""Which of several cameras, robots, targets or instruments a row is of; and the robots' models.
+"""Camera, robot, target and instrument of each row, and the robots' models.
 
-Boards and robots are shared between sessions, so files that session.toml names are followed outside
-of the session's folder; but a session may come from a stranger, so each is named to the user, and
-what is wrong with one is said without its content.
+Boards and robots are shared between sessions, so files that session.toml names may be outside of
+the session's folder. Since a session may be untrusted, a warning names each such file, and its
+errors are reported without its content.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,8 +39,8 @@ def is_read(view: View) -> bool:
     return view.reading_m is not None
 
 
-# Which rows must name one of several, what the column names, and how to mend a row.
-_NEEDS: Mapping[Kind, tuple[_Test, str, str]] = {
+# By kind: which rows must name one of several, what the column names, and a hint for the remedy.
+_NAMING_RULES: Mapping[Kind, tuple[_Test, str, str]] = {
     "camera": (is_seen, "the one that took a row's image", ""),
     "robot": (has_robot_state, "the one whose pose or joints a row has", ""),
     "target": (
@@ -53,9 +53,9 @@ _NEEDS: Mapping[Kind, tuple[_Test, str, str]] = {
 
 
 def name_of(declaration: Declaration, kind: Kind, view: View) -> str:
-    """The name that a row's camera, robot, target or instrument has in session.toml.
+    """Name of a row's camera, robot, target or instrument in session.toml.
 
-    Empty for that of a singular table, and where a row of several names none.
+    Empty for a singular table, and where the row names none of several.
     """
     names = list(declaration.named(kind))
     if len(names) == 1:
@@ -70,15 +70,15 @@ def check_kinds_named(declaration: Declaration, views: Sequence[View]) -> None:
         DataError: A row names none of several, or one that is not declared.
     """
     for kind in KINDS:
-        _check(declaration, kind, views)
+        _check_kind(declaration, kind, views)
 
 
-def _check(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
+def _check_kind(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
     plural = f"{kind}s"
     named = {view.number: view.text.get(kind, "").strip() for view in views}
     declared = list(declaration.named(kind))
     if declared in ([], [""]):
-        _check_one(kind, bool(declared), sorted({name for name in named.values() if name}))
+        _check_single(kind, bool(declared), sorted({name for name in named.values() if name}))
         return
     known = ", ".join(declared)
     unknown = {view: name for view, name in named.items() if name and name not in declared}
@@ -93,7 +93,7 @@ def _check(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
         )
     if len(declared) < 2:
         return
-    needs, whose, hint = _NEEDS[kind]
+    needs, whose, hint = _NAMING_RULES[kind]
     without = [str(view.number) for view in views if needs(view) and not named[view.number]]
     if without:
         raise DataError(
@@ -104,8 +104,8 @@ def _check(declaration: Declaration, kind: Kind, views: Sequence[View]) -> None:
         )
 
 
-def _check_one(kind: Kind, is_declared: bool, names: Sequence[str]) -> None:
-    """A session with one of a kind, or none, may name it as it likes, but only one."""
+def _check_single(kind: Kind, is_declared: bool, names: Sequence[str]) -> None:
+    """Checks that rows have only one name for a kind that is not in a plural table."""
     if len(names) < 2:
         return
     tables = ", ".join(f"[{kind}s.{name}]" for name in names)
@@ -119,7 +119,7 @@ def _check_one(kind: Kind, is_declared: bool, names: Sequence[str]) -> None:
 
 
 def kind_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
-    """Words those of several that no row names."""
+    """Warnings of declared cameras, robots, targets and instruments that no row names."""
     for kind in KINDS:
         declared = declaration.named(kind)
         named = {view.text.get(kind, "").strip() for view in views}
@@ -134,37 +134,37 @@ def read_robots(
     """Reads the models of the robots that a session declares.
 
     Args:
-        declaration: What it declares.
-        folder: Relative paths start here; the working directory where None.
-        document: The content of the robot's file, where that is known already; of several robots,
-            the contents by their names.
+        declaration: The typed session.toml.
+        folder: Base of relative paths; the working directory where None.
+        document: Content of the robot's file, if already read; with several robots, contents by
+            name.
 
     Returns:
-        The model, of several the models by name, None where none is known; and in words, why a
-        model is not known.
+        The model, with several robots the models by name, or None; and messages for models that
+        could not be read.
     """
     several = len(declaration.robots) > 1
     if document is not None:
         return document, []
-    found, problems = {}, []
+    models, problems = {}, []
     for name, table in declaration.named("robot").items():
         if not isinstance(table, RobotTable) or table.model is None:
             continue
         try:
-            found[name] = _read(table, table.model, folder)
+            models[name] = _read_robot(table, table.model, folder)
         except DataError as error:
             path = f"robots.{name}" if name else "robot"
             problems.append(f"session.toml: {path}.model: {error}")
     if several:
-        return found or None, problems
-    return next(iter(found.values()), None), problems
+        return models or None, problems
+    return next(iter(models.values()), None), problems
 
 
-def _read(table: RobotTable, model: str, folder: Path | None) -> dict[str, Any]:
+def _read_robot(table: RobotTable, model: str, folder: Path | None) -> dict[str, Any]:
     with without_content(model, "model", folder):
         document = read_robot_document(model, tip=table.tip, folder=folder)
         if outside_file(model, "model", folder) is not None:
-            # What is no robot is not taken into recordings.
+            # Recordings contain only valid robots.
             Robot.from_document(document)
     if table.gravity_m_s2 is not None:
         document |= {"gravity_m_s2": table.gravity_m_s2}
@@ -173,15 +173,15 @@ def _read(table: RobotTable, model: str, folder: Path | None) -> dict[str, Any]:
 
 @contextmanager
 def without_content(named: str, field: str, folder: Path | None) -> Iterator[None]:
-    """Keeps what a file outside of the folder holds out of the errors of reading it.
+    """Removes the content of a file outside of the folder from the errors of reading it.
 
     Args:
-        named: The file, as session.toml names it; a name that comes with visioncal is none.
-        field: Which field does: `target` or `model`.
+        named: The file, as session.toml names it; built-in names are no files.
+        field: The field that names it: `target` or `model`.
         folder: The session's folder; None where it has none.
 
     Raises:
-        DataError: In the place of what reading it raises, or it is a link to another kind of file.
+        DataError: Instead of the errors of reading it, or it is a link to another kind of file.
     """
     file = outside_file(named, field, folder)
     if file is None or absence(file):
@@ -201,7 +201,7 @@ def without_content(named: str, field: str, folder: Path | None) -> Iterator[Non
 
 
 def outside_file(named: str, field: str, folder: Path | None) -> Path | None:
-    """The file outside of the folder that a name leads to; None where it leads to none."""
+    """The file outside of the folder that a field names; None for any other."""
     if folder is None or not named.lower().endswith(_SUFFIXES[field]):
         return None
     path = folder / named.replace("\\", "/")
@@ -212,7 +212,7 @@ def outside_file(named: str, field: str, folder: Path | None) -> Path | None:
 
 
 def outside_warnings(declaration: Declaration, folder: Path | None) -> Iterator[str]:
-    """Names the files outside of the folder that were read."""
+    """Warnings that name the files outside of the folder that were read."""
     places: list[tuple[str, str]] = []
     fields: tuple[tuple[Kind, str], ...] = (("target", "target"), ("robot", "model"))
     for kind, field in fields:

@@ -1,4 +1,4 @@
-"""What a session says that the robot carried and was pushed by."""
+"""Payloads, forces and approach directions in a session's rows."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -9,19 +9,14 @@ from visioncal.robot import Loads
 
 _CENTRE = tuple(f"payload_{axis}_m" for axis in "xyz")
 _FORCE = tuple(f"force_{axis}_n" for axis in "xyz")
-# From which side the joints came to a stop, as the column approach has it.
+# Approach direction of the joints to a stop, by the cells of column approach.
 SIDES = {"+": 1.0, "-": -1.0, "": 0.0}
-# A payload or a force beyond these is in another unit [kg, N].
+# Largest plausible payload and force [kg, N].
 _HEAVIEST_KG, _STRONGEST_N = 2500.0, 25000.0
 
 
 def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | None = None) -> Loads:
-    """The loads of some views; where a view says nothing, there is none.
-
-    Args:
-        rows: The views' numbers.
-        approaches: Their cells of the column approach; None where that does not matter.
-    """
+    """Loads of views by their numbers, zero where not stated, and by their cells of approach."""
     sides = [SIDES.get(approach.strip(), 0.0) for approach in approaches or [""] * len(rows)]
 
     def read(*names: str) -> FloatArray:
@@ -36,7 +31,7 @@ def loads_of(rows: Sequence[Mapping[str, float]], approaches: Sequence[str] | No
 
 
 def load_problems(numbers: Mapping[str, float]) -> Iterator[tuple[str, str]]:
-    """Columns of a row that say what no load can be, with what is wrong."""
+    """Columns of a row with an invalid load, with messages."""
     mass = numbers.get("payload_kg")
     if mass is not None and not 0.0 <= mass <= _HEAVIEST_KG:
         yield "payload_kg", f"{mass:g} kg is no payload; 0 to {_HEAVIEST_KG:g} kg are taken"

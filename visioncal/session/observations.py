@@ -1,4 +1,4 @@
-"""The rows of a session as what they are observations of: who saw what, and how robots stood."""
+"""Observations of a session: observer, observed object, and the robots' poses at the stop."""
 
 import math
 from collections import Counter
@@ -14,26 +14,26 @@ from visioncal.session.frames import observed, robots_between
 from visioncal.session.kinds import has_robot_state, name_of
 from visioncal.session.table import View
 
-# Reports of one robot at one stop that are farther apart are of two poses [mm, deg, rad].
+# Largest difference between reports of one robot's pose at one stop [mm, deg, rad].
 _APART_MM, _APART_DEG, _APART_RAD = 1.0, 0.1, 2e-3
-# Reports of a robot that stands still differ by what its readings tremble: no motion is as small.
+# Largest difference between reports of a robot that stands still, by noise of its readings.
 _STILL_M, _STILL_RAD = 1e-4, 1e-4
-# Views of one pose that were taken farther apart than this are of different visits [s].
+# Views of one pose that are farther apart in time are of different stops [s].
 LONG_S = 120.0
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One thing seen by another while the robots stood still.
+    """One observation of a target or point by a camera or instrument at a stop.
 
     Attributes:
         view: Its row.
-        station: Which state of the cell it is of; all rows of a stop share one, unless they give
+        station: Number of the cell's state; all rows of a stop share one, unless they give
             different poses of a robot.
         seer: The frame of the camera or instrument.
         seen: The frame of the target or point.
         robots: The row with the pose of each robot between the two at this stop.
-        lacks: The robots between the two of which no row of the stop has a pose.
+        lacks: The robots between the two without a pose at this stop.
     """
 
     view: View
@@ -46,7 +46,7 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class _StopRows:
-    """The rows of one stop, and for each robot the row whose pose most of them agree with."""
+    """The rows of one stop, and for each robot the row with the majority's pose."""
 
     rows: tuple[View, ...]
     robot_rows: Mapping[str, View]
@@ -55,20 +55,14 @@ class _StopRows:
 def observations_of(
     declaration: Declaration, views: Sequence[View], frames: Mapping[str, str]
 ) -> tuple[Observation, ...]:
-    """Lists what was observed, in the order of the rows.
+    """Observations in the order of the rows; rows with only a robot's pose have none.
 
-    Args:
-        declaration: What the session declares.
-        views: Its rows.
-        frames: What hangs on what, as `resolve_frames` gives it.
-
-    Returns:
-        One observation a row that has one: rows that only have a robot's pose have none.
+    `frames` has the parent of each frame, by `resolve_frames`.
     """
-    place_of = {view.number: at for at, view in enumerate(views)}
-    found, station = [], 0
+    index_of = {view.number: at for at, view in enumerate(views)}
+    observations, station = [], 0
     for stop in _stops(declaration, views):
-        # Rows that have other poses than the rest are of a state of the cell of their own.
+        # Rows that contradict the majority's pose are of another state of the cell.
         states: dict[tuple[int, ...], int] = {}
         for view in stop.rows:
             own = {name_of(declaration, "robot", view): view} if has_robot_state(view) else {}
@@ -83,31 +77,31 @@ def observations_of(
             needed = () if view.is_of_lens else robots_between(frames, seer, seen)
             robots = {name: by_robot[name] for name in needed if name in by_robot}
             lacks = tuple(name for name in needed if name not in by_robot)
-            found.append(Observation(view, states[key], seer, seen, robots, lacks))
-    return tuple(sorted(found, key=lambda value: place_of[value.view.number]))
+            observations.append(Observation(view, states[key], seer, seen, robots, lacks))
+    return tuple(sorted(observations, key=lambda value: index_of[value.view.number]))
 
 
 def standing(declaration: Declaration, views: Sequence[View]) -> dict[int, Mapping[str, View]]:
-    """Of each row, by its view: the rows with the robots' poses at its stop, by robot."""
-    found: dict[int, Mapping[str, View]] = {}
+    """Rows with the robots' poses at each row's stop: by view number, then by robot."""
+    robot_rows: dict[int, Mapping[str, View]] = {}
     for stop in _stops(declaration, views):
-        found |= dict.fromkeys((row.number for row in stop.rows), stop.robot_rows)
-    return found
+        robot_rows |= dict.fromkeys((row.number for row in stop.rows), stop.robot_rows)
+    return robot_rows
 
 
 def _still_since(views: Iterable[View]) -> dict[int, int]:
-    """Of each row of one robot, by its view: the row since which the robot has not moved."""
-    found: dict[int, int] = {}
+    """First view of each run of one robot's rows in which it stood still, by view number."""
+    run_starts: dict[int, int] = {}
     first = last = None
     for view in views:
-        if first is None or last is None or _moved(first, view) or _long(last, view):
+        if first is None or last is None or _moved(first, view) or _long_between(last, view):
             first = view
-        last, found[view.number] = view, first.number
-    return found
+        last, run_starts[view.number] = view, first.number
+    return run_starts
 
 
 def _moved(first: View, second: View) -> bool:
-    """Whether two rows have poses that differ by more than readings of one pose do, or loads."""
+    """Whether two rows differ in pose by more than noise, or in loads."""
     if any(first.numbers.get(name) != second.numbers.get(name) for name in LOAD):
         return True
     before, after = (
@@ -115,7 +109,7 @@ def _moved(first: View, second: View) -> bool:
     )
     if not math.isnan(before[0] + after[0]):
         units = [[value / math.hypot(*pose[3:]) for value in pose[3:]] for pose in (before, after)]
-        # A quaternion and its negative are the same rotation, by twice the angle between them.
+        # Quaternions q and -q are the same rotation; its angle is twice that between quaternions.
         chord = min(math.dist(units[0], [sign * unit for unit in units[1]]) for sign in (1.0, -1.0))
         return math.dist(before[:3], after[:3]) > _STILL_M or 2.0 * chord > _STILL_RAD
     joints = first.joints_rad, second.joints_rad
@@ -124,15 +118,15 @@ def _moved(first: View, second: View) -> bool:
     return bool(np.abs(joints[0] - joints[1]).max() > _STILL_RAD)
 
 
-def _long(first: View, second: View) -> bool:
-    """Whether so much time lies between two rows that the robot may have been elsewhere."""
+def _long_between(first: View, second: View) -> bool:
+    """Whether two rows are so far apart in time that the robot may have moved between them."""
     if first.stamp_s is None or second.stamp_s is None:
         return False
     return abs(second.stamp_s - first.stamp_s) > LONG_S
 
 
 def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[str]:
-    """Words rows that have another pose of a robot than the rest of their stop."""
+    """Warnings of rows whose pose of a robot contradicts their stop."""
     for stop in _stops(declaration, views):
         for view in stop.rows:
             robot = name_of(declaration, "robot", view)
@@ -146,13 +140,13 @@ def stop_warnings(declaration: Declaration, views: Sequence[View]) -> Iterator[s
 
 
 def _stops(declaration: Declaration, views: Sequence[View]) -> list[_StopRows]:
-    """Groups rows by their stop; without one, by runs in which their robot stood still."""
+    """Groups rows by stop number; without one, by runs in which their robot stood still."""
     groups: dict[tuple[int, int], list[View]] = {}
     rows_of: dict[str, list[View]] = {}
     for view in views:
         if view.stop is None and not view.is_of_lens and has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
-    since = {row: first for mine in rows_of.values() for row, first in _still_since(mine).items()}
+    since = {row: first for own in rows_of.values() for row, first in _still_since(own).items()}
     for view in views:
         alone = view.stop is None or view.is_of_lens
         key = (1, since.get(view.number, view.number)) if alone else (0, view.stop or 0)
@@ -161,26 +155,26 @@ def _stops(declaration: Declaration, views: Sequence[View]) -> list[_StopRows]:
 
 
 def _robot_rows(declaration: Declaration, rows: Sequence[View]) -> dict[str, View]:
-    """Of each robot, the row with the pose that most rows of a stop agree on."""
+    """For each robot, the row with the pose that most rows of a stop agree on."""
     rows_of: dict[str, list[View]] = {}
     for view in rows:
         if has_robot_state(view):
             rows_of.setdefault(name_of(declaration, "robot", view), []).append(view)
-    agreed = {}
-    for robot, mine in rows_of.items():
+    majority = {}
+    for robot, own in rows_of.items():
         counts, first = (
-            Counter(map(_pose_cells, mine)),
-            {_pose_cells(view): view for view in mine[::-1]},
+            Counter(map(_pose_cells, own)),
+            {_pose_cells(view): view for view in own[::-1]},
         )
-        agreeing = Counter(
+        votes = Counter(
             {a: sum(counts[b] for b in counts if not _differ(first[a], first[b])) for a in counts}
         )
-        agreed[robot] = first[agreeing.most_common(1)[0][0]]
-    return agreed
+        majority[robot] = first[votes.most_common(1)[0][0]]
+    return majority
 
 
 def _pose_cells(view: View) -> tuple[float | None, ...]:
-    """What a row says of where its robot stood: most rows of a stop repeat it to the digit."""
+    """Pose and joints of a row as they were read, for exact comparison."""
     names = (*POSE, *joint_columns(tuple(view.numbers)))
     return tuple(view.numbers.get(name) for name in names)
 

@@ -1,4 +1,4 @@
-"""A session written as a folder that needs no other file; whole or not at all."""
+"""Atomic writing of a session as a self-contained folder."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from visioncal.vision.targets import rig_csv
 
 
 def refuse_filled(folder: Path) -> None:
-    """Refuses a folder that a session cannot be written to.
+    """Checks that a session can be written to a folder.
 
     Raises:
         DataError: It exists and is not empty.
@@ -33,17 +33,11 @@ def refuse_filled(folder: Path) -> None:
 def write_folder(
     folder: Path, texts: Mapping[str, str], images: ImageStore, paths: Sequence[str]
 ) -> None:
-    """Writes texts and images, by their paths inside a new folder.
-
-    Args:
-        folder: The folder; it must not hold anything yet.
-        texts: The texts.
-        images: Where the images' bytes come from; missing ones stay missing.
-        paths: The images.
+    """Writes texts by path, and images that are not missing, into a new or empty folder.
 
     Raises:
-        DataError: The folder exists and is not empty, or cannot be written; or an image is
-            elsewhere.
+        DataError: The folder exists and is not empty, or cannot be written; or only the digest of
+            an image is available.
     """
     folder = folder.absolute()
     refuse_filled(folder)
@@ -53,7 +47,7 @@ def write_folder(
             new = aside / "new"
             new.mkdir()
             for path in paths:
-                # One of which no more than its digest is known refuses to be read.
+                # Reading fails for an image of which only the digest is available.
                 if images.exists(path) or images.sha256(path):
                     _write_below(new, path, images.read(path))
             for path, text in texts.items():
@@ -73,11 +67,11 @@ def placed_files(
     target_document: Mapping[str, Any] | None,
     robot_document: Mapping[str, Any] | None,
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Gives targets and robots that were files a place in the session's folder.
+    """Moves target and robot files into the session's folder.
 
     Returns:
-        The content of session.toml with paths in the folder, and their texts by these paths. What
-        comes with visioncal stays a name.
+        The content of session.toml with paths in the folder, and the files' texts by these paths.
+        Built-in names are kept.
     """
     placed = dict(document)
     texts = {} if target_document is None else _place_targets(declaration, placed, target_document)
@@ -104,7 +98,7 @@ def _place_targets(
 
 
 def _target_texts(path: str, content: Mapping[str, Any]) -> dict[str, str]:
-    """A target's file, and beside it the table of a rig's points."""
+    """Text of a target's file, and of the table of a rig's points, by path."""
     points = content.get("points")
     if content.get("kind") != "points" or not isinstance(points, Mapping):
         return {path: tomli_w.dumps(content)}
@@ -126,9 +120,9 @@ def _place_robots(
         return {model: content}
     texts, several = {}, len(declaration.robots) > 1
     for robot, table in declaration.robots.items():
-        mine = contents.get(robot) if several else contents
-        if table.model is not None and is_file(table.model) and mine is not None:
-            name, content = robot_file(mine, table.model)
+        model_document = contents.get(robot) if several else contents
+        if table.model is not None and is_file(table.model) and model_document is not None:
+            name, content = robot_file(model_document, table.model)
             path = _place_inside(table.model, f"{robot}_{name}")
             kept = {**table.model_dump(exclude_none=True), "model": path}
             document["robots"] = {**document["robots"], robot: kept}
@@ -137,7 +131,7 @@ def _place_robots(
 
 
 def _place_inside(path: str, fallback: str) -> str:
-    """Keeps a path that stays inside the session's folder; others become `fallback`."""
+    """A path if it is inside the session's folder, else `fallback`."""
     try:
         return inside_path(path)
     except DataError:

@@ -1,4 +1,4 @@
-"""Whether a session is of a whole cell, and that of one camera, robot and target out of it."""
+"""Selection of one camera, robot and target, or of some views, from a session."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
@@ -19,7 +19,7 @@ from visioncal.session.table import View
 if TYPE_CHECKING:
     from visioncal.session.session import Session
 
-# What is a camera's or the air's: all other numbers of a row are the robot's.
+# Beginnings of number columns that are not the robot's.
 _NOT_OF_ROBOTS = ("stamp_s", "ambient_c", "cft_", "meas_")
 
 
@@ -31,40 +31,18 @@ def has_several(session: "Session") -> bool:
 def chosen_of(
     session: "Session", choice: Choice, needs: Collection[Part] = PARTS, *, parted: bool = True
 ) -> Chosen:
-    """Finds the camera, robot and target that are meant by their names, and by a session's rows.
-
-    Args:
-        session: A session.
-        choice: What is named.
-        needs: What has to be clear.
-        parted: Whether the robot is to move camera and target before each other.
-
-    Raises:
-        DataError: There is no such thing, several are meant, or this robot does not part these.
-    """
+    """Finds the camera, robot and target chosen by names and by a session's rows; see `choose`."""
     seen = {(observation.seer, observation.seen) for observation in session.observations}
     label = f"session {session.name!r}"
     return choose(session.frames, choice, needs, label=label, parted=parted, seen=seen)
 
 
 def select(
-    session: "Session",
-    choice: Choice,
-    needs: Collection[Part] = PARTS,
-    *,
-    parted: bool = True,
+    session: "Session", choice: Choice, needs: Collection[Part] = PARTS, *, parted: bool = True
 ) -> "Session":
-    """Takes one camera, robot and target out of a session; see `Session.of`.
+    """Selects one camera, robot and target from a session; see `Session.of` and `choose`.
 
-    Args:
-        session: A session.
-        choice: What is meant.
-        needs: What has to be clear: where no camera is needed, the rows are those without images
-            with the robot's pose.
-        parted: Whether the robot is to move camera and target before each other.
-
-    Raises:
-        DataError: There is no such thing, several are meant, or this robot does not part these.
+    Where no camera is needed, the rows are those without images with the robot's pose.
     """
     if not choice and not has_several(session):
         return session
@@ -74,7 +52,7 @@ def select(
     if "camera" not in needs:
         chosen = replace(chosen, camera="", target="")
     rows = dict(_rows(session, chosen))
-    # Columns of other robots alone, as the joints of one with more axes, are none of its rows.
+    # Columns that only other robots fill, as joints of one with more axes, are dropped.
     filled = {name for _, numbers in rows.values() for name in numbers}
     columns = tuple(
         column
@@ -86,7 +64,7 @@ def select(
     ]
     table, target = session.corner_table, chosen.target.partition("_")[2]
     models, boards = session.robot_documents, session.target_document
-    found = session.assemble(
+    selected = session.assemble(
         _document(session, chosen),
         columns,
         cells,
@@ -95,21 +73,21 @@ def select(
         robot_document=models.get(chosen.robot),
         corners=None if table is None else table.of_views(tuple(rows)).without_targets(),
     )
-    return found.with_streams(streams_of(session, chosen.robot))
+    return selected.with_streams(streams_of(session, chosen.robot))
 
 
 def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
-    """Takes some views out of a session, with the robots' rows at their stops; see `Session.only`.
+    """Selects views of a session, with the robots' rows at their stops; see `Session.only`.
 
     Raises:
-        DataError: The session has no such view, or none is meant.
+        DataError: The session has no such view, or none is given.
     """
-    there = [view.number for view in session.views]
-    unknown = sorted(set(numbers) - set(there))
+    known = [view.number for view in session.views]
+    unknown = sorted(set(numbers) - set(known))
     if unknown or not numbers:
         missing = f"views {ranges(unknown)}" if unknown else "no view"
         raise DataError(
-            f"{missing} of session {session.name!r} are asked for; it has {ranges(there)}.",
+            f"{missing} of session {session.name!r} are asked for; it has {ranges(known)}.",
             culprits=[ranges(unknown)] if unknown else [],
             next_step="Name views of views.csv, as 1-12,14.",
         )
@@ -121,7 +99,7 @@ def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
         or (view.stop in stops and has_robot_state(view) and not is_seen(view))
     ]
     table = session.corner_table
-    found = session.assemble(
+    selected = session.assemble(
         session.document,
         session.columns,
         [[view.cell(column) for column in session.columns] for view in kept],
@@ -130,19 +108,21 @@ def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
         robot_document=session.robot_document,
         corners=None if table is None else table.of_views([view.number for view in kept]),
     )
-    return found.with_streams(session.streams)
+    return selected.with_streams(session.streams)
 
 
 def streams_of(session: "Session", robot: str) -> dict[str, Stream]:
-    """The streams of one robot, and those of none, by name."""
-    mine = {None, robot or "robot"}
+    """The streams of one robot, and those of no robot, by name."""
+    owners = {None, robot or "robot"}
     return {
-        name: stream for name, stream in session.streams.items() if _robot_of(session, name) in mine
+        name: stream
+        for name, stream in session.streams.items()
+        if _robot_of(session, name) in owners
     }
 
 
 def _robot_of(session: "Session", stream: str) -> str | None:
-    """The robot whose name a stream has or begins with, as `a` and `a_excite`; None for none."""
+    """Robot of a stream, whose name it has or begins with, as `a` and `a_excite`; else None."""
     names = (robot or "robot" for robot in session.robots)
     fitting = [name for name in names if stream == name or stream.startswith(f"{name}_")]
     return max(fitting, key=len, default=None)
@@ -151,20 +131,20 @@ def _robot_of(session: "Session", stream: str) -> str | None:
 def _rows(
     session: "Session", chosen: Chosen
 ) -> Iterator[tuple[int, tuple[View, Mapping[str, float]]]]:
-    """The rows that are meant, by view, with the robot's numbers at their stop."""
-    declaration, stood = session.declaration, standing(session.declaration, session.views)
+    """The selected rows by view number, with the robot's numbers at their stop."""
+    declaration, robot_rows = session.declaration, standing(session.declaration, session.views)
     seen = {
         observation.view.number: (observation.seer, observation.seen)
         for observation in session.observations
     }
     for view in session.views:
         if chosen.camera:
-            mine = is_seen(view) and seen.get(view.number) == (chosen.camera, chosen.target)
+            is_selected = is_seen(view) and seen.get(view.number) == (chosen.camera, chosen.target)
         else:
-            of = name_of(declaration, "robot", view)
-            mine = has_robot_state(view) and not is_seen(view) and of == chosen.robot
-        if mine:
-            robot_row = stood[view.number].get(chosen.robot)
+            robot = name_of(declaration, "robot", view)
+            is_selected = has_robot_state(view) and not is_seen(view) and robot == chosen.robot
+        if is_selected:
+            robot_row = robot_rows[view.number].get(chosen.robot)
             yield view.number, (view, {} if robot_row is None else robot_row.numbers)
 
 
@@ -179,11 +159,11 @@ def _is_of_robots(column: str) -> bool:
 
 
 def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
-    """The content of session.toml, of what is meant alone."""
-    given, declaration = dict(session.document), session.declaration
+    """Content of session.toml for the chosen parts."""
+    document, declaration = dict(session.document), session.declaration
     for name in ("frames", "clocks", "prior", "mount", *KINDS, *(f"{kind}s" for kind in KINDS)):
-        given.pop(name, None)
-    given["mount"] = "eye-in-hand" if chosen.mount == "instrument" else chosen.mount
+        document.pop(name, None)
+    document["mount"] = "eye-in-hand" if chosen.mount == "instrument" else chosen.mount
     for kind, name in (
         ("camera", chosen.camera.partition("_")[2]),
         ("robot", chosen.robot),
@@ -191,17 +171,17 @@ def _document(session: "Session", chosen: Chosen) -> dict[str, Any]:
     ):
         table = _table(session.document, kind, name)
         if table is not None:
-            given[kind] = table
+            document[kind] = table
     clock = declaration.clocks.get(chosen.camera.partition("_")[2])
     if clock is not None:
-        given["clock"] = clock.model_dump(exclude_unset=True)
+        document["clock"] = clock.model_dump(exclude_unset=True)
     if prior := dict(_priors(session, chosen)):
-        given["prior"] = prior
-    return given
+        document["prior"] = prior
+    return document
 
 
 def _table(document: Mapping[str, Any], kind: str, name: str) -> Any:  # noqa: ANN401 - TOML's
-    """A kind's table as the singular has it: the short forms of several are written out."""
+    """A kind's table in its singular form; short forms are expanded."""
     several = document.get(f"{kind}s", {})
     if name not in several:
         return document.get(kind)
@@ -212,7 +192,7 @@ def _table(document: Mapping[str, Any], kind: str, name: str) -> Any:  # noqa: A
 
 
 def _priors(session: "Session", chosen: Chosen) -> Iterator[tuple[str, Any]]:
-    """What is known beforehand of the edges, by their names in the smaller session."""
+    """Priors of the edges, by their names in the selected session."""
     short = {
         chosen.base: "base",
         chosen.flange: "flange",
@@ -226,26 +206,26 @@ def _priors(session: "Session", chosen: Chosen) -> Iterator[tuple[str, Any]]:
 
 
 def is_whole_cell(session: "Session") -> bool:
-    """Whether all of a session can only be adjusted together.
+    """Whether a session can only be calibrated as a whole cell.
 
-    So is a camera with an instrument, where the session says what hangs on what.
+    This includes a camera with an instrument, where the session has `[frames]`.
     """
     both = bool(session.cameras and session.instruments)
-    return bool(_several(session)) or (both and bool(session.declaration.frames))
+    return bool(_whole_cell_words(session)) or (both and bool(session.declaration.frames))
 
 
 def is_to_be_parted(session: "Session", choice: Choice) -> bool:
-    """Whether one of each is to be taken out: several boards of one pair go together otherwise."""
+    """Whether one of each must be selected; several boards of one camera and robot need not be."""
     return is_whole_cell(session) or (bool(choice) and has_several(session))
 
 
 def check_one_of_each(session: "Session") -> None:
-    """Refuses a session with several cameras, robots or instruments, or boards on either side.
+    """Checks that a session has one camera, robot and instrument, and boards on one side.
 
     Raises:
-        DataError: It is one of a whole cell.
+        DataError: It is of a whole cell.
     """
-    if words := _several(session):
+    if words := _whole_cell_words(session):
         raise DataError(
             f"session {session.name!r} {words}.",
             culprits=["session.toml"],
@@ -255,8 +235,8 @@ def check_one_of_each(session: "Session") -> None:
         )
 
 
-def _several(session: "Session") -> str:
-    """What makes a session that of a whole cell; empty where it is none."""
+def _whole_cell_words(session: "Session") -> str:
+    """Why a session is of a whole cell, in words; empty where it is not."""
     several = {kind: list(session.declaration.named(kind)) for kind in KINDS if kind != "target"}
     words = [f"{kind}s ({some_of(names)})" for kind, names in several.items() if len(names) > 1]
     if words:
@@ -264,17 +244,18 @@ def _several(session: "Session") -> str:
     if not session.declaration.frames or session.mount == "instrument":
         return ""
     boards = [frame_name("target", name) for name in session.declaration.named("target")]
-    moves = {
+    on_flange = {
         board: session.frames[board].startswith("flange")
         for board in boards
         if board in session.frames
     }
-    amiss = [
-        name for name, is_moved in moves.items() if is_moved == (session.mount == "eye-in-hand")
+    misplaced = [
+        name for name, is_moved in on_flange.items() if is_moved == (session.mount == "eye-in-hand")
     ]
-    if not amiss:
+    if not misplaced:
         return ""
+    first = misplaced[0]
     return (
-        f"has its camera {session.mount} and {some_of(amiss)} on {session.frames[amiss[0]]}; "
-        f"this takes boards {'in the cell' if moves[amiss[0]] else 'on the flange'} alone"
+        f"has its camera {session.mount} and {some_of(misplaced)} on {session.frames[first]}; "
+        f"this takes boards {'in the cell' if on_flange[first] else 'on the flange'} alone"
     )

@@ -1,4 +1,4 @@
-"""A session: what was recorded of a cell, read from a folder and written to one."""
+"""Session: the recording of a cell, read from a folder and written to one."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
 from visioncal.core.shown import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.arrays import CellArguments, Poses, of_corners, of_images
 from visioncal.session.boards import COLUMN, read_targets, target_warnings
 from visioncal.session.checks import check_images_can_be_used, check_times, view_warnings
@@ -55,28 +55,27 @@ from visioncal.session.streams import (
 from visioncal.session.table import TextRow, View, parse_csv, read_views, write_csv
 from visioncal.session.tables import CameraTable, InstrumentTable, RobotTable
 
-# The columns of a session without views.
+# Columns of a session without views.
 ALONE = ("view",)
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What was recorded of a cell. The content is kept as it was read; transforms are derived.
+    """Recording of a cell. The content is kept as it was read; transforms are derived.
 
     Attributes:
-        document: The content of session.toml.
-        columns: The columns of views.csv, in its order.
-        views: Its rows, in its order.
+        document: Content of session.toml.
+        columns: Columns of views.csv, in its order.
+        views: Rows of views.csv, in its order.
         target: The printed target, where the session names one; of several, the first.
-        target_document: The content of the target's `.toml`; of several, the contents by name.
-        images: Where the images' bytes come from.
-        warnings: What is allowed but suspicious, in words for the user.
-        robot_document: The robot's model as `Robot.from_document` reads it; None where the session
-            names no robot or one that is unknown, which a warning says. Of several, the models by
-            name.
+        target_document: Content of the target's `.toml`; of several, the contents by name.
+        images: Source of the images.
+        warnings: Suspicious content, in sentences.
+        robot_document: The robot's model for `Robot.from_document`; of several, the models by name.
+            None where the session names no robot or, with a warning, an unknown one.
         targets: Several printed targets by name, in the session's order; empty for one or none.
-        streams: What was read many times a second beside the views, by name.
-        corner_table: The corners that another detector found; None where there are none.
+        streams: Time series beside the views, by name.
+        corner_table: Corners by another detector; None where there are none.
     """
 
     document: Mapping[str, Any]
@@ -100,22 +99,22 @@ class Session:
         target_document: Mapping[str, Any] | None = None,
         table: tuple[tuple[str, ...], tuple[TextRow, ...]] | None = None,
     ) -> "Session":
-        """Loads a session's folder, or the `.rrd` recording of one.
+        """Loads a session from a folder or an `.rrd` recording.
 
-        An image that is missing is no error here: the view that needs it is named later. Where
-        there are streams, views.csv may be absent.
+        A missing image is no error here: its view is rejected later. Where there are streams,
+        views.csv may be absent.
 
         Args:
             path: The folder or the recording.
-            target_document: Taken in the place of a folder's own target, or targets by name.
-            table: The columns and rows taken in the place of a folder's own views.csv.
+            target_document: Replaces the folder's target, or targets by name.
+            table: Columns and rows that replace the folder's views.csv.
 
         Raises:
             DataError: A file is missing, or a field, row or column of one is wrong.
         """
         path = Path(path)
         if path.suffix.lower() == ".rrd":
-            # Recordings are built on sessions; only this one call goes the other way.
+            # Imported here, since recordings depend on sessions.
             from visioncal.present.recording import read_session
 
             return read_session(path)
@@ -125,7 +124,7 @@ class Session:
                 culprits=[str(path)],
                 next_step="Check the path and its spelling.",
             )
-        # What calibrate writes lies together, and is taken for its folder.
+        # calibration.json stands for the output folder that contains it.
         folder = path.parent if path.name == "calibration.json" else path
         recording = folder / "recording.rrd"
         if recording.is_file() and not (folder / "session.toml").exists():
@@ -159,7 +158,7 @@ class Session:
         streams = read_streams(path)
         columns: tuple[str, ...] = ALONE
         rows: tuple[TextRow, ...] = ()
-        # Streams alone have what an arm's drives needed.
+        # Streams are enough for identifying an arm's dynamics.
         if table is not None:
             columns, rows = table
         elif not streams or (path / "views.csv").exists():
@@ -178,7 +177,7 @@ class Session:
 
     @classmethod
     def of_streams(cls, document: Mapping[str, Any], streams: Mapping[str, Stream]) -> "Session":
-        """Builds a session that has streams and no views, with the checks of `load`.
+        """Builds a session with streams and without views, with the checks of `load`.
 
         Raises:
             DataError: A field or a column is wrong.
@@ -197,17 +196,18 @@ class Session:
         robot_document: Mapping[str, Any] | None = None,
         corners: CornerTable | None = None,
     ) -> "Session":
-        """Builds a session from facts that were kept elsewhere, with the checks of `load`.
+        """Builds a session from content in memory, with the checks of `load`.
 
         Args:
-            document: The content of session.toml.
-            columns: The columns of views.csv.
+            document: Content of session.toml.
+            columns: Columns of views.csv.
             cells: Its rows, one text for each column, as `View.cell` gives them.
-            images: Where the images' bytes come from.
-            target_document: The content of the target's `.toml`, of several the contents by name;
-                needed where `document` names a file rather than a target that comes with visioncal.
-            robot_document: The robot's model, of several the models by name; needed likewise.
-            corners: The corners that another detector found.
+            images: Source of the images.
+            target_document: Content of the target's `.toml`, of several the contents by name;
+                needed where `document` names a file rather than a built-in target.
+            robot_document: The robot's model, of several the models by name; needed where
+                `document` names a file rather than a built-in model.
+            corners: Corners by another detector.
 
         Raises:
             DataError: A field, row or column is wrong.
@@ -236,13 +236,13 @@ class Session:
 
         Args:
             images: (h, w) or (h, w, 3) arrays of uint8, blue first, or the bytes of image files.
-            base_from_flange: (n, 4, 4), or n transforms: where the robot stood at each.
-            board: What they show: a board, or the name of one that comes with visioncal.
-            **cell: What else is known: `mount`, `camera` (estimated where left out), `robot` (a
-                built-in model), `q` (n, j) [rad], `name`.
+            base_from_flange: (n, 4, 4), or n transforms: the flange's pose at each.
+            board: The board in the images, or the name of a built-in one.
+            **cell: Options `mount`, `camera` (estimated by default), `robot` (a built-in model),
+                `q` (n, j) [rad], `name`.
 
         Raises:
-            DataError: The arrays do not match, or one is of another form.
+            DataError: The arrays do not match, or one has a wrong form.
         """
         return cls.assemble(**of_images(images, base_from_flange, board, **cell))
 
@@ -256,18 +256,18 @@ class Session:
         resolution: tuple[int, int],
         **cell: Unpack[CellArguments],
     ) -> "Session":
-        """Builds a session of corners that another detector found.
+        """Builds a session of corners by another detector.
 
         Args:
-            corners: For each view the (k,) numbers of its corners and their (k, 2) places [px];
+            corners: For each view the (k,) numbers of its corners and their (k, 2) positions [px];
                 None for both, or empty ones, where nothing was found.
             base_from_flange: As in `from_arrays`.
-            board: Likewise.
+            board: As in `from_arrays`.
             resolution: (width, height) of the images [px].
-            **cell: Likewise.
+            **cell: As in `from_arrays`.
 
         Raises:
-            DataError: The arrays do not match, or one is of another form.
+            DataError: The arrays do not match, or one has a wrong form.
         """
         return cls.assemble(**of_corners(corners, base_from_flange, board, resolution, **cell))
 
@@ -294,36 +294,38 @@ class Session:
     def of(
         self, camera: str | None = None, robot: str | None = None, target: str | None = None
     ) -> "Session":
-        """Returns the session of one camera, one robot and one target of a whole cell.
+        """Selects one camera, one robot and one target of a whole cell.
 
-        It has the rows in which this camera saw this target, with the robot's poses of their stops.
+        The result has the rows in which this camera observes this target, with the robot's poses at
+        their stops.
 
         Args:
-            camera: Its name, or its frame's; may be left out where only one fits.
-            robot: The robot that moves one of them before the other; likewise.
-            target: The target; likewise.
+            camera: Name of the camera or its frame; optional where unambiguous.
+            robot: Name of the robot between camera and target; optional where unambiguous.
+            target: Name of the target; optional where unambiguous.
 
         Raises:
-            DataError: There is no such thing, several are meant, or this robot does not part these.
+            DataError: There is none of that name, the choice is ambiguous, or this robot is not
+                between camera and target.
         """
         return select(self, Choice(camera, robot, target))
 
     @typed
     def only(self, views: Sequence[int]) -> "Session":
-        """Returns the session of some views alone, as those before something moved.
+        """Selects views, such as those before something moved.
 
-        Of a whole cell, the rows of robots at their stops stay, too.
+        In a whole cell, the robots' rows at their stops are kept, too.
 
         Args:
-            views: Their numbers.
+            views: The views' numbers.
 
         Raises:
-            DataError: The session has no such view, or none is meant.
+            DataError: The session has no such view, or none is given.
         """
         return keep_views(self, views)
 
     def with_streams(self, streams: Mapping[str, Stream]) -> "Session":
-        """Returns the session with streams beside its views, in the order of their names.
+        """The session with streams, in the order of their names.
 
         Raises:
             DataError: A stream is wrong; see `check_stream`.
@@ -335,17 +337,17 @@ class Session:
 
     @typed
     def needing(self, mm: float | None = None, deg: float | None = None) -> "Session":
-        """Returns the session of a task that needs something else; what is None stays as declared.
+        """The session with another required accuracy; a value of None keeps the declared one.
 
         Args:
-            mm: How near picks have to come [mm].
+            mm: Required accuracy of picks [mm].
             deg: The same in rotation [deg].
 
         Raises:
-            DataError: One is no number above 0.
+            DataError: One is not a number above 0.
         """
-        both = (("mm", mm), ("deg", deg))
-        asked = {name: float(value) for name, value in both if value is not None}
+        given = {"mm": mm, "deg": deg}
+        asked = {name: float(value) for name, value in given.items() if value is not None}
         for name, value in asked.items():
             if not 0.0 < value < np.inf:
                 raise DataError(
@@ -360,16 +362,16 @@ class Session:
 
     @property
     def need(self) -> Need | None:
-        """What the task needs; None where nothing is said of it."""
+        """Required accuracy of the task; None where not declared."""
         table = self.declaration.need
         return None if table is None else table.need
 
     @typed
     def save(self, folder: Path | str) -> None:
-        """Writes the session as a folder that needs no other file; whole or not at all.
+        """Writes the session atomically as a self-contained folder.
 
-        Targets and robots that were files are written into it; those that come with visioncal
-        stay names. Image files are copied byte by byte; missing ones stay missing.
+        Files of targets and robots are written into it; built-in ones remain names. Image files are
+        copied byte by byte; missing ones are skipped.
 
         Raises:
             DataError: The folder exists and is not empty, or cannot be written; a recording is
@@ -397,10 +399,10 @@ class Session:
         write_folder(Path(folder), texts, self.images, tuple(paths))
 
     def digest(self) -> str:
-        """Computes the SHA-256 digest of the session's facts.
+        """Computes the SHA-256 digest of the session's content, independent of its storage.
 
-        It is equal for every storage of the same facts: folders, their formatting, the spelling of
-        numbers and the names of a target's or a robot's file do not enter, their contents do.
+        It depends on the contents of target and robot files, not on their names, nor on folders,
+        formatting and the spelling of numbers.
         """
         return digest_facts(
             self.document,
@@ -415,7 +417,7 @@ class Session:
 
     @cached_property
     def corners(self) -> Mapping[int, Corners]:
-        """The corners that another detector found, by view, each numbered as its target's are."""
+        """Corners by another detector, by view, numbered by index on the target."""
         if self.corner_table is None:
             return {}
         shown = [view for view in self.views if view.has_corners]
@@ -424,7 +426,7 @@ class Session:
 
     @cached_property
     def declaration(self) -> Declaration:
-        """The content of session.toml, typed: the clock, the priors, the instrument."""
+        """Typed content of session.toml: the clock, the priors, the instrument."""
         return read_declaration(self.document, "session.toml", observed=bool(self.views))
 
     @property
@@ -434,9 +436,9 @@ class Session:
 
     @property
     def mount(self) -> Mount:
-        """What observes whom: a camera in the hand or one that looks at it, or an instrument.
+        """`eye-in-hand`, `eye-to-hand`, or `instrument` where an instrument observes the robot.
 
-        Of several cameras that are not declared alike, it is that of none in the hand.
+        Several cameras without declaration are `eye-in-hand` only if all are on flanges.
         """
         declared = self.declaration.mount
         if self.is_read_by_instrument or (declared is None and not self.cameras):
@@ -448,36 +450,36 @@ class Session:
 
     @property
     def is_network(self) -> bool:
-        """Whether it has several cameras, robots or instruments, or says what hangs on what."""
+        """Whether it has several cameras, robots or instruments, or `[frames]`."""
         return self.declaration.is_network
 
     @cached_property
     def cameras(self) -> Mapping[str, CameraTable]:
-        """The cameras by the names that rows give them; that of `[camera]` is empty."""
-        found = self.declaration.named("camera").items()
-        return {name: table for name, table in found if isinstance(table, CameraTable)}
+        """Cameras by their names in rows; that of `[camera]` is empty."""
+        tables = self.declaration.named("camera").items()
+        return {name: table for name, table in tables if isinstance(table, CameraTable)}
 
     @cached_property
     def robots(self) -> Mapping[str, RobotTable]:
-        """The robots by name; that of `[robot]`, and of poses without a robot, is empty."""
+        """Robots by name; that of `[robot]`, and of poses without a robot, is empty."""
         in_streams = any(stream.has_robot_state for stream in self.streams.values())
         return robots_of(self.declaration, self.views, in_streams=in_streams)
 
     @cached_property
     def instruments(self) -> Mapping[str, InstrumentTable]:
-        """The instruments by name; that of `[instrument]` is empty."""
-        found = self.declaration.named("instrument").items()
-        return {name: table for name, table in found if isinstance(table, InstrumentTable)}
+        """Instruments by name; that of `[instrument]` is empty."""
+        tables = self.declaration.named("instrument").items()
+        return {name: table for name, table in tables if isinstance(table, InstrumentTable)}
 
     @cached_property
     def plates(self) -> Mapping[str, Target]:
-        """The targets by the names that session.toml gives them, also where there is one."""
+        """Targets by their names in session.toml, also for the only one."""
         names = list(self.declaration.named("target"))
         return dict(zip(names, self.boards.values(), strict=False))
 
     @property
     def robot_documents(self) -> Mapping[str, Mapping[str, Any]]:
-        """The robots' models by name, of those whose models are known."""
+        """Models of the robots by name, where known."""
         if self.robot_document is None:
             return {}
         if len(self.robots) > 1:
@@ -486,16 +488,17 @@ class Session:
 
     @cached_property
     def frames(self) -> Mapping[str, str]:
-        """What each frame hangs on, by name: bases, flanges, cameras, targets, instruments, points.
+        """Parent of each frame by name: bases, flanges, cameras, targets, instruments, points.
 
         Raises:
-            DataError: What is said contradicts itself, or something is neither said nor follows.
+            DataError: The declaration contradicts itself, or a parent is neither declared nor
+                inferred.
         """
         return resolve_frames(self.declaration, self.views, self.robots)
 
     @cached_property
     def observations(self) -> tuple[Observation, ...]:
-        """What saw what while which robots stood how.
+        """Observations with observer, observed object and robot poses.
 
         Raises:
             DataError: See `frames`.
@@ -504,24 +507,24 @@ class Session:
 
     @cached_property
     def is_read_by_instrument(self) -> bool:
-        """Whether an instrument's readings are all that was observed: a camera comes before it."""
+        """Whether all observations are an instrument's; otherwise the camera's are used."""
         seen = any(is_seen(view) for view in self.views)
         return not seen and any(view.reading_m is not None for view in self.views)
 
     @property
     def boards(self) -> Mapping[str, Target]:
-        """The printed targets by name; an only one has an empty name."""
+        """Printed targets by name, which is empty for the only one."""
         if self.targets or self.target is None:
             return self.targets
         return {"": self.target}
 
     def board_of(self, view: View) -> str:
-        """Names the target among `boards` that a view shows."""
+        """Name in `boards` of the target that a view shows."""
         return view.text.get(COLUMN, "").strip() if self.targets else ""
 
     @property
     def camera(self) -> Camera | None:
-        """The camera's intrinsics; None where the session leaves them to be estimated."""
+        """The stated intrinsics; None where they are to be estimated."""
         table = self.declaration.only_camera
         return None if table is None else table.stated
 
@@ -540,7 +543,7 @@ class Session:
 
     @property
     def robot_name(self) -> str | None:
-        """The robot's model as the session names it: a built-in name or a path."""
+        """The robot's model in the session: a built-in name or a path."""
         return None if self.declaration.only_robot is None else self.declaration.only_robot.model
 
 
@@ -555,7 +558,7 @@ def _build(
     robot_document: Mapping[str, Any] | None = None,
     corners: CornerTable | None = None,
 ) -> Session:
-    """Checks the facts of a session and puts them together."""
+    """Builds a session from its content, with all checks."""
     declaration = read_declaration(document, "session.toml", observed=bool(rows))
     views = read_views(columns, rows, "views.csv", with_corners=corners is not None)
     targets, target_document = read_targets(declaration, folder, target_document)
@@ -565,7 +568,7 @@ def _build(
     check_images_can_be_used(declaration, views)
     warnings = [
         *declaration_warnings(declaration, "session.toml"),
-        *known.column_warnings(columns, "views.csv"),
+        *cols.column_warnings(columns, "views.csv"),
         *view_warnings(views),
         *kind_warnings(declaration, views),
         *target_warnings(declaration, target_document),
@@ -574,8 +577,8 @@ def _build(
     check_frames(declaration, views)
     if declaration.is_network:
         warnings += stop_warnings(declaration, views)
-    robot_document, unknown = read_robots(declaration, folder, robot_document)
-    warnings += [*unknown, *outside_warnings(declaration, folder)]
+    robot_document, problems = read_robots(declaration, folder, robot_document)
+    warnings += [*problems, *outside_warnings(declaration, folder)]
     session = Session(
         document,
         columns,
@@ -590,6 +593,6 @@ def _build(
     )
     if corners is not None:
         seen = (view for view in views if view.has_corners)
-        shown = {view.number: session.board_of(view) for view in seen}
-        check_points(corners, [shown[index] for index in corners.views.tolist()], session.boards)
+        named = {view.number: session.board_of(view) for view in seen}
+        check_points(corners, [named[index] for index in corners.views.tolist()], session.boards)
     return session

@@ -1,8 +1,7 @@
-"""Several sessions of one arm as one of a whole cell: the arm is shared, all else is each its own.
+"""Joining of several sessions of one arm into one of a whole cell, which share only the arm.
 
-The more sessions an arm is calibrated from, the more of its joints' range they cover, whichever
-camera and board each of them had. Nothing of the cells is taken for the same but the arm: every
-session keeps a camera, a board and their frames of its own.
+More sessions cover more of the arm's joint ranges, with any camera and board. Each session keeps
+its own camera, board and frames.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,34 +20,34 @@ from visioncal.session.selecting import has_several
 from visioncal.session.session import Session
 from visioncal.session.table import View
 
-# Tables of session.toml that a session of the whole cell has by name, or of the arm alone.
-_NAMED = ("camera", "target", "mount", "frames", "clock", "clocks", "prior", "name")
-# Between two sessions whose clocks overlap [s]: long enough for a robot to be as cold as before.
+# Fields of session.toml that differ between the sessions and are not copied.
+_OWN = ("camera", "target", "mount", "frames", "clock", "clocks", "prior", "name")
+# Time between two sessions whose clocks overlap [s]: the robot cools down completely.
 _BETWEEN_S = 86_400.0
 
 
 @dataclass(frozen=True, eq=False)
 class JoinedImages(ImageStore):
-    """The images of several sessions, each below a folder of its session's name."""
+    """Images of several sessions, each in a folder with its session's name."""
 
     stores: Mapping[str, ImageStore]
 
     def read(self, path: str) -> bytes:
         """Reads the bytes of one image file."""
-        store, name = self._of(path)
+        store, name = self._locate(path)
         return store.read(name)
 
     def sha256(self, path: str) -> str:
-        """Digest of the bytes of an image; empty where there is none."""
-        store, name = self._of(path)
+        """Digest of an image file; empty where there is none."""
+        store, name = self._locate(path)
         return store.sha256(name)
 
     def absence(self, path: str) -> str:
-        """Says why there is no such image; empty where there is one."""
-        store, name = self._of(path)
+        """Why there is no such image; empty where there is one."""
+        store, name = self._locate(path)
         return store.absence(name)
 
-    def _of(self, path: str) -> tuple[ImageStore, str]:
+    def _locate(self, path: str) -> tuple[ImageStore, str]:
         first, _, rest = path.partition("/")
         return self.stores[first], rest
 
@@ -62,8 +61,8 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             are named s1, s2, ... in this order.
 
     Returns:
-        The session of a cell with that robot, a camera and a board a session. Stops and views are
-        numbered anew, one session after the other; times that overlap are moved apart.
+        The session of a cell with that robot, and a camera and a board of each session. Stops and
+        views are renumbered, one session after the other; overlapping times are shifted.
 
     Raises:
         DataError: One is a whole cell, has streams or no robot, or the robots differ.
@@ -80,7 +79,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             )
     names = [f"s{at}" for at in range(1, len(sessions) + 1)]
     by_name = dict(zip(names, sessions, strict=True))
-    document = {name: value for name, value in sessions[0].document.items() if name not in _NAMED}
+    document = {name: value for name, value in sessions[0].document.items() if name not in _OWN}
     document |= {
         "name": " + ".join(session.name for session in sessions),
         "cameras": {name: session.document.get("camera", {}) for name, session in by_name.items()},
@@ -101,9 +100,9 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     tables: list[CornerTable] = []
     views, stops, until_s = 0, 0, -np.inf
     for name, session in by_name.items():
-        later_s = _later(session, until_s)
+        shift_s = _time_shift_s(session, until_s)
         for view in session.views:
-            own = {
+            changed = {
                 "view": str(views + view.number),
                 "stop": "" if view.stop is None else str(stops + view.stop),
                 "image": view.image and f"{name}/{view.image}",
@@ -111,15 +110,15 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
                 TARGET: name,
             }
             if view.stamp_s is not None:
-                own["stamp_s"] = repr(view.stamp_s + later_s)
-            rows.append([own.get(column, view.cell(column)) for column in columns])
+                changed["stamp_s"] = repr(view.stamp_s + shift_s)
+            rows.append([changed.get(column, view.cell(column)) for column in columns])
         if session.corner_table is not None:
             table = session.corner_table
-            mine = (name,) * len(table)
-            tables.append(replace(table, views=table.views + views, targets=mine))
+            target_names = (name,) * len(table)
+            tables.append(replace(table, views=table.views + views, targets=target_names))
         views += 1 + max((view.number for view in session.views), default=0)
         stops += 1 + max((view.stop or 0 for view in session.views), default=0)
-        until_s = max([until_s, *(stamp + later_s for stamp in _stamps(session.views))])
+        until_s = max([until_s, *(stamp + shift_s for stamp in _stamps(session.views))])
     return Session.assemble(
         document,
         columns,
@@ -127,7 +126,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         JoinedImages({name: session.images for name, session in by_name.items()}),
         target_document={name: session.target_document for name, session in by_name.items()},
         robot_document=sessions[0].robot_document,
-        corners=_stacked(tables) if tables else None,
+        corners=_joined_corners(tables) if tables else None,
     )
 
 
@@ -188,14 +187,14 @@ def _stamps(views: Sequence[View]) -> list[float]:
     return [view.stamp_s for view in views if view.stamp_s is not None]
 
 
-def _later(session: Session, until_s: float) -> float:
-    """By how much its times are moved to come after those before [s]."""
+def _time_shift_s(session: Session, until_s: float) -> float:
+    """Shift of a session's times that puts them after earlier sessions [s]."""
     stamps = _stamps(session.views)
     return until_s + _BETWEEN_S - min(stamps) if stamps and min(stamps) <= until_s else 0.0
 
 
-def _stacked(tables: Sequence[CornerTable]) -> CornerTable:
-    """All corners in one table; a sigma is stated of all or of none."""
+def _joined_corners(tables: Sequence[CornerTable]) -> CornerTable:
+    """All corners in one table; sigmas are kept where all tables have them."""
     sigmas = [table.sigmas_px for table in tables if table.sigmas_px is not None]
     return CornerTable(
         np.concatenate([table.views for table in tables]),

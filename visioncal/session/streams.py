@@ -1,4 +1,4 @@
-"""streams/NAME.csv: what was read many times a second, beside the views."""
+"""streams/NAME.csv: time series beside the views."""
 
 import csv
 import io
@@ -15,33 +15,32 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import named_errors, read_text_inside, sha256, write_atomically
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.table import NUMBER
 
 FOLDER, STAMP = "streams", "stamp_s"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*", re.ASCII)
 # Rounding to four digits leaves a unit quaternion's norm within this of 1, as in views.csv.
 _NORM_TOLERANCE = 1e-3
-# Samples farther apart than so many times the usual, and than so much [s], have others missing
-# between them.
+# Samples are missing where steps exceed this multiple of the median, and this time [s].
 _GAP_RATIO, _GAP_S = 2.5, 0.02
 _SHOWN_PROBLEMS = 10
-# What stands for no number in other programs' tables.
+# Cells that stand for missing numbers in other programs' tables.
 _NONE = frozenset({"nan", "-nan", "+nan", "na", "n/a", "null", "none", "inf", "-inf", "+inf", "-"})
-# Units that stamps may be in by mistake, and how many of them are a second.
+# Units that stamps may be in by mistake, per second.
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-# Half an hour of twenty columns at 500 Hz, of all streams together.
+# Largest size of all streams together: half an hour of twenty columns at 500 Hz.
 _MOST_BYTES = 300_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """The rows of one stream, with their numbers as they were read.
+    """Time series with named columns.
 
     Attributes:
-        columns: Their names; `stamp_s` is one of them.
-        values: (n, c) their numbers, in their columns' units; NaN where a cell is empty.
-        lines: (n,) in which line of its file each row stands; None where they follow the header.
+        columns: Names of the columns; `stamp_s` is one of them.
+        values: (n, c) numbers in the columns' units; NaN where a cell is empty.
+        lines: (n,) line of each row in its file; None where rows follow the header.
     """
 
     columns: tuple[str, ...]
@@ -55,7 +54,7 @@ class Stream:
         return column in self.columns
 
     def __getitem__(self, column: str) -> FloatArray:
-        """(n,) the numbers of a column; NaN where a cell is empty."""
+        """(n,) numbers of a column; NaN where a cell is empty."""
         return np.asarray(self.values[:, self.columns.index(column)])
 
     @property
@@ -64,16 +63,16 @@ class Stream:
         return self[STAMP]
 
     def group(self, columns: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Takes the rows in which some columns are filled: (m,) times [s] and (m, k) numbers."""
+        """(m,) times [s] and (m, k) numbers of the rows in which all given columns are filled."""
         if not columns or any(name not in self for name in columns):
             return np.zeros(0), np.zeros((0, len(columns)))
         numbers = np.stack([self[name] for name in columns], axis=1)
-        there = np.isfinite(numbers).all(axis=1)
-        return self.stamps_s[there], numbers[there]
+        filled = np.isfinite(numbers).all(axis=1)
+        return self.stamps_s[filled], numbers[filled]
 
     def poses(self) -> tuple[FloatArray, FloatArray]:
-        """The poses that the controller reported: (m,) times [s] and (m, 4, 4) [m]."""
-        stamps_s, numbers = self.group(known.POSE)
+        """Reported flange poses: (m,) times [s] and (m, 4, 4) [m]."""
+        stamps_s, numbers = self.group(cols.POSE)
         if not len(numbers):
             return stamps_s, np.zeros((0, 4, 4))
         rotations = Rotation.from_quat(numbers[:, 3:])
@@ -83,21 +82,21 @@ class Stream:
     @property
     def has_robot_state(self) -> bool:
         """Whether it has poses or joints of a robot."""
-        return known.POSE[0] in self or "q1_rad" in self
+        return cols.POSE[0] in self or "q1_rad" in self
 
     def joints(self) -> tuple[FloatArray, FloatArray]:
-        """The joint angles: (m,) times [s] and (m, n) [rad]."""
-        return self.group(known.joint_columns(self.columns))
+        """Joint angles: (m,) times [s] and (m, n) [rad]."""
+        return self.group(cols.joint_columns(self.columns))
 
     def gaps(self) -> IntArray:
-        """The rows behind which samples are missing, by how far apart the others are."""
+        """Rows after which samples are missing, by comparison with the median step."""
         steps = np.diff(self.stamps_s)
         if not len(steps):
             return np.zeros(0, dtype=np.int64)
         return np.flatnonzero(steps > max(_GAP_RATIO * float(np.median(steps)), _GAP_S))
 
     def fact(self) -> dict[str, object]:
-        """What of it counts for the session's digest, free of how the numbers are spelt."""
+        """Content for the session's digest, independent of the numbers' formatting."""
         # Adding zero turns -0.0 into 0.0; every NaN gets the same bits.
         values = np.where(np.isnan(self.values), np.nan, self.values + 0.0)
         data = np.ascontiguousarray(values, dtype="<f8").tobytes()
@@ -108,48 +107,44 @@ def read_streams(folder: Path) -> dict[str, Stream]:
     """Reads the streams of a session's folder, by name.
 
     Raises:
-        DataError: A cell is no number; it is named.
+        DataError: A cell is not a number.
     """
     paths = sorted((folder / FOLDER).glob("*.csv"))
-    found, left = {}, _MOST_BYTES
+    streams, bytes_left = {}, _MOST_BYTES
     for path in paths:
-        text = read_text_inside(folder, f"{FOLDER}/{path.name}", left)
-        left -= len(text)
-        found[path.stem] = parse_stream(text, f"{FOLDER}/{path.name}")
-        _check_sizes(found[path.stem], f"{FOLDER}/{path.name}")
-    return found
+        text = read_text_inside(folder, f"{FOLDER}/{path.name}", bytes_left)
+        bytes_left -= len(text)
+        streams[path.stem] = parse_stream(text, f"{FOLDER}/{path.name}")
+        _check_sizes(streams[path.stem], f"{FOLDER}/{path.name}")
+    return streams
 
 
 def _check_sizes(stream: Stream, label: str) -> None:
     for column in dict.fromkeys(stream.columns):
-        wrong = known.no_size(column, stream[column])
+        wrong = cols.no_size(column, stream[column])
         if wrong:
             raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
 
 
 def parse_stream(text: str, label: str) -> Stream:
-    """Reads the text of a stream.
-
-    Args:
-        text: A header row, and a row of numbers a sample.
-        label: The file's name, for messages.
+    """Reads the text of a stream: a header row, and a row of numbers for each sample.
 
     Raises:
-        DataError: A cell is no number; it is named.
+        DataError: A cell is not a number.
     """
     head, _, body = text.partition("\n")
     separator = separator_of(head)
     _, names = next(numbered_rows(head, label, 1, separator), (1, []))
     columns = tuple(name.strip() for name in names)
-    values, lines = (_plain_numbers(body, len(columns)) if separator == "," else None), None
+    values, lines = (_read_fast(body, len(columns)) if separator == "," else None), None
     if values is None:
-        values, lines = _numbers(body, columns, label, separator)
+        values, lines = _read_cells(body, columns, label, separator)
     values.setflags(write=False)
     return Stream(columns, values, lines)
 
 
-def _plain_numbers(body: str, count: int) -> FloatArray | None:
-    """Reads rows without empty cells, fast; None for what has to be looked at cell by cell."""
+def _read_fast(body: str, count: int) -> FloatArray | None:
+    """Fast reading of rows without empty cells; None where cells must be read one by one."""
     body = body.replace("\r\n", "\n").strip("\n")
     if not body.strip() or "\n\n" in body:
         return None
@@ -160,10 +155,10 @@ def _plain_numbers(body: str, count: int) -> FloatArray | None:
     return values if values.shape[1] == count and np.isfinite(values).all() else None
 
 
-def _numbers(
+def _read_cells(
     body: str, columns: Sequence[str], label: str, separator: str
 ) -> tuple[FloatArray, IntArray]:
-    """Reads rows cell by cell with their lines, and names those that are wrong."""
+    """Reads rows cell by cell, with their lines; raises an error for wrong ones."""
     rows: list[list[float]] = []
     lines: list[int] = []
     problems: list[str] = []
@@ -179,11 +174,12 @@ def _numbers(
                 f"{len(columns)} columns"
             )
             continue
-        rows.append([_number(cell.strip()) for cell in cells])
+        texts = [cell.strip() for cell in cells]
+        rows.append([float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in texts])
         lines.append(line)
-        for name, cell, value in zip(columns, cells, rows[-1], strict=True):
-            if cell.strip() and not np.isfinite(value):
-                wrong.setdefault(name, []).append((line, cell.strip()))
+        for name, cell, value in zip(columns, texts, rows[-1], strict=True):
+            if cell and not np.isfinite(value):
+                wrong.setdefault(name, []).append((line, cell))
     if problems or wrong:
         shown = [*problems, *_wrong_cells(wrong, label)][:_SHOWN_PROBLEMS]
         missing = all(cell.lower() in _NONE for of in wrong.values() for _, cell in of)
@@ -199,7 +195,7 @@ def _numbers(
 
 
 def _wrong_cells(wrong: Mapping[str, Sequence[tuple[int, str]]], label: str) -> Iterator[str]:
-    """A sentence for each column that holds what is no number."""
+    """Message for each column with cells that are not numbers."""
     for name, ((line, cell), *others) in wrong.items():
         more = ""
         if others:
@@ -211,7 +207,7 @@ def _wrong_cells(wrong: Mapping[str, Sequence[tuple[int, str]]], label: str) -> 
 def numbered_rows(
     text: str, label: str, first: int, separator: str = ","
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yields rows with the number of the line in which they end, the text's first being `first`."""
+    """Rows with the number of the line in which they end, where the first line is `first`."""
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
         for cells in reader:
@@ -222,12 +218,8 @@ def numbered_rows(
         raise DataError(f"{place}: {error}.", culprits=[place]) from error
 
 
-def _number(cell: str) -> float:
-    return float(cell) if NUMBER.fullmatch(cell) else np.nan
-
-
 def write_stream(stream: Stream) -> str:
-    """Writes a stream so that reading it gives the same numbers again."""
+    """Text of a stream that reads back to the same numbers."""
     rows = (
         ",".join("" if value != value else repr(value) for value in row)
         for row in stream.values.tolist()
@@ -236,7 +228,7 @@ def write_stream(stream: Stream) -> str:
 
 
 def save_stream(folder: Path, name: str, stream: Stream) -> None:
-    """Writes a stream beside those of a session's folder.
+    """Writes a stream into a session's folder.
 
     Raises:
         DataError: It cannot be written.
@@ -248,11 +240,11 @@ def save_stream(folder: Path, name: str, stream: Stream) -> None:
 
 
 def check_stream(name: str, stream: Stream) -> None:
-    """Checks what a stream's columns say.
+    """Checks a stream's name, columns and values.
 
     Raises:
-        DataError: Its name is none, columns are missing or there twice, it has no rows, times are
-            missing or do not ascend, a pose is filled in part, or a quaternion is none.
+        DataError: Its name is invalid, columns are missing or duplicate, it has no rows, times are
+            missing or do not ascend, a pose is incomplete, or a quaternion is not of unit length.
     """
     label = f"{FOLDER}/{name}.csv"
     if not _NAME.fullmatch(name):
@@ -261,7 +253,7 @@ def check_stream(name: str, stream: Stream) -> None:
         )
     # A stream needs no `view`, and may have it.
     header = stream.columns if "view" in stream else ("view", *stream.columns)
-    known.check_header(header, f"{label}, header")
+    cols.check_header(header, f"{label}, header")
     if STAMP not in stream:
         raise DataError(
             f"{label}, header: the column {STAMP}, the time of each row, is missing.",
@@ -270,15 +262,15 @@ def check_stream(name: str, stream: Stream) -> None:
     if not len(stream):
         raise DataError(f"{label} has a header row and no samples.", culprits=[label])
     _check_times(stream, label)
-    for group in (*known.WHOLE_GROUPS, known.joint_columns(stream.columns)):
+    for group in (*cols.WHOLE_GROUPS, cols.joint_columns(stream.columns)):
         _check_whole(stream, group, label)
     for column in (
-        column for column in stream.columns if column.endswith("_c") and known.is_number(column)
+        column for column in stream.columns if column.endswith("_c") and cols.is_number(column)
     ):
-        wrong = known.no_celsius(stream[column])
+        wrong = cols.no_celsius(stream[column])
         if wrong:
             raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
-    for group in known.QUATERNION_GROUPS:
+    for group in cols.QUATERNION_GROUPS:
         rows = np.flatnonzero(_are_no_quaternions(stream, group))
         if len(rows):
             raise _wrong_rows(
@@ -305,8 +297,8 @@ def _check_times(stream: Stream, label: str) -> None:
 def _check_whole(stream: Stream, group: Sequence[str], label: str) -> None:
     if not group or group[0] not in stream:
         return
-    there = np.isfinite(np.stack([stream[name] for name in group], axis=1))
-    rows = np.flatnonzero(there.any(axis=1) & ~there.all(axis=1))
+    filled = np.isfinite(np.stack([stream[name] for name in group], axis=1))
+    rows = np.flatnonzero(filled.any(axis=1) & ~filled.all(axis=1))
     if len(rows):
         raise _wrong_rows(stream, label, rows, f"{group[0]} ... {group[-1]} are filled in part")
 
@@ -331,14 +323,8 @@ def _wrong_rows(
 
 
 def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:
-    """What to raise of samples that are too far apart to show a motion.
-
-    Args:
-        label: The stream's place, as `streams/robot.csv`.
-        usual_s: How far apart they usually are by their stamps [s].
-        slowest_s: How far apart they may be [s].
-    """
-    # The largest unit that leaves steps of a controller.
+    """Error for samples whose typical step `usual_s` exceeds the accepted `slowest_s` [s]."""
+    # The first unit in which the steps are plausible for a controller.
     unit = next((name for name, per_s in _UNITS.items() if usual_s <= slowest_s * per_s), "")
     like = "no time in seconds"
     if unit:
@@ -354,7 +340,7 @@ def too_far_apart(label: str, usual_s: float, slowest_s: float) -> DataError:
 
 
 def gap_warnings(streams: Mapping[str, Stream]) -> Iterator[str]:
-    """Words where samples of streams are missing."""
+    """Warnings of gaps in streams."""
     for name, stream in streams.items():
         behind, stamps_s = stream.gaps(), stream.stamps_s
         if len(behind):

@@ -1,4 +1,4 @@
-"""views.csv: one row an observation."""
+"""views.csv: reading, checking and writing of its rows, one for each observation."""
 
 import csv
 import io
@@ -16,25 +16,24 @@ from visioncal.core.documents.tables import separator_of, with_points, without_m
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import READ_AGAIN
-from visioncal.session import columns as known
+from visioncal.session import columns as cols
 from visioncal.session.images import image_path
 from visioncal.session.loads import SIDES, load_problems
 
-# Two days of a stop every ten seconds, which a calibration refuses within 2 GB of memory; and more
-# columns than any log has.
+# Largest numbers of rows and columns: two days of a stop every ten seconds.
 _MOST_VIEWS, _MOST_COLUMNS = 20_000, 1_000
-# Rounding to four digits leaves a unit quaternion's norm within this of 1.
+# Tolerance of a quaternion's norm, for four digits.
 _NORM_TOLERANCE = 1e-3
-# So many rows that are no quaternions are another form of rotation: not one that was rounded, and
-# of a norm that angles in radians do not have, in degrees.
+# Smallest number of rows with wrong norms, and largest norm of them, from which they are taken for
+# another form of rotation; norms beyond the last are of angles in degrees.
 _FEWEST_ALIKE, _FAR_FROM_UNIT, _ANGLES_RAD = 3, 1.5, 7.0
 _SHOWN_PROBLEMS = 10
-# Stricter than float(), which also takes 1_000, nan, and the digits of other scripts.
+# Stricter than float(), which also accepts 1_000, nan, and digits of other scripts.
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]*")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _DECIMAL = re.compile(r"[+-]?[0-9]*\.[0-9]+([eE][+-]?[0-9]+)?")
-# What differs between problems of one kind: values that are quoted, and numbers.
+# Quoted values and numbers, which differ between problems of one kind.
 _VALUES = re.compile(r"'[^']*'|[0-9.]+")
 _LINE = re.compile(r", line ([0-9]+)")
 
@@ -43,15 +42,15 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One row of views.csv, with its numbers as they were read.
+    """One row of views.csv.
 
     Attributes:
         number: The view's number, unique in its session.
         image: Path of its image, with forward slashes; empty where it has none.
-        holdout: Whether no fit may use it.
-        stop: The robot stop that it shares with other rows, if it names one.
-        numbers: The known numeric columns that are filled in this row, in their columns' units.
-        text: The other columns that are filled in this row.
+        holdout: Whether it is held out of all fits.
+        stop: Number of the robot's stop, if stated.
+        numbers: Filled known numeric columns, in their columns' units.
+        text: Other filled columns.
         has_corners: Whether corners.csv has rows of it.
     """
 
@@ -65,46 +64,46 @@ class View:
 
     @property
     def stamp_s(self) -> float | None:
-        """The time of the observation [s], if it was recorded."""
+        """Time of the observation [s], if recorded."""
         return self.numbers.get("stamp_s")
 
     @property
     def is_of_lens(self) -> bool:
-        """Whether it serves the camera's lens alone, as the board was anywhere."""
+        """Whether it is used for the lens only, with the board held by hand."""
         return self.text.get("role", "").strip() == "intrinsics"
 
     @property
     def point(self) -> str:
-        """The point that an instrument's reading is of; empty where it has no name."""
+        """Name of the point that an instrument measured; empty where it has none."""
         return self.text.get("point", "").strip()
 
     @property
     def joints_rad(self) -> FloatArray | None:
-        """(n,) joint angles [rad], if they were recorded."""
-        names = known.joint_columns(tuple(self.numbers))
+        """(n,) joint angles [rad], if recorded."""
+        names = cols.joint_columns(tuple(self.numbers))
         return np.array([self.numbers[name] for name in names]) if names else None
 
     def base_from_flange(self) -> RigidTransform | None:
-        """The pose that the controller reported, if it was recorded."""
-        return self._transform(known.POSE)
+        """The reported pose of the flange, if recorded."""
+        return self._transform(cols.POSE)
 
     def cam_from_target(self) -> RigidTransform | None:
-        """The target's pose that was already measured (cft_*), if there is one."""
-        return self._transform(known.MEASURED_CAM_POSE)
+        """The measured pose of the target (cft_*), if there is one."""
+        return self._transform(cols.MEASURED_CAM_POSE)
 
     @property
     def reading_m(self) -> FloatArray | None:
-        """(3,) the place that an instrument read (meas_*), in its frame [m], if there is one."""
-        names = known.INSTRUMENT_POSITION
+        """(3,) position measured by an instrument (meas_*), in its frame [m], if there is one."""
+        names = cols.INSTRUMENT_POSITION
         return (
             np.array([self.numbers[name] for name in names]) if names[0] in self.numbers else None
         )
 
     def instrument_from_probe(self) -> RigidTransform | None:
-        """The pose of a probe that an instrument read (meas_*), if its rotation was read too."""
-        names = (*known.INSTRUMENT_POSITION, *known.INSTRUMENT_QUATERNION)
-        there = names[0] in self.numbers and names[-1] in self.numbers
-        return self._transform(names) if there else None
+        """Pose of a probe measured by an instrument (meas_*), if its rotation was measured, too."""
+        names = (*cols.INSTRUMENT_POSITION, *cols.INSTRUMENT_QUATERNION)
+        complete = names[0] in self.numbers and names[-1] in self.numbers
+        return self._transform(names) if complete else None
 
     def _transform(self, names: Sequence[str]) -> RigidTransform | None:
         if names[0] not in self.numbers:
@@ -113,10 +112,7 @@ class View:
         return RigidTransform.from_components(values[:3], Rotation.from_quat(values[3:]))
 
     def cell(self, column: str) -> str:
-        """Writes the row's value of a column as views.csv has it; empty where it is not filled.
-
-        Numbers are written so that reading them gives the same number again.
-        """
+        """Text of a column in views.csv, empty where not filled; numbers read back the same."""
         if column == "view":
             return str(self.number)
         if column == "stop":
@@ -129,21 +125,21 @@ class View:
 
 
 def reported_matrices(views: Sequence[View]) -> dict[int, FloatArray]:
-    """(4, 4) `base_from_flange` of each view that the controller reported one of, by its number.
+    """(4, 4) reported `base_from_flange` by view number, where there is one.
 
-    All at once: one pose alone takes as long as a hundred together.
+    Vectorised: one pose alone takes as long as a hundred together.
     """
-    reported = [view for view in views if known.POSE[0] in view.numbers]
+    reported = [view for view in views if cols.POSE[0] in view.numbers]
     if not reported:
         return {}
-    values = np.array([[view.numbers[name] for name in known.POSE] for view in reported])
+    values = np.array([[view.numbers[name] for name in cols.POSE] for view in reported])
     poses = RigidTransform.from_components(values[:, :3], Rotation.from_quat(values[:, 3:]))
     return dict(zip((view.number for view in reported), poses.as_matrix(), strict=True))
 
 
 @dataclass(frozen=True)
 class TextRow:
-    """One row of text cells, and the words that place it in messages (`views.csv, line 3`)."""
+    """One row of text cells, and its place in messages (`views.csv, line 3`)."""
 
     where: str
     cells: tuple[str, ...]
@@ -151,20 +147,20 @@ class TextRow:
 
 @dataclass(frozen=True)
 class TableProblem:
-    """What is wrong with a table, and where."""
+    """Problem of a table, with its place."""
 
     place: str
     words: str
-    norm: float | None = None  # of what should be a unit quaternion
-    step: str = ""  # what to do about it, where the table is not what to correct
+    norm: float | None = None  # of a quaternion
+    step: str = ""  # remedy other than correcting the table
 
 
 def parse_csv(text: str, label: str) -> tuple[tuple[str, ...], tuple[TextRow, ...]]:
     """Splits a views.csv into its column names and its rows; blank lines are skipped.
 
-    Where the header has semicolons or tabs and no comma, they separate the columns, and a decimal
-    comma is read as a point: so spreadsheets write tables in half of the world. Empty columns
-    behind all others are left aside.
+    Where the header has semicolons or tabs and no comma, they separate the columns, and decimal
+    commas are read as points, as many spreadsheets write them. Empty columns at the end are
+    dropped.
 
     Raises:
         DataError: It is empty, has no rows, or its quotes do not close.
@@ -215,13 +211,13 @@ def _check_count(rows: Sequence[TextRow], label: str) -> None:
 
 
 def write_csv(columns: Sequence[str], views: Sequence[View]) -> str:
-    """Writes views as the text of a views.csv, the columns in the order that is given."""
+    """Text of a views.csv with the columns in the given order."""
     rows = [columns, *([view.cell(column) for column in columns] for view in views)]
     return "".join(",".join(map(_quoted, row)) + "\n" for row in rows)
 
 
 def _quoted(cell: str) -> str:
-    """Quotes a cell where it needs it; csv.writer leaves a lone carriage return bare."""
+    """Quotes a cell where needed; csv.writer does not quote a lone carriage return."""
     needs_quotes = any(character in cell for character in ',"\r\n')
     return '"' + cell.replace('"', '""') + '"' if needs_quotes else cell
 
@@ -235,13 +231,12 @@ def read_views(
         columns: The column names.
         rows: The rows' cells, as text.
         label: The file's name, for messages.
-        with_corners: Whether what the views show may stand in corners.csv.
+        with_corners: Whether there is a corners.csv.
 
     Raises:
-        DataError: Naming up to ten rows and columns that are wrong, the values that they hold and
-            those that are needed.
+        DataError: Rows are wrong; it lists up to ten problems.
     """
-    known.check_header(columns, f"{label}, header")
+    cols.check_header(columns, f"{label}, header")
     views: list[View] = []
     problems: list[TableProblem] = []
     first_seen: dict[int, str] = {}
@@ -267,7 +262,7 @@ def read_views(
 
 
 def problems_error(problems: Sequence[TableProblem]) -> DataError:
-    """Words the first ten problems of a table."""
+    """Error that lists the first ten problems of a table."""
     norms = [problem.norm for problem in problems if problem.norm is not None]
     if len(norms) == len(problems) >= _FEWEST_ALIKE and max(norms) > _FAR_FROM_UNIT:
         degrees = max(norms) > _ANGLES_RAD
@@ -285,9 +280,9 @@ def problems_error(problems: Sequence[TableProblem]) -> DataError:
         step = ""
         if len(columns) == 1 and "" not in columns:
             step = f"Correct column {', '.join(columns)} of {where.partition(',')[0]}."
-    own = {problem.step for problem in problems}
-    if len(own) == 1:
-        step = own.pop() or step
+    steps = {problem.step for problem in problems}
+    if len(steps) == 1:
+        step = steps.pop() or step
     if len(problems) <= _SHOWN_PROBLEMS:
         lines = [f"{problem.place}: {problem.words}." for problem in problems]
         return DataError(
@@ -298,16 +293,16 @@ def problems_error(problems: Sequence[TableProblem]) -> DataError:
         column = problem.place.partition(", column ")[2]
         kinds[column, _VALUES.sub("", problem.words)].append(problem)
     shown = list(kinds.values())[:_SHOWN_PROBLEMS]
-    lines = [_line_of(alike) for alike in shown]
+    lines = [_kind_message(alike) for alike in shown]
     if len(kinds) > len(shown):
         lines.append(f"And {len(kinds) - len(shown)} more of other kinds.")
-    named = [alike[0] for alike in shown] if all(map(_is_run, shown)) else problems
+    named = [alike[0] for alike in shown] if all(map(_are_consecutive, shown)) else problems
     culprits = [problem.place for problem in named[:_SHOWN_PROBLEMS]]
     return DataError("\n".join(lines), culprits=culprits, next_step=step)
 
 
-def _line_of(alike: Sequence[TableProblem]) -> str:
-    """Words problems of one kind in one column: the first, and how many more there are."""
+def _kind_message(alike: Sequence[TableProblem]) -> str:
+    """Message for problems of one kind in one column: the first, and the number of others."""
     words = f"{alike[0].place}: {alike[0].words}."
     if len(alike) == 1:
         return words
@@ -315,16 +310,16 @@ def _line_of(alike: Sequence[TableProblem]) -> str:
     return f"{words} And {len(alike) - 1} more alike, up to {last}."
 
 
-def _is_run(alike: Sequence[TableProblem]) -> bool:
-    """Whether problems are those of all lines from the first to the last."""
-    lines = [found for problem in alike if (found := _LINE.search(problem.place))]
-    numbers = [int(found[1]) for found in lines]
+def _are_consecutive(alike: Sequence[TableProblem]) -> bool:
+    """Whether problems are in all lines from the first to the last."""
+    lines = [match for problem in alike if (match := _LINE.search(problem.place))]
+    numbers = [int(match[1]) for match in lines]
     return len(numbers) == len(alike) and numbers[-1] - numbers[0] == len(alike) - 1
 
 
 @dataclass(frozen=True)
 class _RowReader:
-    """Reads one row and collects what is wrong with it in `problems`."""
+    """Reader of one row, which collects its problems in `problems`."""
 
     row: TextRow
     columns: Sequence[str]
@@ -336,7 +331,7 @@ class _RowReader:
         self.problems.append(TableProblem(place, words, norm, step))
 
     def view(self) -> View | None:
-        """Reads the row; None where it is so wrong that its problems are all there is."""
+        """Reads the row; None where it has no valid number or a wrong number of fields."""
         if len(self.row.cells) != len(self.columns):
             words = (
                 f"it has {len(self.row.cells)} fields, but the header has {len(self.columns)} "
@@ -368,9 +363,9 @@ class _RowReader:
             )
         self._check_sizes(numbers)
         self._check_groups(numbers)
-        # A row of a stop may have no more than the pose of one of several robots.
-        stands = {"x_m", "q1_rad"} & numbers.keys() and stop is not None and "robot" in text
-        observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text or stands
+        # A row of a stop may have only the pose of one of several robots.
+        is_robot_row = {"x_m", "q1_rad"} & numbers.keys() and stop is not None and "robot" in text
+        observed = {"cft_x_m", "meas_x_m"} & numbers.keys() or "point" in text or is_robot_row
         if not image and not observed and not self.with_corners and not self.problems:
             absent = "it is empty" if "image" in self.columns else "there is no such column"
             self.report(
@@ -380,7 +375,7 @@ class _RowReader:
                 "another detector into corners.csv.",
             )
         if role == "intrinsics" and not self.problems:
-            self._check_lens_alone(image or "", numbers)
+            self._check_lens_only(image or "", numbers)
         if number is None:
             return None
         return View(number, image or "", role == "holdout", stop, numbers, text)
@@ -388,7 +383,7 @@ class _RowReader:
     def _take(
         self, cells: dict[str, str], column: str, read: Callable[[str], _T], *, keep: bool = False
     ) -> _T | None:
-        """Takes a column out of the cells and reads it; None where it is empty or wrong."""
+        """Pops a column of the cells and reads it; None where it is empty or wrong."""
         cell = (cells.get(column, "") if keep else cells.pop(column, "")).strip()
         if not cell:
             return None
@@ -401,7 +396,7 @@ class _RowReader:
     def _numbers(self, cells: dict[str, str]) -> dict[str, float]:
         numbers = {}
         for column in self.columns:
-            if known.is_number(column):
+            if cols.is_number(column):
                 value = self._take(cells, column, read_number)
                 if value is not None:
                     numbers[column] = value
@@ -409,18 +404,18 @@ class _RowReader:
 
     def _check_sizes(self, numbers: Mapping[str, float]) -> None:
         for column, value in numbers.items():
-            # Recordings of earlier versions hold any time; see `check_times`.
-            wrong = known.no_size(column, np.array([value])) if column != "stamp_s" else ""
+            # Recordings of earlier versions may have any time; see `check_times`.
+            wrong = cols.no_size(column, np.array([value])) if column != "stamp_s" else ""
             if wrong:
                 self.report(column, wrong)
-            wrong = known.no_celsius(np.array([value])) if column.endswith("_c") else ""
+            wrong = cols.no_celsius(np.array([value])) if column.endswith("_c") else ""
             if wrong:
                 self.report(column, wrong)
 
         for column, words in load_problems(numbers):
             self.report(column, words)
 
-    def _check_lens_alone(self, image: str, numbers: Mapping[str, float]) -> None:
+    def _check_lens_only(self, image: str, numbers: Mapping[str, float]) -> None:
         poses = [name for name in ("x_m", "q1_rad", "cft_x_m", "meas_x_m") if name in numbers]
         if not (image or self.with_corners) or poses:
             self.report(
@@ -430,13 +425,13 @@ class _RowReader:
             )
 
     def _check_groups(self, numbers: Mapping[str, float]) -> None:
-        joints = known.joint_columns(self.columns)
+        joints = cols.joint_columns(self.columns)
         if "robot" in self.columns:
-            # Of several robots one may have fewer joints than another.
+            # Robots may have different numbers of joints.
             filled = [name for name in joints if name in numbers]
             joints = tuple(dict.fromkeys((*joints[: len(filled)], *filled)))
-        # A cell that was refused would be reported again as missing from its group.
-        groups = () if self.problems else (*known.WHOLE_GROUPS, joints)
+        # A rejected cell would be reported again as missing from its group.
+        groups = () if self.problems else (*cols.WHOLE_GROUPS, joints)
         for group in groups:
             missing = [name for name in group if name not in numbers]
             if 0 < len(missing) < len(group):
@@ -445,7 +440,7 @@ class _RowReader:
                     f"it is empty while {group[0] if group[0] in numbers else group[-1]} is "
                     f"filled; a row fills all of {group[0]} ... {group[-1]} or none",
                 )
-        for group in known.QUATERNION_GROUPS:
+        for group in cols.QUATERNION_GROUPS:
             if all(name in numbers for name in group):
                 norm = math.hypot(*(numbers[name] for name in group))
                 if abs(norm - 1.0) > _NORM_TOLERANCE:
@@ -461,7 +456,7 @@ def read_number(cell: str) -> float:
     """Reads a finite number.
 
     Raises:
-        DataError: It is none.
+        DataError: It is not one.
     """
     value = float(cell) if NUMBER.fullmatch(cell) else math.nan
     if not math.isfinite(value):
@@ -475,10 +470,10 @@ def read_number(cell: str) -> float:
 
 
 def read_integer(cell: str) -> int:
-    """Reads a whole number; `3.0` is one, as programs write those of a table with gaps.
+    """Reads a whole number, also as `3.0`, which some programs write.
 
     Raises:
-        DataError: It is none.
+        DataError: It is not one.
     """
     cell = cell.removesuffix(".0")
     if not _INTEGER.fullmatch(cell) or len(cell) > 18:

@@ -1,4 +1,4 @@
-"""The tables of session.toml: their fields, types and ranges."""
+"""Tables of session.toml: fields, types and ranges."""
 
 from typing import Annotated, Any, Literal
 
@@ -7,26 +7,25 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from visioncal.core.types import Camera, CameraKind, Need
 
-# Squares and products of larger numbers leave what floats hold; no field of a cell has such.
+# Limit that keeps squares and products from overflowing.
 _LARGEST = 1e15
 Number = Annotated[FiniteFloat, Field(ge=-_LARGEST, le=_LARGEST)]
 Positive = Annotated[FiniteFloat, Field(gt=0, le=_LARGEST)]
-# Nobody knows a focal length better than the least of these, or worse than the largest [px].
+# Plausible standard deviations of a focal length [px].
 PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
-# Four times the side of the largest sensors [px].
+# Largest side of an image: four times that of the largest sensors [px].
 Side = Annotated[int, Field(gt=0, le=65_535)]
 
-# Where a need counts that names no place.
+# Default place of a need.
 VIEWS: Literal["views"] = "views"
-# No arm reaches this far [m]: such numbers are in millimetres.
+# Largest plausible reach of an arm [m].
 _FAR_M = 20.0
 
 
 class TableModel(BaseModel):
-    """A table of session.toml. Unknown keys are kept in `model_extra`."""
+    """A table of session.toml. Unknown keys, of newer versions or users, are in `model_extra`."""
 
-    # Unknown keys are kept: a newer version, or the user, may have put them there.
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
 
 
@@ -49,7 +48,7 @@ class CameraTable(TableModel):
 
     @property
     def stated(self) -> Camera | None:
-        """Its intrinsics; None where they are left to be estimated."""
+        """The stated intrinsics; None where they are to be estimated."""
         if self.matrix is None or self.distortion is None or self.size is None:
             return None
         matrix, distortion = np.array(self.matrix, float), np.array(self.distortion, float)
@@ -59,8 +58,8 @@ class CameraTable(TableModel):
 class RobotTable(TableModel):
     """`[robot]`. model: a built-in name, or the path of a .urdf, a DH .toml or an arm's .json.
 
-    It may go without, where its poses are enough. gravity_m_s2: its acceleration in the robot's
-    base, for a base that does not stand upright.
+    Optional where poses are enough. gravity_m_s2: acceleration of gravity in the robot's base, for
+    a base that is not upright.
     """
 
     model: str | None = None
@@ -78,29 +77,29 @@ class InstrumentTable(TableModel):
 
 
 class ClockTable(TableModel):
-    """`[clock]`. What the camera's stamps are ahead of the robot's [s]."""
+    """`[clock]`. Offset of the camera's stamps from the robot's [s]."""
 
     camera_minus_robot_s: Number = 0.0
 
 
 class NeedTable(TableModel):
-    """`[need]`. How near picks have to come [mm], [deg], and where; see `types.Need`."""
+    """`[need]`. Required accuracy of picks [mm], [deg], and where; see `types.Need`."""
 
     mm: Positive | None = None
     deg: Positive | None = None
-    # "views" or three numbers: checked with the other contradictions, in one sentence.
+    # "views" or three numbers: checked by `wrong_place`.
     at: Any = VIEWS
 
     @property
     def need(self) -> Need:
-        """The need, typed."""
+        """The typed need."""
         if self.at == VIEWS:
             return Need(self.mm, self.deg)
         x, y, z = map(float, self.at)
         return Need(self.mm, self.deg, (x, y, z))
 
     def wrong_place(self) -> str:
-        """What is wrong with `at`, in words; empty where nothing is."""
+        """Message for an invalid `at`; empty where it is valid."""
         if self.at == VIEWS:
             return ""
         numbers = self.at if isinstance(self.at, list) else []
@@ -117,9 +116,9 @@ class NeedTable(TableModel):
 
 
 class PriorTable(TableModel):
-    """`[prior.A_from_B]`. Measured components of where frame B is in A, to sigma_m [m].
+    """`[prior.A_from_B]`. Measured components of B's position in A, with sigma_m [m].
 
-    quaternion_xyzw: its rotation, to sigma_rad about each axis [rad].
+    quaternion_xyzw: its rotation, with sigma_rad about each axis [rad].
     """
 
     x_m: Number | None = None

@@ -1,4 +1,4 @@
-"""Compensation: what to command a nominal controller so that the real arm goes where wanted."""
+"""Compensation of arm errors: commands for a nominal controller that reach the real targets."""
 
 from visioncal.results.compensation.correction import CalibratedArm, Corrected, correct
 

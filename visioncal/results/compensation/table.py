@@ -1,4 +1,4 @@
-"""Tables of targets: read from views.csv's columns, and written with what to send instead."""
+"""Tables of targets: read with the columns of views.csv, and written with the corrections."""
 
 import csv
 import io
@@ -13,12 +13,12 @@ from visioncal.core.documents import TextTable, is_number, read_table
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import compose, invert, rotation_angle
-from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.core.types import FloatArray, IntArray
 from visioncal.results.compensation.correction import FAR_M, WIDE_RAD, Corrected
 from visioncal.robot import Robot
 from visioncal.session.columns import POSE, joint_columns
 
-# What is added to each row; a table that has them already has been corrected.
+# Columns of a corrected table.
 ADDED = ("moved_mm", "moved_deg", "sigma_mm", "off_deg")
 # Rounding to four digits leaves a unit quaternion's norm within this of 1.
 _NORM_TOLERANCE = 1e-3
@@ -31,9 +31,9 @@ class Targets:
 
     Attributes:
         table: The table itself.
-        places: (m,) where each row stands: `targets.csv, line 3`.
+        places: (m,) the rows' lines: `targets.csv, line 3`.
         base_from_tool: (m, 4, 4) the targets, of the flange or of a tool [m].
-        q_seed: (m, n) joints to look near to [rad or m], NaN in a row without.
+        q_seed: (m, n) joint seeds [rad or m], NaN in a row without.
     """
 
     table: TextTable
@@ -46,12 +46,11 @@ class Targets:
 
 
 def read_targets(path: Path, robot: Robot) -> Targets:
-    """Reads targets.
+    """Reads a table of targets.
 
     Args:
-        path: A table with x_m ... qw; q1_rad ... may say which posture is meant; other columns are
-            kept.
-        robot: Whose joints these are.
+        path: A table with x_m ... qw, and optional seeds q1_rad ...; other columns are kept.
+        robot: The robot that the joints belong to.
 
     Raises:
         DataError: It cannot be read, has been corrected already, or rows are no targets in metres
@@ -90,7 +89,7 @@ def _check_columns(table: TextTable) -> None:
 
 
 def _numbers(table: TextTable, names: Sequence[str], *, needed: bool) -> FloatArray:
-    """Columns of numbers (m, k); a row leaves all of them empty or none, and none where needed."""
+    """(m, k) numbers of columns; a row may leave all of them empty unless they are needed."""
     at = [table.columns.index(name) for name in names]
     values = np.full((len(table.rows), len(names)), np.nan)
     problems: list[tuple[str, str]] = []
@@ -115,22 +114,18 @@ def _numbers(table: TextTable, names: Sequence[str], *, needed: bool) -> FloatAr
     return values
 
 
-def _rows_where(mask: Mask) -> list[int]:
-    return [int(index) for index in np.flatnonzero(mask)]
-
-
 def _check_poses(poses: FloatArray, places: Sequence[str]) -> None:
-    away = np.linalg.norm(poses[:, :3], axis=1)
-    far = _rows_where(away > FAR_M)
+    distances = np.linalg.norm(poses[:, :3], axis=1)
+    far = np.flatnonzero(distances > FAR_M).tolist()
     if far:
         raise DataError(
-            f"{places[far[0]]}: its position is {away[far[0]]:.4g} m from the base, and no arm "
-            f"reaches {FAR_M:g} m: these look like millimetres.",
+            f"{places[far[0]]}: its position is {distances[far[0]]:.4g} m from the base, and no "
+            f"arm reaches {FAR_M:g} m: these look like millimetres.",
             culprits=[places[index] for index in far],
             next_step="Write metres.",
         )
     norms = np.linalg.norm(poses[:, 3:], axis=1)
-    off = _rows_where(np.abs(norms - 1.0) > _NORM_TOLERANCE)
+    off = np.flatnonzero(np.abs(norms - 1.0) > _NORM_TOLERANCE).tolist()
     if off:
         raise DataError(
             f"{places[off[0]]}: the quaternion's norm is {norms[off[0]]:.6g}, but must be 1 to "
@@ -154,7 +149,7 @@ def _seeds(table: TextTable, places: Sequence[str], robot: Robot) -> FloatArray:
         )
     seeds = _numbers(table, names, needed=False)
     turns = np.where(robot.chain.prismatic, 0.0, np.abs(np.nan_to_num(seeds))).max(axis=1)
-    wide = _rows_where(turns > WIDE_RAD)
+    wide = np.flatnonzero(turns > WIDE_RAD).tolist()
     if wide:
         raise DataError(
             f"{places[wide[0]]}: a joint stands at {turns[wide[0]]:.4g} rad, more than two turns: "
@@ -166,32 +161,29 @@ def _seeds(table: TextTable, places: Sequence[str], robot: Robot) -> FloatArray:
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
-    """The columns of a robot's joints."""
+    """Column names of a robot's joints."""
     return tuple(f"q{index}_rad" for index in range(1, robot.joint_count + 1))
 
 
 def columns_to_send(
-    targets: Targets,
-    corrected: Corrected,
-    base_from_tool: FloatArray,
-    sigma_mm: FloatArray,
+    targets: Targets, corrected: Corrected, base_from_tool: FloatArray, sigma_mm: FloatArray
 ) -> dict[str, FloatArray]:
-    """The numbers of each target to send, (m,) by the names of their columns.
+    """Corrected values of all targets, (m,) by column name.
 
     Args:
         targets: The rows as they were read.
-        corrected: What to send.
-        base_from_tool: (m, 4, 4) Cartesian targets to send, of the flange or the tool [m].
+        corrected: The corrected commands.
+        base_from_tool: (m, 4, 4) corrected Cartesian targets, of the flange or the tool [m].
         sigma_mm: (m,) predicted sigma of each [mm]; NaN where there is none.
     """
     names = tuple(f"q{index}_rad" for index in range(1, corrected.q.shape[1] + 1))
     turns = Rotation.from_matrix(base_from_tool[:, :3, :3]).as_quat(canonical=True)
-    between = invert(targets.base_from_tool) @ base_from_tool
+    correction = invert(targets.base_from_tool) @ base_from_tool
     columns: dict[str, FloatArray] = {
         **dict(zip(POSE, np.column_stack([base_from_tool[:, :3, 3], turns]).T, strict=True)),
         **dict(zip(names, corrected.q.T, strict=True)),
-        "moved_mm": 1e3 * np.linalg.norm(between[:, :3, 3], axis=1),
-        "moved_deg": np.rad2deg(rotation_angle(between)),
+        "moved_mm": 1e3 * np.linalg.norm(correction[:, :3, 3], axis=1),
+        "moved_deg": np.rad2deg(rotation_angle(correction)),
     }
     if np.isfinite(sigma_mm).all():
         columns["sigma_mm"] = sigma_mm
@@ -201,13 +193,7 @@ def columns_to_send(
 
 
 def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: IntArray) -> str:
-    """Writes some rows as CSV: all that they had, with what to send in place.
-
-    Args:
-        targets: The rows as they were read.
-        columns: What to send, of `columns_to_send`.
-        rows: Which rows.
-    """
+    """Formats rows, by index, as CSV with all their columns, corrected values in place."""
     own = targets.table.columns
     names = [*own, *(column for column in columns if column not in own)]
     text = io.StringIO()
@@ -221,6 +207,6 @@ def table_to_send(targets: Targets, columns: Mapping[str, FloatArray], rows: Int
 
 
 def written(name: str, value: float) -> str:
-    """Writes a number with the digits that count: 0.1 nm of a place, 1e-12 of a quaternion."""
+    """Formats a number with significant digits: 0.1 nm of a position, 1e-12 of a quaternion."""
     digits = 4 if name in ADDED else 12 if name in POSE[3:] else 10
     return f"{value:.{digits}f}"
