@@ -277,8 +277,8 @@ def drift_sentence(thermal: ThermalResult) -> str:
     last, residual = thermal.course[-1], thermal.residual_mm
     return (
         f"By {source}, the flange had moved by {significant(last.drift_mm)} mm at the end, "
-        f"{significant(hours(thermal, last.stamp_s))} h after the start. Counted with, it takes the "
-        f"views' residuals from {significant(residual.without)} to "
+        f"{significant(hours(thermal, last.stamp_s))} h after the start. Modelling this drift "
+        f"takes the views' residuals from {significant(residual.without)} to "
         f"{significant(residual.with_drift)} mm."
     )
 

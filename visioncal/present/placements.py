@@ -28,7 +28,7 @@ def placement(
 
     Args:
         calibration: The result.
-        seen: Poses of the view.
+        view_poses: Poses of the view.
         frame: Frame of its target; None for a single target.
 
     Returns:
