@@ -37,7 +37,7 @@ _SIDE_POINTS = 9
 
 @dataclass(frozen=True, eq=False)
 class PreviewStop:
-    """A stop: its view's number, joint angles (n,), and those (j, n) on the way to it [rad]."""
+    """A stop: view number, joint angles (n,), and those of via points before it (j, n) [rad]."""
 
     view: int
     q: FloatArray

@@ -283,11 +283,15 @@ class SceneDrawing:
         """All positions of a flange; those of unused views in another colour."""
         stops = paths.part_of(paths.STOPS, self.frames.robots[flange])
         frame = rr.CoordinateFrame(self.frames.parents[flange])
-        own = {view: state.pose for view, state in self.states[flange].items() if not state.is_past}
+        poses_by_view = {
+            view: state.pose for view, state in self.states[flange].items() if not state.is_past
+        }
         for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
             is_rejected = name == paths.REJECTED
             poses = [
-                array for view, array in own.items() if (view in self._rejected) is is_rejected
+                array
+                for view, array in poses_by_view.items()
+                if (view in self._rejected) is is_rejected
             ]
             if not poses:
                 continue

@@ -325,7 +325,7 @@ class Uncertainty:
     def _positions_m(self, views: Iterable[int], frame: str) -> FloatArray:
         """(k, 3) drawn positions of a target by some views, in its frame."""
         shown = [view for view in views if self.frames[view] == frame]
-        places_m = [self._within_reach(self.factor * self.scatter_m[index]) for index in shown]
+        places_m = [self._within_reach(self.factor * self.scatter_m[view]) for view in shown]
         return np.reshape(places_m, (-1, 3))
 
     def _placements(self, frame: str) -> str:
