@@ -115,7 +115,8 @@ def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
     offset = _START_BYTES
     while offset + _HEAD.size <= size:
         file.seek(offset)
-        frame = _frame(file.read(_HEAD.size), offset)
+        kind, length = _HEAD.unpack(file.read(_HEAD.size))
+        frame = MessageFrame(kind, offset + _HEAD.size, length)
         # Zeros, as after a power loss, would read as an empty message of kind LAST.
         empty_last = frame.kind == LAST and not frame.size
         if frame.kind > ACTIVATION or frame.end > size or empty_last:
@@ -124,11 +125,6 @@ def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
         if frame.kind == LAST:
             return
         offset = frame.end
-
-
-def _frame(head: bytes, at: int) -> MessageFrame:
-    kind, length = _HEAD.unpack(head)
-    return MessageFrame(kind, at + _HEAD.size, length)
 
 
 def read_payload(path: Path, frame: MessageFrame) -> bytes:

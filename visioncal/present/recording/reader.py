@@ -221,7 +221,10 @@ def _read_records(scanned: Scan) -> _Records:
                 # Of two rows with one number, the later one has a damaged number.
                 rows = codec.read_rows(batch) | rows
             elif entity == paths.IMAGE:
-                images |= _images(frame, batch)
+                images |= {
+                    row: _Image(frame, position, sha256(codec.image_at(batch, position)))
+                    for row, position in codec.image_places(batch).items()
+                }
             else:
                 closed = codec.read_end(batch)
         except _DAMAGE:
@@ -233,13 +236,6 @@ def _read_records(scanned: Scan) -> _Records:
         # The first format had no end mark.
         closed = header.rows
     return _Records(header, rows, images, streams, corners, closed, len(damaged))
-
-
-def _images(frame: MessageFrame, batch: pa.RecordBatch) -> dict[int, _Image]:
-    return {
-        row: _Image(frame, place, sha256(codec.image_at(batch, place)))
-        for row, place in codec.image_places(batch).items()
-    }
 
 
 def _no_header(scanned: Scan, damaged: Sequence[MessageFrame]) -> DataError:

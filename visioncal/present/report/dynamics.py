@@ -58,15 +58,9 @@ def render_dynamics(run: Run) -> str:
         identified=identified,
         counts=_counts(identified),
         humps=tuple(_hump_facts(identified)),
-        plots=tuple(_plots(shown)),
+        plots=tuple((f"{each.label}, {use}", torques(each)) for each, use in shown),
         friction_plot=friction(identified, run.predictions),
     )
-
-
-def _plots(shown: Sequence[tuple[Prediction, str]]) -> Iterator[tuple[str, Markup]]:
-    """Titled plots of torques over time."""
-    for prediction, use in shown:
-        yield f"{prediction.label}, {use}", torques(prediction)
 
 
 def _key_figures(identified: Identified) -> Iterator[Fact]:

@@ -427,7 +427,11 @@ def frame_plot(name: str, frame: Frame) -> Markup:
     """Residual of each observation of a tool or a fixture; outliers in red."""
     if all(observation.residual_mm is None for observation in frame.observations):
         return Markup("")
-    labels = [_short(observation.name) for observation in frame.observations]
+    names = [observation.name for observation in frame.observations]
+    labels = [
+        name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"
+        for name in names
+    ]
     vertical = sum(map(len, labels)) > _MOST_CHARACTERS
     shown = [
         Bar(label, observation.residual_mm, observation.used, _observation_colour(observation))
@@ -445,7 +449,3 @@ def _observation_colour(observation: Observation) -> str:
     if not observation.used:
         return svg.BAD
     return svg.CHECK if observation.reason else svg.ACCENT
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"

@@ -1,4 +1,4 @@
-"""The size that an image file claims, read from its header before anything is decoded."""
+"""Image size from a file's header, read before decoding."""
 
 import struct
 from collections.abc import Iterator
@@ -8,15 +8,15 @@ MOST_PIXELS = 160_000_000
 _PNG, _JPEG, _BMP = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 SIGNATURES = (_PNG, _JPEG, _BMP, *_TIFF)
-# Start-of-frame markers of JPEG; the three others between them are tables.
+# Start-of-frame markers of JPEG; the three excluded ones are tables.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _SCAN = 0xDA
-# Tags of TIFF, and how a value is packed by its type.
+# Tags of TIFF, and format of a value by its type.
 _WIDTH, _HEIGHT, _PACKED = 256, 257, {1: "B", 3: "H", 4: "I"}
 
 
 def claimed_size(data: bytes) -> tuple[int, int] | None:
-    """Reads (width, height) [px] in the header of a png, jpg, tif or bmp; None without one."""
+    """Size (width, height) [px] in the header of a png, jpg, tif or bmp; None without one."""
     try:
         if data.startswith(_PNG):
             return struct.unpack_from(">II", data, 16)
@@ -31,12 +31,12 @@ def claimed_size(data: bytes) -> tuple[int, int] | None:
 
 
 def start_of_scan(data: bytes) -> int:
-    """Finds where the picture of a JPEG begins, behind thumbnails; -1 without one."""
+    """Offset of a JPEG's image data, after thumbnails; -1 without one."""
     return next((at for marker, at in _segments(data) if marker == _SCAN), -1)
 
 
 def _segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """The markers of a JPEG's header with their places, up to the first scan."""
+    """Markers of a JPEG's header with their offsets, up to the first scan."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         yield data[at + 1], at
