@@ -217,7 +217,7 @@ def _lattice(blobs: _Blobs) -> tuple[IntArray, IntArray]:
 
 
 def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
-    """Two steps (2, 2) that lead from a point to others, forwards and backwards [px]."""
+    """Two steps (2, 2) [px] to neighbours of a point that has opposite neighbours as well."""
     neighbours = tree.query(px[seed], k=min(_NEAREST + 1, len(px)))[1][1:]
     steps: list[FloatArray] = []
     for other in neighbours.tolist():
