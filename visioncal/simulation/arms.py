@@ -241,7 +241,8 @@ def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reac
         step = np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(gram, error[..., None])
         joints += np.clip(step[..., 0], -0.5, 0.5)
     jacobian, error = _linearise(arm, joints, base_from_flange, scale)
-    joints = seeds + _wrap(joints - seeds)
+    # The joint angles closest to the seeds.
+    joints = seeds + ((joints - seeds + _HALF_TURN) % (2.0 * _HALF_TURN) - _HALF_TURN)
     limits = np.full(arm.a.size, 2.0 * _HALF_TURN)
     limits[2] = _HALF_TURN
     within = np.all(np.abs(joints) < limits, axis=1)
@@ -296,8 +297,3 @@ def _linearise(
     translation = goal[:, :3, 3] - tip[:, :3, 3]
     error = np.concatenate([rotation, translation], axis=1)
     return jacobian * scale[:, None], error * scale
-
-
-def _wrap(angles: FloatArray) -> FloatArray:
-    """Wraps angles [rad] to half a turn either way."""
-    return (angles + _HALF_TURN) % (2.0 * _HALF_TURN) - _HALF_TURN

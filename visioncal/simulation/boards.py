@@ -75,7 +75,7 @@ def unit_m(target: Target) -> float:
 
 
 def circles_m(target: Target) -> FloatArray:
-    """(n, 2) centres of circles, row by row; a shifted row is half a column farther on [m]."""
+    """(n, 2) centres of circles, row by row; every second row of an asymmetric grid is shifted."""
     wide, shift = (2, 1) if target.asymmetric else (1, 0)
     return target.square_m * np.array(
         [

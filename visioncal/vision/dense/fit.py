@@ -460,11 +460,6 @@ def _limited(shift: FloatArray) -> FloatArray:
     return np.where(np.isfinite(length), bounded, 0.0)
 
 
-def _clipped(values: FloatArray) -> FloatArray:
-    """Blur and tone, clipped to their limits."""
-    return np.append(Blur.of(values[:4]).values, np.clip(values[4], -_MOST_TONE, _MOST_TONE))
-
-
 def _fit_blur(patches: _Patches, values: FloatArray, iterations: int) -> tuple[FloatArray, float]:
     """Blur and tone fitted to some corners, and the mean square residual (Levenberg-Marquardt)."""
     shift, damping = np.zeros((len(patches.px), 2)), _DAMPING
@@ -472,7 +467,9 @@ def _fit_blur(patches: _Patches, values: FloatArray, iterations: int) -> tuple[F
     good = _similar_misfit(sums.misfit)
     for _ in range(iterations):
         shared, own = sums.steps(good, damping)
-        tried = _clipped(values + shared)
+        tried = values + shared
+        tone = np.clip(tried[4], -_MOST_TONE, _MOST_TONE)
+        tried = np.append(Blur.of(tried[:4]).values, tone)
         tried_sums = _Sums.of(patches, tried, shift + own, blurs=True)
         gain = 1.0 - tried_sums.cost(good) / sums.cost(good)
         if gain > 0.0:

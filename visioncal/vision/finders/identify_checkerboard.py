@@ -141,7 +141,9 @@ def _counted(image: Image, grid: FloatArray, scale: float) -> Squares | None:
     columns, rows = max(grown.size), min(grown.size)
     if rows < _SEED[1]:
         return None
-    found = _is_there(image, (columns, rows))
+    found = any(
+        cv2.findChessboardCornersSB(image, (columns, rows), flags=flags)[0] for flags in _ATTEMPTS
+    )
     filled = _filled(image, plane, shrunk, typical)
     return Squares(columns, rows, cut, found, filled, _side_px(plane, grown) / scale)
 
@@ -237,8 +239,3 @@ def _filled(image: Image, plane: Plane, extent: _Extent, typical: float) -> bool
     light = even if typical > 0 else ~even
     excess = np.median(scatter[light]) - np.median(scatter[~light])
     return bool(excess > _TEXTURE * abs(typical))
-
-
-def _is_there(image: Image, size: tuple[int, int]) -> bool:
-    """Whether the corner detector finds a board of exactly this size."""
-    return any(cv2.findChessboardCornersSB(image, size, flags=flags)[0] for flags in _ATTEMPTS)
