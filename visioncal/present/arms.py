@@ -82,8 +82,8 @@ def level_reason(arm: ArmResult) -> str:
 
 
 def _held_out(level: ArmLevel) -> str:
-    turned = "" if level.held_out_deg is None else f" and {significant(level.held_out_deg)} deg"
-    return f"{significant(level.held_out_mm)} mm{turned}"
+    rotation = "" if level.held_out_deg is None else f" and {significant(level.held_out_deg)} deg"
+    return f"{significant(level.held_out_mm)} mm{rotation}"
 
 
 def arm_sentences(arm: ArmResult) -> list[str]:
@@ -139,7 +139,7 @@ def level_table(arm: ArmResult) -> Table | None:
     titles = ("what is free", "values", "fit, mm", "fit, deg", "left out, mm", "left out, deg",
               "likelihood ratio")  # fmt: skip
     return Table.of(
-        titles, [_level_row(level, taken=level.level == arm.level) for level in arm.levels]
+        titles, [_level_row(level, chosen=level.level == arm.level) for level in arm.levels]
     )
 
 
@@ -153,14 +153,14 @@ def level_note(observed: str) -> str:
     )
 
 
-def _level_row(level: ArmLevel, *, taken: bool) -> TableRow:
-    words = level_words(level.level) + (" (taken)" if taken else "")
+def _level_row(level: ArmLevel, *, chosen: bool) -> TableRow:
+    words = level_words(level.level) + (" (taken)" if chosen else "")
     residuals = map(
         significant,
         (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg),
     )
     ratio = significant(None) if level.level == NOMINAL else f"{level.likelihood_ratio:.0f}"
-    return TableRow((words, str(level.unknowns), *residuals, ratio), "taken" if taken else "")
+    return TableRow((words, str(level.unknowns), *residuals, ratio), "taken" if chosen else "")
 
 
 def parameter_tables(arm: ArmResult, count: int = 1) -> list[Table]:
@@ -274,10 +274,10 @@ def index_facts(arm: ArmResult) -> Iterator[Fact]:
 def drift_sentence(thermal: ThermalResult) -> str:
     """Drift of the flange, and the residuals with and without the drift model."""
     source = "measured temperatures" if thermal.heated_by == "temperatures" else "motor currents"
-    last, residual = thermal.course[-1], thermal.residual_mm
+    end, residual = thermal.course[-1], thermal.residual_mm
     return (
-        f"By {source}, the flange had moved by {significant(last.drift_mm)} mm at the end, "
-        f"{significant(hours(thermal, last.stamp_s))} h after the start. Modelling this drift "
+        f"By {source}, the flange had moved by {significant(end.drift_mm)} mm at the end, "
+        f"{significant(hours(thermal, end.stamp_s))} h after the start. Modelling this drift "
         f"takes the views' residuals from {significant(residual.without)} to "
         f"{significant(residual.with_drift)} mm."
     )

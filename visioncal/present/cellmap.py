@@ -84,8 +84,8 @@ def sigma_words(tree: FrameTree, frame: str) -> str:
     if frame == tree.reference:
         return "the reference"
     edge = tree.edge_of(frame)
-    turned = f", {significant(edge.sigma_deg)}\N{DEGREE SIGN}" if edge.oriented else ""
-    return f"{significant(edge.sigma_mm)} mm{turned}"
+    rotation = f", {significant(edge.sigma_deg)}\N{DEGREE SIGN}" if edge.oriented else ""
+    return f"{significant(edge.sigma_mm)} mm{rotation}"
 
 
 def _placed(tree: FrameTree) -> list[str]:

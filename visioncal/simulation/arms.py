@@ -194,11 +194,7 @@ def reach_m(arm: DhArm) -> float:
 
 
 def link_frames(arm: DhArm, joints: FloatArray) -> FloatArray:
-    """Link frames for a batch of postures.
-
-    Args:
-        arm: Arm with n joints.
-        joints: (m, n) joint angles [rad].
+    """Link frames of (m, n) joint angles [rad].
 
     Returns:
         (m, n + 1, 4, 4) `base_from_link`, from the base itself to the flange.

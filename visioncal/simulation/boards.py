@@ -112,15 +112,7 @@ def found_in_part(target: Target) -> bool:
 
 
 def outline_m(sheet: Sheet, margin_m: float) -> FloatArray:
-    """Points around the real print.
-
-    Args:
-        sheet: The sheet.
-        margin_m: Distance of the outline outside the print [m].
-
-    Returns:
-        (64, 3) points in the target frame [m].
-    """
+    """(64, 3) points in the target frame around the real print, at a distance `margin_m` [m]."""
     left, top, right, bottom = pattern_box(sheet.target)
     along = np.linspace(0.0, 1.0, 16, endpoint=False)[:, None]
     print_m = sheet.scale * np.array([[left, top], [right, top], [right, bottom], [left, bottom]])

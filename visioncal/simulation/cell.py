@@ -62,8 +62,10 @@ class SimulatedRobot:
             joints=self.joints[kept],
             base_from_flange=self.base_from_flange[kept],
             true_base_from_flange=self.true_base_from_flange[kept],
-            wrong_stops=tuple(at for at, index in enumerate(kept) if index in self.wrong_stops),
-            loads=tuple(self.loads[at] for at in kept if self.loads),
+            wrong_stops=tuple(
+                stop for stop, old_stop in enumerate(kept) if old_stop in self.wrong_stops
+            ),
+            loads=tuple(self.loads[stop] for stop in kept if self.loads),
             approach=None if self.approach is None else self.approach[kept],
         )
 

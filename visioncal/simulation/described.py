@@ -73,7 +73,7 @@ def read_cell(name_or_path: str) -> NetworkOptions:
         name_or_path, what="cell", shipped=_shipped(), suffixes=(".toml",), folder=None
     )
     document = parse_toml(read_text(path), path.name)
-    own = {key: value for key, value in document.items() if key not in _TABLES}
+    options = {key: value for key, value in document.items() if key not in _TABLES}
     robots = tuple(_table(document, "robots", path.name))
     if not robots:
         raise DataError(
@@ -97,7 +97,7 @@ def read_cell(name_or_path: str) -> NetworkOptions:
     table = DocumentTable(document, path.name)
     moved = reader.listed(Moved, table, "moved")
     sweeps = reader.listed(Swept, table, "sweeps")
-    return reader.read(NetworkOptions, own, "", moved=moved, sweeps=sweeps, **things)
+    return reader.read(NetworkOptions, options, "", moved=moved, sweeps=sweeps, **things)
 
 
 def _shipped() -> dict[str, Path]:

@@ -116,8 +116,8 @@ class LiveView:
         hits = start - directions * (start[2] / directions[..., 2])[..., None]
         px = project(camera, hits @ plane[:3, :3].T + plane[:3, 3])
         map_x, map_y = between(raster, px[..., 0]), between(raster, px[..., 1])
-        moved = cv2.remap(light, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(moved, np.float32)
+        shifted = cv2.remap(light, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(shifted, np.float32)
 
     def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """(k,) bounds of the image motion between board poses (k, 4, 4) [px]."""
@@ -126,8 +126,8 @@ class LiveView:
         after = second[:, :3, :3] @ centre + second[:, :3, 3]
         distance = np.maximum(np.linalg.norm(before, axis=1), 0.1)
         shift = np.linalg.norm(after - before, axis=1) / distance
-        turn = rotation_angle(second @ invert(first))
-        return np.asarray(self._cell.camera().camera.matrix[0] * (shift + turn))
+        rotation = rotation_angle(second @ invert(first))
+        return np.asarray(self._cell.camera().camera.matrix[0] * (shift + rotation))
 
 
 def _faces(cell: SimulatedCell, cam_from_target: FloatArray) -> bool:

@@ -58,9 +58,11 @@ def simulate(
     mountings = standing.mounted(options)
     cell = observed(_moved_cell(options, mountings, standing.postures(options, mountings)))
     cell = with_faults(cell)
-    last = replace(cell, mountings={name: array[-1] for name, array in _parent_poses(cell).items()})
+    pushed = replace(
+        cell, mountings={name: array[-1] for name, array in _parent_poses(cell).items()}
+    )
     for swept in options.sweeps:
-        cell = with_sweep(cell, swept, last)
+        cell = with_sweep(cell, swept, pushed)
     return cell
 
 
@@ -68,34 +70,34 @@ def _one_robot_cell(options: CellOptions, postures: FloatArray | None) -> Simula
     """A cell of one robot and one camera, before observations."""
     mountings = one_robot.mounted(options)
     if postures is None:
-        moved = one_robot.postures(options, mountings)
+        joints = one_robot.postures(options, mountings)
     else:
-        moved = np.array(postures, dtype=float)
-        options = replace(options, views=len(moved))
-    return _moved_cell(options, one_robot.pushed(options, mountings), {"": moved})
+        joints = np.array(postures, dtype=float)
+        options = replace(options, views=len(joints))
+    return _moved_cell(options, one_robot.pushed(options, mountings), {"": joints})
 
 
 def _moved_cell(
     options: CellOptions | NetworkOptions,
     mountings: Mapping[str, FloatArray],
-    moved: Mapping[str, FloatArray],
+    joints_by_robot: Mapping[str, FloatArray],
 ) -> SimulatedCell:
     """A cell whose robots moved to (s, n) joint angles each [rad], before observations."""
     layout = options.layout
     stamps_s = np.arange(layout.stops, dtype=np.float64) * layout.pace_s
     robots, heat = {}, {}
-    for at, robot in enumerate(layout.robots):
-        arm, q = arm_named(robot.robot), moved[robot.name]
-        true_arm = robot.built(_stream(options, RandomStream.ARM, at))
+    for index, robot in enumerate(layout.robots):
+        arm, q = arm_named(robot.robot), joints_by_robot[robot.name]
+        true_arm = robot.built(_stream(options, RandomStream.ARM, index))
         loads, approach = robot.loads(layout.stops), robot.approach(layout.stops)
-        stood = robot.flange_at(true_arm, q, loads, approach)
+        flange_poses = robot.flange_at(true_arm, q, loads, approach)
         if robot.warms_up:
-            heats, hours = Heat.drawn(options.seed + at), stamps_s[-1] / 3600.0
-            warming = warm_up(heats, hours, seed=options.seed + at)
-            stood = heated_flanges(true_arm, heats, q, warming.at(stamps_s), stood)
+            heats, hours = Heat.drawn(options.seed + index), stamps_s[-1] / 3600.0
+            warming = warm_up(heats, hours, seed=options.seed + index)
+            flange_poses = heated_flanges(true_arm, heats, q, warming.at(stamps_s), flange_poses)
             heat[f"{robot.name}_heat"] = warming.recorded(temperatures=True)
-        jitter = robot.jitter(layout.stops, _stream(options, RandomStream.ROBOT, at))
-        rng = _stream(options, RandomStream.WRONG, at)
+        jitter = robot.jitter(layout.stops, _stream(options, RandomStream.ROBOT, index))
+        rng = _stream(options, RandomStream.WRONG, index)
         joints, wrong_stops = misreported(arm, q, robot.wrong_stops, rng)
         robots[robot.name] = SimulatedRobot(
             options=robot,
@@ -103,7 +105,7 @@ def _moved_cell(
             true_arm=true_arm,
             joints=joints,
             base_from_flange=forward(arm, joints),
-            true_base_from_flange=stood @ jitter,
+            true_base_from_flange=flange_poses @ jitter,
             wrong_stops=wrong_stops,
             loads=loads,
             approach=approach,
@@ -114,8 +116,8 @@ def _moved_cell(
         mountings=mountings,
         robots=robots,
         stated={
-            camera.name: camera.stated(_stream(options, RandomStream.LENS, at))
-            for at, camera in enumerate(layout.cameras)
+            camera.name: camera.stated(_stream(options, RandomStream.LENS, index))
+            for index, camera in enumerate(layout.cameras)
         },
         stamps_s=stamps_s if layout.pace_s else None,
         streams=heat,
@@ -123,12 +125,12 @@ def _moved_cell(
 
 
 def _stream(
-    options: CellOptions | NetworkOptions, purpose: RandomStream, at: int
+    options: CellOptions | NetworkOptions, purpose: RandomStream, index: int
 ) -> np.random.Generator:
     """Randomness of a component by its index; that of a single robot's cell has no index."""
     if isinstance(options, CellOptions):
         return options.stream(purpose)
-    return options.stream(_OF_SEVERAL.get(purpose, purpose), at)
+    return options.stream(_OF_SEVERAL.get(purpose, purpose), index)
 
 
 def observed(cell: SimulatedCell) -> SimulatedCell:
@@ -192,8 +194,8 @@ def _need(cell: SimulatedCell, needed: dict[str, bool], first: str, second: str)
     robots = [robot for robot in carried if robot is not None]
     if len(set(robots)) < len(robots):
         return
-    for place, robot in enumerate(robots):
-        needed[robot] = needed.get(robot, False) or place == 0
+    for position, robot in enumerate(robots):
+        needed[robot] = needed.get(robot, False) or position == 0
 
 
 def _parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
@@ -202,17 +204,17 @@ def _parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
     poses = {
         name: np.tile(mounting, (layout.stops, 1, 1)) for name, mounting in cell.mountings.items()
     }
-    for index, moved in enumerate(layout.moved):
-        if moved.frame not in poses:
+    for index, push in enumerate(layout.moved):
+        if push.frame not in poses:
             raise DataError(
-                f"simulation: {moved.frame!r} cannot be pushed; there are {', '.join(poses)}."
+                f"simulation: {push.frame!r} cannot be pushed; there are {', '.join(poses)}."
             )
-        start = layout.first_pushed(moved)
+        start = layout.first_pushed(push)
         twist = cell.options.stream(RandomStream.FAULTS, 10 + index).standard_normal((2, 3))
-        twist *= np.array([[moved.turn_rad], [moved.shift_m]]) / np.linalg.norm(
+        twist *= np.array([[push.turn_rad], [push.shift_m]]) / np.linalg.norm(
             twist, axis=1, keepdims=True
         )
-        poses[moved.frame][start:] = poses[moved.frame][start:] @ exp(twist.ravel())
+        poses[push.frame][start:] = poses[push.frame][start:] @ exp(twist.ravel())
     return poses
 
 
@@ -296,10 +298,10 @@ def misreported(
     joints = moved.copy()
     for stop in chosen:
         for _ in range(20):
-            turn, shift = rng.normal(size=(2, 3))
-            turn *= np.deg2rad(rng.uniform(1.0, 5.0)) / np.linalg.norm(turn)
+            rotvec, shift = rng.normal(size=(2, 3))
+            rotvec *= np.deg2rad(rng.uniform(1.0, 5.0)) / np.linalg.norm(rotvec)
             shift *= rng.uniform(0.005, 0.030) / np.linalg.norm(shift)
-            error = compose(Rotation.from_rotvec(turn).as_matrix(), shift)
+            error = compose(Rotation.from_rotvec(rotvec).as_matrix(), shift)
             reach = inverse(arm, forward(arm, moved[stop, None]) @ error, moved[stop, None])
             if reach.solved[0]:
                 joints[stop] = reach.joints[0]

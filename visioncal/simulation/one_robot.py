@@ -35,16 +35,16 @@ def mounted(options: CellOptions) -> dict[str, FloatArray]:
         aside = rng.uniform([0.05, -0.02, 0.03], [0.09, 0.02, 0.07])
         cam = compose((Rotation.from_euler("z", 0.5 * np.pi) * skewed).as_matrix(), aside)
         # The target's z points into the table.
-        turn = Rotation.from_euler("ZX", [front + spin, np.pi]).as_matrix()
+        rotation = Rotation.from_euler("ZX", [front + spin, np.pi]).as_matrix()
         # The table is low enough to view the board from a comfortable height.
         middle = np.array([*ahead[:2], min(0.0, 0.4 * reach - float(straight[2, 3]))])
     else:
-        turn = (Rotation.from_euler("ZX", [spin, np.pi]) * skewed).as_matrix()
+        rotation = (Rotation.from_euler("ZX", [spin, np.pi]) * skewed).as_matrix()
         middle = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
-        away = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
+        direction = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
         distance_m = float(np.linalg.norm(straight[:3, 3]))
-        cam = looking_at(ahead, away / np.linalg.norm(away), distance_m)
-    target = compose(turn, middle - turn @ centre_m(first))
+        cam = looking_at(ahead, direction / np.linalg.norm(direction), distance_m)
+    target = compose(rotation, middle - rotation @ centre_m(first))
     placed = {"cam": cam, frame_name("target", first.name): target}
     if options.second is not None:
         placed[frame_name("target", further[0].name)] = _second(
@@ -56,18 +56,20 @@ def mounted(options: CellOptions) -> dict[str, FloatArray]:
 def _second(second: Second, first: Sheet, pose: FloatArray, mount: Mount) -> FloatArray:
     """(4, 4) pose of a second board, given that of the first."""
     middle = pose[:3, :3] @ centre_m(first) + pose[:3, 3]
-    around = Rotation.from_euler("z", second.turn_rad).as_matrix()
+    rotation_z = Rotation.from_euler("z", second.turn_rad).as_matrix()
     if mount == "eye-in-hand":
-        place = around @ middle
-        lean = np.cross([0.0, 0.0, 1.0], place / np.linalg.norm(place))
+        position = rotation_z @ middle
+        lean = np.cross([0.0, 0.0, 1.0], position / np.linalg.norm(position))
         # The print faces the base, as the arm comes from there.
-        turn = Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ around @ pose[:3, :3]
+        rotation = (
+            Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ rotation_z @ pose[:3, :3]
+        )
     else:
-        aside = around @ np.array([1.0, 0.0, 0.0])
-        place = middle + _ASIDE_M * aside
+        aside = rotation_z @ np.array([1.0, 0.0, 0.0])
+        position = middle + _ASIDE_M * aside
         lean = np.cross([0.0, 0.0, 1.0], aside)
-        turn = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix() @ pose[:3, :3]
-    return compose(turn, place - turn @ centre_m(second))
+        rotation = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix() @ pose[:3, :3]
+    return compose(rotation, position - rotation @ centre_m(second))
 
 
 def pushed(options: CellOptions, mountings: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -85,10 +87,10 @@ def postures(options: CellOptions, mountings: Mapping[str, FloatArray]) -> Float
     """
     arm, boards = arm_named(options.robot), options.layout.boards
     joints = np.zeros((options.views, arm.a.size))
-    for at, board in enumerate(boards):
-        stops = np.arange(at, options.views, len(boards))
+    for index, board in enumerate(boards):
+        stops = np.arange(index, options.views, len(boards))
         target = mountings[frame_name("target", board.name)]
-        rng = options.stream(RandomStream.POSES, *([at] if at else []))
+        rng = options.stream(RandomStream.POSES, *([index] if index else []))
         joints[stops] = _aimed_postures(
             options, arm, board, (mountings["cam"], target), len(stops), rng
         )

@@ -45,13 +45,7 @@ def fisheye_camera() -> Camera:
 
 
 def mistaken(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
-    """Intrinsics from a slightly inaccurate calibration.
-
-    Args:
-        camera: True camera.
-        rms_px: Root mean square error of pixels over the image [px].
-        rng: Source of randomness.
-    """
+    """Intrinsics from a slightly inaccurate calibration, with an rms pixel error over the image."""
     if rms_px == 0.0:
         return camera
     # Errors that each move pixels at the image's edge by about one pixel.
@@ -69,8 +63,8 @@ def mistaken(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
             distortion=camera.distortion + share * distortion,
         )
 
-    moved = project(disturbed(1e-3), directions) - project(camera, directions)
-    unit = 1e3 * float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
+    errors_px = project(disturbed(1e-3), directions) - project(camera, directions)
+    unit = 1e3 * float(np.sqrt(np.mean(np.sum(errors_px**2, axis=-1))))
     return disturbed(rms_px / unit)
 
 
@@ -126,16 +120,7 @@ CAMERAS: Mapping[str, Camera] = {
 
 
 def sees(camera: Camera, points_cam: FloatArray, margin_px: float) -> npt.NDArray[np.bool_]:
-    """Mask of points that are in the image.
-
-    Args:
-        camera: The camera.
-        points_cam: (..., 3) points in the camera frame [m].
-        margin_px: Distance that they must keep from the image's edge [px].
-
-    Returns:
-        (...) booleans.
-    """
+    """(...) mask of (..., 3) points in the camera frame [m] inside the image, by a margin [px]."""
     px = project(camera, points_cam)
     width, height = camera.resolution
     inside = (px >= margin_px - 0.5) & (px <= np.array([width, height]) - 0.5 - margin_px)

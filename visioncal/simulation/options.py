@@ -20,9 +20,9 @@ def _tags() -> Target:
         (9, 0.205, 0.090, 0.040),
     )
     points = [
-        (x + across * side, y + down * side, 0.0)
+        (x + dx * side, y + dy * side, 0.0)
         for _, x, y, side in tags
-        for across, down in ((0, 0), (1, 0), (1, 1), (0, 1))
+        for dx, dy in ((0, 0), (1, 0), (1, 1), (0, 1))
     ]
     return Target(
         name="tags",

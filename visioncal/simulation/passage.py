@@ -150,12 +150,12 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
         middle = seen(passage.way([taken_s]))[0]
         if len(exact.ids) < min_corners or middle[2, 2] < _FACING:
             continue
-        found = detected(board, exact, options.pixel_sigma_px, rng)
+        corners = detected(board, exact, options.pixel_sigma_px, rng)
         ahead_s = swept.camera_minus_robot_s + swept.jitter_s * stamp_noise.standard_normal()
         names = swept.camera, swept.target
         stamp_s, at_once = taken_s + ahead_s, not swept.readout_s
         sights.append(
-            SimulatedSight(exact.view, -1, *names, middle, exact, found, stamp_s, at_once)
+            SimulatedSight(exact.view, -1, *names, middle, exact, corners, stamp_s, at_once)
         )
     streams = {**cell.streams, swept.robot: recorded}
     return replace(cell, sights=(*cell.sights, *sights), streams=streams)

@@ -72,9 +72,11 @@ class Viewpoints:
         )
         centre = distance[:, None] * rays(self.camera, aim)
         cam_from_target = compose(rotation, centre - rotation @ centre_m(self.board))
-        whole = sees(self.camera, _place(cam_from_target, outline_m(self.board, 0.0)), MARGIN_PX)
+        outline_seen = sees(
+            self.camera, _place(cam_from_target, outline_m(self.board, 0.0)), MARGIN_PX
+        )
         seen = sees(self.camera, _place(cam_from_target, corners_m(self.board)), MARGIN_PX)
-        fits = whole.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
+        fits = outline_seen.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
         return np.asarray(cam_from_target[fits])
 
     def _rotations(self, count: int, rng: np.random.Generator) -> FloatArray:
@@ -90,13 +92,13 @@ class Viewpoints:
         tilted = Rotation.from_rotvec(tilt[:, None] * axis)
         along_z = roll[:, None] * np.array([0.0, 0.0, 1.0])
         if self.motion == "translation":
-            turned = tilted
+            rotations = tilted
         elif self.motion == "one_axis":
             # Rotation about the board's normal, so that all relative rotations share that axis.
-            turned = tilted * Rotation.from_rotvec(along_z)
+            rotations = tilted * Rotation.from_rotvec(along_z)
         else:
-            turned = Rotation.from_rotvec(along_z) * tilted
-        return np.asarray(turned.as_matrix(), dtype=float)
+            rotations = Rotation.from_rotvec(along_z) * tilted
+        return np.asarray(rotations.as_matrix(), dtype=float)
 
 
 def looking_at(point: FloatArray, away: FloatArray, distance_m: float) -> FloatArray:

@@ -82,13 +82,7 @@ class Columns:
 
 
 def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
-    """Traces rays over a patch.
-
-    Args:
-        camera: The camera.
-        patch: Part of its image.
-        samples: Sub-pixels along a pixel's side, evenly around the pixel's centre.
-    """
+    """Traces rays over a patch, with `samples` sub-pixels along a pixel's side."""
     knot_px = _KNOT_RAD * float(camera.matrix[0])
     x, across = _spline(patch.left, patch.right, knot_px, samples)
     y, down = _spline(patch.top, patch.bottom, knot_px, samples)

@@ -56,9 +56,9 @@ def mounted(options: NetworkOptions) -> dict[str, FloatArray]:
     for point in options.points:
         placed[frame_name("point", point.name)] = compose(np.eye(3), np.array(point.place_m))
     for instrument in options.instruments:
-        turn = Rotation.from_euler("z", instrument.turn_rad).as_matrix()
+        rotation = Rotation.from_euler("z", instrument.turn_rad).as_matrix()
         placed[frame_name("instrument", instrument.name)] = compose(
-            turn, np.array(instrument.place_m)
+            rotation, np.array(instrument.place_m)
         )
     return placed
 
@@ -70,8 +70,8 @@ def _skew(rng: np.random.Generator, sigma_rad: float) -> Rotation:
 def _base(robot: RobotAt, rng: np.random.Generator) -> FloatArray:
     place = np.array(robot.place_m)
     ahead = np.array(MIDDLE_M) - place
-    turn = Rotation.from_euler("z", np.arctan2(ahead[1], ahead[0])) * _skew(rng, 0.01)
-    return compose(turn.as_matrix(), place + rng.normal(0.0, 0.01, 3))
+    rotation = Rotation.from_euler("z", np.arctan2(ahead[1], ahead[0])) * _skew(rng, 0.01)
+    return compose(rotation.as_matrix(), place + rng.normal(0.0, 0.01, 3))
 
 
 def _camera(camera: CameraAt, rng: np.random.Generator) -> FloatArray:
@@ -91,16 +91,16 @@ def _camera(camera: CameraAt, rng: np.random.Generator) -> FloatArray:
 def _board(board: BoardAt, rng: np.random.Generator) -> FloatArray:
     centre = centre_m(board)
     # The board's z points into its plate.
-    turn = Rotation.from_euler("ZX", [rng.uniform(-0.5, 0.5), np.pi])
+    rotation = Rotation.from_euler("ZX", [rng.uniform(-0.5, 0.5), np.pi])
     if board.on != CELL:
-        turned = (turn * _skew(rng, 0.05)).as_matrix()
+        matrix = (rotation * _skew(rng, 0.05)).as_matrix()
         held = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
-        return compose(turned, held - turned @ centre)
+        return compose(matrix, held - matrix @ centre)
     place = np.array(board.place_m)
     ahead = np.array([*(np.array(MIDDLE_M) - place)[:2], 0.0])
     lean = np.cross([0.0, 0.0, 1.0], ahead / max(float(np.linalg.norm(ahead)), 1e-9))
-    turned = (Rotation.from_rotvec(board.tilt_rad * lean) * turn * _skew(rng, 0.01)).as_matrix()
-    return compose(turned, place - turned @ centre)
+    matrix = (Rotation.from_rotvec(board.tilt_rad * lean) * rotation * _skew(rng, 0.01)).as_matrix()
+    return compose(matrix, place - matrix @ centre)
 
 
 @dataclass(frozen=True, eq=False)

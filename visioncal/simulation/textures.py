@@ -85,15 +85,9 @@ def margin_m(target: Target) -> float:
 
 
 def draw_table(rng: np.random.Generator, size: int) -> Image:
-    """Draws a used table-top, periodic in both directions.
+    """Draws a used table-top, (size, size), periodic in both directions.
 
-    Args:
-        rng: Source of randomness.
-        size: Side of the image [texels].
-
-    Returns:
-        (size, size) image: brushed grain, stains, scratches and a few small parts, all of low
-        contrast.
+    It has brushed grain, stains, scratches and a few small parts, all of low contrast.
     """
     grain = _smooth_noise(rng, size, 60.0, 0.7)
     mottling = _smooth_noise(rng, size, 40.0, 40.0)
@@ -304,11 +298,11 @@ def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:
 def _around(layer: _Canvas, margin: int) -> tuple[slice, slice]:
     """Rows and columns of a layer's content, with a margin [texels]."""
     rows, columns = (np.flatnonzero(layer.any(axis=axis)) for axis in (1, 0))
-    down, across = (
+    row_range, column_range = (
         slice(max(int(array[0]) - margin, 0), int(array[-1]) + margin + 1)
         for array in (rows, columns)
     )
-    return down, across
+    return row_range, column_range
 
 
 def _point(place: FloatArray) -> tuple[int, int]:

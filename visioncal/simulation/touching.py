@@ -109,8 +109,8 @@ def touch(cell: SimulatedCell) -> dict[str, Touching]:
 
 
 def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
-    turn = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix()
-    flange_from_tool = compose(turn, rng.uniform([-0.04, -0.04, 0.12], [0.04, 0.04, 0.18]))
+    rotation = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix()
+    flange_from_tool = compose(rotation, rng.uniform([-0.04, -0.04, 0.12], [0.04, 0.04, 0.18]))
     fixture_rotation = Rotation.from_rotvec(
         [*rng.normal(0.0, 0.03, 2), rng.uniform(-0.5, 0.5)]
     ).as_matrix()
@@ -170,11 +170,11 @@ def _touched(
         tilt = _CONE_RAD * np.sqrt(rng.uniform(0.0, 1.0, count))
         lean, spin = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(-1.0, 1.0, count)
         axes = np.stack([np.cos(lean), np.sin(lean), np.zeros(count)], axis=1)
-        turns = Rotation.from_rotvec(tilt[:, None] * axes) * down
-        turns = turns * Rotation.from_rotvec(np.outer(spin, [0.0, 0.0, 1.0]))
+        rotations = Rotation.from_rotvec(tilt[:, None] * axes) * down
+        rotations = rotations * Rotation.from_rotvec(np.outer(spin, [0.0, 0.0, 1.0]))
         goals = np.tile(np.eye(4), (count, 1, 1))
-        goals[:, :3, :3] = turns.as_matrix()
-        goals[:, :3, 3] = contacts[pending] - turns.apply(on_flange[pending])
+        goals[:, :3, :3] = rotations.as_matrix()
+        goals[:, :3, 3] = contacts[pending] - rotations.apply(on_flange[pending])
         # The true flange pose deviates by its repeatability.
         goals = goals @ exp(-robot.options.sigma * rng.standard_normal((count, 6)))
         solutions, good = _inverse_with_deflection(robot, goals, home)

@@ -47,14 +47,9 @@ def matrix_3x3(camera: Camera) -> FloatArray:
 
 
 def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
-    """Projects points.
+    """Projects (n, 3) points in the camera's frame [m] to (n, 2) pixels.
 
-    Args:
-        camera: Intrinsics.
-        points_cam: (n, 3) points in the camera's frame [m].
-
-    Returns:
-        (n, 2) pixels; NaN for points that are not in front of the camera.
+    Points that are not in front of the camera give NaN.
     """
     return project_with_jacobian(camera, points_cam).px
 

@@ -135,17 +135,18 @@ def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
     return {name: _column(table, at) for at, name in enumerate(table.columns)}
 
 
-def _column(table: TextTable, at: int) -> list[Any]:
-    read = int if table.columns[at] in _WHOLE_NUMBERS else float
+def _column(table: TextTable, index: int) -> list[Any]:
+    read = int if table.columns[index] in _WHOLE_NUMBERS else float
     values = []
     for row, cells in enumerate(table.rows):
         try:
-            values.append(read(cells[at]))
+            values.append(read(cells[index]))
         except ValueError:
-            what = "whole number" if read is int else "number"
+            kind = "whole number" if read is int else "number"
+            place = table.place(row)
             raise DataError(
-                f"{table.place(row)}, column {table.columns[at]}: {cells[at]!r} is no {what}.",
-                culprits=[table.place(row)],
+                f"{place}, column {table.columns[index]}: {cells[index]!r} is no {kind}.",
+                culprits=[place],
             ) from None
     return values
 
@@ -383,8 +384,11 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
             )
     spread_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
     if spread_m[1] <= _ON_ONE_LINE * spread_m[0]:
-        where = "on one line" if spread_m[0] > 0.0 else "in one place"
-        yield f"has all points {where}", "Give points beside these: no camera tells how they turn."
+        location = "on one line" if spread_m[0] > 0.0 else "in one place"
+        yield (
+            f"has all points {location}",
+            "Give points beside these: no camera tells how they turn.",
+        )
     extent_m = float(np.ptp(places_m, axis=0).max())
     if extent_m > _LARGEST_RIG_M:
         yield (
@@ -426,12 +430,12 @@ def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, 
 
 def _dictionary_size(table: DocumentTable, name: str) -> int:
     """Number of markers of one of OpenCV's dictionaries."""
-    known = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
-    if name not in known:
+    names = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
+    if name not in names:
         raise DataError(
             f"{table.label}: dictionary is {name!r}, which OpenCV does not have.",
             culprits=[f"{table.label}: dictionary"],
-            next_step=did_you_mean(name.upper(), known)
+            next_step=did_you_mean(name.upper(), names)
             or "The names look like DICT_5X5_100 or DICT_APRILTAG_36h11.",
         )
     return len(aruco_dictionary(name).bytesList)
@@ -476,12 +480,7 @@ def target_document(target: Target) -> dict[str, Any]:
 
 
 def board_words(target: Target, least: str = "") -> str:
-    """A target in a few words, without its size.
-
-    Args:
-        target: Target.
-        least: Prefix of its columns and rows, if these are lower bounds.
-    """
+    """A target in a few words, without its size; `least` precedes columns and rows."""
     size = f"{least}{target.columns} x {target.rows}"
     match target.kind:
         case "checkerboard":
@@ -644,8 +643,8 @@ def rotation_transforms(target: Target) -> FloatArray:
     half = transforms.compose(np.diag([-1.0, -1.0, 1.0]), np.array([width_m, height_m, 0.0]))
     if target.columns != target.rows or target.columns % 2:
         return np.stack([identity, half])
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    quarter = transforms.compose(turn, np.array([width_m, 0.0, 0.0]))
+    rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    quarter = transforms.compose(rotation, np.array([width_m, 0.0, 0.0]))
     return np.stack([identity, quarter, half, transforms.invert(quarter)])
 
 

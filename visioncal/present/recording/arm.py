@@ -22,12 +22,7 @@ _BELOW_M = 0.004
 
 
 def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
-    """Draws an arm at the stream's current time.
-
-    Args:
-        stream: Stream to draw into.
-        link_frames: (n, 4, 4) frames of its joints and its flange in the base [m].
-    """
+    """Draws an arm at the stream's current time, by its (n, 4, 4) link frames in the base [m]."""
     shapes = _Shapes.of(link_frames[None])
     capsules = rr.Capsules3D(
         lengths=shapes.lengths_m,
@@ -59,10 +54,8 @@ def log_frames(
 ) -> None:
     """Draws the axes of base and flange, and places the arm in the base.
 
-    Args:
-        stream: Stream to draw into.
-        axis_m: Length of the flange's axes [m]; the base's are twice as long.
-        more: Other entities with axes: entity, frame, and length as a share of the flange's.
+    The flange's axes have the length `axis_m`, the base's are twice as long; `more` are other
+    entities with their frames and their lengths relative to the flange's.
     """
     base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
     stream.log(paths.BASE, base, static=True)
@@ -78,16 +71,9 @@ def log_frames(
 def log_arms(
     stream: rr.RecordingStream, views: Sequence[FloatArray | None], entity: str = paths.ROBOT
 ) -> None:
-    """Draws an arm in every view of a session.
-
-    Args:
-        stream: Stream to draw into.
-        views: (n, 4, 4) link frames of each view, as for `log_arm`; None where the posture is
-            unknown, which clears the arm of the previous view.
-        entity: Entity to draw under.
-    """
-    known = [view for view in views if view is not None]
-    link_frames, rows = np.array(known or [np.zeros((0, 4, 4))]), range(len(views))
+    """Draws an arm in every view by (n, 4, 4) link frames; None clears the previous view's arm."""
+    known_views = [view for view in views if view is not None]
+    link_frames, rows = np.array(known_views or [np.zeros((0, 4, 4))]), range(len(views))
     drawn = [view is not None for view in views]
     shapes, links, joints = _Shapes.of(link_frames), f"{entity}/links", f"{entity}/joints"
     capsules = rr.Capsules3D.from_fields(colors=colours.LINK, fill_mode="solid")
@@ -165,14 +151,7 @@ class Obstacle:
 def log_obstacles(
     stream: rr.RecordingStream, obstacles: Sequence[Obstacle], floor_m: float | None, size_m: float
 ) -> None:
-    """Draws the floor around the cell's centre, and the obstacles' boxes.
-
-    Args:
-        stream: Stream to draw into.
-        obstacles: The boxes.
-        floor_m: Height of the floor in the base [m]; None without a floor.
-        size_m: Size of the cell [m].
-    """
+    """Draws the boxes, and the floor of a cell of `size_m` at a height in the base, if any [m]."""
     frame = rr.CoordinateFrame(paths.BASE_FRAME)
     if floor_m is not None:
         half = _FLOOR * size_m

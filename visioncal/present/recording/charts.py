@@ -50,12 +50,7 @@ class JointChart:
         stream.log(f"{paths.over_joint(self.joint)}/{paths.USED}", bars, static=True)
 
     def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Marks the bar of the current view, for all views in one message.
-
-        Args:
-            stream: Stream to draw into.
-            rows: Row of each view in the session.
-        """
+        """Marks the current view's bar, for all views, by row in the session, in one message."""
         heights = _single_tensors([self.residual_mm.get(view) for view in rows])
         angles_deg = _single_tensors([self.angle_deg.get(view) for view in rows])
         colour = rr.components.ColorBatch([colours.THIS_VIEW] * len(rows))
@@ -124,12 +119,12 @@ class Charts:
                 places, labels=labels, show_labels=True, colors=colours.WORDS, radii=0.0
             )
             stream.log(f"{paths.COVERAGE}/{chart.name}/words", words, static=True)
-            for name, colour, wanted in (
+            for name, colour, is_used in (
                 (paths.USED, colours.USED, True),
                 (paths.REJECTED, colours.REJECTED, False),
             ):
                 shown = [
-                    point for view, point in chart.points.items() if (view in self.used) is wanted
+                    point for view, point in chart.points.items() if (view in self.used) is is_used
                 ]
                 if shown:
                     points = rr.Points2D(np.vstack(shown), colors=colour, radii=_POINT)
@@ -142,12 +137,7 @@ class Charts:
             joint.log(stream)
 
     def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Marks the current view, for all views of a chart in one message.
-
-        Args:
-            stream: Stream to draw into.
-            rows: Row of each view in the session.
-        """
+        """Marks the current view, for all views, by row in the session, in one message a chart."""
         for chart in self.points:
             marked = [chart.points.get(view, np.zeros((0, 2))) for view in rows]
             points = rr.Points2D.columns(positions=np.vstack(marked))

@@ -150,9 +150,9 @@ def read_payload(path: Path, frame: MessageFrame) -> bytes:
 
 def _unreadable(path: Path, error: OSError) -> DataError:
     missing = isinstance(error, FileNotFoundError)
-    what = "does not exist" if missing else f"cannot be read: {error.strerror or error}"
+    problem = "does not exist" if missing else f"cannot be read: {error.strerror or error}"
     return DataError(
-        f"{path} {what}.",
+        f"{path} {problem}.",
         culprits=[str(path)],
         next_step="Check the path and its spelling." if missing else "",
     )
@@ -190,33 +190,33 @@ def _fields(message: bytes) -> tuple[dict[int, int], dict[int, bytes]]:
     """Splits a Protocol Buffers message into integers and other fields, by field number."""
     numbers: dict[int, int] = {}
     fields: dict[int, bytes] = {}
-    at = 0
-    while at < len(message):
-        key, at = _varint(message, at)
+    position = 0
+    while position < len(message):
+        key, position = _varint(message, position)
         number, wire_type = key >> 3, key & 7
         if wire_type == 0:
-            numbers[number], at = _varint(message, at)
+            numbers[number], position = _varint(message, position)
             continue
         if wire_type == 2:
-            size, at = _varint(message, at)
+            size, position = _varint(message, position)
         elif wire_type in (1, 5):
             size = 8 if wire_type == 1 else 4
         else:
             raise ValueError(f"a message has a field of wire type {wire_type}")
-        if at + size > len(message):
+        if position + size > len(message):
             raise ValueError("a message ends within a field")
-        fields[number] = message[at : at + size]
-        at += size
+        fields[number] = message[position : position + size]
+        position += size
     return numbers, fields
 
 
-def _varint(message: bytes, at: int) -> tuple[int, int]:
+def _varint(message: bytes, position: int) -> tuple[int, int]:
     value = 0
     for shift in range(0, 64, 7):
-        if at >= len(message):
+        if position >= len(message):
             raise ValueError("a message ends within a number")
-        value |= (message[at] & 0x7F) << shift
-        at += 1
-        if message[at - 1] < 0x80:
-            return value, at
+        value |= (message[position] & 0x7F) << shift
+        position += 1
+        if message[position - 1] < 0x80:
+            return value, position
     raise ValueError("a number has more than 64 bits")

@@ -76,7 +76,7 @@ class LiveDrawing:
     stream: rr.RecordingStream
     cell: LiveCell
     _px: dict[int, FloatArray] = field(default_factory=dict)
-    _places: list[FloatArray] = field(default_factory=list)
+    _flange_poses: list[FloatArray] = field(default_factory=list)
 
     def begin(self) -> None:
         """Draws the static part."""
@@ -119,10 +119,10 @@ class LiveDrawing:
         log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, flange)
         if cell.robot is not None and view.q is not None:
             log_arm(stream, cell.robot.link_frames(view.q))
-        self._places.append(flange)
+        self._flange_poses.append(flange)
         in_base = rr.CoordinateFrame(paths.BASE_FRAME)
         points = rr.Points3D(
-            [place[:3, 3] for place in self._places], colors=colours.USED, radii=_POINT_M
+            [pose[:3, 3] for pose in self._flange_poses], colors=colours.USED, radii=_POINT_M
         )
         stream.log(f"{paths.STOPS}/{paths.USED}", in_base, points)
         if cell.x is None or cell.z is None:
@@ -131,7 +131,7 @@ class LiveDrawing:
         poses = (flange @ cell.x, cell.z) if in_hand else (cell.x, flange @ cell.z)
         log_pose(stream, paths.CAMERA, paths.CAM_FRAME, poses[0])
         log_pose(stream, paths.TARGET, paths.TARGET_FRAME, poses[1])
-        strips = [array for pose in self._places for array in self._carried(pose)]
+        strips = [line for pose in self._flange_poses for line in self._carried(pose)]
         if strips:
             lines = rr.LineStrips3D(strips, colors=colours.USED, radii=_LINE_M)
             stream.log(f"{paths.STOPS}/{paths.USED}/carried", in_base, lines)

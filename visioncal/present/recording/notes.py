@@ -75,14 +75,7 @@ def log_views(
     rows: Mapping[int, View],
     unposed: Mapping[int, Sequence[str]] = MappingProxyType({}),
 ) -> None:
-    """Logs residuals and status of the views.
-
-    Args:
-        stream: Stream to draw into.
-        sights: Result of each view, by row.
-        rows: All views, by row.
-        unposed: Robots without a known pose in a view, by row.
-    """
+    """Logs residuals and status of the views, by row; `unposed` are robots without a pose."""
     by_seer: dict[str, dict[int, ViewResult]] = defaultdict(dict)
     for row, sight in sights.items():
         by_seer[sight.seer][row] = sight
@@ -164,12 +157,7 @@ def _list(sentences: Iterable[str]) -> Iterator[str]:
 def figures_markdown(
     calibration: Calibration, targets: Mapping[str, Target] = MappingProxyType({})
 ) -> str:
-    """Residuals of fit and validation, noise, uncertainty budget, boards and arms.
-
-    Args:
-        calibration: The result.
-        targets: Boards by name, where known.
-    """
+    """Residuals of fit and validation, noise, uncertainty budget, boards and arms."""
     return "\n".join(_figure_lines(calibration, targets))
 
 
@@ -201,12 +189,7 @@ def solvers_markdown(calibration: Calibration) -> str:
 
 
 def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
-    """Status and residuals of one view.
-
-    Args:
-        sight: Result of the view.
-        unposed: Robots without a pose at its stop.
-    """
+    """Status and residuals of one view; `unposed` are the robots without a pose at its stop."""
     state = "used" if sight.used else "not used"
     lines = [f"# View {sight.view}: {state} ([report](report.html#view-{sight.view}))", ""]
     if sight.reason:

@@ -76,17 +76,20 @@ class Overlay:
             dots = rr.Points2D.from_fields(colors=colour, radii=size * self.width)
             positions = rr.Points2D.columns(positions=np.vstack(points_px) + _CENTRE)
             self._send(stream, entity, dots, positions, points_px)
-        for entity, factor, wanted in (
+        for entity, factor, is_used in (
             (paths.magnified_residuals(self.factor), self.factor, True),
             (paths.RESIDUALS_TO_SCALE, 1, False),
         ):
             paired = [
-                len(ends) == len(begins) and (view.view in self.used) is wanted
+                len(ends) == len(begins) and (view.view in self.used) is is_used
                 for view, begins, ends in zip(seen, px, predicted_px, strict=True)
             ]
-            begins_px = [array if own else empty for array, own in zip(px, paired, strict=True)]
+            begins_px = [
+                array if is_paired else empty for array, is_paired in zip(px, paired, strict=True)
+            ]
             ends_px = [
-                array if own else empty for array, own in zip(predicted_px, paired, strict=True)
+                array if is_paired else empty
+                for array, is_paired in zip(predicted_px, paired, strict=True)
             ]
             origins = np.vstack(begins_px)
             vectors = factor * (np.vstack(ends_px) - origins)

@@ -172,15 +172,9 @@ class _Records:
 def chunks(
     scanned: Scan, entities: Container[str], damaged: list[MessageFrame]
 ) -> Iterator[tuple[MessageFrame, str, pa.RecordBatch]]:
-    """Unpacks the chunks of some entities, in file order.
+    """Unpacks the chunks of some entities in file order: message, entity path and rows of each.
 
-    Args:
-        scanned: The recording.
-        entities: Paths of the entities.
-        damaged: Receives the messages that cannot be unpacked.
-
-    Returns:
-        Message, entity path and rows of each chunk.
+    Messages that cannot be unpacked are appended to `damaged`.
     """
     for frame in scanned.frames:
         if frame.kind == CHUNK:
@@ -241,12 +235,14 @@ def _read_records(scanned: Scan) -> _Records:
 def _no_header(scanned: Scan, damaged: Sequence[MessageFrame]) -> DataError:
     next_step = _AGAIN
     if damaged:
-        what = "is damaged: the session's declaration cannot be read"
+        problem = "is damaged: the session's declaration cannot be read"
     elif scanned.finished:
-        what, next_step = "holds no session of visioncal", "Give the .rrd that visioncal wrote."
+        problem, next_step = "holds no session of visioncal", "Give the .rrd that visioncal wrote."
     else:
-        what = "was cut off before the session's declaration was complete: no view is in it"
-    return DataError(f"{scanned.path} {what}.", culprits=[str(scanned.path)], next_step=next_step)
+        problem = "was cut off before the session's declaration was complete: no view is in it"
+    return DataError(
+        f"{scanned.path} {problem}.", culprits=[str(scanned.path)], next_step=next_step
+    )
 
 
 def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:

@@ -108,15 +108,9 @@ def send_rows(
     rows: Iterable[int],
     columns: Iterable[rr.ComponentColumn],
 ) -> None:
-    """Logs an entity for many views in one message, independent of the stream's time.
+    """Logs an entity for many views, by row, in one message, whatever the stream's time.
 
-    This takes a tenth of the time of single messages.
-
-    Args:
-        stream: Stream to log to.
-        entity: Entity path.
-        rows: Row of each view in the session.
-        columns: Component columns, one partition per view.
+    This takes a tenth of the time of single messages. Each component has one partition per view.
     """
     time = rr.TimeColumn(paths.TIMELINE, sequence=rows)
     rr.send_columns(entity, [time], columns, recording=stream)

@@ -192,7 +192,7 @@ class _Result:
 
 def _read_result(path: Path) -> _Result:
     """Reads the last result, with the intact part of its evidence."""
-    last: dict[str, Any] = {}
+    latest: dict[str, Any] = {}
     evidence: dict[str, dict[int, ViewEvidence]] = {}
     damaged: list[MessageFrame] = []
     entities = (paths.CALIBRATION, paths.EVIDENCE, paths.ALIGNMENT)
@@ -206,17 +206,17 @@ def _read_result(path: Path) -> _Result:
                 else:
                     # Earlier versions stored no evidence for cells.
                     no_evidence = {"result": [""], "evidence_count": [0]}
-                    last = no_evidence | codec.values_of(batch, _ALIGNMENT, position)
-                    last |= codec.values_of(batch, _RESULT, position) | codec.values_of(
+                    latest = no_evidence | codec.values_of(batch, _ALIGNMENT, position)
+                    latest |= codec.values_of(batch, _RESULT, position) | codec.values_of(
                         batch, "TextDocument", position
                     )
                     # Chunks damaged before this one hold no newer result.
                     damaged.clear()
-        if damaged or (last and sha256(last["text"][0].encode()) != last["seal"][0]):
+        if damaged or (latest and sha256(latest["text"][0].encode()) != latest["seal"][0]):
             raise _damaged(path)
-        if not last:
+        if not latest:
             return _Result()
-        (result,), (count,), (text,) = last["result"], last["evidence_count"], last["text"]
+        (result,), (count,), (text,) = latest["result"], latest["evidence_count"], latest["text"]
     except (KeyError, ValueError, TypeError) as error:
         raise _damaged(path) from error
     own_evidence = evidence.get(result, {})

@@ -198,12 +198,7 @@ class SceneDrawing:
             log_network(stream, calibration)
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
-        """Logs the poses in each view.
-
-        Args:
-            stream: Stream to draw into.
-            seen: Evidence of each view, in the order of the session.
-        """
+        """Logs the poses in each view, in the order of the session."""
         for flange in self.frames.robots:
             states = [self.states[flange].get(view.view) for view in seen]
             poses = [None if state is None else state.pose for state in states]

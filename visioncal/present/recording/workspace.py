@@ -103,15 +103,10 @@ class ArmPicture:
                         marker_sizes=5.0 if held else 3.5,
                         names=f"{label}, held back" if held else label,
                     )
-                    stream.log(_series(plot, name, held=held), points, static=True)
+                    stream.log(_series(plot, name, is_holdout=held), points, static=True)
 
     def log_views(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Draws the nominal arm in each view, and plots the residuals of both arms.
-
-        Args:
-            stream: Stream to draw into.
-            rows: Row of each view in the session.
-        """
+        """Draws the nominal arm in each view, by row, and plots the residuals of both arms."""
         drawn = [self.off_m[view] for view in rows if view in self.off_m]
         strips = [
             np.vstack([np.zeros(3), origins + self.factor * deviations])
@@ -126,7 +121,9 @@ class ArmPicture:
         )
         for held, views in ((False, self.found.left_out), (True, self.found.holdout)):
             _log_unseen(
-                stream, {rows[view.view]: view for view in views if view.view in rows}, held=held
+                stream,
+                {rows[view.view]: view for view in views if view.view in rows},
+                is_holdout=held,
             )
 
 
@@ -162,7 +159,9 @@ def log_map(
     stream.log(f"{paths.WORKSPACE}/legend", frame, legend, static=True)
 
 
-def _log_unseen(stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, held: bool) -> None:
+def _log_unseen(
+    stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, is_holdout: bool
+) -> None:
     for plot, before, after in (
         (paths.UNSEEN_MM, "nominal_mm", "mm"),
         (paths.UNSEEN_DEG, "nominal_deg", "deg"),
@@ -170,12 +169,12 @@ def _log_unseen(stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, h
         pairs = {row: (getattr(view, before), getattr(view, after)) for row, view in seen.items()}
         known = {row: pair for row, pair in pairs.items() if None not in pair}
         for index, name in enumerate((_STATED, _CALIBRATED)):
-            entity = _series(plot, name, held=held)
+            entity = _series(plot, name, is_holdout=is_holdout)
             log_scalars(stream, entity, {row: pair[index] for row, pair in known.items()})
 
 
-def _series(plot: str, name: str, *, held: bool) -> str:
-    return f"{plot}/{name}_held_back" if held else f"{plot}/{name}"
+def _series(plot: str, name: str, *, is_holdout: bool) -> str:
+    return f"{plot}/{name}_held_back" if is_holdout else f"{plot}/{name}"
 
 
 def _deviations(
@@ -234,11 +233,7 @@ class Uncertainty:
     ) -> "Uncertainty":
         """Collects the placements, and chooses the magnification by the used views.
 
-        Args:
-            calibration: The result.
-            evidence: Evidence of the views.
-            size_m: Size of the cell [m].
-            frames: By view, frame of its target; None for a single target.
+        `frames` is the frame of each view's target; None for a single target.
         """
         used = frozenset(view.view for view in calibration.views if view.used)
         if frames is None:
@@ -248,11 +243,11 @@ class Uncertainty:
             for view, seen in evidence.items()
             if view in frames and (placed := placement(calibration, seen, frames[view])) is not None
         }
-        last = parts.frames(calibration).matrices
+        final_frames = parts.frames(calibration).matrices
         edges = {
             name: edge
             for name, edge in calibration.placed.items()
-            if edge.covariance.any() and name.rpartition("_from_")[2] in last
+            if edge.covariance.any() and name.rpartition("_from_")[2] in final_frames
         }
         sizes_m = [SIGMAS_95 * _principal_sigmas(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
@@ -263,11 +258,11 @@ class Uncertainty:
         """Draws the ellipsoids, and the target positions by all views."""
         for name, edge in self.edges.items():
             self._log_ellipsoid(stream, name, edge)
-        for name, colour, wanted in (
+        for name, colour, is_used in (
             (paths.USED, colours.USED, True),
             (paths.REJECTED, colours.REJECTED, False),
         ):
-            views = [view for view in self.scatter_m if (view in self.used) is wanted]
+            views = [view for view in self.scatter_m if (view in self.used) is is_used]
             for frame in self._frames_of(views):
                 positions_m = self._positions_m(views, frame)
                 points = rr.Points3D(positions_m, colors=colour, radii=_POINT * self.size_m)
@@ -305,12 +300,7 @@ class Uncertainty:
         stream.log(f"{entity}/label", frame, label, static=True)
 
     def log_views(self, stream: rr.RecordingStream, views: Sequence[int]) -> None:
-        """Marks the current view's target position.
-
-        Args:
-            stream: Stream to draw into.
-            views: All views, in the order of the session.
-        """
+        """Marks the current view's target position, for all views of the session in order."""
         for frame in self._frames_of(self.scatter_m):
             # For other targets, an empty part clears the mark of the previous view.
             marked = [self._positions_m([view] * (view in self.scatter_m), frame) for view in views]
@@ -337,11 +327,11 @@ class Uncertainty:
             vector for view, vector in self.scatter_m.items() if self.frames[view] == frame
         ]
         drawn_m = [self.factor * vector for vector in deviations]
-        far = [vector for vector in drawn_m if np.linalg.norm(vector) > _REACH * self.size_m]
-        if far:
+        beyond = [vector for vector in drawn_m if np.linalg.norm(vector) > _REACH * self.size_m]
+        if beyond:
             arrows = rr.Arrows3D(
-                vectors=[self._within_reach(vector) for vector in far],
-                origins=np.zeros((len(far), 3)),
+                vectors=[self._within_reach(vector) for vector in beyond],
+                origins=np.zeros((len(beyond), 3)),
                 colors=colours.REJECTED,
                 radii=_FINE_LINE * self.size_m,
             )

@@ -102,32 +102,25 @@ def _mark_rms(panel: Panel, values: FloatArray) -> None:
 
 def _name_sets(panel: Panel, first_held: float) -> None:
     """Labels cross-validation and hold-out views above the panels."""
-    for words, place in (("left out in turn", -0.4), ("held back by the session", first_held)):
-        x, y = float(panel.x_at(place)), panel.box.top - 4.0
+    for words, position in (("left out in turn", -0.4), ("held back by the session", first_held)):
+        x, y = float(panel.x_at(position)), panel.box.top - 4.0
         panel.figure.text(x, y, words, size=svg.SMALL, colour=svg.MUTED)
 
 
-def side_map(found: ArmResult, stops_m: FloatArray) -> Markup:
-    """Map of the workspace from the side: height against distance from the base's axis.
-
-    Args:
-        found: The arm, with a workspace map.
-        stops_m: (m, 3) flange positions of the calibration's stops; may be empty [m].
-    """
+def side_map(arm: ArmResult, stops_m: FloatArray) -> Markup:
+    """Map of the workspace from the side, with the stops' (m, 3) flange positions [m]."""
     return _map(
-        found,
-        _from_the_side(found.map_places_m),
+        arm,
+        _from_the_side(arm.map_places_m),
         _from_the_side(stops_m),
         ("distance from the base's axis [m]", "base z [m]"),
         "side",
     )
 
 
-def top_map(found: ArmResult, stops_m: FloatArray) -> Markup:
+def top_map(arm: ArmResult, stops_m: FloatArray) -> Markup:
     """Map of the workspace from above; see `side_map`."""
-    return _map(
-        found, found.map_places_m[:, :2], stops_m[:, :2], ("base x [m]", "base y [m]"), "top"
-    )
+    return _map(arm, arm.map_places_m[:, :2], stops_m[:, :2], ("base x [m]", "base y [m]"), "top")
 
 
 def _from_the_side(places_m: FloatArray) -> FloatArray:
@@ -188,7 +181,7 @@ def course(thermal: ThermalResult) -> Markup:
     panel.band(np.array(times_h), low, high, svg.ACCENT)
     panel.line(times_h, drift_mm, svg.ACCENT)
     if seen:
-        panel.marks([at for at, _ in seen], [mm for _, mm in seen], "dot", svg.INK)
+        panel.marks([time_h for time_h, _ in seen], [mm for _, mm in seen], "dot", svg.INK)
         line, dot = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}", "\N{BLACK CIRCLE}"
         entries = [(line, svg.ACCENT, "the model"), (dot, svg.INK, "seen by the stops")]
         figure.legend(box.right - 6.0, box.bottom - 6.0, entries)

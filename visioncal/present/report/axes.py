@@ -64,8 +64,8 @@ class Scale:
 
 def spanning(values: FloatArray) -> Scale:
     """A scale that holds the values with room at both ends; NaN are ignored."""
-    known = values[np.isfinite(values)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     spare = _ROOM * (high - low) or 0.5
     return Scale(low - spare, high + spare)
 
@@ -131,13 +131,7 @@ def boxes(
 ) -> list[list[Box]]:
     """Splits a figure into rows and columns of panels.
 
-    Args:
-        figure: Figure to split.
-        rows: Number of rows.
-        columns: Number of columns.
-        margins: Margins around all panels.
-        gaps_in: Gaps between columns and between rows [inches].
-        shares: Relative widths of the columns; equal where None.
+    `gaps_in` are between columns and between rows [inches]; `shares` are relative column widths.
     """
     left, top = 72.0 * margins.left, 72.0 * margins.top
     gap_x, gap_y = 72.0 * gaps_in[0], 72.0 * gaps_in[1]
@@ -283,15 +277,15 @@ class Panel:
 
     def level(self, y: float, colour: str, width: float = 0.9, dash: str = "") -> None:
         """Draws a horizontal line at a value."""
-        at = float(self.y_at(y))
-        data = f"M{self.box.left:.1f} {at:.1f}H{self.box.right:.1f}"
+        y_at = float(self.y_at(y))
+        data = f"M{self.box.left:.1f} {y_at:.1f}H{self.box.right:.1f}"
         self.figure.path(data, stroke=colour, width=width, dash=dash)
 
     def post(self, x: float, colour: str, width: float = 0.9) -> None:
         """Draws a vertical line at a value."""
-        at = float(self.x_at(x))
+        x_at = float(self.x_at(x))
         self.figure.path(
-            f"M{at:.1f} {self.box.bottom:.1f}V{self.box.top:.1f}", stroke=colour, width=width
+            f"M{x_at:.1f} {self.box.bottom:.1f}V{self.box.top:.1f}", stroke=colour, width=width
         )
 
     def bars(self, x: Places, y: Places, width: float, colour: str) -> None:
@@ -332,8 +326,8 @@ class Panel:
             "|": (0.0, -half, f"v{size:g}"),
             "-": (-half, 0.0, f"h{size:g}"),
         }  # fmt: skip
-        across, down, pen = strokes[shape]
-        places = zip((self.x_at(x) + across).tolist(), (self.y_at(y) + down).tolist(), strict=True)
+        dx, dy, pen = strokes[shape]
+        places = zip((self.x_at(x) + dx).tolist(), (self.y_at(y) + dy).tolist(), strict=True)
         data = "".join(f"M{a:.1f} {b:.1f}{pen}" for a, b in places if a == a and b == b)
         if shape in ("^", "square"):
             self.figure.path(data, fill=colour, opacity=opacity)

@@ -93,19 +93,19 @@ def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
     for fact in need_facts(calibration.need, calibration.verdict):
         yield fact.label[0].upper() + fact.label[1:], f"{fact.value} {fact.note}".strip()
     for name, edge in [*calibration.placed.items()][:_MOST_EDGES]:
-        turn = ", ".join(
+        rotation = ", ".join(
             f"{value:.4f}" for value in edge.transform.rotation.as_rotvec(degrees=True)
         )
-        yield name, f"{edge.place_words(3)}; rotation vector ({turn}) deg; {edge.sigma_words}"
+        yield name, f"{edge.place_words(3)}; rotation vector ({rotation}) deg; {edge.sigma_words}"
     if (test := calibration.touch_test) is not None:
         largest = max(point.gap_mm for point in test.points)
         words = "passed" if test.passed else "not passed"
         yield "Touch test", f"{words}, largest gap {figure(largest)} mm, with {test.tool}"
     left_out = calibration.validation.held_out
-    turned = "" if left_out.deg is None else f" and {figure(left_out.deg)} deg"
+    rotation_words = "" if left_out.deg is None else f" and {figure(left_out.deg)} deg"
     used = sum(view.used for view in calibration.views)
     yield "Views used", f"{used} of {len(calibration.views)}"
-    yield "Left out, views are predicted to", f"{figure(left_out.mm)} mm{turned} (rms)"
+    yield "Left out, views are predicted to", f"{figure(left_out.mm)} mm{rotation_words} (rms)"
 
 
 def _limits(calibration: Calibration) -> Iterator[tuple[str, str]]:

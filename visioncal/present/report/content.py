@@ -47,8 +47,8 @@ def edge_facts(name: str, edge: Edge) -> list[Fact]:
     else:
         parent = frame_words(name.partition("_from_")[0])
         rows.append(Fact("rotation", "not measured", f"taken as that of {parent}"))
-    turned = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
-    return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{turned}")]
+    rotation_sigma = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
+    return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{rotation_sigma}")]
 
 
 def _rotation_facts(edge: Edge) -> list[Fact]:
@@ -204,9 +204,11 @@ def _clock_facts(clock: ClockResult, label: str) -> Iterator[Fact]:
 
 def _point_fact(point: PointResult) -> Fact:
     axis_mm = point.sigma_mm / np.sqrt(3.0)
-    place = ", ".join(matched(1e3 * value, axis_mm) for value in (point.x_m, point.y_m, point.z_m))
+    position = ", ".join(
+        matched(1e3 * value, axis_mm) for value in (point.x_m, point.y_m, point.z_m)
+    )
     note = f"{PLUS_MINUS} {significant(point.sigma_mm)}, on the flange"
-    return Fact(f"point {point.point}", f"[{place}] mm", note)
+    return Fact(f"point {point.point}", f"[{position}] mm", note)
 
 
 def lens_facts(result: CameraResult) -> tuple[Fact, ...]:

@@ -32,12 +32,7 @@ class _Odd:
 
 
 def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> str:
-    """Renders the page as HTML text, with links relative to its folder.
-
-    Args:
-        rows: Sessions, the most outstanding first.
-        cells: Summaries of simulated cells.
-    """
+    """Renders the page as HTML text, with links relative to its folder; worst sessions first."""
     states = Counter(row.verdict or row.state for row in rows)
     return template("fleet.html.j2").render(
         kind="Batch",

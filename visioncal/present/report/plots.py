@@ -224,9 +224,9 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
         return Markup("")
     px = np.concatenate([view.corners.px for view in seen if view.corners is not None])
     errors = np.concatenate([_corner_errors(view) for view in seen])
-    known = np.isfinite(errors)
+    with_error = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
-    errors_known = bool(known.any())
+    errors_known = bool(with_error.any())
     margins = Margins(right=0.85 if errors_known else 0.15)
     width_in = _SMALL_IN - margins.left - margins.right
     figure = Figure(_SMALL_IN, margins.top + width_in * height / width + margins.bottom)
@@ -236,12 +236,12 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
     panel.x_axis("image x [px]", 4)
     panel.y_axis("image y [px]", 5)
     panel.frame()
-    top = float(np.percentile(errors[known], 98)) if errors_known else 1.0
-    steps, colours = svg.shades(errors[known], 0.0, top, svg.PLASMA, _SHADES)
-    layers = [(px[~known], svg.ACCENT), *((px[known][steps == index], colours[index])
+    top = float(np.percentile(errors[with_error], 98)) if errors_known else 1.0
+    steps, colours = svg.shades(errors[with_error], 0.0, top, svg.PLASMA, _SHADES)
+    layers = [(px[~with_error], svg.ACCENT), *((px[with_error][steps == index], colours[index])
                                           for index in range(_SHADES))]  # fmt: skip
     if len(px) > _MANY_MARKS and errors_known:
-        _draw_bitmap(panel, px[known], steps, colours)
+        _draw_bitmap(panel, px[with_error], steps, colours)
     else:
         for positions, colour in layers:
             panel.marks(positions[:, 0], positions[:, 1], "dot", colour, _DOT_PT)

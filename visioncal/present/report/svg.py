@@ -35,12 +35,6 @@ class Figure:
     """A figure; positions are in points (1/72 inch) from its upper left corner, y downwards."""
 
     def __init__(self, width_in: float, height_in: float) -> None:
-        """Creates an empty figure.
-
-        Args:
-            width_in: Width [inches].
-            height_in: Height [inches].
-        """
         self.width, self.height = _POINTS_AN_INCH * width_in, _POINTS_AN_INCH * height_in
         self._parts: list[str] = []
 
@@ -112,14 +106,7 @@ class Figure:
     def legend(
         self, x: float, y: float, entries: Sequence[tuple[str, str, str]], anchor: str = "end"
     ) -> None:
-        """Adds a legend in one line.
-
-        Args:
-            x: Where it ends, or starts [points].
-            y: Its baseline [points].
-            entries: Sign, colour and text of each entry.
-            anchor: `end` or `start`.
-        """
+        """Adds a legend of (sign, colour, text) in one line; `x` is its end, or start [points]."""
         parts = (
             f'<tspan style="fill:{colour}">{sign}</tspan> {escape(words)}'
             for sign, colour, words in entries
@@ -134,11 +121,7 @@ class Figure:
         self._parts.append(f'<image {box} preserveAspectRatio="none" href="{uri}"/>')
 
     def inline(self, words: str) -> Markup:
-        """The figure as an `<svg>` element for an HTML page, scaling with its container.
-
-        Args:
-            words: Description for screen readers.
-        """
+        """The figure as an `<svg>` element that scales with its container, described by `words`."""
         # Numbers and colours are our own; all texts are escaped.
         return Markup(
             f'<svg role="img" aria-label="{escape(words)}" '
@@ -169,17 +152,9 @@ def rounded(left: float, top: float, width: float, height: float, radius: float)
 def shades(
     values: FloatArray, low: float, high: float, scale: Sequence[tuple[int, int, int]], count: int
 ) -> tuple[np.ndarray, list[str]]:
-    """Assigns values to the steps of a colour scale.
+    """Steps of values on a colour scale, and the colours of all steps.
 
-    Args:
-        values: Values to colour.
-        low: Start of the scale; values beyond an end have its colour.
-        high: End of the scale.
-        scale: Colours of the scale.
-        count: Number of steps.
-
-    Returns:
-        Step of each value, and colours of all steps.
+    The scale runs from `low` to `high`; values beyond an end have its colour.
     """
     steps = np.linspace(0.0, len(scale) - 1.0, count)
     stops = np.arange(float(len(scale)))

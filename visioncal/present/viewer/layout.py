@@ -54,17 +54,10 @@ class _Contents:
 
 
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
-    """Layout of a recording of a session and its result.
+    """Layout of a recording of a session and its result; parts that they lack get no space.
 
     The first tab shows the verdict, the cell and the image. Others show the network of a cell, the
     calibrated arm, the residuals, the coverage, and the solvers.
-
-    Args:
-        session: The session; parts that it lacks get no space.
-        calibration: Its result, by which the eye also covers camera and target.
-
-    Returns:
-        The layout, to write into the recording.
     """
     contents, eye = _Contents.of(session, calibration), _eye(session, calibration)
     tabs: list[rrb.Container | rrb.View] = [_overview(contents, eye, calibration)]
@@ -226,13 +219,15 @@ def _arm(arm: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
     return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
 
 
-def verdict_views(found: Verdict | None) -> rrb.Container | rrb.View:
+def verdict_views(verdict: Verdict | None) -> rrb.Container | rrb.View:
     """The verdict's text, below a strip in its colour if there is a verdict."""
     text = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
-    if found is None:
+    if verdict is None:
         return text
     strip = rrb.Spatial2DView(
-        name=found.headline, origin=paths.VERDICT_STRIP, background=[*colours.VERDICT[found.status]]
+        name=verdict.headline,
+        origin=paths.VERDICT_STRIP,
+        background=[*colours.VERDICT[verdict.status]],
     )
     return rrb.Vertical(strip, text, row_shares=[1, 8], name="Verdict")
 
@@ -340,14 +335,14 @@ def _cell_contents(contents: _Contents) -> list[str]:
 
 def _plots(contents: _Contents, seer: str) -> list[rrb.TimeSeriesView]:
     """Residual plots of one camera's views."""
-    wanted = [
+    plots = [
         ("Position residual [mm]", paths.POSITION_MM),
         *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.turns else []),
     ]
     if contents.images:
-        wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))
+        plots.append(("Reprojection error [px]", paths.REPROJECTION_PX))
     # A legend would cover the marks at the top and bottom, which are of these views; a longer title
     # would be cut off.
     legend = "; red: not used" if contents.unused else ""
     of = f"{seer}: " if seer else ""
-    return [series(f"{of}{name}{legend}", paths.part_of(word, seer)) for name, word in wanted]
+    return [series(f"{of}{name}{legend}", paths.part_of(word, seer)) for name, word in plots]

@@ -27,11 +27,7 @@ _TITLES = {
 
 
 def plan_blueprint(preview: Preview) -> rrb.Blueprint:
-    """Layout of the preview of a plan.
-
-    Returns:
-        The layout, to be written into the recording.
-    """
+    """Layout of the preview of a plan."""
     flange = preview.base_from_flange
     poses = [pose for base_from_flange in flange for pose in preview.placed(base_from_flange)]
     places = np.array(
@@ -99,11 +95,7 @@ def _coverage() -> rrb.Container:
 
 
 def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
-    """Layout of the preview of motions.
-
-    Returns:
-        The layout, to be written into the recording.
-    """
+    """Layout of the preview of motions."""
     entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.OBSTACLES, paths.WAY)
     cell = space_view(
         "The flange's way: exciting motion in orange, sweeps in blue",
@@ -132,11 +124,7 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
 
 
 def dynamics_blueprint(run: Run) -> rrb.Blueprint:
-    """Layout of torques over time beside the moving arm.
-
-    Returns:
-        The layout, to be written into the recording.
-    """
+    """Layout of torques over time beside the moving arm."""
     tabs = rrb.Tabs(_torques(run), _figures(), active_tab=0)
     return with_panels(tabs, paths.MOTION_TIMELINE)
 

@@ -158,9 +158,9 @@ def fit_corners(
             is_lit = relit_sums.cost(good) < _LIGHT_COST_RATIO * sums.cost(good)
             if is_lit:
                 patches, shift, sums, jacobian = relit, relit_shift, relit_sums, relit.jacobian
-            moved = positions + shift
-            good = _accepted(patches, sums, moved - px)
-            positions = np.where(good[:, None], moved, px)
+            shifted = positions + shift
+            good = _accepted(patches, sums, shifted - px)
+            positions = np.where(good[:, None], shifted, px)
             # Small shifts do not change the maps and the blur.
             if not is_lit and np.sqrt(np.mean(shift[good] ** 2)) < _CONVERGED_PX:
                 break
@@ -233,8 +233,8 @@ class _Patches:
         by_board = np.linalg.inv(normals)
         side_px = np.sqrt(np.abs(np.linalg.det(by_board)))
         half = np.clip(_HALF, _LEAST_PX / side_px, _MOST_PX / side_px)
-        wanted = float(np.max(half * np.abs(by_board).sum(axis=2).max(axis=1)))
-        reach = int(np.ceil(min(wanted, _MOST_PX)))
+        needed_px = float(np.max(half * np.abs(by_board).sum(axis=2).max(axis=1)))
+        reach = int(np.ceil(min(needed_px, _MOST_PX)))
         margin = int(np.ceil(min(blur_px, _MOST_MARGIN_PX))) + 1
         size = _fft_size(2 * (reach + margin + _TAPER_PX))
         samples = (np.arange(2 * size) - size) / 2
@@ -373,11 +373,11 @@ def _decimated(spectrum: "Tensor") -> "Tensor":
 def _fft_size(size: int) -> int:
     """The next even size with small prime factors, for a fast Fourier transform."""
     while True:
-        rest = size
+        remainder = size
         for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1 and size % 2 == 0:
+            while remainder % prime == 0:
+                remainder //= prime
+        if remainder == 1 and size % 2 == 0:
             return size
         size += 1
 
@@ -411,8 +411,8 @@ class _Sums:
             columns = patches.at(part).columns(values, shift[part], blurs=blurs)
             sums.append((columns @ columns.transpose(1, 2)).cpu().numpy().astype(float))
         total = np.concatenate(sums)
-        own = total[:, :2, :2] + 1e-6 * np.eye(2)
-        levels = np.linalg.solve(own, total[:, :2, -1:])[..., 0]
+        level_normal = total[:, :2, :2] + 1e-6 * np.eye(2)
+        levels = np.linalg.solve(level_normal, total[:, :2, -1:])[..., 0]
         right = total[:, :-1, -1] - np.einsum("ncl,nl->nc", total[:, :-1, :2], levels)
         squares = total[:, -1, -1] - np.einsum("nl,nl->n", total[:, :2, -1], levels)
         scale = np.repeat(levels[:, 1:], total.shape[1] - 1, axis=1)
@@ -423,10 +423,10 @@ class _Sums:
     @property
     def inverse(self) -> FloatArray:
         """(n, 4, 4) inverse normal matrices of the corners' own unknowns."""
-        own = self.normal[:, :4, :4]
-        scale = np.sqrt(np.einsum("nii->ni", own)) + 1e-9
+        corner_normal = self.normal[:, :4, :4]
+        scale = np.sqrt(np.einsum("nii->ni", corner_normal)) + 1e-9
         scales = scale[:, :, None] * scale[:, None, :]
-        return np.asarray(np.linalg.inv(own / scales + 1e-7 * np.eye(4)) / scales)
+        return np.asarray(np.linalg.inv(corner_normal / scales + 1e-7 * np.eye(4)) / scales)
 
     @property
     def misfit(self) -> FloatArray:
@@ -450,8 +450,8 @@ class _Sums:
         right = (self.right[:, 4:] - (kept @ self.right[:, :4, None])[..., 0])[good].sum(axis=0)
         diagonal = np.diag(reduced) + 1e-9 * np.trace(reduced) + 1e-12
         shared = np.linalg.solve(reduced + damping * np.diag(diagonal), right)
-        own = (inverse @ (self.right[:, :4] - cross @ shared)[..., None])[:, 2:, 0]
-        return shared, _limited(own)
+        corner_steps = (inverse @ (self.right[:, :4] - cross @ shared)[..., None])[:, 2:, 0]
+        return shared, _limited(corner_steps)
 
 
 def _limited(shift: FloatArray) -> FloatArray:
@@ -466,14 +466,14 @@ def _fit_blur(patches: _Patches, values: FloatArray, iterations: int) -> tuple[F
     sums = _Sums.of(patches, values, shift, blurs=True)
     good = _similar_misfit(sums.misfit)
     for _ in range(iterations):
-        shared, own = sums.steps(good, damping)
+        shared, corner_steps = sums.steps(good, damping)
         tried = values + shared
         tone = np.clip(tried[4], -_MOST_TONE, _MOST_TONE)
         tried = np.append(Blur.of(tried[:4]).values, tone)
-        tried_sums = _Sums.of(patches, tried, shift + own, blurs=True)
+        tried_sums = _Sums.of(patches, tried, shift + corner_steps, blurs=True)
         gain = 1.0 - tried_sums.cost(good) / sums.cost(good)
         if gain > 0.0:
-            values, shift, sums, damping = tried, shift + own, tried_sums, damping / 10
+            values, shift, sums, damping = tried, shift + corner_steps, tried_sums, damping / 10
         else:
             damping *= 10
         if abs(gain) < _COST_TOLERANCE or damping > 1e6:
@@ -509,8 +509,8 @@ def _blur_candidates(normals: FloatArray, widths: FloatArray) -> Iterator[FloatA
     for sign in (1.0, -1.0):
         line = np.linalg.solve(directions, np.sqrt(12.0) * excess * np.array([1.0, sign]))
         yield np.array([_SHARP_PX, little, *line])
-    along = directions[np.argmax(widths)] * np.sqrt(12.0 * (widths.max() ** 2 - widths.min() ** 2))
-    yield np.array([_SHARP_PX, max(2.0 * float(excess.min()), little), *along])
+    motion = directions[np.argmax(widths)] * np.sqrt(12.0 * (widths.max() ** 2 - widths.min() ** 2))
+    yield np.array([_SHARP_PX, max(2.0 * float(excess.min()), little), *motion])
 
 
 def _fit_positions(
@@ -553,13 +553,13 @@ def _similar_misfit(misfit: FloatArray) -> Mask:
 def _accepted(patches: _Patches, sums: _Sums, moved_px: FloatArray) -> Mask:
     """Mask of usable corners; see `finders.template`."""
     contrast = sums.levels[:, 1] * np.sign(np.median(sums.levels[:, 1]))
-    moved = np.linalg.norm((patches.normals @ moved_px[..., None])[..., 0], axis=1)
+    moved_squares = np.linalg.norm((patches.normals @ moved_px[..., None])[..., 0], axis=1)
     return np.asarray(
         _similar_misfit(sums.misfit)
         & (patches.inside >= _LEAST_INSIDE)
         & (contrast > _LEAST_CONTRAST * np.median(contrast))
         & (np.linalg.norm(sums.shifts(), axis=1) < _LAST_STEP_PX)
-        & (moved < _MOST_SHIFT)
+        & (moved_squares < _MOST_SHIFT)
     )
 
 

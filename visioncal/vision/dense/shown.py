@@ -171,16 +171,18 @@ def explain(
         light, x, y = light[inner], x[inner], y[inner]
         part = image[low[1] : high[1], low[0] : high[0]].astype(float)
         toned = light + tone * light * (1.0 - light)
-        on = _on_print(printed, x, y)
-        if on.sum() < _FEWEST_LIT:
+        on_board_mask = _on_print(printed, x, y)
+        if on_board_mask.sum() < _FEWEST_LIT:
             return None
-        model = _with_light(part, toned, on)
+        model = _with_light(part, toned, on_board_mask)
         drawn, rest = image.copy(), np.full_like(image, MIDDLE)
-        place = (slice(low[1], high[1]), slice(low[0], high[0]))
-        drawn[place] = np.where(on, np.clip(np.rint(model), 0, 255), part).astype(np.uint8)
-        difference = np.where(on, MAGNIFIED * (part - model), 0.0) + MIDDLE
-        rest[place] = np.clip(np.rint(difference), 0, 255).astype(np.uint8)
-        return DenseImage(drawn, rest, float(np.sqrt(np.mean((part - model)[on] ** 2))))
+        region = (slice(low[1], high[1]), slice(low[0], high[0]))
+        drawn[region] = np.where(on_board_mask, np.clip(np.rint(model), 0, 255), part).astype(
+            np.uint8
+        )
+        difference = np.where(on_board_mask, MAGNIFIED * (part - model), 0.0) + MIDDLE
+        rest[region] = np.clip(np.rint(difference), 0, 255).astype(np.uint8)
+        return DenseImage(drawn, rest, float(np.sqrt(np.mean((part - model)[on_board_mask] ** 2))))
     return None
 
 
@@ -243,13 +245,13 @@ def _on_print(printed: Print, x: FloatArray, y: FloatArray) -> Mask:
     )
 
 
-def _with_light(part: FloatArray, toned: FloatArray, on: Mask) -> FloatArray:
+def _with_light(part: FloatArray, toned: FloatArray, mask: Mask) -> FloatArray:
     """The rendering in grey levels, with offset and gain as quadratic surfaces over the image."""
     height, width = part.shape
     v, u = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     columns = np.concatenate([terms, terms * toned[..., None]], axis=-1)
-    chosen = np.flatnonzero(on)
+    chosen = np.flatnonzero(mask)
     chosen = chosen[:: 1 + len(chosen) // _LIT_BY]
     rows = columns.reshape(-1, columns.shape[-1])[chosen]
     return np.asarray(columns @ np.linalg.lstsq(rows, part.ravel()[chosen], rcond=None)[0])

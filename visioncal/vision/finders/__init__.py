@@ -15,15 +15,10 @@ __all__ = ["DetectedCorners", "NotFound", "blur_of", "find_target", "fitting_lay
 
 
 def find_target(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
-    """Finds a target's corners to sub-pixel accuracy.
+    """Detects a target's corners in a (h, w) grey image, to sub-pixel accuracy.
 
-    Args:
-        image: (h, w) grey image.
-        target: Target to detect.
-        quick: Whether to stop if a first, quick search for a board fails.
-
-    Returns:
-        The corners, or why there are none.
+    Returns the corners, or why there are none. With `quick`, detection of a board stops if a first,
+    quick search fails.
     """
     match target.kind:
         case "charuco" | "checkerboard" | "aprilgrid" | "circles":

@@ -38,15 +38,7 @@ _MOST_OF, _NEAR_LINES = 0.8, 2
 
 
 def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Detects the corners of an AprilGrid's tags.
-
-    Args:
-        image: (h, w) grey image.
-        target: An AprilGrid target.
-
-    Returns:
-        The corners, or why there are none.
-    """
+    """Corners of an AprilGrid's tags in a (h, w) grey image, or why there are none."""
     expected = _MANY * target.columns * target.rows
     ids, px = grid_tags(image, target.dictionary, target.border, expected)
     border = NotFound(
@@ -166,19 +158,19 @@ def laid(target: Target, numbers: IntArray, px: FloatArray, own: Mask) -> tuple[
         (t, 4, 2) ordered corners, and the misfit of `layout_misfit`; 0 for a single tag.
     """
     # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
-    turned = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
+    rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
     if own.sum() < _LEAST_TAGS:
-        return turned[0], 0.0
+        return rotated[0], 0.0
     places = _tag_corners(target, numbers[own])
-    misfits = [layout_misfit(places, array[own]) for array in turned]
-    return turned[int(np.argmin(misfits))], min(misfits)
+    misfits = [layout_misfit(places, array[own]) for array in rotated]
+    return rotated[int(np.argmin(misfits))], min(misfits)
 
 
 def _has_other_border(image: Image, target: Target, ids: IntArray) -> bool:
     """Whether many more tags are read with the other border; a wrong one reads some."""
     expected = max(_MORE * len(ids), _MANY * target.columns * target.rows)
-    other = grid_tags(image, target.dictionary, 3 - target.border, expected)[0]
-    return len(other) >= expected
+    other_ids = grid_tags(image, target.dictionary, 3 - target.border, expected)[0]
+    return len(other_ids) >= expected
 
 
 def _has_squares(image: Image, px: FloatArray, spacing: float) -> bool:
@@ -239,8 +231,8 @@ def seen_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
         return target.spacing
     a, b, c, d = np.moveaxis(np.array(lines), 1, 0)
     far, near = (
-        np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
-        for one, other in ((c - a, d - b), (c - b, d - a))
+        np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+        for first, second in ((c - a, d - b), (c - b, d - a))
     )
     quarter, middle, last = np.percentile(np.sqrt(far / np.maximum(far - near, 1e-9)), [25, 50, 75])
     # Scattered corners, as in blurred images, are inconclusive.

@@ -46,18 +46,10 @@ QUICK: dict[TargetKind, _Finder] = {
 
 
 def find_board(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
-    """Detects the corners of a board, refined by template matching.
+    """Corners of a board in a (h, w) grey image, or why there are none.
 
     OpenCV detects them, by a quick search or in a reduced copy if that finds the whole board;
-    `refine` then measures their positions.
-
-    Args:
-        image: (h, w) grey image.
-        target: A target of one of the kinds of `FINDERS`.
-        quick: Whether to stop if the first search finds nothing.
-
-    Returns:
-        The corners, or why there are none.
+    `refine` then measures their positions. With `quick`, detection stops if the first search fails.
     """
     for find, factor in _quick_searches(image, target.kind):
         small = image if factor == 1 else _shrunk(image, factor)

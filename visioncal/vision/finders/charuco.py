@@ -83,27 +83,22 @@ def _refined(image: Image, px: FloatArray, marker_px: Sequence[Any]) -> FloatArr
     # squares they include a marker's sides, which bias the corner by up to half a pixel.
     corners = np.reshape(np.array(marker_px, dtype=float), (-1, 4, 2))
     sides = np.roll(corners, -1, axis=1) - corners
-    along = corners[:, :, None] + np.linspace(0.0, 1.0, _ALONG)[:, None] * sides[:, :, None]
-    distances, _ = KDTree(along.reshape(-1, 2)).query(px, p=np.inf)
+    side_points = corners[:, :, None] + np.linspace(0.0, 1.0, _ALONG)[:, None] * sides[:, :, None]
+    distances, _ = KDTree(side_points.reshape(-1, 2)).query(px, p=np.inf)
     windows = np.clip(distances - _CLEAR_PX, *_WINDOWS_PX).astype(int)
     refined = px.astype(np.float32)
     for window in np.unique(windows).tolist():
-        these = windows == window
-        start = refined[these].reshape(-1, 1, 2).copy()
-        found = cv2.cornerSubPix(image, start, (window, window), (-1, -1), _ENDS)
-        refined[these] = found.reshape(-1, 2)
+        mask = windows == window
+        start = refined[mask].reshape(-1, 1, 2).copy()
+        refined_px = cv2.cornerSubPix(image, start, (window, window), (-1, -1), _ENDS)
+        refined[mask] = refined_px.reshape(-1, 2)
     return refined.astype(np.float64)
 
 
 def fitting_layouts(image: Image, target: Target) -> tuple[Target, ...]:
-    """Variants of a ChArUco description that fit the markers in an image.
+    """Variants of a ChArUco description that fit the markers in a (h, w) grey image.
 
-    Args:
-        image: (h, w) grey image.
-        target: A ChArUco target as declared.
-
-    Returns:
-        The variants that fit: other corner layout, columns and rows exchanged, or both.
+    They have the other corner layout, columns and rows exchanged, or both.
     """
     transposed = replace(target, columns=target.rows, rows=target.columns)
     variants = [
@@ -119,7 +114,7 @@ def fitting_layouts(image: Image, target: Target) -> tuple[Target, ...]:
     candidates = [
         variant for variant in variants if len(_matches(markers, variant)[0]) >= 4 * _LAYOUT_MARKERS
     ]
-    return tuple(item for item in candidates if _misfit(markers, item) <= LAYOUT_MISFIT)
+    return tuple(variant for variant in candidates if _misfit(markers, variant) <= LAYOUT_MISFIT)
 
 
 def _by_id(marker_px: Sequence[Any], marker_ids: Any) -> _Markers:  # noqa: ANN401 - OpenCV's
@@ -134,11 +129,11 @@ def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]
     board = charuco_board(target)
     ids = np.ravel(np.asarray(board.getIds()))
     places = dict(zip(ids.tolist(), board.getObjPoints(), strict=True))
-    known = [marker for marker in markers if marker in places]
-    if not known:
+    on_target = [marker for marker in markers if marker in places]
+    if not on_target:
         return np.empty((0, 2)), np.empty((0, 2))
-    on_board = np.concatenate([places[marker][:, :2] for marker in known])
-    return on_board.astype(np.float64), np.concatenate([markers[marker] for marker in known])
+    on_board = np.concatenate([places[marker][:, :2] for marker in on_target])
+    return on_board.astype(np.float64), np.concatenate([markers[marker] for marker in on_target])
 
 
 def _misfit(markers: _Markers, target: Target) -> float:

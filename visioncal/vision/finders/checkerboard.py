@@ -22,19 +22,12 @@ _APART, _CHECKERED = 0.25, 0.5
 def find_checkerboard(
     image: Image, target: Target, *, quick: bool = False
 ) -> DetectedCorners | NotFound:
-    """Detects the inner corners of a checkerboard (Duda and Frese 2018, through OpenCV).
+    """Inner corners of a checkerboard in a (h, w) grey image, or why there are none.
 
-    Corner 0 is the one whose outward diagonal square is dark. For a board with a symmetry by 180
-    degrees this is ambiguous, and the robot's motion has to decide.
-
-    Args:
-        image: (h, w) grey image.
-        target: A checkerboard target.
-        quick: Whether to search only at the image's size; OpenCV also searches at twice the size,
-            which takes four times as long.
-
-    Returns:
-        The corners, or why there are none.
+    Duda and Frese (2018), through OpenCV. Corner 0 is the one whose outward diagonal square is
+    dark. For a board with a symmetry by 180 degrees this is ambiguous, and the robot's motion has
+    to decide. With `quick`, only the image's size is searched; OpenCV also searches at twice the
+    size, which takes four times as long.
     """
     height, width = image.shape
     if min(image.shape) < 2 or height + width > _MOST_SIDES or height * width > MOST_PIXELS:
@@ -69,10 +62,13 @@ def _is_checkered(image: Image, grid: FloatArray) -> bool:
         )
         extended = np.concatenate([before, extended, after], axis=axis)
     levels = _levels(image, extended)
-    one = np.stack([levels[:-1, :-1], levels[1:, 1:]])
-    other = np.stack([levels[:-1, 1:], levels[1:, :-1]])
-    gap = np.maximum(other.min(axis=0) - one.max(axis=0), one.min(axis=0) - other.max(axis=0))
-    meet = gap > _APART * np.ptp(np.concatenate([one, other]), axis=0)
+    diagonal = np.stack([levels[:-1, :-1], levels[1:, 1:]])
+    antidiagonal = np.stack([levels[:-1, 1:], levels[1:, :-1]])
+    gap = np.maximum(
+        antidiagonal.min(axis=0) - diagonal.max(axis=0),
+        diagonal.min(axis=0) - antidiagonal.max(axis=0),
+    )
+    meet = gap > _APART * np.ptp(np.concatenate([diagonal, antidiagonal]), axis=0)
     return all(bool(np.all(meet.mean(axis=axis) >= _CHECKERED)) for axis in (0, 1))
 
 

@@ -62,16 +62,9 @@ class Circles:
 
 
 def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Detects the centres of a grid of circles, to about a pixel.
+    """Centres of a grid of circles in a (h, w) grey image, to about a pixel, or why there are none.
 
     For a symmetric grid, the numbering with the least rotation in the image is used.
-
-    Args:
-        image: (h, w) grey image.
-        target: A grid of circles.
-
-    Returns:
-        The centres, or why there are none.
     """
     seen = seen_grids(image)
     for circles in seen:
@@ -89,9 +82,9 @@ def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
                 )
             return DetectedCorners(np.arange(len(circles.px)), circles.px)
     layout = "asymmetric" if target.asymmetric else "symmetric"
-    wanted = f"{layout} grid of {target.columns} x {target.rows} circles"
+    requested = f"{layout} grid of {target.columns} x {target.rows} circles"
     if not seen:
-        return NotFound(f"no board: no {wanted} is seen")
+        return NotFound(f"no board: no {requested} is seen")
     best = seen[0]
     return NotFound(
         f"{_article(best.asymmetric)} grid of {best.columns} x {best.rows} circles is seen, "
@@ -105,13 +98,9 @@ def _article(asymmetric: bool) -> str:
 
 
 def seen_grids(image: Image) -> tuple[Circles, ...]:
-    """Detects a grid of circles in all its numberings, the least rotated first.
+    """A grid of circles in a (h, w) grey image, in each order that forms a grid, or nothing.
 
-    Args:
-        image: (h, w) grey image.
-
-    Returns:
-        The same circles in each order that forms a grid; empty without a grid.
+    The least rotated order comes first.
     """
     blobs = _blobs(image)
     if len(blobs.px) < _LEAST:
@@ -135,8 +124,8 @@ def seen_grids(image: Image) -> tuple[Circles, ...]:
 
 def _turn(grid: Circles) -> float:
     """Angle of the first row against the image's rows [rad]."""
-    along = grid.px[grid.columns - 1] - grid.px[0]
-    return float(np.arctan2(along[1], along[0]))
+    first_row = grid.px[grid.columns - 1] - grid.px[0]
+    return float(np.arctan2(first_row[1], first_row[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +149,9 @@ class _Blobs:
         """(n,) diameters of circles of the same area [px]."""
         return np.asarray(4.0 * np.linalg.det(self.moments) ** 0.25)
 
-    def alike(self, one: int, other: int) -> bool:
+    def alike(self, first: int, second: int) -> bool:
         """Whether two blobs could be the same shape in a similar view."""
-        ratios = np.linalg.eigvals(np.linalg.solve(self.moments[one], self.moments[other])).real
+        ratios = np.linalg.eigvals(np.linalg.solve(self.moments[first], self.moments[second])).real
         return bool(np.abs(np.log(np.maximum(ratios, 1e-9))).max() < 2.0 * np.log(_ALIKE))
 
 
@@ -220,8 +209,8 @@ def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
     """Two steps (2, 2) [px] to neighbours of a point that has opposite neighbours as well."""
     neighbours = tree.query(px[seed], k=min(_NEAREST + 1, len(px)))[1][1:]
     steps: list[FloatArray] = []
-    for other in neighbours.tolist():
-        step = px[other] - px[seed]
+    for neighbour in neighbours.tolist():
+        step = px[neighbour] - px[seed]
         length = float(np.linalg.norm(step))
         if tree.query(px[seed] - step)[0] > _OFF * length:
             continue
@@ -241,20 +230,20 @@ def _grown(
     places, used = {(0, 0): seed}, {seed}
     waiting = deque([((0, 0), steps)])
     while waiting:
-        place, local = waiting.popleft()
+        coordinates, local = waiting.popleft()
         for axis, sign in product((0, 1), (1, -1)):
-            neighbour = (place[0] + sign * (axis == 0), place[1] + sign * (axis == 1))
-            distance, other = tree.query(px[places[place]] + sign * local[axis])
-            if neighbour in places or other in used:
+            neighbour = (coordinates[0] + sign * (axis == 0), coordinates[1] + sign * (axis == 1))
+            distance, blob = tree.query(px[places[coordinates]] + sign * local[axis])
+            if neighbour in places or blob in used:
                 continue
             if distance > _OFF * np.linalg.norm(local[axis]):
                 continue
-            if not blobs.alike(places[place], int(other)):
+            if not blobs.alike(places[coordinates], int(blob)):
                 continue
-            places[neighbour] = int(other)
-            used.add(int(other))
+            places[neighbour] = int(blob)
+            used.add(int(blob))
             updated = local.copy()
-            updated[axis] = sign * (px[other] - px[places[place]])
+            updated[axis] = sign * (px[blob] - px[places[coordinates]])
             waiting.append((neighbour, updated))
     return places
 
@@ -266,9 +255,9 @@ def _grid(places: IntArray, px: FloatArray, asymmetric: bool) -> tuple[int, int,
     columns = width // 2 if asymmetric else width
     if columns * rows != len(places) or columns < 2 or rows < 2:
         return None
-    wanted = circle_places(columns, rows, asymmetric=asymmetric)
+    expected = circle_places(columns, rows, asymmetric=asymmetric)
     order = np.lexsort((places[:, 0], places[:, 1]))
-    if not np.array_equal(places[order], wanted):
+    if not np.array_equal(places[order], expected):
         return None
     x, y = px[order[columns - 1]] - px[order[0]], px[order[-columns]] - px[order[0]]
     return (columns, rows, order) if x[0] * y[1] - x[1] * y[0] > 0 else None

@@ -37,19 +37,19 @@ def start_of_scan(data: bytes) -> int:
 
 def _segments(data: bytes) -> Iterator[tuple[int, int]]:
     """Markers of a JPEG's header with their offsets, up to the first scan."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        yield data[at + 1], at
-        if data[at + 1] == _SCAN:
+    offset = 2
+    while offset + 4 <= len(data) and data[offset] == 0xFF:
+        yield data[offset + 1], offset
+        if data[offset + 1] == _SCAN:
             return
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        offset += 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
 
 
 def _size_of_jpeg(data: bytes) -> tuple[int, int] | None:
-    at = next((at for marker, at in _segments(data) if marker in _FRAMES), None)
-    if at is None:
+    offset = next((offset for marker, offset in _segments(data) if marker in _FRAMES), None)
+    if offset is None:
         return None
-    height, width = struct.unpack_from(">HH", data, at + 5)
+    height, width = struct.unpack_from(">HH", data, offset + 5)
     return width, height
 
 
@@ -57,8 +57,8 @@ def _size_of_tiff(data: bytes, order: str) -> tuple[int, int] | None:
     (start,) = struct.unpack_from(f"{order}I", data, 4)
     (count,) = struct.unpack_from(f"{order}H", data, start)
     sizes = {}
-    for at in range(start + 2, start + 2 + 12 * count, 12):
-        tag, kind = struct.unpack_from(f"{order}HH", data, at)
+    for offset in range(start + 2, start + 2 + 12 * count, 12):
+        tag, kind = struct.unpack_from(f"{order}HH", data, offset)
         if tag in (_WIDTH, _HEIGHT) and kind in _PACKED:
-            (sizes[tag],) = struct.unpack_from(f"{order}{_PACKED[kind]}", data, at + 8)
+            (sizes[tag],) = struct.unpack_from(f"{order}{_PACKED[kind]}", data, offset + 8)
     return (sizes[_WIDTH], sizes[_HEIGHT]) if len(sizes) == 2 else None

@@ -89,12 +89,7 @@ class Identity:
         return _MAYBE_CHARUCO in self.notes
 
     def target(self, name: str, square_m: float) -> Target:
-        """Builds the target.
-
-        Args:
-            name: Its name.
-            square_m: Measured side of a square, or of the marker for a single one [m].
-        """
+        """The target, with the measured side of a square, or of a single marker [m]."""
         return Target(
             name,
             self.kind,

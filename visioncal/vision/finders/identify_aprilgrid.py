@@ -57,8 +57,8 @@ def find_grid(image: Image) -> Grid | None:
     first += columns * int((ids.min() - first) // columns)
     rows = int((ids.max() - first) // columns) + 1
     target = _target(columns, rows, first, border)
-    numbers, every = ids - first, np.ones(len(ids), bool)
-    quads = refined_tags(image, laid(target, numbers, px, every)[0], _USUAL_SPACING)
+    numbers, all_tags = ids - first, np.ones(len(ids), bool)
+    quads = refined_tags(image, laid(target, numbers, px, all_tags)[0], _USUAL_SPACING)
     target = replace(target, spacing=round(seen_spacing(target, numbers, quads), 2))
     # Rows below the image are included, as ids start with 0.
     if first and not lacks_a_line(image, *_one_more(target, numbers, below=True), quads):
@@ -70,7 +70,7 @@ def find_grid(image: Image) -> Grid | None:
 
 def _columns(ids: IntArray, px: FloatArray, border: int) -> tuple[int, int]:
     """Number of columns, and an id in the first column; 0 if none fits."""
-    every = np.ones(len(ids), bool)
+    all_tags = np.ones(len(ids), bool)
     tried = range(1, _MOST_COLUMNS + 1)
     # Ids start with 0 unless the tags contradict it.
     for starts in (
@@ -81,7 +81,7 @@ def _columns(ids: IntArray, px: FloatArray, border: int) -> tuple[int, int]:
         for columns, first in starts:
             numbers = ids - first + columns * (first > 0)
             target = _target(columns, int(numbers.max()) // columns + 1, 0, border)
-            misfits[columns, first] = laid(target, numbers, px, every)[1]
+            misfits[columns, first] = laid(target, numbers, px, all_tags)[1]
         best = min(misfits, key=lambda key: misfits[key], default=(0, 0))
         if misfits.get(best, np.inf) <= LAYOUT_MISFIT:
             return best

@@ -132,15 +132,15 @@ def find_lattices(image: Image, markers: Sequence[Marker]) -> tuple[Lattice, ...
 
 
 def _lattice(image: Image, markers: Sequence[Marker], fit: _Fit) -> Lattice:
-    held = tuple(marker for marker, fits in zip(markers, fit.fits, strict=True) if fits)
-    squares = _places(np.array([marker.number for marker in held]), fit.columns, fit.legacy)
+    fitting = tuple(marker for marker, fits in zip(markers, fit.fits, strict=True) if fits)
+    squares = _places(np.array([marker.number for marker in fitting]), fit.columns, fit.legacy)
     on_board = (squares + 0.5)[:, None] + fit.share * _AROUND
-    in_image = np.concatenate([marker.px for marker in held])
+    in_image = np.concatenate([marker.px for marker in fitting])
     fit = replace(fit, plane=bent_plane(fit.plane, on_board.reshape(-1, 2), in_image))
     rows, certain = _rows(image, fit, int(squares[:, 1].max()) + 1)
-    modules = modules_along(held[0].family)
+    modules = modules_along(fitting[0].family)
     share, sigma = marker_share(image, fit.plane, squares, modules, fit.share)
-    return Lattice(fit.columns, rows, certain, fit.legacy, share, sigma, held)
+    return Lattice(fit.columns, rows, certain, fit.legacy, share, sigma, fitting)
 
 
 def _places(ids: IntArray, columns: int, legacy: bool) -> FloatArray:
@@ -234,13 +234,13 @@ def marker_share(
         markers show their outline.
     """
     shares = [_share(image, plane, square + 0.5, modules, guess) for square in squares]
-    known = np.array([share for share in shares if share > 0.0])
-    if len(known) < _LEAST_MARKERS:
+    valid = np.array([share for share in shares if share > 0.0])
+    if len(valid) < _LEAST_MARKERS:
         return guess, 0.1 * guess
-    median = float(np.median(known))
+    median = float(np.median(valid))
     # The median of n values has 1.25 times the standard deviation of their mean; 1.48 converts the
     # median absolute deviation to a standard deviation.
-    sigma = 1.25 * 1.48 * float(np.median(np.abs(known - median))) / np.sqrt(len(known))
+    sigma = 1.25 * 1.48 * float(np.median(np.abs(valid - median))) / np.sqrt(len(valid))
     diagonals_px = np.linalg.norm(plane.to_px(squares + 1.0) - plane.to_px(squares), axis=1)
     square_px = float(np.median(diagonals_px)) / np.sqrt(2)
     bloom = _BLOOM_PX / square_px

@@ -85,17 +85,12 @@ class _Extent:
 
 
 def find_squares(image: Image) -> Squares | None:
-    """Detects a checkerboard and counts its inner corners.
+    """The largest checkerboard in a (h, w) grey image, with its inner corners counted, or None.
 
     The corner detector (Duda and Frese 2018, through OpenCV) may return a larger board than
     requested, but then often stops early or continues over the rim. Its grid is therefore only a
-    start: lines of corners are removed and added by the colours around them.
-
-    Args:
-        image: (h, w) grey image.
-
-    Returns:
-        The largest board, preferably confirmed by an exact search; None if there is none.
+    start: lines of corners are removed and added by the colours around them, and the result is
+    preferably confirmed by an exact search.
     """
     scale = min(1.0, float(np.sqrt(_SEARCH_PIXELS / image.size)))
     small = image
@@ -141,11 +136,11 @@ def _counted(image: Image, grid: FloatArray, scale: float) -> Squares | None:
     columns, rows = max(grown.size), min(grown.size)
     if rows < _SEED[1]:
         return None
-    found = any(
+    is_found = any(
         cv2.findChessboardCornersSB(image, (columns, rows), flags=flags)[0] for flags in _ATTEMPTS
     )
     filled = _filled(image, plane, shrunk, typical)
-    return Squares(columns, rows, cut, found, filled, _side_px(plane, grown) / scale)
+    return Squares(columns, rows, cut, is_found, filled, _side_px(plane, grown) / scale)
 
 
 def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:

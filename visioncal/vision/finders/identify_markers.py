@@ -53,12 +53,12 @@ class Marker:
     def centre(self) -> FloatArray:
         """Intersection of its diagonals, (2,), which is invariant under perspective [px]."""
         a, b, c, d = self.px
-        across, along = c - a, d - b
-        cross_product = across[0] * along[1] - across[1] * along[0]
+        diagonal_ac, diagonal_bd = c - a, d - b
+        cross_product = diagonal_ac[0] * diagonal_bd[1] - diagonal_ac[1] * diagonal_bd[0]
         if cross_product == 0.0:
             return np.asarray(self.px.mean(axis=0))
-        share = ((b - a)[0] * along[1] - (b - a)[1] * along[0]) / cross_product
-        return np.asarray(a + share * across)
+        share = ((b - a)[0] * diagonal_bd[1] - (b - a)[1] * diagonal_bd[0]) / cross_product
+        return np.asarray(a + share * diagonal_ac)
 
     @cached_property
     def side_px(self) -> float:
@@ -67,24 +67,20 @@ class Marker:
 
 
 def decode_markers(image: Image) -> tuple[Marker, ...]:
-    """Decodes the markers of all families (Garrido-Jurado et al. 2014; OpenCV).
+    """Markers of all families in a (h, w) grey image (Garrido-Jurado et al. 2014; OpenCV).
 
-    Args:
-        image: (h, w) grey image.
-
-    Returns:
-        The markers, with false positives, which a lattice or `Marker.likeness` separates.
+    They include false positives, which a lattice or `Marker.likeness` separates.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     dictionaries = [aruco_dictionary(names[-1]) for names in FAMILIES.values()]
     detector = cv2.aruco.ArucoDetector(dictionaries, parameters)
-    corners, ids, _, which = detector.detectMarkersMultiDict(image)
+    corners, ids, _, family_indices = detector.detectMarkersMultiDict(image)
     if not corners:
         return ()
     families = list(FAMILIES)
     markers = []
-    for px, number, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
+    for px, number, index in zip(corners, np.ravel(ids), np.ravel(family_indices), strict=True):
         quad = np.asarray(px, dtype=float).reshape(4, 2)
         family = families[int(index)]
         likeness = _likeness(image, quad, family, int(number))

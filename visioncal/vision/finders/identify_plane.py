@@ -117,7 +117,7 @@ def robust_plane(
     """
     if len(board) < _LEAST_POINTS:
         return None
-    found, mask = cv2.findHomography(
+    homography, mask = cv2.findHomography(
         board,
         lens.straighten(px),
         cv2.RANSAC,
@@ -125,9 +125,13 @@ def robust_plane(
         maxIters=200,
         confidence=0.99,
     )
-    if found is None or np.shape(found) != (3, 3) or np.linalg.matrix_rank(found) < 3:
+    if (
+        homography is None
+        or np.shape(homography) != (3, 3)
+        or np.linalg.matrix_rank(homography) < 3
+    ):
         return None
-    return Plane(lens, np.asarray(found, dtype=float)), np.ravel(mask) > 0
+    return Plane(lens, np.asarray(homography, dtype=float)), np.ravel(mask) > 0
 
 
 def bent_plane(plane: Plane, board: FloatArray, px: FloatArray) -> Plane:
@@ -137,9 +141,9 @@ def bent_plane(plane: Plane, board: FloatArray, px: FloatArray) -> Plane:
 
     def fit(bend: float) -> Plane:
         lens = Lens(plane.lens.middle, plane.lens.radius, bend)
-        found, _ = cv2.findHomography(board, lens.straighten(px))
-        usable = found is not None and np.linalg.matrix_rank(found) == len(found)
-        return Plane(lens, np.asarray(found, dtype=float)) if usable else plane
+        homography, _ = cv2.findHomography(board, lens.straighten(px))
+        usable = homography is not None and np.linalg.matrix_rank(homography) == len(homography)
+        return Plane(lens, np.asarray(homography, dtype=float)) if usable else plane
 
     def misfit(bend: float) -> float:
         return float(np.sum((fit(bend).to_px(board) - px) ** 2))
@@ -176,13 +180,7 @@ def typical_contrast(values: FloatArray, corners: FloatArray) -> float:
 
 
 def alternating(values: FloatArray, corners: FloatArray, typical: float) -> Mask:
-    """Mask of corners that alternate as those of the board do.
-
-    Args:
-        values: (n,) `contrasts` of the corners.
-        corners: (n, 2) corners.
-        typical: `typical_contrast` of the board.
-    """
+    """Mask of (n, 2) corners whose `contrasts` alternate as the board's typical one does."""
     signed = values * _signs(corners) * np.sign(typical)
     return np.asarray(signed > _LEAST_CONTRAST * abs(typical))
 

@@ -32,17 +32,9 @@ def looks_like_image(data: bytes) -> bool:
 
 
 def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
-    """Decodes an image file without EXIF rotation.
+    """Decodes a png, jpg or tif file to a (h, w) grey or (h, w, 3) BGR image, or says why not.
 
-    The camera matrix refers to the sensor's own orientation, so the rotation for viewers is
-    ignored.
-
-    Args:
-        data: Content of a png, jpg or tif file.
-        colour: Whether to keep colours, as blue, green and red; grey otherwise.
-
-    Returns:
-        The (h, w) or (h, w, 3) image, or the reason why it cannot be decoded.
+    EXIF rotation for viewers is ignored: the camera matrix refers to the sensor's orientation.
     """
     if not data:
         return "unreadable: the file is empty"
@@ -153,17 +145,10 @@ def _is_damaged_png(data: bytes) -> bool:
 
 
 def blur_at_corners(image: Image, px: FloatArray) -> float:
-    """Edge width at chessboard corners.
+    """Median edge width (sigma) at a sample of (n, 2) chessboard corners, n >= 1 [px].
 
     A step edge blurred by a Gaussian of sigma s has a steepest central difference of 2 Phi(1 / s) -
     1 times half the step; solved for s, this holds down to half a pixel.
-
-    Args:
-        image: (h, w) grey image.
-        px: (n, 2) corners, n >= 1.
-
-    Returns:
-        The median sigma of a sample of the corners [px].
     """
     chosen = px[:: max(1, len(px) // _SAMPLE)]
     spacing = np.linalg.norm(np.diff(px, axis=0), axis=1).min(initial=4 * _REACH_PX[1])

@@ -25,18 +25,18 @@ def layout_misfit(on_board: FloatArray, in_image: FloatArray) -> float:
         on_board: (m, 4, 2) corners of the markers on the board, in any unit.
         in_image: (m, 4, 2) detected corners [px].
     """
-    whole = _off_plane(on_board, in_image)
-    if whole <= LAYOUT_MISFIT:
-        return whole
+    board_misfit = _off_plane(on_board, in_image)
+    if board_misfit <= LAYOUT_MISFIT:
+        return board_misfit
     centres = in_image.mean(axis=1)
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)
-    near = np.argsort(distances, axis=1)[:, :_NEIGHBOURS]
-    squares, limit = 0.0, len(near) * LAYOUT_MISFIT**2
-    for index in near:
+    neighbours = np.argsort(distances, axis=1)[:, :_NEIGHBOURS]
+    squares, limit = 0.0, len(neighbours) * LAYOUT_MISFIT**2
+    for index in neighbours:
         squares += _off_plane(on_board[index], in_image[index]) ** 2
         if squares > limit:
             break
-    return float(np.sqrt(squares / len(near)))
+    return float(np.sqrt(squares / len(neighbours)))
 
 
 def _off_plane(on_board: FloatArray, in_image: FloatArray) -> float:

@@ -63,22 +63,22 @@ def maps_about(
     """
     undistorted = None if axis is None else _undistorted(px[good], board[good], axis)
     flatten = undistorted or _homography(px, board)
-    own = flatten(px[chosen])[:, None]
-    distances, around = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
-    offsets = flatten(px)[around] - own
+    origin = flatten(px[chosen])[:, None]
+    distances, neighbours = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
+    offsets = flatten(px)[neighbours] - origin
     terms = _terms(offsets)
-    weighted = terms * (good[around] / (1.0 + (distances / _NEAR) ** 2))[..., None]
+    weighted = terms * (good[neighbours] / (1.0 + (distances / _NEAR) ** 2))[..., None]
     weighted = weighted.transpose(0, 2, 1)
     smoother = np.linalg.solve(weighted @ terms + _RIDGE, weighted)
-    coefficients = smoother @ (board[around] - board[chosen, None] - offsets)
+    coefficients = smoother @ (board[neighbours] - board[chosen, None] - offsets)
     # A map is zero at its own corner.
     coefficients[:, 0] = 0.0
 
     def on_board(places: FloatArray) -> FloatArray:
-        offsets = flatten(places) - own
+        offsets = flatten(places) - origin
         return np.asarray(offsets + _terms(offsets) @ coefficients)
 
-    return on_board, around, smoother
+    return on_board, neighbours, smoother
 
 
 def _homography(places: FloatArray, board: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -181,7 +181,7 @@ def map_of_all(board: FloatArray, places: FloatArray) -> Callable[[FloatArray], 
     coefficients = np.linalg.solve(terms.T @ terms + ridge, terms.T @ offsets)
 
     def on_board(at: FloatArray) -> FloatArray:
-        near = flat(at)
-        return np.asarray(centre + size * (near + _terms(near) @ coefficients))
+        flattened_at = flat(at)
+        return np.asarray(centre + size * (flattened_at + _terms(flattened_at) @ coefficients))
 
     return on_board

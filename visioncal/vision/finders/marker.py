@@ -17,17 +17,10 @@ _DETECTED_SIGMA_PX = 0.2
 
 
 def find_marker(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Detects the four corners of one marker, in OpenCV's order (Garrido-Jurado et al. 2014).
+    """Corners of one marker in a (h, w) grey image, or why there are none.
 
-    OpenCV's corners are biased inwards by blur. They are refined by the template of `refine_tags`;
-    a corner that it does not fit remains OpenCV's, with less weight.
-
-    Args:
-        image: (h, w) grey image.
-        target: A marker target.
-
-    Returns:
-        The corners, or why there are none.
+    OpenCV's corners (Garrido-Jurado et al. 2014) are biased inwards by blur. They are refined by
+    the template of `refine_tags`; a corner that it does not fit remains OpenCV's, with less weight.
     """
     if min(image.shape) < 2:
         return NotFound("the image is a line")

@@ -16,15 +16,7 @@ _LEAST_TAGS = 2
 
 
 def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Detects the corners of a rig's tags.
-
-    Args:
-        image: (h, w) grey image.
-        target: A rig whose points are corners of tags.
-
-    Returns:
-        The corners, or why there are none.
-    """
+    """Corners of a rig's tags in a (h, w) grey image, or why there are none."""
     if min(image.shape) < 2:
         return NotFound("the image is a line")
     dictionary = aruco_dictionary(target.dictionary)

@@ -246,9 +246,9 @@ class _Windows:
         if pattern.radius:
             around_px = np.maximum(_AROUND_CIRCLE * pattern.radius * side_px, _AROUND_PX)
             half = np.minimum(half, pattern.radius + around_px / side_px)
-        wanted = float(np.max(half * np.abs(by_board).sum(axis=2).max(axis=1)))
+        needed_px = float(np.max(half * np.abs(by_board).sum(axis=2).max(axis=1)))
         affordable = max(_LEAST_PX, (np.sqrt(_MOST_PIXELS / len(chosen)) - 1.0) / 2.0)
-        reach = int(np.ceil(min(most, affordable, wanted)))
+        reach = int(np.ceil(min(most, affordable, needed_px)))
         steps = np.arange(-reach, reach + 1)
         centre = np.rint(start).astype(int)
         # The map is smooth, so a polynomial through some nodes replaces its evaluation everywhere.
@@ -556,17 +556,17 @@ def _fit_positions(
     """Shifts of the corners (n, 2) [squares], and their last steps."""
     shift = np.zeros((len(windows.px), 2))
     moving = np.arange(len(shift))
-    last = step = first
+    latest = step = first
     for _ in range(_MAX_ITERATIONS):
         shift[moving] += _limited(step.shift)
-        converged = windows.length_px(last.shift)[moving] < tolerance_px
+        converged = windows.length_px(latest.shift)[moving] < tolerance_px
         moving = moving[~converged]
         if not moving.size:
             break
         moving_slopes = None if slopes is None else slopes[moving]
         step = _step(windows.at(moving), pattern.at(moving), shift[moving], blur_px, moving_slopes)
-        last.replace(moving, step)
-    return shift, last
+        latest.replace(moving, step)
+    return shift, latest
 
 
 def _limited(shift: FloatArray) -> FloatArray:
@@ -654,10 +654,10 @@ def _steps(
     sums[:, 1:] = stack[:, 1:] @ stack.transpose(0, 2, 1)
     sums[:, 0, 1:] = sums[:, 1:, 0]
     sums[:, 0, 0] = np.count_nonzero(used, axis=(1, 2))
-    own = [*range(unknowns)]
+    parameters = [*range(unknowns)]
     return [
         _GaussNewtonStep.solved(
-            sums[:, [*own, index]][:, :, [*own, index]], blurs=len(derivatives) - 2
+            sums[:, [*parameters, index]][:, :, [*parameters, index]], blurs=len(derivatives) - 2
         )
         for index in range(unknowns, len(columns) + 1)
     ]
@@ -762,7 +762,7 @@ def _reasons(
 ) -> tuple[str, ...]:
     """(n,) why corners are rejected, in words; empty if accepted."""
     last = windows.length_px(step.shift)
-    moved = np.linalg.norm(moved_px, axis=1) * windows.widths.max(axis=1)
+    shift_squares = np.linalg.norm(moved_px, axis=1) * windows.widths.max(axis=1)
     contrast = step.levels[:, 1] * np.sign(_median(step.levels[:, 1]))
     share = np.sum(windows.within & windows.inside, axis=(1, 2)) / np.sum(
         windows.within, axis=(1, 2)
@@ -775,7 +775,7 @@ def _reasons(
             contrast > _LEAST_CONTRAST * _median(contrast),
         ),
         ("no place fits best", last < last_px),
-        ("the place that fits best is far from where it was found", moved < _MOST_SHIFT),
+        ("the place that fits best is far from where it was found", shift_squares < _MOST_SHIFT),
         (
             "unlike the print",
             step.misfit < min(_MISFIT_TIMES * _median(step.misfit) + _MISFIT_MORE, _MOST_MISFIT),

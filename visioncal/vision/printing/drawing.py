@@ -42,12 +42,7 @@ def to_svg(sheet: Sheet) -> bytes:
 
 
 def to_png(sheet: Sheet, dpi: float) -> bytes:
-    """Draws a sheet as PNG, with anti-aliased edges that keep sub-pixel positions.
-
-    Args:
-        sheet: The sheet.
-        dpi: Pixels per inch, also stated in the file.
-    """
+    """Draws a sheet as PNG, with anti-aliased edges that keep sub-pixel positions."""
     return _saved(sheet, "png", {"Software": "visioncal"}, dpi)
 
 
@@ -131,10 +126,10 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
     side = 1e3 * (sheet.pattern.box[across] - sheet.pattern.quiet_m) - _BASE_MM
 
     def at(along: float, away: float) -> FloatArray:
-        place = np.array(sheet.origin_mm)
-        place[axis] += along
-        place[across] += side - away
-        return place
+        position = np.array(sheet.origin_mm)
+        position[axis] += along
+        position[across] += side - away
+        return position
 
     half = _LINE_PT / _PT_PER_MM / 2
     tip = length + _TIP_MM
@@ -157,10 +152,10 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
     if length > 0.0:
         labels.append((f"{length:g} mm", length / 2, _LABEL_MM + FONT_PT / _PT_PER_MM / 2.6))
     for text, along, away in labels:
-        place = at(along, away)
+        position = at(along, away)
         figure.text(
-            float(place[0]),
-            float(place[1]),
+            float(position[0]),
+            float(position[1]),
             text,
             transform=on_page,
             fontsize=FONT_PT - 1,

@@ -160,14 +160,9 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
 
 
 def largest_side_mm(target: Target, pages: tuple[Page, ...]) -> int:
-    """Largest square side that fits, in whole millimetres; for a marker, its own side.
+    """Largest square side that fits one of the pages [mm], whole; 0 if none does.
 
-    Args:
-        target: Target; its markers scale with its squares.
-        pages: Pages that it may be printed on.
-
-    Returns:
-        The side [mm]; 0 if not even one millimetre fits.
+    For a marker it is the marker's own side; markers scale with squares.
     """
     fits, fails = 0, 1 + int(max(max(page.width_mm, page.height_mm) for page in pages))
     while fails - fits > 1:
@@ -251,24 +246,24 @@ def _sentences(target: Target) -> tuple[str, str, str]:
     printed = "Print at 100 %, not fitted to the page, and check both rulers."
     match target.kind:
         case "marker":
-            what = f"marker {target.marker_id} of {target.dictionary}, {side_mm} a side"
+            description = f"marker {target.marker_id} of {target.dictionary}, {side_mm} a side"
             origin = "the marker's centre"
             measure = "Measure the dark square's side and write it into size_m, in metres."
         case "checkerboard":
-            what = (
+            description = (
                 f"checkerboard, {target.columns} x {target.rows} inner corners, squares of "
                 f"{side_mm}"
             )
             origin = "the inner corner at the top left"
         case "charuco":
             layout = "legacy layout" if target.legacy else "layout of OpenCV 4.6 and later"
-            what = (
+            description = (
                 f"ChArUco, {target.columns} x {target.rows} squares of {side_mm}, markers of "
                 f"{1e3 * target.marker_m:g} mm, {target.dictionary}, {layout}"
             )
             origin = "the print's top left corner"
         case "aprilgrid":
-            what = (
+            description = (
                 f"AprilGrid, {target.columns} x {target.rows} tags of {side_mm}, "
                 f"{1e3 * target.spacing * target.square_m:g} mm apart, {target.dictionary} from id "
                 f"{target.marker_id} at the lower left"
@@ -281,11 +276,11 @@ def _sentences(target: Target) -> tuple[str, str, str]:
                 "into size_m, in metres."
             )
         case "points":
-            what = f"{len(target.point_tags) // 4} tags of {target.dictionary}"
+            description = f"{len(target.point_tags) // 4} tags of {target.dictionary}"
             origin = "the origin of the table of their corners"
             measure = "Measure the tags' corners and write them into that table, in metres."
         case "circles":
-            what = (
+            description = (
                 f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {target.columns} x "
                 f"{target.rows} circles of {1e3 * target.diameter_m:g} mm, rows {side_mm} apart"
             )
@@ -305,4 +300,4 @@ def _sentences(target: Target) -> tuple[str, str, str]:
         f"Frame: origin at {origin}, level with the zeros of both rulers; x to the right, y down, "
         "z into the page."
     )
-    return f"{target.name}: {what}", frame, f"{printed} {measure}"
+    return f"{target.name}: {description}", frame, f"{printed} {measure}"
