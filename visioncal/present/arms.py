@@ -156,8 +156,7 @@ def level_note(observed: str) -> str:
 def _level_row(level: ArmLevel, *, chosen: bool) -> TableRow:
     words = level_words(level.level) + (" (taken)" if chosen else "")
     residuals = map(
-        significant,
-        (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg),
+        significant, (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg)
     )
     ratio = significant(None) if level.level == NOMINAL else f"{level.likelihood_ratio:.0f}"
     return TableRow((words, str(level.unknowns), *residuals, ratio), "taken" if chosen else "")
@@ -250,10 +249,7 @@ def stop_table(arm: ArmResult) -> Table | None:
     most, least = arm.stops[:_MOST_INFLUENTIAL], arm.stops[_MOST_INFLUENTIAL:][-1:]
     labelled = [*((item, "") for item in most), *((item, ", the least") for item in least)]
     rows = [
-        (
-            f"view {stop.view}{suffix}",
-            f"{significant(100.0 * max(stop.influence, 0.0))} %",
-        )
+        (f"view {stop.view}{suffix}", f"{significant(100.0 * max(stop.influence, 0.0))} %")
         for stop, suffix in labelled
     ]
     return Table.of(("without", "grows by"), rows) if rows else None

@@ -169,10 +169,7 @@ class NetworkOptions(DrawOptions):
         stray_images: Number of rows whose image is from another stop.
     """
 
-    robots: tuple[RobotAt, ...] = (
-        RobotAt("a", (-0.6, 0.0, 0.0)),
-        RobotAt("b", (0.6, 0.05, 0.02)),
-    )
+    robots: tuple[RobotAt, ...] = (RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02)))
     cameras: tuple[CameraAt, ...] = (
         CameraAt("left", place_m=(0.0, -1.0, 1.1)),
         CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),

@@ -41,10 +41,7 @@ class Overlay:
 
     @classmethod
     def of(
-        cls,
-        session: Session,
-        calibration: Calibration | None,
-        evidence: Mapping[int, ViewEvidence],
+        cls, session: Session, calibration: Calibration | None, evidence: Mapping[int, ViewEvidence]
     ) -> "Overlay":
         """Chooses the magnification by the used views' residuals."""
         views = () if calibration is None else calibration.views

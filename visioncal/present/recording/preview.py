@@ -134,11 +134,7 @@ def _charts(preview: Preview) -> Charts:
         directions_chart(evidence),
         rotation_axes_chart(list(evidence.values())),
     )
-    return Charts(
-        tuple(chart for chart in charts if chart is not None),
-        (),
-        frozenset(evidence),
-    )
+    return Charts(tuple(chart for chart in charts if chart is not None), (), frozenset(evidence))
 
 
 def _corners_px(preview: Preview, cam_from_target: FloatArray) -> FloatArray:

@@ -195,14 +195,7 @@ def _read_records(scanned: Scan) -> _Records:
     corners: CornerTable | None = None
     damaged: list[MessageFrame] = []
     closed: int | None = None
-    entities = (
-        paths.SESSION,
-        paths.STREAMS,
-        paths.CORNERS,
-        paths.ROWS,
-        paths.IMAGE,
-        paths.END,
-    )
+    entities = (paths.SESSION, paths.STREAMS, paths.CORNERS, paths.ROWS, paths.IMAGE, paths.END)
     for frame, entity, batch in chunks(scanned, entities, damaged):
         try:
             if entity == paths.SESSION:

@@ -141,10 +141,7 @@ class SceneDrawing:
 
     @classmethod
     def of(
-        cls,
-        session: Session,
-        calibration: Calibration | None,
-        evidence: Mapping[int, ViewEvidence],
+        cls, session: Session, calibration: Calibration | None, evidence: Mapping[int, ViewEvidence]
     ) -> "SceneDrawing":
         """Collects flange poses from the evidence, or else as recorded."""
         frames = parts.frames(calibration)

@@ -128,11 +128,7 @@ def _from_the_side(places_m: FloatArray) -> FloatArray:
 
 
 def _map(
-    arm: ArmResult,
-    places_m: FloatArray,
-    stops_m: FloatArray,
-    labels: tuple[str, str],
-    name: str,
+    arm: ArmResult, places_m: FloatArray, stops_m: FloatArray, labels: tuple[str, str], name: str
 ) -> Markup:
     """Draws (k, 2) places with the largest sigmas on top, and the stops as crosses."""
     order = np.argsort(arm.map_sigmas_mm)

@@ -257,13 +257,7 @@ class Panel:
         x = 0.5 * (box.left + box.right) if anchor == "middle" else box.left
         self.figure.text(x, box.top - 5.0, words, anchor=anchor)
 
-    def line(
-        self,
-        x: Places,
-        y: Places,
-        colour: str,
-        width: float = 1.6,
-    ) -> None:
+    def line(self, x: Places, y: Places, colour: str, width: float = 1.6) -> None:
         """Draws a line through points; NaN interrupts it."""
         self.figure.path(
             svg.polyline(self.x_at(x), self.y_at(y)), stroke=colour, width=width, cap="butt"
@@ -297,13 +291,7 @@ class Panel:
         self.figure.path(data, fill=colour, opacity=0.9)
 
     def marks(
-        self,
-        x: Places,
-        y: Places,
-        shape: str,
-        colour: str,
-        size: float = 5.5,
-        opacity: float = 1.0,
+        self, x: Places, y: Places, shape: str, colour: str, size: float = 5.5, opacity: float = 1.0
     ) -> None:
         """Draws a mark at each point, all as one path.
 

@@ -120,10 +120,7 @@ def image_view(
 def series(name: str, entity: str) -> rrb.TimeSeriesView:
     """Curves of an entity, without a legend, which would cover them."""
     return rrb.TimeSeriesView(
-        name=name,
-        origin=entity,
-        contents=["$origin/**"],
-        plot_legend=rrb.PlotLegend(visible=False),
+        name=name, origin=entity, contents=["$origin/**"], plot_legend=rrb.PlotLegend(visible=False)
     )
 
 

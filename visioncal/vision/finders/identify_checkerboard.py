@@ -37,10 +37,7 @@ _INSIDE = np.stack(np.meshgrid(*2 * [np.linspace(-0.3, 0.3, 7)]), axis=-1).resha
 _TEXTURE = 0.1
 # Tolerance of a board's corners [squares].
 _OFF = 0.15
-_ATTEMPTS = (
-    0,
-    cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
-)
+_ATTEMPTS = (0, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE)
 
 
 @dataclass(frozen=True)

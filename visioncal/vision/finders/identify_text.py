@@ -22,11 +22,7 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
         "notes": list(identity.notes),
     }
     if identity.kind != "marker":
-        document |= {
-            "columns": identity.columns,
-            "rows": identity.rows,
-            "whole": identity.whole,
-        }
+        document |= {"columns": identity.columns, "rows": identity.rows, "whole": identity.whole}
     if identity.dictionary:
         document |= {
             "dictionary": identity.dictionary,

@@ -692,11 +692,7 @@ def _crossing(
 
 
 def _circle(
-    pattern: _Pattern,
-    x: _Float32Array,
-    y: _Float32Array,
-    sx: _Float32Array,
-    sy: _Float32Array,
+    pattern: _Pattern, x: _Float32Array, y: _Float32Array, sx: _Float32Array, sy: _Float32Array
 ) -> tuple[_Float32Array, ...]:
     """A disc, likewise; its last derivative is with respect to the radius."""
     distance = np.hypot(x, y) + np.float32(1e-6)
@@ -770,10 +766,7 @@ def _reasons(
     # Written so that NaN fails.
     checks = (
         ("cut off by the edge of the image", share >= _LEAST_INSIDE),
-        (
-            "without the board's contrast",
-            contrast > _LEAST_CONTRAST * _median(contrast),
-        ),
+        ("without the board's contrast", contrast > _LEAST_CONTRAST * _median(contrast)),
         ("no place fits best", last < last_px),
         ("the place that fits best is far from where it was found", shift_squares < _MOST_SHIFT),
         (

@@ -140,11 +140,7 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
         bars.append(_bar(at(tick - half, 0.0), at(tick + half, tall)))
     bars.append(
         np.array(
-            [
-                at(tip, 0.0),
-                at(tip - _HEAD_MM, _HALF_HEAD_MM),
-                at(tip - _HEAD_MM, -_HALF_HEAD_MM),
-            ]
+            [at(tip, 0.0), at(tip - _HEAD_MM, _HALF_HEAD_MM), at(tip - _HEAD_MM, -_HALF_HEAD_MM)]
         )
     )
     _fill(figure, bars, _GREY, on_page)
