@@ -80,7 +80,7 @@ class _Image:
     """Position of an image, as a row of a chunk, and the SHA-256 of its bytes."""
 
     frame: MessageFrame
-    place: int
+    position: int
     digest: str
 
 
@@ -113,7 +113,7 @@ class RecordedImages(ImageStore):
         )
         try:
             chunk = record_batch(read_payload(self.path, image.frame), (paths.IMAGE,))
-            data = b"" if chunk is None else codec.image_at(chunk[1], image.place)
+            data = b"" if chunk is None else codec.image_at(chunk[1], image.position)
         except _DAMAGE as error:
             raise changed from error
         if sha256(data) != image.digest:
@@ -152,7 +152,7 @@ class _Records:
     damaged: int
 
     @property
-    def begun(self) -> bool:
+    def is_incomplete(self) -> bool:
         """Whether a view lacks its row or its image."""
         if self.header.images:
             return False
@@ -326,10 +326,12 @@ def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:
                 "results that were added last may not be."
             )
     elif announced == codec.UNKNOWN:
-        begun = " A view that had been begun is lost." if scanned.cut or records.begun else ""
+        lost = (
+            " A view that had been begun is lost." if scanned.cut or records.is_incomplete else ""
+        )
         yield (
             f"{name}: the recording was not closed: its writer was stopped, or the file was cut "
-            f"off. {complete} views are complete.{begun}"
+            f"off. {complete} views are complete.{lost}"
         )
     elif complete < announced:
         yield (

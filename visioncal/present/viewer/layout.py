@@ -31,8 +31,8 @@ class _Contents:
     joints: int
     unused: bool
     frames: bool
-    turns: bool
-    sight: bool
+    orientations: bool
+    by_camera: bool
     seers: tuple[str, ...]
     cell: CellResult | None
 
@@ -258,7 +258,7 @@ def _residuals(contents: _Contents) -> rrb.Container:
 
 def _coverage(contents: _Contents) -> rrb.Container:
     directions, axes = disc_views()
-    if not contents.sight:
+    if not contents.by_camera:
         return rrb.Horizontal(axes, name="Coverage")
     if not contents.images:
         return rrb.Horizontal(directions, axes, name="Coverage")
@@ -334,7 +334,7 @@ def _plots(contents: _Contents, seer: str) -> list[rrb.TimeSeriesView]:
     """Residual plots of one camera's views."""
     plots = [
         ("Position residual [mm]", paths.POSITION_MM),
-        *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.turns else []),
+        *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.orientations else []),
     ]
     if contents.images:
         plots.append(("Reprojection error [px]", paths.REPROJECTION_PX))

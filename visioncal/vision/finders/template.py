@@ -195,26 +195,26 @@ class _Windows:
 
     Attributes:
         px: (n, 2) corner positions at which the maps were made [px].
-        by_board: (n, 2, 2) Jacobian of pixels with respect to the board position [px/square].
+        jacobian: (n, 2, 2) Jacobian of pixels with respect to the board position [px/square].
         widths: (n, 2) squares per pixel, across the lines of constant x and y.
         x: (n, h, w) x of each pixel on the board, relative to the corner [squares].
         y: (n, h, w) y, likewise.
         grey: (n, h, w) the smoothed image, less 128.
         within: (n, h, w) mask of a corner's patch.
         inside: (n, h, w) mask of pixels inside the image.
-        around: (n, k) neighbours of each corner.
+        neighbours: (n, k) neighbours of each corner.
         smoother: (n, 10, k) operators from neighbours' values to polynomial coefficients.
     """
 
     px: FloatArray
-    by_board: FloatArray
+    jacobian: FloatArray
     widths: FloatArray
     x: _Float32Array
     y: _Float32Array
     grey: _Float32Array
     within: Mask
     inside: Mask
-    around: IntArray
+    neighbours: IntArray
     smoother: FloatArray
 
     @classmethod
@@ -229,7 +229,7 @@ class _Windows:
         axis: OpticalAxis,
     ) -> Self:
         """Cuts the windows of the chosen corners; the good corners determine the maps."""
-        on_board, around, smoother = maps_about(board, px, good, chosen, axis)
+        on_board, neighbours, smoother = maps_about(board, px, good, chosen, axis)
         axes = np.eye(2) if pattern.axes is None else pattern.axes[chosen]
 
         def on_own(places: FloatArray) -> FloatArray:
@@ -237,16 +237,16 @@ class _Windows:
 
         start = px[chosen]
         ends = on_own(start[:, None] + 0.5 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]))
-        by_px = np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=2)
-        by_board = np.asarray(np.linalg.inv(by_px), float)
-        side_px = np.sqrt(np.abs(np.linalg.det(by_board)))
+        jacobian_px = np.stack([ends[:, 0] - ends[:, 1], ends[:, 2] - ends[:, 3]], axis=2)
+        jacobian = np.asarray(np.linalg.inv(jacobian_px), float)
+        side_px = np.sqrt(np.abs(np.linalg.det(jacobian)))
         # A circle needs its whole edge.
         most = np.inf if pattern.radius else _MOST_PX
         half = np.clip(pattern.half, _LEAST_PX / side_px, most / side_px)
         if pattern.radius:
             around_px = np.maximum(_AROUND_CIRCLE * pattern.radius * side_px, _AROUND_PX)
             half = np.minimum(half, pattern.radius + around_px / side_px)
-        needed_px = float(np.max(half * np.abs(by_board).sum(axis=2).max(axis=1)))
+        needed_px = float(np.max(half * np.abs(jacobian).sum(axis=2).max(axis=1)))
         affordable = max(_LEAST_PX, (np.sqrt(_MOST_PIXELS / len(chosen)) - 1.0) / 2.0)
         reach = int(np.ceil(min(most, affordable, needed_px)))
         steps = np.arange(-reach, reach + 1)
@@ -272,15 +272,15 @@ class _Windows:
         within = distances < half[:, None, None]
         return cls(
             start,
-            by_board,
-            np.linalg.norm(by_px, axis=2),
+            jacobian,
+            np.linalg.norm(jacobian_px, axis=2),
             x,
             y,
             # Centred, so that single precision suffices.
             np.take(smooth, rows[:, :, None] * width + columns[:, None, :]) - np.float32(128.0),
             within,
             inside,
-            around,
+            neighbours,
             # Gradients are along a corner's own axes.
             _along_axes(smoother, axes),
         )
@@ -293,15 +293,15 @@ class _Windows:
 
     def length_px(self, shift: FloatArray) -> FloatArray:
         """(n,) lengths of shifts (n, 2) [squares] in the image [px]."""
-        return np.asarray(np.linalg.norm((self.by_board @ shift[..., None])[..., 0], axis=1))
+        return np.asarray(np.linalg.norm((self.jacobian @ shift[..., None])[..., 0], axis=1))
 
-    def moved(self, shift: FloatArray) -> FloatArray:
+    def shifted(self, shift: FloatArray) -> FloatArray:
         """Positions (n, 2) [px] of corners shifted by (n, 2) squares."""
-        return np.asarray(self.px + (self.by_board @ shift[..., None])[..., 0])
+        return np.asarray(self.px + (self.jacobian @ shift[..., None])[..., 0])
 
-    def slopes(self, levels: FloatArray) -> FloatArray:
+    def gradients(self, levels: FloatArray) -> FloatArray:
         """(n, 2, 2) gradients along x and y of (n, 2) levels, from the neighbours."""
-        return np.asarray(self.smoother[:, 1:3] @ (levels[self.around] - levels[:, None]))
+        return np.asarray(self.smoother[:, 1:3] @ (levels[self.neighbours] - levels[:, None]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +324,7 @@ class _GaussNewtonStep:
     misfit: FloatArray
 
     @classmethod
-    def solved(cls, sums: FloatArray, *, blurs: int) -> Self:
+    def solve(cls, sums: FloatArray, *, blurs: int) -> Self:
         """Solves the normal equations.
 
         Args:
@@ -492,7 +492,7 @@ def _refine_corners(
     for _ in range(_LONE_MAP_UPDATES if is_lone else 1):
         first = _step(windows, pattern, no_shift, blur_px)
         shift, step = _fit_positions(windows, pattern, blur_px, None, first, tolerances_px[0])
-        refined_px = windows.moved(shift)
+        refined_px = windows.shifted(shift)
         good = np.array(
             [not reason for reason in _reasons(windows, step, refined_px - px, last_px[0])]
         )
@@ -501,17 +501,17 @@ def _refine_corners(
         windows = _Windows.cut(smooth, board, refined_px, good, indices, pattern, axis)
         if change_px < _MAP_TOLERANCE_PX:
             break
-    gradients = windows.slopes(step.levels)
+    gradients = windows.gradients(step.levels)
     # Glare and shadows have edges: gradients are only used where they reduce a corner's misfit.
     first, without_gradients = _steps(windows, pattern, no_shift, blur_px, (gradients, None))
     unlit = np.flatnonzero(~(first.misfit < without_gradients.misfit))
     gradients[unlit] = 0.0
     first.replace(unlit, without_gradients.at(unlit))
     shift, step = _fit_positions(windows, pattern, blur_px, gradients, first, tolerances_px[1])
-    refined_px = windows.moved(shift)
+    refined_px = windows.shifted(shift)
     reasons = _reasons(windows, step, refined_px - px, last_px[1])
     good = np.array([not reason for reason in reasons])
-    covariance = windows.by_board @ step.covariance @ windows.by_board.transpose(0, 2, 1)
+    covariance = windows.jacobian @ step.covariance @ windows.jacobian.transpose(0, 2, 1)
     sigma_px = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
     return Refined(
         np.where(good[:, None], refined_px, px),
@@ -633,7 +633,10 @@ def _steps(
         # Gradients apply to white, where the product is 0; in the dark it is 4.
         columns += [(1 - product / 4) * array for array in (x, y)]
         # The corners of a single tag do not determine how lens distortion bends its sides.
-        if windows.around.shape[1] == _MIN_CORNERS and np.median(windows.widths) * _BENT_PX < 1.0:
+        if (
+            windows.neighbours.shape[1] == _MIN_CORNERS
+            and np.median(windows.widths) * _BENT_PX < 1.0
+        ):
             columns += [y * derivatives[0], x * derivatives[1]]
     unknowns = len(columns) + 1
     for slopes in lights:
@@ -656,7 +659,7 @@ def _steps(
     sums[:, 0, 0] = np.count_nonzero(used, axis=(1, 2))
     parameters = [*range(unknowns)]
     return [
-        _GaussNewtonStep.solved(
+        _GaussNewtonStep.solve(
             sums[:, [*parameters, index]][:, :, [*parameters, index]], blurs=len(derivatives) - 2
         )
         for index in range(unknowns, len(columns) + 1)
