@@ -117,7 +117,7 @@ def spans(tree: FrameTree) -> dict[str, tuple[float, float]]:
 
 
 def places(tree: FrameTree) -> dict[str, tuple[float, float]]:
-    """Where each frame stands in the drawing, upwards; bodies themselves have none."""
+    """Position of each frame in the drawing, y upwards; bodies have none."""
     begins = spans(tree)
     return {
         name: (x, y) for body in bodies(tree) for name, x, y in body.places(begins[body.name][0])

@@ -36,7 +36,7 @@ def placement(
     """
     if view_poses.base_from_flange is None or view_poses.cam_from_target is None:
         return None
-    # The edge of the camera, or of the instrument, is the first; targets' follow.
+    # The first edge is the camera's or the instrument's; targets' edges follow.
     sensor, *targets = calibration.edges
     target_edge = next(
         (target for target in targets if target.endswith(f"_from_{frame}")), targets[0]

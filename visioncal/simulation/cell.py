@@ -171,7 +171,7 @@ class SimulatedCell:
 
     @property
     def robot(self) -> SimulatedRobot:
-        """The only robot."""
+        """The single robot."""
         (robot,) = self.robots.values()
         return robot
 
@@ -199,11 +199,11 @@ class SimulatedCell:
         )
 
     def camera(self, name: str = "") -> CameraAt:
-        """The camera of that name, or the only one."""
+        """The camera of that name, or the single one."""
         return next(camera for camera in self.layout.cameras if camera.name == name)
 
     def board(self, name: str = "") -> BoardAt:
-        """The board of that name, or the only one."""
+        """The board of that name, or the single one."""
         return next(board for board in self.layout.boards if board.name == name)
 
     def between(self, first: str, second: str) -> FloatArray:

@@ -16,7 +16,7 @@ from visioncal.present.recording.markdown import markdown
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
 from visioncal.robot import Robot
 
-# Sizes of what is drawn [m].
+# Sizes of axes, lines and points [m].
 _AXIS_M, _LINE_M, _POINT_M = 0.08, 0.001, 0.003
 # JPEG quality: pictures are for display only, and the arm waits for their transfer.
 _JPEG = 80
@@ -24,7 +24,7 @@ _JPEG = 80
 
 @dataclass(frozen=True, eq=False)
 class LiveCell:
-    """What is drawn of a cell besides its views.
+    """Content of a live drawing that is the same for all views.
 
     Attributes:
         mount: Where the camera is.
@@ -48,7 +48,7 @@ class LiveCell:
 
 @dataclass(frozen=True, eq=False)
 class LiveView:
-    """What is drawn of a view.
+    """Content of a live drawing for one view.
 
     Attributes:
         view: Its number.

@@ -27,7 +27,7 @@ from visioncal.robot import Robot
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
 
-# Sizes of what is drawn, as shares of the cell's size.
+# Sizes as shares of the cell's size.
 _AXIS, _LINE, _POINT = 0.12, 0.002, 0.004
 # Largest joint rotation between drawn postures of the path [rad].
 _STEP_RAD = 0.05
@@ -47,7 +47,7 @@ class PreviewStop:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What is drawn of a plan.
+    """Content of a plan's preview.
 
     Attributes:
         name: Name of the recording.
@@ -277,7 +277,7 @@ class MotionPart:
 
 @dataclass(frozen=True, eq=False)
 class MotionPreview:
-    """What is drawn of planned motions.
+    """Content of a preview of planned motions.
 
     Attributes:
         name: Name of the recording.

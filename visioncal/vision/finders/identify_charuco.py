@@ -47,7 +47,7 @@ _HALF = 0.5
 # Positions along a marker's side where its edge is sampled, in half sides.
 _ALONG = np.linspace(-0.7, 0.7, 9)
 _SAMPLES = 60
-# One marker has no scatter.
+# Minimum number of markers for a scatter.
 _LEAST_MARKERS = 2
 # Sum of the shifts of a marker's two outlines by over-exposure and ink [px].
 _BLOOM_PX = 0.5

@@ -18,7 +18,7 @@ from visioncal.vision.finders.headers import MOST_PIXELS, SIGNATURES, claimed_si
 _REACH_PX = (4, 12)
 # Number of corners measured in an image; their median is stable to some percent.
 _SAMPLE = 12
-# Rows that are scaled at a time.
+# Number of rows scaled at a time.
 _STRIP = 256
 # Minimum contrast that detectors need [grey levels].
 _LEAST_CONTRAST = 12
