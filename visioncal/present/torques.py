@@ -82,7 +82,6 @@ def base_parameter_table(identified: "Identified") -> Table:
 
 
 def _unit_of(name: str) -> str:
-    """Unit of a standard parameter."""
     if "*" in name:
         return _FIRST_MOMENT
     return next(unit for start, unit in _UNITS.items() if name.startswith(start))

@@ -212,18 +212,11 @@ def forward(arm: DhArm, joints: FloatArray) -> FloatArray:
 
 
 def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
-    """Inverse kinematics by damped least squares, with one start per pose.
+    """Inverse kinematics by damped least squares, of (m, 4, 4) poses from (m, n) starts [rad].
 
     Method: Wampler (1986). The damping decreases with the error, so that the iteration ends as
-    Newton's method and reaches machine precision.
-
-    Args:
-        arm: Arm with n joints.
-        base_from_flange: (m, 4, 4) poses to reach.
-        seeds: (m, n) start postures [rad].
-
-    Returns:
-        The postures, with the elbow within half a turn and every other joint within a turn.
+    Newton's method and reaches machine precision. The elbow is within half a turn, and every other
+    joint within a turn.
     """
     joints = seeds.copy()
     scale = np.repeat([1.0, 1.0 / reach_m(arm)], 3)

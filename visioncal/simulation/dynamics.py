@@ -178,18 +178,10 @@ def _disturbed(body: LinkBody, share: float, rng: np.random.Generator) -> LinkBo
 
 
 def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
-    """Drive torques of a motion (Luh, Walker and Paul 1980).
+    """(m, n) drive torques [N m] of a motion (Luh, Walker and Paul 1980).
 
-    All vectors are in the base frame.
-
-    Args:
-        built: Real arm.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) joint speeds [rad/s].
-        ddq: (m, n) joint accelerations [rad/s^2].
-
-    Returns:
-        (m, n) torques [N m].
+    `q`, `dq` and `ddq` are (m, n) joint angles [rad], speeds and accelerations. All vectors are in
+    the base frame.
     """
     frames = link_frames(built.arm, q)
     axes, origins = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]

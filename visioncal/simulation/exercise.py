@@ -53,15 +53,7 @@ def multi_sine(
     rate_hz: float = 500.0,
     speed_rad_s: float = 2.0,
 ) -> Exercise:
-    """A random periodic motion of `count` joints with five harmonics.
-
-    Args:
-        count: Number of joints.
-        rng: Source of randomness.
-        seconds: Duration, which is one period.
-        rate_hz: Samples per second.
-        speed_rad_s: Highest speed of each joint.
-    """
+    """A random periodic motion of `count` joints with five harmonics, of one period."""
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz
     omega = 2.0 * np.pi / seconds * np.arange(1, _HARMONICS + 1)
     phases = omega[:, None] * times_s

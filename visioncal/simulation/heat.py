@@ -94,13 +94,9 @@ class Warming:
 
 
 def warm_up(heat: Heat, hours: float, *, step_s: float = 10.0, seed: int = 0) -> Warming:
-    """Temperatures of an arm that starts cold and works.
+    """Temperatures of an arm that starts cold and works for some hours, in steps of `step_s`.
 
-    Args:
-        heat: Thermal parameters; the duty varies by a quarter between pieces of work.
-        hours: Duration [h].
-        step_s: Time between samples [s].
-        seed: Seed of the duty's variation and the sensors' noise.
+    The duty varies by a quarter between pieces of work.
     """
     if min(hours, step_s) <= 0.0:
         raise DataError("simulation: a warm-up needs a time and a step above 0.")

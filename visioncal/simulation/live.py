@@ -50,14 +50,10 @@ class LiveView:
         self._rest: tuple[FloatArray, Float32Array] | None = None
 
     def picture(self, joints: FloatArray) -> Image:
-        """Takes an image.
+        """A (height, width) grey image with motion blur and independent noise.
 
-        Args:
-            joints: (k, n) true joint angles at equal intervals during the exposure; one row for a
-                stationary arm [rad].
-
-        Returns:
-            (height, width) grey image with motion blur and independent noise.
+        The true joint angles (k, n) [rad] are at equal intervals during the exposure; one row
+        stands for a stationary arm.
         """
         poses = self.cam_from_target(joints)
         smear_px = float(self._moved_px(poses[:-1], poses[1:]).sum())

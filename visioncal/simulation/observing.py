@@ -170,7 +170,6 @@ def observed(cell: SimulatedCell) -> SimulatedCell:
 def _sight(
     cell: SimulatedCell, view: int, stop: int, camera: str, board: str, pose: FloatArray
 ) -> SimulatedSight:
-    """A camera's observation of a board, before detection."""
     exact = seen_in(cell.camera(camera), cell.board(board), pose, view)
     return SimulatedSight(view, stop, camera, board, pose, exact, exact)
 
@@ -265,7 +264,6 @@ def _lens_sights(cell: SimulatedCell, first_view: int) -> list[SimulatedSight]:
 def _read(
     cell: SimulatedCell, frames: Mapping[str, FloatArray], stop: int, first_view: int
 ) -> list[InstrumentReading]:
-    """Instrument readings at a stop."""
     readings: list[InstrumentReading] = []
     for instrument in cell.layout.instruments:
         instrument_from_cell = invert(frames[frame_name("instrument", instrument.name)][stop])
@@ -340,7 +338,6 @@ def with_faults(cell: SimulatedCell) -> SimulatedCell:
 
 
 def _moves(cell: SimulatedCell, sight: SimulatedSight) -> bool:
-    """Whether a board moves relative to a camera."""
     carriers = [
         cell.parents[frame_name("camera", sight.camera)],
         cell.parents[frame_name("target", sight.board)],

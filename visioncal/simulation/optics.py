@@ -91,17 +91,10 @@ def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
 
 
 def rays(camera: Camera, px: FloatArray) -> FloatArray:
-    """Directions of pixels.
+    """(..., 3) unit vectors in the camera frame, from (..., 2) pixels.
 
     Newton's method on the distortion. Outside the region where the distortion is monotonic, which
     contains the image of any real lens, the directions are meaningless.
-
-    Args:
-        camera: The camera.
-        px: (..., 2) pixels [px].
-
-    Returns:
-        (..., 3) unit vectors in the camera frame.
     """
     fx, fy, cx, cy = camera.matrix
     x_bent, y_bent = (px[..., 0] - cx) / fx, (px[..., 1] - cy) / fy

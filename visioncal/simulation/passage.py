@@ -86,12 +86,8 @@ class Passage:
     ) -> Corners:
         """Corners of one frame, each at the time of its image row.
 
-        Args:
-            taken_s: Time of the middle row [s].
-            before: Function from k postures (k, n) [rad] to `cam_from_target` (k, 4, 4).
-            camera: The camera.
-            sheet: The board.
-            view: Number of the frame.
+        `before` maps k postures (k, n) [rad] to `cam_from_target` (k, 4, 4); `taken_s` is the time
+        of the middle row.
         """
         corners, optics = corners_m(sheet), camera.camera
         delays_s = np.zeros(len(corners))

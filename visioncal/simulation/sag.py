@@ -217,16 +217,10 @@ class ArmOptions(ArmErrors):
         payloads: Sequence[Payload] = (),
         approach: FloatArray | None = None,
     ) -> FloatArray:
-        """Flange poses of a real arm, before repeatability errors.
+        """Flange poses (k, 4, 4) of a real arm, before repeatability errors.
 
-        Args:
-            arm: Real arm.
-            q: (k, n) encoder angles [rad].
-            payloads: k payloads; empty for none.
-            approach: (k,) side of approach; None for the middle of the backlash.
-
-        Returns:
-            (k, 4, 4) `base_from_flange`.
+        `q` are (k, n) encoder angles [rad]. Without payloads there are none; without sides of
+        approach (k,), the arm is in the middle of its backlash.
         """
         giving = giving_of(arm, self.compliance_rad_per_nm, self.mass_share, self.backlash_rad)
         return forward(arm, sagging(arm, giving, q, payloads, approach))

@@ -100,13 +100,9 @@ def above(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatArray:
 def session_of(
     shop: Shop, *, joints: bool = True, poses: bool = False, **document: object
 ) -> Session:
-    """The session in memory.
+    """The session in memory, with joint angles or the nominal arm's poses.
 
-    Args:
-        shop: Readings.
-        joints: Whether rows have joint angles and the session names the robot.
-        poses: Whether rows have the nominal arm's poses.
-        document: Tables of session.toml that replace the correct ones.
+    `document` are tables of session.toml that replace the correct ones.
     """
     options = shop.options
     nominal = forward(shop.arm, shop.joints)

@@ -188,7 +188,6 @@ def _from_buffers(
 
 
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:
-    """Charts of the used views with joint angles."""
     residual_mm = {
         view.view: view.residual_mm
         for view in calibration.views

@@ -113,7 +113,6 @@ def _log_series(stream: rr.RecordingStream, prediction: Prediction, times_s: Flo
 def _log_motion(
     recorder: Recorder, identified: Identified, prediction: Prediction, times_s: FloatArray
 ) -> None:
-    """Draws the moving arm at the display rate."""
     steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
     rows = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
     recorder.stream.reset_time()

@@ -235,7 +235,6 @@ def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
 
 
 def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: FloatArray) -> None:
-    """Draws the predicted image of the board."""
     frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
     outline = board.closed_outline(preview.target)
     shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
@@ -350,7 +349,6 @@ def _log_motions(stream: rr.RecordingStream, preview: MotionPreview) -> None:
 
 
 def _log_curves(stream: rr.RecordingStream, part: MotionPart, start_s: float) -> None:
-    """Draws the joints' curves."""
     motion = part.motion
     curves = [np.rad2deg(array) for array in (motion.q, motion.dq, motion.ddq)]
     if part.torques_nm is not None:
@@ -364,7 +362,6 @@ def _log_curves(stream: rr.RecordingStream, part: MotionPart, start_s: float) ->
 def _log_arm_motion(
     stream: rr.RecordingStream, preview: MotionPreview, part: MotionPart, start_s: float
 ) -> None:
-    """Draws the moving arm."""
     motion = part.motion
     for duration, q in zip(_durations(start_s + motion.times_s), motion.q, strict=True):
         stream.set_time(paths.MOTION_TIMELINE, duration=duration)

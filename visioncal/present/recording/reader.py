@@ -160,12 +160,10 @@ class _Records:
         return with_image != set(self.images)
 
     def image_name(self, row: int) -> str:
-        """Name of the image of a row."""
         cells = self.header.cells(self.rows[row])
         return dict(zip(self.header.columns, cells, strict=True))["image"]
 
     def images_by_name(self, rows: Sequence[int]) -> dict[str, _Image]:
-        """Images of some rows, by name."""
         return {self.image_name(row): self.images[row] for row in rows if row in self.images}
 
 

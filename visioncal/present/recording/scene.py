@@ -250,7 +250,6 @@ class SceneDrawing:
         return share * self.size_m
 
     def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str) -> None:
-        """Draws a frame's axes with its name."""
         tools = () if self.calibration is None else self.calibration.frames
         is_tool = any(tool.endswith(f"_from_{frame}") for tool in tools)
         share = _TOOL_AXES if is_tool else _AXES.get(frame.partition("_")[0], _OTHER_AXES)

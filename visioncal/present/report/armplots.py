@@ -101,7 +101,6 @@ def _mark_rms(panel: Panel, values: FloatArray) -> None:
 
 
 def _name_sets(panel: Panel, first_held: float) -> None:
-    """Labels cross-validation and hold-out views above the panels."""
     for words, position in (("left out in turn", -0.4), ("held back by the session", first_held)):
         x, y = float(panel.x_at(position)), panel.box.top - 4.0
         panel.figure.text(x, y, words, size=svg.SMALL, colour=svg.MUTED)

@@ -251,7 +251,6 @@ def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -
 
 
 def _draw_bitmap(panel: Panel, px: FloatArray, steps: IntArray, colours: Sequence[str]) -> None:
-    """Draws coloured dots as a bitmap."""
     box: Box = panel.box
     size = np.array([box.right - box.left, box.bottom - box.top]) * _DOTS_A_POINT
     image = np.zeros((int(size[1]) + 1, int(size[0]) + 1, 4), np.uint8)

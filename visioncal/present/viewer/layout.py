@@ -331,7 +331,6 @@ def _cell_contents(contents: _Contents) -> list[str]:
 
 
 def _plots(contents: _Contents, seer: str) -> list[rrb.TimeSeriesView]:
-    """Residual plots of one camera's views."""
     plots = [
         ("Position residual [mm]", paths.POSITION_MM),
         *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.orientations else []),

@@ -146,7 +146,6 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*arguments)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
-        """Sends the content of a route."""
         self._answer(with_content=True)
 
     def do_HEAD(self) -> None:

@@ -295,7 +295,6 @@ class _Patches:
         )
 
     def at(self, chosen: IntArray) -> Self:
-        """Patches of some corners."""
         parts = (field for field in fields(self) if field.name != "scene")
         return replace(self, **{part.name: getattr(self, part.name)[chosen] for part in parts})
 
@@ -435,7 +434,6 @@ class _Sums:
         return np.asarray(np.sqrt(variance) / np.abs(self.levels[:, 1]))
 
     def cost(self, good: Mask) -> float:
-        """Sum of squared residuals of some corners."""
         return float(np.sum(self.squares[good]))
 
     def shifts(self) -> FloatArray:

@@ -79,13 +79,9 @@ class Print:
         return np.asarray(self.light[row, column])
 
     def drawn(self, x: "Tensor", y: "Tensor", sigma_x: "Tensor", sigma_y: "Tensor") -> "Tensor":
-        """Renders the print: 1 for light, 0 for dark, with Gaussian edges.
+        """Renders the print at (...) positions [squares]: 1 for light, 0 for dark.
 
-        Args:
-            x: (...) positions along x on the board [squares].
-            y: (...) positions along y on the board [squares].
-            sigma_x: Edge widths across the lines of constant x [squares].
-            sigma_y: Edge widths across the lines of constant y [squares].
+        Edges are Gaussian, with widths across the lines of constant x and of constant y [squares].
         """
         torch = library("torch")
         light = torch.as_tensor(self.light, dtype=x.dtype, device=x.device)
@@ -187,7 +183,6 @@ def explain(
 
 
 def _region(px: FloatArray, board: FloatArray, image: Image) -> tuple[IntArray, IntArray]:
-    """Low and high corner of the rendered region [px]."""
     extent = np.ptp(px, axis=0) / np.maximum(np.ptp(board, axis=0).min(), 1.0)
     margin = _RIM * float(extent.max()) + 2.0
     size = np.array(image.shape[::-1])

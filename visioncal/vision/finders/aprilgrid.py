@@ -94,13 +94,9 @@ def free_tags_step(target: Target) -> str:
 def grid_tags(
     image: Image, dictionary: str, border: int, enough: float
 ) -> tuple[IntArray, FloatArray]:
-    """Detects tags whose corners touch dark squares; ids that appear twice are dropped.
+    """Tags in a (h, w) grey image whose corners touch dark squares, without ids that appear twice.
 
-    Args:
-        image: (h, w) grey image.
-        dictionary: OpenCV's name of the tag family.
-        border: Dark modules around the bits.
-        enough: Number of tags at which the search stops.
+    The search stops at `enough` tags.
 
     Returns:
         (t,) ids, ascending, and (t, 4, 2) corners in OpenCV's order, to one or two pixels [px].

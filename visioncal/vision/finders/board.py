@@ -96,15 +96,9 @@ def _shrunk(image: Image, factor: int) -> Image:
 def hidden_corners(
     seen: DetectedCorners | Corners, shape: tuple[int, ...], target: Target
 ) -> IntArray:
-    """Undetected corners that the image should contain with the squares around them.
+    """Ids (n,) of undetected corners that the image should contain with the squares around them.
 
-    Args:
-        seen: Detected corners; if too few to locate the board, all others are returned.
-        shape: Height and width of the image [px].
-        target: A board of squares.
-
-    Returns:
-        (n,) corner ids, ascending.
+    If the detected corners are too few to locate the board, these are all others.
     """
     places: FloatArray = corner_positions(target)[:, :2] / target.square_m
     missing = np.setdiff1d(np.arange(len(places)), seen.ids)

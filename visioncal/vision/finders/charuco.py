@@ -137,6 +137,5 @@ def _matches(markers: _Markers, target: Target) -> tuple[FloatArray, FloatArray]
 
 
 def _misfit(markers: _Markers, target: Target) -> float:
-    """Misfit of the markers' layout; see `layout_misfit`."""
     on_board, in_image = (match.reshape(-1, 4, 2) for match in _matches(markers, target))
     return layout_misfit(on_board, in_image) if len(on_board) >= _LAYOUT_MARKERS else 0.0

@@ -156,7 +156,6 @@ class _Blobs:
 
 
 def _blobs(image: Image) -> _Blobs:
-    """Dark blobs that fill the ellipse of their moments."""
     block = 2 * int(_SURROUNDINGS * min(image.shape) / 2) + 3
     dark = cv2.adaptiveThreshold(
         image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, _DARKER

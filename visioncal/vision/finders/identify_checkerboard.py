@@ -152,7 +152,6 @@ def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
 
 
 def _side_px(plane: Plane, extent: _Extent) -> float:
-    """Median side of a board's squares [px]."""
     px = plane.to_px(extent.corners()).reshape(*extent.size[::-1], 2)
     sides = [np.linalg.norm(np.diff(px, axis=axis), axis=2).ravel() for axis in (0, 1)]
     return float(np.median(np.concatenate(sides)))

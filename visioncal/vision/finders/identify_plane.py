@@ -104,16 +104,9 @@ def lens_of(image: Image, bend: float) -> Lens:
 def robust_plane(
     lens: Lens, board: FloatArray, px: FloatArray, tolerance_px: float
 ) -> tuple[Plane, Mask] | None:
-    """Fits a plane to points with outliers (RANSAC; Fischler and Bolles 1981).
+    """A plane and its inliers, fitted to points with outliers, or None.
 
-    Args:
-        lens: Distortion.
-        board: (n, 2) positions on the board [squares].
-        px: (n, 2) pixels.
-        tolerance_px: Inlier threshold [px].
-
-    Returns:
-        The plane and its inliers; None if there is none.
+    RANSAC (Fischler and Bolles 1981) on (n, 2) positions on the board [squares] and pixels.
     """
     if len(board) < _LEAST_POINTS:
         return None

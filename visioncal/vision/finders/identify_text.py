@@ -10,10 +10,8 @@ from visioncal.vision.targets import board_words, target_document
 def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
     """An identity as the content of a JSON document, without fields that do not apply.
 
-    Args:
-        identity: Identified target.
-        square_m: Measured side of a square, or of a single marker [m], where known: the document
-            then also holds the target's description.
+    With a measured side of a square, or of a single marker [m], it has the target's description
+    too.
     """
     document: dict[str, Any] = {
         "kind": identity.kind,
@@ -48,13 +46,10 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
 
 
 def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
-    """An identity as a target's description.
+    """An identity as a target's description; `source` names the image in its first line.
 
-    Args:
-        identity: Identified target.
-        square_m: Measured side of a square, or of a single marker [m]. If unknown, sizes become
-            comments on what to measure.
-        source: Name of the image, for the first line.
+    Without a measured side of a square, or of a single marker [m], sizes become comments on what to
+    measure.
     """
     size, what, where = "square_m", "side of a square", "measured over many squares"
     if identity.kind == "marker":

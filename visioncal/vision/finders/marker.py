@@ -44,7 +44,6 @@ def marker_ids(image: Image, dictionary: str) -> tuple[int, ...]:
 
 
 def _markers(image: Image, dictionary: str) -> tuple[Sequence[FloatArray], list[int]]:
-    """Corners and ids of all markers."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), parameters)

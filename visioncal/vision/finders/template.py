@@ -184,7 +184,6 @@ class _Pattern:
         return cls(np.where(odd == light, 1.0, -1.0), inset)
 
     def at(self, chosen: IntArray) -> Self:
-        """The pattern at some corners."""
         lone, axes = (None if array is None else array[chosen] for array in (self.lone, self.axes))
         return replace(self, signs=self.signs[chosen], lone=lone, axes=axes)
 
@@ -286,7 +285,6 @@ class _Windows:
         )
 
     def at(self, chosen: IntArray) -> Self:
-        """The windows of some corners."""
         return replace(
             self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)}
         )
@@ -353,13 +351,11 @@ class _GaussNewtonStep:
         )
 
     def at(self, chosen: IntArray) -> Self:
-        """The steps of some corners."""
         return replace(
             self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)}
         )
 
     def replace(self, chosen: IntArray, others: Self) -> None:
-        """Replaces the steps of some corners."""
         for field in fields(self):
             getattr(self, field.name)[chosen] = getattr(others, field.name)
 
