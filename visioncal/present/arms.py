@@ -1,4 +1,4 @@
-"""What a result says of an arm: its levels, parameters, springs and drift."""
+"""Facts and tables about an arm: model level, parameters, joint springs and thermal drift."""
 
 from collections.abc import Iterator
 
@@ -18,7 +18,7 @@ from visioncal.results.arm import (
     ThermalResult,
 )
 
-# What each level frees, for people.
+# What each model level estimates.
 LEVELS = {
     NOMINAL: "the arm as stated",
     "backlash": "play of the joints",
@@ -36,9 +36,9 @@ _SYMBOLS = {
     "cosine": "eccentricity, cosine",
     "ratio": "gear ratio",
 }
-# Units on disk with those for people, and how many of these one of them is.
+# Suffixes of units on disk: the unit shown, and the factor to it.
 _UNITS = {"_m": ("mm", 1e3), "_rad": ("\N{DEGREE SIGN}", float(np.rad2deg(1.0)))}
-# Without a sigma: about a hundredth of what an arm repeats to.
+# Decimals without a sigma: about a hundredth of an arm's repeatability.
 _DECIMALS = {"mm": 3, "\N{DEGREE SIGN}": 4}
 
 
@@ -54,22 +54,22 @@ _INDICES = (
     ("o4", "O4", "square of the smallest over the largest (Nahvi and Hollerbach 1996)"),
     ("o5", "O5", "inverse of the sum of their inverses (Sun and Hollerbach 2008)"),
 )
-# So many of the most influential stops are named, and the least.
+# Number of most influential stops that are listed, beside the least influential one.
 _MOST_INFLUENTIAL = 5
 
 
 def joint_words(name: str) -> str:
-    """A joint's name for people."""
+    """A joint's name for display."""
     return name.replace("_", " ")
 
 
 def level_words(name: str) -> str:
-    """What a level of the arm's model frees."""
+    """What a level of the arm's model estimates."""
     return LEVELS.get(name, name.replace("_", " "))
 
 
 def level_reason(arm: ArmResult) -> str:
-    """Why this level was taken, or none, in one sentence."""
+    """One sentence: why this model level was chosen, or none."""
     if not arm.is_calibrated:
         return (
             "No level was taken: none predicts stops that are left out of the fit better than "
@@ -82,35 +82,35 @@ def level_reason(arm: ArmResult) -> str:
 
 
 def _held_out(level: ArmLevel) -> str:
-    turned = "" if level.held_out_deg is None else f" and {significant(level.held_out_deg)} deg"
-    return f"{significant(level.held_out_mm)} mm{turned}"
+    rotation = "" if level.held_out_deg is None else f" and {significant(level.held_out_deg)} deg"
+    return f"{significant(level.held_out_mm)} mm{rotation}"
 
 
-def arm_sentences(found: ArmResult) -> list[str]:
-    """Which level of the arm was taken and why, and how accurate it is."""
-    sentences, sigma = [level_reason(found)], found.workspace_sigma_mm
+def arm_sentences(arm: ArmResult) -> list[str]:
+    """Sentences: the model level with its reason, and the arm's accuracy."""
+    sentences, sigma = [level_reason(arm)], arm.workspace_sigma_mm
     if sigma is not None:
         median, p95 = significant(sigma.median), significant(sigma.p95)
         sentences.append(
             f"All over the workspace, a tool's place is predicted with a sigma of {median} mm "
             f"(median; 95 % of the places: under {p95} mm)."
         )
-    if found.carries_over is not None:
-        sentences.append(found.carries_over.words)
+    if arm.carries_over is not None:
+        sentences.append(arm.carries_over.words)
     return sentences
 
 
 def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:
-    """The size of the errors that follow the arm's posture."""
-    treated = (
+    """Size of the posture-dependent errors of an arm."""
+    treatment = (
         ("estimated along with the result", "what looks the same in all views is left, see above")
         if errors.estimated
         else ("not taken out", "no joint angles with a known robot model: only their size is known")
     )
-    away: tuple[Fact, ...] = ()
+    extrapolated: tuple[Fact, ...] = ()
     if errors.away_mm is not None and errors.away_deg is not None:
         predicted = _size(errors.away_predicted_mm, errors.away_predicted_deg)
-        away = (
+        extrapolated = (
             Fact(
                 "at postures away from the views it errs by",
                 _size(errors.away_mm, errors.away_deg),
@@ -122,9 +122,9 @@ def error_facts(errors: ArmErrorsResult) -> tuple[Fact, ...]:
             f"{'the flange' if errors.of else 'a link'} is typically off by",
             _size(errors.sigma_mm, errors.sigma_deg),
         ),
-        *away,
+        *extrapolated,
         Fact("likelihood ratio", f"{errors.likelihood_ratio:.0f}", "noise alone stays under 15"),
-        Fact("its errors were", *treated),
+        Fact("its errors were", *treatment),
     )
 
 
@@ -132,19 +132,19 @@ def _size(mm: float | None, deg: float | None) -> str:
     return f"{significant(mm)} mm, {significant(deg)} deg"
 
 
-def level_table(found: ArmResult) -> Table | None:
-    """The levels that were tried, each with its residuals; None of one alone."""
-    if len(found.levels) < 2:
+def level_table(arm: ArmResult) -> Table | None:
+    """The model levels tried, with their residuals; None if there is only one."""
+    if len(arm.levels) < 2:
         return None
     titles = ("what is free", "values", "fit, mm", "fit, deg", "left out, mm", "left out, deg",
               "likelihood ratio")  # fmt: skip
     return Table.of(
-        titles, [_level(level, taken=level.level == found.level) for level in found.levels]
+        titles, [_level_row(level, chosen=level.level == arm.level) for level in arm.levels]
     )
 
 
 def level_note(observed: str) -> str:
-    """What the figures of the levels are, of a target's pose or the like."""
+    """Legend of the level table; `observed` names what the residuals are of."""
     return (
         f"Residuals of the {observed}, root mean square: of all stops in the fit, and of "
         "stops left out of it in turn. Likelihood ratio: twice the gain in log-likelihood over the "
@@ -153,75 +153,74 @@ def level_note(observed: str) -> str:
     )
 
 
-def _level(arm_level: ArmLevel, *, taken: bool) -> TableRow:
-    words = level_words(arm_level.level) + (" (taken)" if taken else "")
+def _level_row(level: ArmLevel, *, chosen: bool) -> TableRow:
+    words = level_words(level.level) + (" (taken)" if chosen else "")
     residuals = map(
-        significant,
-        (arm_level.rms_mm, arm_level.rms_deg, arm_level.held_out_mm, arm_level.held_out_deg),
+        significant, (level.rms_mm, level.rms_deg, level.held_out_mm, level.held_out_deg)
     )
-    ratio = significant(None) if arm_level.level == NOMINAL else f"{arm_level.likelihood_ratio:.0f}"
-    return TableRow((words, str(arm_level.unknowns), *residuals, ratio), "taken" if taken else "")
+    ratio = significant(None) if level.level == NOMINAL else f"{level.likelihood_ratio:.0f}"
+    return TableRow((words, str(level.unknowns), *residuals, ratio), "taken" if chosen else "")
 
 
-def parameter_tables(found: ArmResult, count: int = 1) -> list[Table]:
-    """The numbers of the arm's model, joint by joint, in so many tables."""
+def parameter_tables(arm: ArmResult, count: int = 1) -> list[Table]:
+    """The parameters of the arm's model, joint by joint, in `count` tables."""
     joints: dict[str, list[TableRow]] = {}
-    for parameter in found.parameters:
+    for parameter in arm.parameters:
         joints.setdefault(parameter.joint, [TableRow((joint_words(parameter.joint),))]).append(
-            _parameter(parameter)
+            _parameter_row(parameter)
         )
     titles, rows = ("parameter", "nominal", "identified", "change", "sigma", "unit"), [*joints]
     size = max(-(-len(rows) // count), 1)
-    parts = [rows[at : at + size] for at in range(0, len(rows), size)]
-    return [Table(titles, tuple(joint for name in part for joint in joints[name]), (0, 4, 5))
-            for part in parts]  # fmt: skip
+    groups = [rows[start : start + size] for start in range(0, len(rows), size)]
+    return [Table(titles, tuple(joint for name in names for joint in joints[name]), (0, 4, 5))
+            for names in groups]  # fmt: skip
 
 
-def _parameter(arm_parameter: ArmParameter) -> TableRow:
-    """Writes a number of the arm's model with as many digits as its change is known to."""
-    suffix = next((end for end in _UNITS if arm_parameter.name.endswith(end)), "")
+def _parameter_row(parameter: ArmParameter) -> TableRow:
+    """One parameter's row, rounded by the sigma of its change."""
+    suffix = next((end for end in _UNITS if parameter.name.endswith(end)), "")
     unit, scale = _UNITS.get(suffix, ("", 1.0))
-    stem = arm_parameter.name.removesuffix(suffix)
-    sigma = None if arm_parameter.sigma is None else scale * arm_parameter.sigma
+    stem = parameter.name.removesuffix(suffix)
+    sigma = None if parameter.sigma is None else scale * parameter.sigma
     decimals = decimals_for(sigma) if sigma else _DECIMALS.get(unit, 5)
     cells = (
         _SYMBOLS.get(stem, stem.replace("_", " ")),
-        # As stated, whatever is known of it now.
-        f"{scale * arm_parameter.nominal + 0.0:.7g}",
-        fixed(scale * arm_parameter.identified, decimals),
-        signed(scale * arm_parameter.change, decimals),
+        # All digits of the nominal value, whatever the sigma.
+        f"{scale * parameter.nominal + 0.0:.7g}",
+        fixed(scale * parameter.identified, decimals),
+        signed(scale * parameter.change, decimals),
         f"{PLUS_MINUS} {significant(sigma)}" if sigma else "",
         unit,
     )
-    return TableRow(cells, "sure" if arm_parameter.is_sure else "")
+    return TableRow(cells, "sure" if parameter.is_sure else "")
 
 
-def parameter_note(found: ArmResult) -> str:
-    """In which form the parameters are, and how many changes are beyond chance."""
-    form = _CONVENTIONS.get(found.convention or "", "")
+def parameter_note(arm: ArmResult) -> str:
+    """Convention of the parameters, and the number of significant changes."""
+    form = _CONVENTIONS.get(arm.convention or "", "")
     words = f"In {form}. " if form else ""
-    if any(parameter.sigma is not None for parameter in found.parameters):
-        sure = sum(parameter.is_sure for parameter in found.parameters)
+    if any(parameter.sigma is not None for parameter in arm.parameters):
+        sure = sum(parameter.is_sure for parameter in arm.parameters)
         words += (
-            f"{sure} of {len(found.parameters)} changes are beyond three sigma, in bold; "
+            f"{sure} of {len(arm.parameters)} changes are beyond three sigma, in bold; "
             f"{PLUS_MINUS} is one standard deviation."
         )
     return words
 
 
-def identifiability_facts(found: ArmResult) -> Iterator[Fact]:
-    """How many directions the stops determine, and how well."""
-    known = found.observability
-    if known is not None:
-        count = f"{known.determined} of {known.identifiable}"
+def identifiability_facts(arm: ArmResult) -> Iterator[Fact]:
+    """Number of directions that the stops determine, and their condition."""
+    observability = arm.observability
+    if observability is not None:
+        count = f"{observability.determined} of {observability.identifiable}"
         yield Fact("directions determined", count, "that any stops could determine")
-        if known.condition is not None:
+        if observability.condition is not None:
             note = "best over worst determined, scaled"
-            yield Fact("condition", significant(known.condition), note)
+            yield Fact("condition", significant(observability.condition), note)
 
 
 def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
-    """What the loads of the stops do."""
+    """Deflection of the flange under the stops' loads, and the payload."""
     median, most = significant(elastic.sag_mm.median), significant(elastic.sag_mm.most)
     yield Fact("the flange gives way by", f"{median} mm", f"median; at most {most} mm")
     low, high = map(significant, elastic.payload_kg)
@@ -234,62 +233,59 @@ def spring_facts(elastic: ElasticResult) -> Iterator[Fact]:
 
 
 def spring_table(elastic: ElasticResult) -> Table:
-    """The joints' stiffness, and the torques on them."""
+    """Stiffness of each joint, and the range of torques on it."""
     rows = []
     for joint in elastic.joints:
         stiffness, sigma = joint.stiffness_nm_per_rad, joint.stiffness_sigma_nm_per_rad
         low, high = (f"{round(end, 1) + 0.0:g}" for end in joint.torque_nm)
-        words = "taken for rigid" if stiffness is None else f"{1e-3 * stiffness:.4g}"
-        known = "" if sigma is None else f"{PLUS_MINUS} {significant(1e-3 * sigma)}"
-        rows.append((joint_words(joint.joint), words, known, f"{low} to {high}"))
+        stiffness_words = "taken for rigid" if stiffness is None else f"{1e-3 * stiffness:.4g}"
+        sigma_words = "" if sigma is None else f"{PLUS_MINUS} {significant(1e-3 * sigma)}"
+        rows.append((joint_words(joint.joint), stiffness_words, sigma_words, f"{low} to {high}"))
     return Table.of(("joint", "stiffness [kN m/rad]", "sigma", "torque [N m]"), rows, (0, 2))
 
 
-def stop_table(found: ArmResult) -> Table | None:
-    """By how much the variance would grow without the most influential stops, and the least."""
-    first, rest = found.stops[:_MOST_INFLUENTIAL], found.stops[_MOST_INFLUENTIAL:][-1:]
-    named = [*((item, "") for item in first), *((item, ", the least") for item in rest)]
+def stop_table(arm: ArmResult) -> Table | None:
+    """Growth of the variance without the most influential stops, and the least influential."""
+    most, least = arm.stops[:_MOST_INFLUENTIAL], arm.stops[_MOST_INFLUENTIAL:][-1:]
+    labelled = [*((item, "") for item in most), *((item, ", the least") for item in least)]
     rows = [
-        (
-            f"view {stop_influence.view}{words}",
-            f"{significant(100.0 * max(stop_influence.influence, 0.0))} %",
-        )
-        for stop_influence, words in named
+        (f"view {stop.view}{suffix}", f"{significant(100.0 * max(stop.influence, 0.0))} %")
+        for stop, suffix in labelled
     ]
     return Table.of(("without", "grows by"), rows) if rows else None
 
 
-def index_facts(found: ArmResult) -> Iterator[Fact]:
-    """Indices of observability."""
-    known = found.observability
-    if known is not None:
+def index_facts(arm: ArmResult) -> Iterator[Fact]:
+    """Observability indices."""
+    observability = arm.observability
+    if observability is not None:
         note = "both transforms' and the arm's, redundant ones among them"
-        yield Fact("values carried", str(known.columns), note)
+        yield Fact("values carried", str(observability.columns), note)
         for name, label, note in _INDICES:
-            value = getattr(known, name)
+            value = getattr(observability, name)
             if value is not None:
                 yield Fact(label, f"{value:.3g}", note)
 
 
-def drift_sentence(found: ThermalResult) -> str:
-    """How far the flange drifted, and what it brings to count that."""
-    source = "measured temperatures" if found.heated_by == "temperatures" else "motor currents"
-    last, residual = found.course[-1], found.residual_mm
+def drift_sentence(thermal: ThermalResult) -> str:
+    """Drift of the flange, and the residuals with and without the drift model."""
+    source = "measured temperatures" if thermal.heated_by == "temperatures" else "motor currents"
+    end, residual = thermal.course[-1], thermal.residual_mm
     return (
-        f"By {source}, the flange had moved by {significant(last.drift_mm)} mm at the end, "
-        f"{significant(hours(found, last.stamp_s))} h after the start. Counted with, it takes the "
-        f"views' residuals from {significant(residual.without)} to "
+        f"By {source}, the flange had moved by {significant(end.drift_mm)} mm at the end, "
+        f"{significant(hours(thermal, end.stamp_s))} h after the start. Modelling this drift "
+        f"takes the views' residuals from {significant(residual.without)} to "
         f"{significant(residual.with_drift)} mm."
     )
 
 
-def hours(found: ThermalResult, stamp_s: float) -> float:
-    """Since the start of the course."""
-    return (stamp_s - found.course[0].stamp_s) / 3600.0
+def hours(thermal: ThermalResult, stamp_s: float) -> float:
+    """Hours since the start of the course."""
+    return (stamp_s - thermal.course[0].stamp_s) / 3600.0
 
 
-def drift_table(found: ThermalResult) -> Table:
-    """How each joint and its link follow their temperature."""
+def drift_table(thermal: ThermalResult) -> Table:
+    """Thermal growth and zero drift of each joint and its link."""
     titles = (
         "joint and its link",
         "growth [\N{MICRO SIGN}m/(m K)]",
@@ -298,8 +294,8 @@ def drift_table(found: ThermalResult) -> Table:
         "",
     )
     rows = []
-    for joint in found.joints:
-        known = f"growth of {joint.joint}" in found.not_determined
+    for joint in thermal.joints:
+        growth_is_prior = f"growth of {joint.joint}" in thermal.not_determined
         rows.append(
             (
                 joint.joint,
@@ -307,7 +303,7 @@ def drift_table(found: ThermalResult) -> Table:
                 f"{1e6 * joint.drift_rad_per_k:.1f} {PLUS_MINUS} "
                 f"{1e6 * joint.drift_sigma_rad_per_k:.1f}",
                 significant(joint.tau_s / 60.0),
-                "growth as known before" if known else "",
+                "growth as known before" if growth_is_prior else "",
             )
         )
     return Table.of(titles, rows, (0, 4))

@@ -1,4 +1,4 @@
-"""Charts of what the views cover: the image, the directions of sight, the axes of rotation."""
+"""Charts of the views' coverage: the image, the viewing directions, the rotation axes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from visioncal.core.types import FloatArray
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 
-# The image is divided so, for the eye to find what no corner reached.
+# Columns and rows of the image's grid, to show where no corner lies.
 _CELLS = (8, 5)
-# Rings of equal angle in the charts of directions and of axes.
+# Rings of equal angle in the charts of directions and axes [deg].
 DIRECTIONS_RINGS_DEG = (15, 30, 45, 60)
 AXES_RINGS_DEG = (30, 60, 90)
-# Smaller turns have axes that are mostly noise.
-_LEAST_TURN_RAD = np.deg2rad(1.0)
+# The axes of smaller rotations are mostly noise.
+_MIN_ROTATION_RAD = np.deg2rad(1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,10 @@ class PointChart:
     """Points of views in a plane whose x goes to the right and whose y goes down.
 
     Attributes:
-        name: What it is of: `image`, `directions` or `rotation_axes`.
+        name: `image`, `directions` or `rotation_axes`.
         points: By view, (k, 2).
-        lines: What is drawn behind them, (k, 2) each.
-        words: Texts with their places.
+        lines: Background lines, (k, 2) each.
+        words: Labels with their positions.
     """
 
     name: str
@@ -39,10 +39,8 @@ class PointChart:
 def image_chart(
     calibration: Calibration, evidence: Mapping[int, ViewEvidence]
 ) -> PointChart | None:
-    """All corners of all views in one image; None where there are none."""
-    points = {
-        view: other.corners.px for view, other in evidence.items() if other.corners is not None
-    }
+    """All corners of all views in one image; None if there are none."""
+    points = {view: seen.corners.px for view, seen in evidence.items() if seen.corners is not None}
     if not points or calibration.camera is None:
         return None
     return corners_chart(calibration.camera.camera.resolution, points)
@@ -60,12 +58,12 @@ def corners_chart(resolution: tuple[int, int], points: Mapping[int, FloatArray])
 
 
 def directions_chart(evidence: Mapping[int, ViewEvidence]) -> PointChart | None:
-    """Where the camera looked from: how far from the target's normal [deg], and to which side."""
+    """Viewing directions: angle from the target's normal [deg], and azimuth."""
     points = {
-        # The target's z axis points into the board, away from who looks at it.
-        view: _disc(other.cam_from_target[2:3, :3] * [-1.0, -1.0, 1.0])
-        for view, other in evidence.items()
-        if other.cam_from_target is not None
+        # The target's z axis points into the board, away from the camera.
+        view: _disc(seen.cam_from_target[2:3, :3] * [-1.0, -1.0, 1.0])
+        for view, seen in evidence.items()
+        if seen.cam_from_target is not None
     }
     if not points:
         return None
@@ -73,9 +71,9 @@ def directions_chart(evidence: Mapping[int, ViewEvidence]) -> PointChart | None:
 
 
 def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
-    """The axis about which the flange turned from each view to the next, in the flange's frame.
+    """Axis of the flange's rotation from each view to the next, in the flange's frame.
 
-    The middle is the flange's z axis, the rim its x, y plane; an axis and its reverse are one.
+    The centre is the flange's z axis, the rim its x, y plane; opposite axes coincide.
     """
     poses = {
         view.view: view.base_from_flange for view in evidence if view.base_from_flange is not None
@@ -83,29 +81,29 @@ def rotation_axes_chart(evidence: Sequence[ViewEvidence]) -> PointChart | None:
     if len(poses) < 2:
         return None
     rotations = np.array(list(poses.values()))[:, :3, :3]
-    turns = Rotation.from_matrix(rotations[:-1].transpose(0, 2, 1) @ rotations[1:]).as_rotvec()
+    rotvecs = Rotation.from_matrix(rotations[:-1].transpose(0, 2, 1) @ rotations[1:]).as_rotvec()
     points: dict[int, FloatArray] = {}
-    for view, turn in zip(list(poses)[1:], turns, strict=True):
-        angle_rad = float(np.linalg.norm(turn))
-        if angle_rad > _LEAST_TURN_RAD:
-            axis = turn / (angle_rad if turn[2] > 0 else -angle_rad)
+    for view, rotvec in zip(list(poses)[1:], rotvecs, strict=True):
+        angle_rad = float(np.linalg.norm(rotvec))
+        if angle_rad > _MIN_ROTATION_RAD:
+            axis = rotvec / (angle_rad if rotvec[2] > 0 else -angle_rad)
             points[view] = _disc(axis[None])
     return _disc_chart("rotation_axes", points, AXES_RINGS_DEG) if points else None
 
 
-def _disc(towards: FloatArray) -> FloatArray:
-    """(k, 3) unit vectors as (k, 2) points: their angle from z [deg], in their direction."""
-    angle_deg = np.rad2deg(np.arccos(np.clip(towards[:, 2], -1.0, 1.0)))
-    azimuth = np.arctan2(towards[:, 1], towards[:, 0])
+def _disc(directions: FloatArray) -> FloatArray:
+    """Azimuthal projection of (k, 3) unit vectors: (k, 2) with radius = angle from z [deg]."""
+    angle_deg = np.rad2deg(np.arccos(np.clip(directions[:, 2], -1.0, 1.0)))
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     return np.asarray(angle_deg[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1))
 
 
 def _disc_chart(
     name: str, points: Mapping[int, FloatArray], rings_deg: Sequence[int]
 ) -> PointChart:
-    """A chart with rings of equal angle, and the axes x and y."""
-    turn = np.linspace(0.0, 2 * np.pi, 73)
-    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    """A chart with rings of equal angle, and the x and y axes."""
+    angles = np.linspace(0.0, 2 * np.pi, 73)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     rim = float(rings_deg[-1])
     lines = [ring * circle for ring in rings_deg]
     lines += [np.array([[-rim, 0], [rim, 0]]), np.array([[0, -rim], [0, rim]])]
@@ -113,7 +111,7 @@ def _disc_chart(
     words = [
         ((1.08 * rim, 0.0), "x"),
         ((0.0, 1.08 * rim), "y"),
-        # Of the rim alone: words would hide the points of the middle.
+        # Only the rim is labelled: other labels would hide points.
         ((diagonal, -diagonal), f"{rim:g}\N{DEGREE SIGN}"),
     ]
     return PointChart(name, points, lines, words)

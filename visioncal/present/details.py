@@ -1,4 +1,4 @@
-"""What is said of a tool or a fixture: its figures, and what was observed of it."""
+"""Facts and observation table of a tool or a fixture."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Frame
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "_rad": "rad", "_m": "m", "_percent": "%"}
-# What keys mean, by their path; {} is the name of a point. Others are shown as they are written.
+# Labels by the key's path; {} is the name of a point. Other keys are shown as written.
 _LABELS = {
     "noise_95_mm": "noise, 95 %",
     "turn_deg": "largest turn between touches",
@@ -37,12 +37,12 @@ _LABELS = {
     "spare_points": "drawn points that were not measured",
 }
 _RANGES = {"noise_95_mm"}
-# Ratios near one: what counts are their last digits.
+# Ratios near one: their last digits matter.
 _RATIOS = {"scale.value"}
 
 
 def frame_facts(frame: Frame) -> tuple[Fact, ...]:
-    """How a tool or a fixture was found, and how well."""
+    """Method, source and accuracy of a tool or a fixture."""
     used = sum(observation.used for observation in frame.observations)
     return (
         Fact("method", frame.method),
@@ -56,7 +56,7 @@ def frame_facts(frame: Frame) -> tuple[Fact, ...]:
 
 
 def observation_table(frame: Frame) -> Table:
-    """How far each observation is off, and what became of it."""
+    """Residual and status of each observation."""
     rows = []
     for observation in frame.observations:
         mark = "left-out" if not observation.used else "look" if observation.reason else "used"
@@ -70,23 +70,19 @@ def observation_table(frame: Frame) -> Table:
     return Table.of(("observation", "kind", "mm", "used"), rows, (0, 1, 3))
 
 
-def details(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Writes the further figures of a method as (label, value, unit).
+def details(document: Mapping[str, Any], parent: str = "") -> Iterator[tuple[str, str, str]]:
+    """Further figures of a method as (label, value, unit); `parent` is the document's path.
 
-    Matrices and lists of objects are left out: they are for programs, which find them on disk.
+    Matrices and lists of objects are left out: programs read them from disk.
     """
-    yield from _details(document, "")
-
-
-def _details(document: Mapping[str, Any], parent: str) -> Iterator[tuple[str, str, str]]:
     for name, value in document.items():
         path = f"{parent}.{name}" if parent else name
         if isinstance(value, Mapping):
-            yield from _details(value, path)
+            yield from details(value, path)
             continue
         text = _text(value, _digits(path), " to " if path in _RANGES else ", ")
         if text:
-            # The keys of points are their names, and their unit is that of all of them.
+            # The keys of points are their names; the unit is that of their parent.
             suffix = _suffix(parent if parent in _LABELS else name)
             yield _label(parent, name), text, _UNITS.get(suffix, "")
 
@@ -110,8 +106,8 @@ def _digits(path: str) -> int:
     return 2 if path in _RANGES or "sigma" in path else 4
 
 
-def _text(value: object, digits: int, between: str) -> str:
-    """Writes a detail; empty for what is not for people."""
+def _text(value: object, digits: int, separator: str) -> str:
+    """A detail as text; empty if it is not for display."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int | float):
@@ -121,5 +117,5 @@ def _text(value: object, digits: int, between: str) -> str:
     if isinstance(value, Sequence) and all(
         isinstance(number, int | float | str) for number in value
     ):
-        return between.join(_text(number, digits, between) for number in value)
+        return separator.join(_text(number, digits, separator) for number in value)
     return ""

@@ -1,4 +1,4 @@
-"""What a result says, as facts and tables that pages and recordings show."""
+"""Facts and tables about a result, for pages and recordings."""
 
 from collections.abc import Iterator, Mapping
 from datetime import datetime
@@ -15,9 +15,9 @@ from visioncal.results import Calibration, CellResult, Edge, Rms
 from visioncal.results.sections import BoardResult, UncertaintyResult
 
 PLUS_MINUS, DEGREE = "\N{PLUS-MINUS SIGN}", "\N{DEGREE SIGN}"
-# Endings of names on disk, and what they are for people.
+# Suffixes of names on disk, and the units shown.
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "deg", "level": "times what is said of it"}
-# What each source of uncertainty is, for people.
+# Sources of uncertainty, in words.
 SOURCES = {
     "pixels": "noise of the corners",
     "instrument": "the instrument's readings",
@@ -33,9 +33,9 @@ SOURCES = {
     "lens_field": "the lens beyond its model",
     "misfit": "neighbouring stops that err alike",
 }
-# Of a frame's sigma, as it counts in its square.
+# As a share of the total sigma: a hundredth of the variance.
 _LEAST_SHARE = 0.1
-# What would lower each source's part.
+# How to reduce each source's contribution.
 _REMEDIES = {
     "pixels": "sharper images, or a board that fills more of them, would lower it",
     "instrument": "a nearer or a better instrument would lower it",
@@ -55,7 +55,7 @@ _REMEDIES = {
 
 
 def readable_time(created: str) -> str:
-    """When something was computed, for people; it stands in ISO 8601."""
+    """A time in ISO 8601, for display; other texts are returned as they are."""
     try:
         time = datetime.fromisoformat(created)
     except ValueError:
@@ -64,71 +64,73 @@ def readable_time(created: str) -> str:
 
 
 def of(name: str) -> str:
-    """Whose something is, behind its name; of one without a name, nothing."""
+    """The suffix ` of <name>`; empty without a name."""
     return f" of {name}" if name else ""
 
 
 def frame_words(frame: str) -> str:
-    """What a frame is the frame of."""
+    """A frame's name in words."""
     return {"cam": "the camera", "base": "the robot's base"}.get(frame, f"the {frame}")
 
 
 def answering_solver(calibration: Calibration) -> str | None:
-    """The solver whose transforms are the result; None where none's are."""
+    """The solver whose transforms are the result; None if there is none."""
     for name, result in calibration.solvers.items():
         if all(
-            edge in result.matrices and np.array_equal(result.matrices[edge], item.matrix)
-            for edge, item in calibration.edges.items()
+            edge in result.matrices and np.array_equal(result.matrices[edge], placed.matrix)
+            for edge, placed in calibration.edges.items()
         ):
             return name
     return None
 
 
 def edge_table(edges: Mapping[str, Edge]) -> Table:
-    """Position, rotation and sigma of transforms."""
+    """Position, rotation and sigma of each transform."""
     rows = []
     for name, edge in edges.items():
         position = ", ".join(f"{value:.2f}" for value in 1e3 * edge.transform.translation)
-        turn, sigma = "not measured", f"{significant(edge.sigma_mm)} mm"
+        rotation, sigma = "not measured", f"{significant(edge.sigma_mm)} mm"
         if edge.oriented:
             degrees = edge.transform.rotation.as_rotvec(degrees=True)
-            turn = ", ".join(f"{value:.3f}" for value in degrees)
+            rotation = ", ".join(f"{value:.3f}" for value in degrees)
             sigma += f", {significant(edge.sigma_deg)} deg"
-        rows.append((name, position, turn, sigma))
+        rows.append((name, position, rotation, sigma))
     titles = ("transform", "x, y, z [mm]", "rotation vector [deg]", "sigma")
     return Table.of(titles, rows, (0, 1, 2, 3))
 
 
 def solver_table(calibration: Calibration) -> Table | None:
-    """What each solver left, and how far its edges are from the result's; None without solvers."""
+    """Residuals of each solver, and the distances of its edges from the result's."""
     if not calibration.solvers:
         return None
     titles = ("solver", "rms, mm", "rms, deg", *(f"{edge} off by" for edge in calibration.edges))
-    answer, rows = answering_solver(calibration), []
+    chosen, rows = answering_solver(calibration), []
     for name, result in calibration.solvers.items():
-        away = [
+        distances = [
             f"{significant(mm)} mm, {significant(deg)}{DEGREE}"
-            if name != answer and word in result.matrices
+            if name != chosen and edge_name in result.matrices
             else significant(None)
-            for word, edge in calibration.edges.items()
-            for mm, deg in [pose_difference(edge.matrix, result.matrices.get(word, edge.matrix))]
+            for edge_name, edge in calibration.edges.items()
+            for mm, deg in [
+                pose_difference(edge.matrix, result.matrices.get(edge_name, edge.matrix))
+            ]
         ]
-        label = f"{name} (result)" if name == answer else name
-        rows.append((label, significant(result.rms_mm), significant(result.rms_deg), *away))
+        label = f"{name} (result)" if name == chosen else name
+        rows.append((label, significant(result.rms_mm), significant(result.rms_deg), *distances))
     return Table.of(titles, rows)
 
 
 def moved_table(cell: CellResult) -> Table:
-    """What moved while the session was taken, and what nothing ties to the rest."""
+    """Frames that moved during the session, and frames that no observation links."""
     rows = []
     for move in cell.moved:
-        how_far = f"{significant(move.shift_mm)} mm, {significant(move.turn_deg)}{DEGREE}"
+        distance = f"{significant(move.shift_mm)} mm, {significant(move.turn_deg)}{DEGREE}"
         rivals = f" It may have been {', '.join(move.rivals)} instead." if move.rivals else ""
-        words = (
+        explanation = (
             f"Between stops {move.last_stop} and {move.first_stop}. {move.frame} is where it stood "
             f"last, {move.before} where it stood before.{rivals}"
         )
-        rows.append(TableRow((move.frame, how_far, words), "look"))
+        rows.append(TableRow((move.frame, distance, explanation), "look"))
     rows += [
         TableRow((untied.frame, "not tied", untied.remedy), "left-out") for untied in cell.untied
     ]
@@ -136,7 +138,7 @@ def moved_table(cell: CellResult) -> Table:
 
 
 def residual_table(calibration: Calibration) -> Table:
-    """Residuals of the fit, of views left out in turn, and of the declared hold-out set."""
+    """Residuals of the fit, of cross-validation, and of the declared hold-out set."""
     validation = calibration.validation
     left_out = validation.held_out if validation.is_of_unseen else None
     sets = (
@@ -155,7 +157,7 @@ def _rms_cells(rms: Rms) -> Iterator[str]:
 
 
 def pair_table(calibration: Calibration) -> Table | None:
-    """How well what each camera saw of each target fits; None of one camera and one robot."""
+    """Residuals by camera and target; None for one camera and one robot."""
     if calibration.cell is None:
         return None
     with_unseen = calibration.validation.is_of_unseen
@@ -172,22 +174,19 @@ def pair_table(calibration: Calibration) -> Table | None:
 
 
 def source_table(calibration: Calibration) -> Table | None:
-    """What the place of a point, or of each frame of a whole cell, is uncertain by [mm].
+    """Uncertainty budget of a point, or of each frame of a cell [mm]; None where unknown.
 
-    Of a cell, a source that counts for less than a hundredth of every frame's variance is left out.
-
-    Returns:
-        The table; None where that is unknown.
+    For a cell, a source below a hundredth of every frame's variance is left out.
     """
-    known, named = calibration.budget, calibration.by_name.uncertainty
-    if known is not None:
-        found = [
-            (SOURCES.get(name, name), significant(value), known.percent(name))
-            for name, value in known.parts_mm.items()
+    point_budget, cell_uncertainty = calibration.budget, calibration.by_name.uncertainty
+    if point_budget is not None:
+        budget_rows = [
+            (SOURCES.get(name, name), significant(value), point_budget.percent(name))
+            for name, value in point_budget.parts_mm.items()
         ]
-        total = ("total", significant(known.total_mm), "")
-        return Table.of(("source", "sigma, mm", "of the variance"), [*found, total])
-    budgets = {} if named is None else named.budget_mm
+        total = ("total", significant(point_budget.total_mm), "")
+        return Table.of(("source", "sigma, mm", "of the variance"), [*budget_rows, total])
+    budgets = {} if cell_uncertainty is None else cell_uncertainty.budget_mm
     if not budgets:
         return None
     names = dict.fromkeys(name for budget in budgets.values() for name in budget)
@@ -198,35 +197,35 @@ def source_table(calibration: Calibration) -> Table | None:
             budget.get(name, 0.0) > _LEAST_SHARE * budget["total"] for budget in budgets.values()
         )
     ]
-    rows = [
+    edge_rows = [
         (edge, *(significant(budget.get(name)) for name in shown))
         for edge, budget in budgets.items()
     ]
-    return Table.of(("", *(SOURCES.get(name, name) for name in shown)), rows)
+    return Table.of(("", *(SOURCES.get(name, name) for name in shown)), edge_rows)
 
 
-def summary(calibration: Calibration, found: UncertaintyResult) -> tuple[str, ...]:
-    """Sentences: how well a point is placed where the views look, and what limits it."""
+def summary(calibration: Calibration, budget: UncertaintyResult) -> tuple[str, ...]:
+    """Sentences: the sigma of a point where the views look, and its largest source."""
     parent, _, sensor = next(iter(calibration.edges)).partition("_from_")
     where = "the views look" if calibration.camera is not None else "it was measured"
     sentences = [
-        f"A point where {where}, {significant(found.distance_m)} m from {frame_words(sensor)}, is "
+        f"A point where {where}, {significant(budget.distance_m)} m from {frame_words(sensor)}, is "
         f"placed in the frame of {frame_words(parent)} with a sigma of "
-        f"{significant(found.total_mm)} mm; 95 % of such results are right to within "
-        f"{significant(found.radius95_mm)} mm."
+        f"{significant(budget.total_mm)} mm; 95 % of such results are right to within "
+        f"{significant(budget.radius95_mm)} mm."
     ]
-    if found.total_mm > 0.0:
-        largest = next(iter(found.parts_mm))
+    if budget.total_mm > 0.0:
+        largest = next(iter(budget.parts_mm))
         remedy = f"; {_REMEDIES[largest]}" if largest in _REMEDIES else ""
         sentences.append(
-            f"The largest part, {found.percent(largest)} of the variance, comes from the "
+            f"The largest part, {budget.percent(largest)} of the variance, comes from the "
             f"{largest.replace('_', ' ')}{remedy}."
         )
     return tuple(sentences)
 
 
 def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:
-    """The noise's levels, with the intervals that they lie in with 95 % where these are known."""
+    """Noise levels, with their 95 % intervals where known."""
     return tuple(
         _noise_fact(of, name, value, levels.intervals.get(name))
         for of, levels in parts.noise(calibration).items()
@@ -247,7 +246,7 @@ def _noise_fact(of: str, name: str, value: float, interval: tuple[float, float] 
 def board_facts(
     calibration: Calibration, board: BoardResult, target: Target | None
 ) -> tuple[Fact, ...]:
-    """The board's size and shape, stated and found; empty where nothing was looked for."""
+    """The board's size and shape, stated and estimated; empty if nothing was estimated."""
     if not board.sigma:
         return ()
     if answering_solver(calibration) not in (None, "joint"):
@@ -259,9 +258,9 @@ def board_facts(
         facts.append(Fact("bend", "none", "flat within what is seen"))
     if "shear" in board.estimated:
         angle, sigma = np.rad2deg([board.shape["shear"], board.sigma["shear"]])
-        known = f"{PLUS_MINUS} {significant(sigma)}"
+        tolerance = f"{PLUS_MINUS} {significant(sigma)}"
         angle_deg = f"{90 - angle:.{decimals_for(sigma)}f} deg"
-        facts.append(Fact("angle of rows and columns", angle_deg, known))
+        facts.append(Fact("angle of rows and columns", angle_deg, tolerance))
     return tuple(facts)
 
 
@@ -272,14 +271,14 @@ def _size_facts(board: BoardResult, target: Target) -> tuple[Fact, ...]:
         f"{matched(1e3 * target.square_m, sigma_mm)} mm",
         f"{PLUS_MINUS} {significant(sigma_mm)}",
     )
-    moved = {"scale", "aspect"} & set(board.estimated)
-    if not moved:
+    adjusted = {"scale", "aspect"} & set(board.estimated)
+    if not adjusted:
         return (stated, Fact("squares, found", "as stated", "nothing speaks against it"))
-    known_mm = 1e3 * target.square_m * board.sigma.get("scale", target.square_sigma_m)
-    decimals = decimals_for(known_mm)
+    posterior_mm = 1e3 * target.square_m * board.sigma.get("scale", target.square_sigma_m)
+    decimals = decimals_for(posterior_mm)
     x_mm, y_mm = (f"{1e3 * square:.{decimals}f}" for square in board.squares_m(target))
-    note = f"{PLUS_MINUS} {significant(known_mm)}"
-    if "scale" in moved:
+    note = f"{PLUS_MINUS} {significant(posterior_mm)}"
+    if "scale" in adjusted:
         note += ", between what is stated and what the robot's motion measures"
-    found = f"{x_mm} \N{MULTIPLICATION SIGN} {y_mm} mm"
-    return (stated, Fact("squares, found", found, note))
+    size = f"{x_mm} \N{MULTIPLICATION SIGN} {y_mm} mm"
+    return (stated, Fact("squares, found", size, note))

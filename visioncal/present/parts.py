@@ -1,7 +1,7 @@
-"""What a result has of each kind, by name.
+"""The cameras, robots, boards and frames of a result, by name.
 
-A whole cell has cameras, arms and boards with names; one camera with one robot is the case of one
-of each, whose name is empty.
+A cell has named cameras, arms and boards. One camera with one robot has one of each, whose name is
+empty.
 """
 
 from collections.abc import Mapping
@@ -19,12 +19,12 @@ from visioncal.session.frames import CELL
 
 @dataclass(frozen=True, eq=False)
 class FrameHierarchy:
-    """What hangs on what.
+    """The tree of frames, with the poses that are fixed.
 
     Attributes:
-        parents: What each frame hangs on, the cell the first of them.
-        matrices: (4, 4) `parent_from_frame` of those that no robot moves there.
-        robots: The robot's name of each flange, by its frame.
+        parents: Parent of each frame; the cell is the root.
+        matrices: (4, 4) `parent_from_frame` of the frames that no robot moves on their parent.
+        robots: Robot name by its flange's frame.
     """
 
     parents: Mapping[str, str]
@@ -34,33 +34,33 @@ class FrameHierarchy:
 
 @dataclass(frozen=True)
 class Levels:
-    """Levels of noise by name, as `pixel_px`, and those of their 95 % intervals that are known."""
+    """Noise levels by name, as `pixel_px`, and their 95 % intervals where known."""
 
     sigmas: Mapping[str, float]
     intervals: Intervals
 
 
 def cameras(calibration: Calibration) -> Mapping[str, CameraResult]:
-    """The cameras by their frames."""
+    """Cameras by frame."""
     if calibration.cell is not None:
         return calibration.cell.lenses
     return {} if calibration.camera is None else {"": calibration.camera}
 
 
 def image_width(calibration: Calibration) -> int | None:
-    """Width of the images, of several cameras that of the widest [px]; None without a camera."""
+    """Width of the widest camera's images [px]; None without a camera."""
     widths = [camera.camera.resolution[0] for camera in cameras(calibration).values()]
     return max(widths, default=None)
 
 
 def robots(calibration: Calibration) -> dict[str, Robot]:
-    """The nominal models of the robots, as far as they are known."""
-    found = calibration.by_name.robots.items()
-    return {name: robot.model for name, robot in found if robot.model is not None}
+    """Nominal models of the robots, where known."""
+    named = calibration.by_name.robots.items()
+    return {name: robot.model for name, robot in named if robot.model is not None}
 
 
 def calibrated_robots(calibration: Calibration) -> dict[str, Robot]:
-    """The robots as they were calibrated, or else their nominal models."""
+    """Calibrated models of the robots, or else their nominal ones."""
     calibrated = {
         name: robot.arm.robot
         for name, robot in calibration.by_name.robots.items()
@@ -70,15 +70,15 @@ def calibrated_robots(calibration: Calibration) -> dict[str, Robot]:
 
 
 def stated_boards(session: Session | None) -> dict[str, Target]:
-    """The boards as the session states them, by the names that results give them."""
+    """Boards as the session states them, by their names in results."""
     if session is None:
         return {}
-    found = {**session.plates, **session.boards}
-    return {"target": found[""], **found} if "" in found else found
+    boards = {**session.plates, **session.boards}
+    return {"target": boards[""], **boards} if "" in boards else boards
 
 
 def noise(calibration: Calibration) -> dict[str, Levels]:
-    """The levels of noise of each sensor and each robot."""
+    """Noise levels of each sensor and each robot."""
     named = calibration.by_name
     intervals = {} if named.uncertainty is None else named.uncertainty.noise_95
     robots = named.flanges.values()
@@ -89,9 +89,9 @@ def noise(calibration: Calibration) -> dict[str, Levels]:
 
 
 def frames(calibration: Calibration | None) -> FrameHierarchy:
-    """The frames of a result as they hang last, tools and fixtures among them.
+    """Frames of a result at the end of the session, with tools and fixtures.
 
-    Without a result, base and flange of one robot.
+    Without a result: base and flange of one robot.
     """
     if calibration is None:
         return FrameHierarchy({"base": CELL, "flange": "base"}, {"base": np.eye(4)}, {"flange": ""})

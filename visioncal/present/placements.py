@@ -1,4 +1,4 @@
-"""Where single views place their targets, against where the result does."""
+"""Target poses by single views, relative to the result."""
 
 import numpy as np
 
@@ -10,35 +10,42 @@ from visioncal.session import Session, frame_name
 
 
 def target_frames(calibration: Calibration, session: Session | None) -> dict[int, str]:
-    """The frame of the target that each view of an only camera shows, where it is placed."""
+    """Frame of the target in each view of a single camera, where the result places it."""
     placed = [name.rpartition("_from_")[2] for name in calibration.edges][1:]
     if session is None or calibration.cell is not None:
         return {}
     if not session.targets:
-        # A target, or what an instrument reads in its place.
+        # A target, or an instrument's probe in its place.
         return dict.fromkeys((view.number for view in session.views), placed[0])
     frames = {view.number: frame_name("target", session.board_of(view)) for view in session.views}
     return {view: frame for view, frame in frames.items() if frame in placed}
 
 
 def placement(
-    calibration: Calibration, seen: ViewEvidence, frame: str | None = None
+    calibration: Calibration, view_poses: ViewEvidence, frame: str | None = None
 ) -> FloatArray | None:
-    """Where a view of an only camera places its target against where the result does.
+    """Target pose by one view of a single camera, relative to the result.
 
     Args:
         calibration: The result.
-        seen: The view's poses.
-        frame: The frame of the target that it shows; that of an only one where None.
+        view_poses: Poses of the view.
+        frame: Frame of its target; None for a single target.
 
     Returns:
         (4, 4) in the target's frame [m]; None without poses.
     """
-    if seen.base_from_flange is None or seen.cam_from_target is None:
+    if view_poses.base_from_flange is None or view_poses.cam_from_target is None:
         return None
-    # The edge of the camera, or of the instrument, is the first; targets' follow.
-    x, *targets = calibration.edges
-    z = next((target for target in targets if target.endswith(f"_from_{frame}")), targets[0])
+    # The first edge is the camera's or the instrument's; targets' edges follow.
+    sensor, *targets = calibration.edges
+    target_edge = next(
+        (target for target in targets if target.endswith(f"_from_{frame}")), targets[0]
+    )
     is_in_hand, edges = calibration.mount == "eye-in-hand", calibration.edges
-    robot = seen.base_from_flange if is_in_hand else invert(seen.base_from_flange)
-    return np.asarray(invert(edges[z].matrix) @ robot @ edges[x].matrix @ seen.cam_from_target)
+    robot = view_poses.base_from_flange if is_in_hand else invert(view_poses.base_from_flange)
+    return np.asarray(
+        invert(edges[target_edge].matrix)
+        @ robot
+        @ edges[sensor].matrix
+        @ view_poses.cam_from_target
+    )

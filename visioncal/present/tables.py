@@ -22,10 +22,10 @@ class TableRow:
     """A row of a table.
 
     Attributes:
-        cells: Its text; one alone is a heading of the rows below.
-        mark: What it is marked as: `taken`, `sure`, `used`, `look` (at it), `left-out` or
-            `rejected`; empty for nothing.
-        anchor: By what name a link leads to it; empty for none.
+        cells: Its text; a single cell is a heading of the rows below.
+        mark: Kind of highlighting: `taken`, `sure`, `used`, `look` (worth a look), `left-out` or
+            `rejected`; empty for none.
+        anchor: Name that links lead to; empty for none.
     """
 
     cells: tuple[str, ...]
@@ -38,9 +38,9 @@ class Table:
     """A table.
 
     Attributes:
-        titles: Of its columns.
+        titles: Column titles.
         rows: Its rows.
-        words: The places of columns that have words; the others have figures.
+        words: Indices of columns with text; the others have figures.
     """
 
     titles: tuple[str, ...]
@@ -54,25 +54,27 @@ class Table:
         rows: Iterable[Sequence[str] | TableRow],
         words: tuple[int, ...] = (0,),
     ) -> "Table":
-        """A table without the columns in which nothing is known."""
-        marked = [row if isinstance(row, TableRow) else TableRow(tuple(row)) for row in rows]
-        filled = [group.cells for group in marked if len(group.cells) > 1]
+        """A table without the columns in which no value is known."""
+        all_rows = [
+            given if isinstance(given, TableRow) else TableRow(tuple(given)) for given in rows
+        ]
+        filled = [row.cells for row in all_rows if len(row.cells) > 1]
         kept = [
-            at
-            for at in range(len(titles))
-            if not filled or any(value[at] not in ("", _UNKNOWN) for value in filled)
+            column
+            for column in range(len(titles))
+            if not filled or any(value[column] not in ("", _UNKNOWN) for value in filled)
         ]
         return cls(
-            tuple(titles[at] for at in kept),
-            tuple(replace(group, cells=_some(group.cells, kept)) for group in marked),
-            tuple(place for place, at in enumerate(kept) if at in words),
+            tuple(titles[column] for column in kept),
+            tuple(replace(row, cells=_some(row.cells, kept)) for row in all_rows),
+            tuple(index for index, column in enumerate(kept) if column in words),
         )
 
     def parts(self, count: int) -> Iterator["Table"]:
-        """Its rows in so many tables, one beside the other."""
+        """Its rows split into at most `count` tables, to stand side by side."""
         size = max(-(-len(self.rows) // count), 1)
-        for at in range(0, len(self.rows), size):
-            yield replace(self, rows=self.rows[at : at + size])
+        for start in range(0, len(self.rows), size):
+            yield replace(self, rows=self.rows[start : start + size])
 
 
 def _some(cells: tuple[str, ...], kept: Sequence[int]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What an identification of dynamics says, as tables that page and recording show."""
+"""Tables of an identified dynamic model, for pages and recordings."""
 
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,7 @@ from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
 from visioncal.present.tables import Table, TableRow
 
-# A tenth of a second to import, which reports of calibrations need not wait for.
+# Its import takes a tenth of a second, which reports of calibrations do not need.
 if TYPE_CHECKING:
     from visioncal.dynamics import Identified
 
@@ -24,19 +24,19 @@ _MARKS = {"2 %": "sure", "10 %": "used"}
 
 
 def torque_table(identified: "Identified") -> Table:
-    """How well the torques of each joint are fitted, and predicted of a motion not fitted."""
-    (first, *_), found = identified.streams, identified.validation
+    """Torque errors of each joint: of the fit, and of predictions for unseen motion."""
+    (first, *_), validation = identified.streams, identified.validation
     figures: dict[str, FloatArray | None] = {
         "torque [N m]": first.torque_nm,
         "noise [N m]": first.noise_nm,
         "error, fitted [N m]": first.rms_nm,
     }
-    if found is not None:
+    if validation is not None:
         figures |= {
-            "error, unseen [N m]": found.rms_nm,
-            "of the torque [%]": 100.0 * found.shares,
-            "as bodies [N m]": found.consistent_rms_nm,
-            "known before [N m]": found.known_rms_nm,
+            "error, unseen [N m]": validation.rms_nm,
+            "of the torque [%]": 100.0 * validation.shares,
+            "as bodies [N m]": validation.consistent_rms_nm,
+            "known before [N m]": validation.known_rms_nm,
         }
     columns = [
         [significant(None)] * identified.robot.joint_count
@@ -49,9 +49,13 @@ def torque_table(identified: "Identified") -> Table:
 
 
 def torque_note(identified: "Identified") -> str:
-    """What the columns of `torque_table` are."""
-    found = identified.validation
-    unseen = "There is no motion beside the fitted one." if found is None else f"{found.label}."
+    """Legend of the columns of `torque_table`."""
+    validation = identified.validation
+    unseen = (
+        "There is no motion beside the fitted one."
+        if validation is None
+        else f"{validation.label}."
+    )
     return (
         "Torque: its standard deviation over the fitted motion. Errors are root mean squares. "
         f"Unseen: {unseen} As bodies: with masses and inertias that real links can have. Known "
@@ -61,9 +65,9 @@ def torque_note(identified: "Identified") -> str:
 
 
 def base_parameter_table(identified: "Identified") -> Table:
-    """What is known of each base parameter."""
+    """Value and sigma of each base parameter."""
     base, rows = identified.base, []
-    for name, own, value, sigma, share in zip(
+    for name, index, value, sigma, share in zip(
         base.names,
         base.independent,
         identified.values.tolist(),
@@ -71,29 +75,28 @@ def base_parameter_table(identified: "Identified") -> Table:
         identified.determined,
         strict=True,
     ):
-        unit = _unit_of(base.model.names[own])
+        unit = _unit_of(base.model.names[index])
         cells = (name, matched(value, sigma), significant(sigma), unit, share)
         rows.append(TableRow(cells, _MARKS.get(share, "rejected")))
     return Table.of(("combination", "value", "sigma", "unit", "known to"), rows, (0, 3, 4))
 
 
 def _unit_of(name: str) -> str:
-    """The unit of a standard parameter."""
     if "*" in name:
         return _FIRST_MOMENT
     return next(unit for start, unit in _UNITS.items() if name.startswith(start))
 
 
 def link_table(identified: "Identified") -> Table | None:
-    """Each link as a body, with the mass that was known before; None where none was found."""
+    """Mass and centre of mass of each link, estimated and by the robot's description."""
     if identified.inertias is None:
         return None
-    found, known = identified.inertias.masses, identified.robot.masses
+    masses, described = identified.inertias.masses, identified.robot.masses
     rows = []
-    for at, joint in enumerate(identified.robot.joint_names):
-        centre = ", ".join(f"{value:.1f}" for value in 1e3 * np.asarray(found.centres_m[at]))
-        before = significant(None if known is None else float(known.kg[at]), 3)
-        rows.append((joint, significant(float(found.kg[at]), 3), before, centre))
+    for index, joint in enumerate(identified.robot.joint_names):
+        centre = ", ".join(f"{value:.1f}" for value in 1e3 * np.asarray(masses.centres_m[index]))
+        described_kg = significant(None if described is None else float(described.kg[index]), 3)
+        rows.append((joint, significant(float(masses.kg[index]), 3), described_kg, centre))
     titles = ("link behind joint", "mass [kg]", "known before [kg]",
               "centre in the joint's frame [mm]")  # fmt: skip
     return Table.of(titles, rows)

@@ -1,7 +1,7 @@
-"""A synthetic robot cell with a forward model of its own: whatever it says is the truth.
+"""A synthetic robot cell with an independent forward model, which provides ground truth.
 
-Nothing here uses the application's camera, robot, targets, solvers or estimator, so that a wrong
-projection or a wrong chain cannot hide by being wrong in both.
+Nothing here uses the application's camera, robot, targets, solvers or estimator, so that an error
+in a projection or in a kinematic chain cannot cancel out.
 """
 
 from visioncal.simulation.arms import DhArm, arm_named, forward, ur_arm

@@ -1,7 +1,7 @@
 """Simulated arms: Universal Robots' published geometry, forward and inverse kinematics.
 
-The chain is written out here in plain numpy and shares nothing with the robot model of the
-application, so that a wrong chain cannot hide by being wrong in both.
+The chain is implemented here in plain numpy, independent of the application's robot model, so that
+an error in the chain cannot cancel out.
 """
 
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ from visioncal.core.transforms import cross
 from visioncal.core.types import FloatArray
 
 _HALF_TURN = np.pi
-# A strain-wave gear of ratio 100 ripples twice a turn of its wave generator.
+# Ripples per turn of a strain-wave gear of ratio 100: two per turn of its wave generator.
 _TEETH = 200
-# Angles all around at which functions of the joints are drawn; between them they run straight.
+# Nodes per turn of the joints' error functions, which are linear in between.
 _NODES = 1440
 
 
@@ -26,9 +26,9 @@ _NODES = 1440
 class DhArm:
     """A serial arm of revolute joints in standard Denavit-Hartenberg form.
 
-    Link i is `Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i) Ry(beta_i)`. The last turn is
-    Hayati's (1983): where two axes are parallel, their lack of parallelism about y is not in the
-    reach of the other four. It is zero in every nominal arm.
+    Link i is `Rz(q_i + offset_i) Tz(d_i) Tx(a_i) Rx(alpha_i) Ry(beta_i)`. The last rotation is
+    Hayati's (1983): where two axes are nearly parallel, the other four parameters cannot represent
+    their misalignment about y. It is zero in every nominal arm.
 
     Attributes:
         name: Name of the model.
@@ -37,10 +37,9 @@ class DhArm:
         alpha: (n,) twists about x [rad].
         beta: (n,) Hayati's twists about y [rad].
         offset: (n,) joint angles at which the encoders read zero [rad].
-        waves: (4, n) what each joint turns beyond its encoder: sine and cosine of its angle, from
-            an eccentric disc, and of the gear's ripple [rad].
-        beyond: (k, n) what each joint turns beyond all that, at k angles all around [rad]; None for
-            nothing.
+        waves: (4, n) periodic joint errors: sine and cosine amplitudes at the joint's angle, from
+            eccentricity, and of the gear's ripple [rad].
+        beyond: (k, n) further joint errors at k angles over a turn [rad]; None for none.
     """
 
     name: str
@@ -55,17 +54,17 @@ class DhArm:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmErrors:
-    """How a real arm departs from its data sheet, as standard deviations per parameter.
+    """Standard deviations of a real arm's parameters from the nominal ones.
 
     Attributes:
-        dh_sigma_m: Of every length a and d [m].
-        dh_sigma_rad: Of every alpha, beta and joint offset [rad].
-        offset_sigma_rad: Of the joint offsets, on top of `dh_sigma_rad` [rad].
-        eccentricity_sigma_rad: How far each joint turns with the sine and the cosine of its angle
-            beyond what its encoder says [rad].
-        ripple_sigma_rad: The same for the ripple of its gear, many times a turn [rad].
-        function_sigma_rad: How far each joint turns beyond that by any function of its angle [rad].
-        function_length_rad: Over which change of the angle that function changes [rad].
+        dh_sigma_m: Every length a and d [m].
+        dh_sigma_rad: Every alpha, beta and joint offset [rad].
+        offset_sigma_rad: Joint offsets, in addition to `dh_sigma_rad` [rad].
+        eccentricity_sigma_rad: Sine and cosine amplitudes of the joint errors at the joint's angle
+            [rad].
+        ripple_sigma_rad: Likewise for the gear's ripple, many times per turn [rad].
+        function_sigma_rad: Further joint errors as arbitrary functions of the angle [rad].
+        function_length_rad: Correlation length of these functions [rad].
     """
 
     dh_sigma_m: float = 0.0
@@ -79,13 +78,13 @@ class ArmErrors:
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Outcome of the inverse kinematics.
+    """Result of the inverse kinematics.
 
     Attributes:
-        joints: (m, n) joint angles [rad], meaningful where `solved`.
+        joints: (m, n) joint angles [rad], valid where `solved`.
         solved: (m,) whether the pose was reached within the joints' limits.
-        dexterity: (m,) smallest singular value of the Jacobian with lengths in units of the
-            arm's reach; it vanishes in a singular posture.
+        dexterity: (m,) smallest singular value of the Jacobian with lengths in units of the arm's
+            reach; zero in a singular posture.
     """
 
     joints: FloatArray
@@ -94,7 +93,7 @@ class Reach:
 
 
 def ur_arm(name: str) -> DhArm:
-    """Nominal arm of Universal Robots' e-Series by the values that the maker publishes.
+    """Nominal arm of Universal Robots' e-Series by the manufacturer's values.
 
     Source: Universal Robots, "DH parameters for calculations of kinematics and dynamics".
 
@@ -133,9 +132,10 @@ def ur_arm(name: str) -> DhArm:
 
 
 def industrial_arm() -> DhArm:
-    """Nominal arm of 1.8 m reach in the proportions of a medium industrial one.
+    """Nominal arm of 1.8 m reach in the proportions of a medium industrial robot.
 
-    No maker's: round numbers, a shoulder that is off the first axis, and a spherical wrist.
+    It is no actual model: round numbers, a shoulder with an offset from the first axis, and a
+    spherical wrist.
     """
     quarter = 0.5 * np.pi
     return DhArm(
@@ -150,10 +150,10 @@ def industrial_arm() -> DhArm:
 
 
 def arm_named(name: str) -> DhArm:
-    """The nominal arm of a name: Universal Robots', or `generic-6r-1800`.
+    """Nominal arm by name: Universal Robots', or `generic-6r-1800`.
 
     Raises:
-        DataError: There is none of that name.
+        DataError: There is no arm of that name.
     """
     return industrial_arm() if name == "generic-6r-1800" else ur_arm(name)
 
@@ -161,11 +161,11 @@ def arm_named(name: str) -> DhArm:
 def disturb(arm: DhArm, errors: ArmErrors, rng: np.random.Generator) -> DhArm:
     """Draws a real arm around a nominal one.
 
-    The same generator state gives the same directions of error whatever their size.
+    The same generator state gives the same error directions, whatever their size.
     """
     draws, waves = rng.standard_normal((6, arm.a.size)), rng.standard_normal((4, arm.a.size))
     sizes = np.repeat([errors.eccentricity_sigma_rad, errors.ripple_sigma_rad], 2)
-    # Nothing is drawn for nothing: what others draw behind it stays.
+    # Drawn only if needed, so that later draws do not change.
     beyond = _functions(errors, arm.a.size, rng) if errors.function_sigma_rad else arm.beyond
     return replace(
         arm,
@@ -180,28 +180,24 @@ def disturb(arm: DhArm, errors: ArmErrors, rng: np.random.Generator) -> DhArm:
 
 
 def _functions(errors: ArmErrors, joints: int, rng: np.random.Generator) -> FloatArray:
-    """(k, n) smooth periodic functions of a random course, by filtering white noise on a circle."""
-    turned = np.linspace(0.0, 2.0 * np.pi, _NODES, endpoint=False)
-    near = np.exp(-2.0 * np.sin(0.5 * turned) ** 2 / errors.function_length_rad**2)
-    power = np.sqrt(np.maximum(np.fft.rfft(near).real, 0.0))[:, None]
+    """(k, n) random smooth periodic functions: filtered white noise on a circle."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _NODES, endpoint=False)
+    kernel = np.exp(-2.0 * np.sin(0.5 * angles) ** 2 / errors.function_length_rad**2)
+    power = np.sqrt(np.maximum(np.fft.rfft(kernel).real, 0.0))[:, None]
     white = np.fft.rfft(rng.standard_normal((_NODES, joints)), axis=0)
     return np.asarray(errors.function_sigma_rad * np.fft.irfft(power * white, _NODES, axis=0))
 
 
 def reach_m(arm: DhArm) -> float:
-    """Length of the stretched upper and lower arm [m]."""
+    """Length of the stretched upper arm and forearm [m]."""
     return float(np.abs(arm.a).sum())
 
 
 def link_frames(arm: DhArm, joints: FloatArray) -> FloatArray:
-    """Frames of all links for a batch of postures.
-
-    Args:
-        arm: The arm, n joints.
-        joints: (m, n) joint angles [rad].
+    """Link frames of (m, n) joint angles [rad].
 
     Returns:
-        (m, n + 1, 4, 4) `base_from_link`, the base itself first and the flange last.
+        (m, n + 1, 4, 4) `base_from_link`, from the base itself to the flange.
     """
     frames = np.empty((len(joints), arm.a.size + 1, 4, 4))
     frames[:, 0] = np.eye(4)
@@ -216,18 +212,11 @@ def forward(arm: DhArm, joints: FloatArray) -> FloatArray:
 
 
 def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reach:
-    """Inverse kinematics by damped least squares, from one starting posture for each pose.
+    """Inverse kinematics by damped least squares, of (m, 4, 4) poses from (m, n) starts [rad].
 
-    Method: Wampler (1986); the damping follows the remaining error, so that the end of the
-    iteration is Newton's and reaches machine precision.
-
-    Args:
-        arm: The arm, n joints.
-        base_from_flange: (m, 4, 4) poses to reach.
-        seeds: (m, n) starting postures [rad].
-
-    Returns:
-        The postures, with the elbow within half a turn and every other joint within a turn.
+    Method: Wampler (1986). The damping decreases with the error, so that the iteration ends as
+    Newton's method and reaches machine precision. The elbow is within half a turn, and every other
+    joint within a turn.
     """
     joints = seeds.copy()
     scale = np.repeat([1.0, 1.0 / reach_m(arm)], 3)
@@ -241,7 +230,8 @@ def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reac
         step = np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(gram, error[..., None])
         joints += np.clip(step[..., 0], -0.5, 0.5)
     jacobian, error = _linearise(arm, joints, base_from_flange, scale)
-    joints = seeds + _wrap(joints - seeds)
+    # The joint angles closest to the seeds.
+    joints = seeds + ((joints - seeds + _HALF_TURN) % (2.0 * _HALF_TURN) - _HALF_TURN)
     limits = np.full(arm.a.size, 2.0 * _HALF_TURN)
     limits[2] = _HALF_TURN
     within = np.all(np.abs(joints) < limits, axis=1)
@@ -254,14 +244,14 @@ def inverse(arm: DhArm, base_from_flange: FloatArray, seeds: FloatArray) -> Reac
 
 def _link(arm: DhArm, i: int, angle: FloatArray) -> FloatArray:
     """(m, 4, 4) `link_from_next` of joint i."""
-    turned = angle + arm.offset[i]
+    joint_angle = angle + arm.offset[i]
     if arm.waves[:, i].any():
         phases = [np.sin(angle), np.cos(angle), np.sin(_TEETH * angle), np.cos(_TEETH * angle)]
-        turned = turned + arm.waves[:, i] @ np.array(phases)
+        joint_angle = joint_angle + arm.waves[:, i] @ np.array(phases)
     if arm.beyond is not None:
         nodes = np.linspace(0.0, 2.0 * np.pi, len(arm.beyond), endpoint=False)
-        turned = turned + np.interp(angle, nodes, arm.beyond[:, i], period=2.0 * np.pi)
-    cos_q, sin_q = np.cos(turned), np.sin(turned)
+        joint_angle = joint_angle + np.interp(angle, nodes, arm.beyond[:, i], period=2.0 * np.pi)
+    cos_q, sin_q = np.cos(joint_angle), np.sin(joint_angle)
     cos_a, sin_a = np.cos(arm.alpha[i]), np.sin(arm.alpha[i])
     matrices = np.zeros((angle.size, 4, 4))
     matrices[:, 0, 0], matrices[:, 0, 1] = cos_q, -sin_q * cos_a
@@ -273,31 +263,26 @@ def _link(arm: DhArm, i: int, angle: FloatArray) -> FloatArray:
     if arm.beta[i] == 0.0:
         return matrices
     cos_b, sin_b = np.cos(arm.beta[i]), np.sin(arm.beta[i])
-    turn = np.eye(4)
-    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = cos_b, sin_b, -sin_b, cos_b
-    return matrices @ turn
+    hayati = np.eye(4)
+    hayati[0, 0], hayati[0, 2], hayati[2, 0], hayati[2, 2] = cos_b, sin_b, -sin_b, cos_b
+    return matrices @ hayati
 
 
 def _linearise(
     arm: DhArm, joints: FloatArray, goal: FloatArray, scale: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Geometric Jacobian (m, 6, n) and pose error (m, 6), both in the base frame and scaled."""
+    """Geometric Jacobian (m, 6, n) and pose error (m, 6), in the base frame and scaled."""
     frames = link_frames(arm, joints)
     axes, origins = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
     tip = frames[:, -1]
     levers = cross(axes, tip[:, None, :3, 3] - origins)
     jacobian = np.swapaxes(np.concatenate([axes, levers], axis=2), 1, 2)
-    # Half the sum of the cross products of the axes: zero only where the rotations agree, or
-    # where they differ by half a turn, which the caller's check of the error does not see.
-    here, there = (np.swapaxes(array[:, :3, :3], 1, 2) for array in (tip, goal))
-    turn = 0.5 * cross(here, there).sum(axis=1)
+    # Half the sum of the axes' cross products: zero if the rotations agree, and also at a
+    # difference of half a turn, which is handled separately.
+    tip_axes, goal_axes = (np.swapaxes(array[:, :3, :3], 1, 2) for array in (tip, goal))
+    rotation = 0.5 * cross(tip_axes, goal_axes).sum(axis=1)
     opposed = np.einsum("mij,mij->m", tip[:, :3, :3], goal[:, :3, :3]) < 0.0
-    turn[opposed] *= 2.0 / np.maximum(np.linalg.norm(turn[opposed], axis=1), 1e-3)[:, None]
-    shift = goal[:, :3, 3] - tip[:, :3, 3]
-    error = np.concatenate([turn, shift], axis=1)
+    rotation[opposed] *= 2.0 / np.maximum(np.linalg.norm(rotation[opposed], axis=1), 1e-3)[:, None]
+    translation = goal[:, :3, 3] - tip[:, :3, 3]
+    error = np.concatenate([rotation, translation], axis=1)
     return jacobian * scale[:, None], error * scale
-
-
-def _wrap(angles: FloatArray) -> FloatArray:
-    """Brings angles [rad] into half a turn either way."""
-    return (angles + _HALF_TURN) % (2.0 * _HALF_TURN) - _HALF_TURN

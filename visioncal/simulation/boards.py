@@ -1,4 +1,4 @@
-"""Geometry of simulated targets: where the corners of a printed, scaled and bowed board lie."""
+"""Geometry of simulated targets: corners of a printed, scaled and bowed board."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,13 @@ from visioncal.core.types import FloatArray, Target
 
 @dataclass(frozen=True, kw_only=True)
 class Sheet:
-    """A target as it came out of the printer and lies on its plate.
+    """A printed target on its plate.
 
     Attributes:
-        target: What was meant to be printed.
+        target: Target as designed.
         scale: Printed size over stated size.
-        bow_m: How far the pattern's outer corners are bent into the board, away from a camera in
-            front of it, relative to its centre [m].
+        bow_m: Depth of the pattern's outer corners relative to its centre, positive away from a
+            camera in front of it [m].
     """
 
     target: Target
@@ -24,7 +24,7 @@ class Sheet:
 
 
 def pattern_box(target: Target) -> tuple[float, float, float, float]:
-    """Bounds of the print in the target frame: left, top, right, bottom [m], as stated."""
+    """Bounds of the print in the target frame: left, top, right, bottom [m], as designed."""
     side = target.square_m
     if target.kind == "marker":
         return (-0.5 * side, -0.5 * side, 0.5 * side, 0.5 * side)
@@ -45,7 +45,7 @@ def corners_m(sheet: Sheet) -> FloatArray:
     """Corners of the real sheet in the target frame.
 
     Returns:
-        (n, 3) points [m]; the row number is the corner's id.
+        (n, 3) points [m] by corner id.
     """
     target = sheet.target
     if target.kind == "marker":
@@ -67,7 +67,7 @@ def corners_m(sheet: Sheet) -> FloatArray:
 
 
 def unit_m(target: Target) -> float:
-    """Side of a square, or of the first of free tags, by which a sheet is drawn [m]."""
+    """Side of a square, or of the first of free tags, as the unit of a sheet's texture [m]."""
     if target.kind != "points":
         return target.square_m
     first, second = target.points_m[:2]
@@ -75,7 +75,7 @@ def unit_m(target: Target) -> float:
 
 
 def circles_m(target: Target) -> FloatArray:
-    """(n, 2) centres of circles, row by row; a shifted row is half a column farther on [m]."""
+    """(n, 2) centres of circles, row by row; every second row of an asymmetric grid is shifted."""
     wide, shift = (2, 1) if target.asymmetric else (1, 0)
     return target.square_m * np.array(
         [
@@ -88,9 +88,9 @@ def circles_m(target: Target) -> FloatArray:
 
 
 def tags_m(target: Target) -> list[tuple[int, FloatArray]]:
-    """The ids of an AprilGrid's tags, and where the upper left corner of each is, (2,) [m].
+    """Ids of an AprilGrid's tags with their upper left corners, (2,) each [m].
 
-    As Kalibr prints them: row by row from the lower left.
+    As on Kalibr's pages: row by row from the lower left.
     """
     pitch_m = (1.0 + target.spacing) * target.square_m
     places = [(x, y) for y in reversed(range(target.rows)) for x in range(target.columns)]
@@ -101,26 +101,18 @@ def tags_m(target: Target) -> list[tuple[int, FloatArray]]:
 
 
 def _around(corner: FloatArray, side_m: float) -> FloatArray:
-    """(4, 2) the corners of a tag, clockwise from its upper left one [m]."""
+    """(4, 2) corners of a tag, clockwise from its upper left one [m]."""
     right, down = side_m * np.eye(2)
     return np.array([corner, corner + right, corner + right + down, corner + down])
 
 
 def found_in_part(target: Target) -> bool:
-    """Whether finders make do with a part of a board; others are found whole or not at all."""
+    """Whether detectors accept a part of a board."""
     return target.kind in ("charuco", "aprilgrid", "points")
 
 
 def outline_m(sheet: Sheet, margin_m: float) -> FloatArray:
-    """Points around the real print.
-
-    Args:
-        sheet: The sheet.
-        margin_m: How far outside the print the outline runs [m].
-
-    Returns:
-        (64, 3) points in the target frame [m].
-    """
+    """(64, 3) points in the target frame around the real print, at a distance `margin_m` [m]."""
     left, top, right, bottom = pattern_box(sheet.target)
     along = np.linspace(0.0, 1.0, 16, endpoint=False)[:, None]
     print_m = sheet.scale * np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
@@ -139,14 +131,14 @@ def centre_m(sheet: Sheet) -> FloatArray:
 
 
 def lift(sheet: Sheet, flat: FloatArray) -> FloatArray:
-    """Puts (..., 2) points of the flat sheet onto the bowed surface, (..., 3) [m]."""
+    """Maps (..., 2) points of the flat sheet onto the bowed surface, (..., 3) [m]."""
     return np.concatenate([flat, bow_depth_m(sheet, flat)[..., None]], axis=-1)
 
 
 def bow_depth_m(sheet: Sheet, flat: FloatArray) -> FloatArray:
-    """Depth of the bowed surface under (..., 2) points of the sheet, (...) [m].
+    """Depth of the bowed surface at (..., 2) points of the sheet, (...) [m].
 
-    A paraboloid, four times as strong along x as along y, as paper curls on one axis. It touches
+    A paraboloid, four times as strong along x as along y, as paper curls about one axis. It touches
     the plane z = 0 at the centre of the print.
     """
     left, top, right, bottom = pattern_box(sheet.target)

@@ -1,4 +1,4 @@
-"""A simulated cell: its robots, cameras and boards, and what was seen and read in it."""
+"""A simulated cell: robots, cameras and boards, with observations and readings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,18 +23,18 @@ from visioncal.simulation.sag import Payload
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRobot:
-    """A robot of a cell, where it stood at s stops, and what it reported.
+    """A robot of a cell with its true and reported poses at s stops.
 
     Attributes:
-        options: What was asked for.
-        arm: The nominal arm.
-        true_arm: The arm as it was built.
-        joints: (s, n) joint angles as reported [rad].
-        base_from_flange: (s, 4, 4) poses as reported: the nominal arm at the reported joints.
-        true_base_from_flange: (s, 4, 4) where the flange really stood.
-        wrong_stops: Stops whose report is wrong, ascending.
-        loads: What it carried, stop by stop; empty where nothing.
-        approach: (s,) the side from which each stop was approached, +1 or -1; None without play.
+        options: Options of the robot.
+        arm: Nominal arm.
+        true_arm: Real arm.
+        joints: (s, n) reported joint angles [rad].
+        base_from_flange: (s, 4, 4) reported poses: the nominal arm at the reported joints.
+        true_base_from_flange: (s, 4, 4) true poses.
+        wrong_stops: Stops with a wrong report, ascending.
+        loads: Payload of each stop; empty without payloads.
+        approach: (s,) side from which each stop was approached, +1 or -1; None without backlash.
     """
 
     options: RobotAt
@@ -48,22 +48,24 @@ class SimulatedRobot:
     approach: FloatArray | None = None
 
     def flange_at(self, q: FloatArray, loads: Sequence[Payload] = ()) -> FloatArray:
-        """Where the real arm's flange stands (k, 4, 4) at (k, n) joint angles [rad].
+        """True flange poses (k, 4, 4) at (k, n) joint angles [rad].
 
-        With k loads, or none but its own weight; from the middle of its play.
+        With k payloads, or its own weight only; in the middle of its backlash.
         """
         return self.options.flange_at(self.true_arm, q, loads)
 
     def only(self, stops: Sequence[int]) -> "SimulatedRobot":
-        """The robot at some of its stops, numbered anew."""
+        """The robot at some of its stops, renumbered."""
         kept = list(stops)
         return replace(
             self,
             joints=self.joints[kept],
             base_from_flange=self.base_from_flange[kept],
             true_base_from_flange=self.true_base_from_flange[kept],
-            wrong_stops=tuple(at for at, index in enumerate(kept) if index in self.wrong_stops),
-            loads=tuple(self.loads[at] for at in kept if self.loads),
+            wrong_stops=tuple(
+                stop for stop, old_stop in enumerate(kept) if old_stop in self.wrong_stops
+            ),
+            loads=tuple(self.loads[stop] for stop in kept if self.loads),
             approach=None if self.approach is None else self.approach[kept],
         )
 
@@ -73,17 +75,17 @@ class SimulatedSight:
     """A camera's image of a board at a stop.
 
     Attributes:
-        view: The number of its row.
-        stop: When it was taken; -1 for an image of the camera's lens alone, and for a frame of a
+        view: Number of its row.
+        stop: Stop at which it was taken; -1 for images for intrinsics only, and for frames of a
             sweep after the stops.
-        camera: The camera's name.
-        board: The board's.
-        cam_from_target: (4, 4) where the board is in the image that the row has.
-        exact: Where its corners are in that image.
-        corners: The same as a detector would report them; which end of a board that looks alike
-            from both it takes for the first, hangs on how it lies in the image.
-        stamp_s: When it was taken in a sweep, by the camera's clock [s]; None at a stop.
-        at_once: Whether all rows of the image are of one moment.
+        camera: Camera name.
+        board: Board name.
+        cam_from_target: (4, 4) board pose in the row's image.
+        exact: True corners in that image.
+        corners: Detected corners; the numbering of a symmetric board depends on its orientation in
+            the image.
+        stamp_s: Time stamp in a sweep, by the camera's clock [s]; None at a stop.
+        at_once: Whether all rows of the image are taken at the same time.
     """
 
     view: int
@@ -98,20 +100,20 @@ class SimulatedSight:
 
     @property
     def is_of_lens(self) -> bool:
-        """Whether it serves the camera's lens alone."""
+        """Whether it is for the camera's intrinsics only."""
         return self.stop < 0 and self.stamp_s is None
 
     def numbered(self, view: int) -> "SimulatedSight":
-        """The same as another row."""
+        """The same sight as another row."""
         exact, corners = (replace(corners, view=view) for corners in (self.exact, self.corners))
         return replace(self, view=view, exact=exact, corners=corners)
 
 
 @dataclass(frozen=True, eq=False)
 class InstrumentReading:
-    """What an instrument read of a point at a stop: (4, 4) in the instrument's frame.
+    """Reading of a point by an instrument at a stop: (4, 4) in the instrument's frame.
 
-    The rotation counts where the instrument reads any.
+    The rotation is valid only if the instrument measures rotations.
     """
 
     view: int
@@ -123,25 +125,25 @@ class InstrumentReading:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCell:
-    """A simulated cell of robots, cameras and boards, and what was seen in it.
+    """A simulated cell of robots, cameras and boards, with its observations.
 
-    One robot, one camera and one board have no names, and the robot's base is what all stands on.
+    A single robot, camera or board has no name; with a single robot, its base is the root frame.
 
     Attributes:
-        options: What was asked for.
-        parents: What each frame but the flanges hangs on, by its name in a session.
-        mountings: (4, 4) `parent_from_frame` of each of them, before anything is pushed.
-        robots: The robots by their names.
-        stated: The cameras' intrinsics as the session states them, by the cameras' names.
-        sights: What cameras saw, by ascending view, and last the images of lenses alone.
-        readings: What instruments read.
-        pose_rows: The row with a robot's pose, for those of which no other row of their stop
-            has it: (view, stop, robot).
-        wrong_views: Rows with another row's image or, in a cell of one robot, with a wrong report;
+        options: Options of the cell.
+        parents: Parent of each frame but the flanges, by its name in a session.
+        mountings: (4, 4) `parent_from_frame` of each of them, before any push.
+        robots: Robots by name.
+        stated: Intrinsics stated in the session, by camera name.
+        sights: Camera observations by ascending view; images for intrinsics only are last.
+        readings: Instrument readings.
+        pose_rows: Rows with only a robot's pose, for stops where no other row has it: (view, stop,
+            robot).
+        wrong_views: Rows with another row's image or, with one robot, with a wrong report;
             ascending.
-        stamps_s: (s,) when each stop was made [s]; None where rows have no time.
-        streams: Robots' states in sweeps, by the robots' names, and temperatures.
-        facts: What else the truth's file says of it.
+        stamps_s: (s,) time of each stop [s]; None if rows have no time.
+        streams: Robots' states in sweeps, by robot name, and temperatures.
+        facts: Further content of the truth's file.
     """
 
     options: CellOptions | NetworkOptions
@@ -159,53 +161,53 @@ class SimulatedCell:
 
     @property
     def layout(self) -> NetworkOptions:
-        """What there is."""
+        """Layout of the cell."""
         return self.options.layout
 
     @property
     def transforms(self) -> dict[str, FloatArray]:
-        """The mountings by the names of a result's transforms, as `flange_from_cam`."""
+        """Mountings by the names of a result's transforms, as `flange_from_cam`."""
         return {f"{self.parents[name]}_from_{name}": pose for name, pose in self.mountings.items()}
 
     @property
     def robot(self) -> SimulatedRobot:
-        """The only robot."""
+        """The single robot."""
         (robot,) = self.robots.values()
         return robot
 
     @property
     def cam_from_target(self) -> FloatArray:
-        """(m, 4, 4) where boards are in all images, by ascending view."""
+        """(m, 4, 4) board poses in all images, by ascending view."""
         return np.array([sight.cam_from_target for sight in self.sights])
 
     @property
     def exact_corners(self) -> tuple[Corners, ...]:
-        """Where the corners really are in all images, by ascending view."""
+        """True corners in all images, by ascending view."""
         return tuple(sight.exact for sight in self.sights)
 
     @property
     def corners(self) -> tuple[Corners, ...]:
-        """What was detected in all images, by ascending view."""
+        """Detected corners in all images, by ascending view."""
         return tuple(sight.corners for sight in self.sights)
 
     @property
     def is_named(self) -> bool:
-        """Whether its things have names: else there is one of each kind."""
+        """Whether its robots and boards have names; else there is one of each kind."""
         layout = self.layout
         return any(
             [*(robot.name for robot in layout.robots), *(board.name for board in layout.boards)]
         )
 
     def camera(self, name: str = "") -> CameraAt:
-        """The camera of that name, or the only one."""
+        """The camera of that name, or the single one."""
         return next(camera for camera in self.layout.cameras if camera.name == name)
 
     def board(self, name: str = "") -> BoardAt:
-        """The board of that name, or the only one."""
+        """The board of that name, or the single one."""
         return next(board for board in self.layout.boards if board.name == name)
 
     def between(self, first: str, second: str) -> FloatArray:
-        """(4, 4) `first_from_second` of two frames of the cell, none of which a robot moves."""
+        """(4, 4) `first_from_second` of two frames that no robot moves."""
         return invert(self._in_cell(first)) @ self._in_cell(second)
 
     def _in_cell(self, frame: str) -> FloatArray:
@@ -217,14 +219,14 @@ class SimulatedCell:
         return self.mountings[frame]
 
     def robot_of(self, frame: str) -> str | None:
-        """The robot whose pose the rows of a camera, board or point have; None for none."""
-        on = self.parents[frame]
-        return next((robot for robot in self.robots if frame_name("flange", robot) == on), None)
+        """Robot that carries a camera, board or point; None for none."""
+        parent = self.parents[frame]
+        return next((robot for robot in self.robots if frame_name("flange", robot) == parent), None)
 
     def seen_from(self, robot: str, camera: str, board: str) -> Callable[[FloatArray], FloatArray]:
-        """Where a board (k, 4, 4) is before a camera, by (k, 4, 4) `base_from_flange`.
+        """Function from (k, 4, 4) `base_from_flange` to (k, 4, 4) `cam_from_target`.
 
-        The robot carries one of the two, and the other stands in the cell.
+        The robot carries camera or board, and the other one is fixed in the cell.
         """
         ends = frame_name("camera", camera), frame_name("target", board)
         base, flange = (frame_name(name, robot) for name in ("base", "flange"))
@@ -242,18 +244,20 @@ class SimulatedCell:
         return before
 
     def only(self, views: Sequence[int]) -> "SimulatedCell":
-        """The cell with some of the images and their stops, both numbered anew."""
+        """The cell with some of the images and their stops, both renumbered."""
         kept = [self.sights[view] for view in views]
         stops = list(dict.fromkeys(sight.stop for sight in kept))
-        number = {stop: at for at, stop in enumerate(stops)}
+        stop_index = {stop: index for index, stop in enumerate(stops)}
         sights = tuple(
-            replace(sight.numbered(view), stop=number[sight.stop])
+            replace(sight.numbered(view), stop=stop_index[sight.stop])
             for view, sight in enumerate(kept)
         )
         return replace(
             self,
             robots={name: robot.only(stops) for name, robot in self.robots.items()},
             sights=sights,
-            wrong_views=tuple(at for at, view in enumerate(views) if view in self.wrong_views),
+            wrong_views=tuple(
+                index for index, view in enumerate(views) if view in self.wrong_views
+            ),
             stamps_s=None if self.stamps_s is None else self.stamps_s[stops],
         )

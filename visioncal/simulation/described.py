@@ -1,6 +1,6 @@
-"""Descriptions of whole cells: a TOML file of one's own, or one that comes with visioncal.
+"""Descriptions of cells: a TOML file, or the name of a cell that comes with visioncal.
 
-The keys are the fields of `NetworkOptions` and of what it holds; `[targets.NAME]` are its boards.
+The keys are the fields of `NetworkOptions` and of its parts; `[targets.NAME]` are its boards.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ Thing: TypeAlias = (
 _T = TypeVar("_T", bound=Thing)
 
 _FOLDER = Path(__file__).with_name("cells")
-# What a file has of each kind, by names: its table, and the field of the options.
+# Named tables of a file: type of their entries, and field of the options.
 _KINDS: Mapping[str, tuple[type[Thing], str]] = {
     "robots": (RobotAt, "robots"),
     "cameras": (CameraAt, "cameras"),
@@ -44,36 +44,36 @@ _KINDS: Mapping[str, tuple[type[Thing], str]] = {
     "points": (PointAt, "points"),
 }
 _TABLES = (*_KINDS, "moved", "sweeps")
-# A board that is bent by more than this is none [m].
+# Largest bow of a board [m].
 _MOST_BOW_M = 0.05
-# Whole numbers go up to this.
+# Largest integer.
 _MOST = 1_000_000
-# Numbers that may be below zero.
+# Numbers that may be negative.
 _SIGNED = ("tilt_rad", "turn_rad", "shift_m", "bow_m", "camera_minus_robot_s")
-# Every simulated arm has so many joints.
+# Number of joints of every simulated arm.
 _JOINTS = 6
 
 
 def cell_names() -> tuple[str, ...]:
-    """The cells that come with visioncal."""
+    """Names of the cells that come with visioncal."""
     return tuple(sorted(_shipped()))
 
 
 def read_cell(name_or_path: str) -> NetworkOptions:
-    """Reads what a whole cell is made of.
+    """Reads the description of a cell.
 
     Args:
-        name_or_path: A name of `cell_names`, or the path of a `.toml`.
+        name_or_path: A name from `cell_names`, or the path of a `.toml`.
 
     Raises:
-        DataError: There is no such cell; or a field is not known, missing, of another type or out
-            of range.
+        DataError: There is no such cell, or a field is unknown, missing, of another type or out of
+            range.
     """
     path = find_described(
         name_or_path, what="cell", shipped=_shipped(), suffixes=(".toml",), folder=None
     )
     document = parse_toml(read_text(path), path.name)
-    own = {key: value for key, value in document.items() if key not in _TABLES}
+    options = {key: value for key, value in document.items() if key not in _TABLES}
     robots = tuple(_table(document, "robots", path.name))
     if not robots:
         raise DataError(
@@ -97,7 +97,7 @@ def read_cell(name_or_path: str) -> NetworkOptions:
     table = DocumentTable(document, path.name)
     moved = reader.listed(Moved, table, "moved")
     sweeps = reader.listed(Swept, table, "sweeps")
-    return reader.read(NetworkOptions, own, "", moved=moved, sweeps=sweeps, **things)
+    return reader.read(NetworkOptions, options, "", moved=moved, sweeps=sweeps, **things)
 
 
 def _shipped() -> dict[str, Path]:
@@ -120,18 +120,18 @@ def _table(document: Mapping[str, Any], key: str, label: str) -> Mapping[str, An
 
 @dataclass(frozen=True)
 class _Reader:
-    """Reads tables by the types of the fields that they fill.
+    """Reads tables by the types of the fields they fill.
 
     Attributes:
-        file: The file's name, for messages.
-        carriers: What things can be on.
+        file: Name of the file, for messages.
+        carriers: Possible values of `on`: the cell, and the robots.
     """
 
     file: str
     carriers: tuple[str, ...]
 
     def read(self, kind: type[_T], row: object, path: str, **given: object) -> _T:
-        """One table as an object of a dataclass."""
+        """One table as a dataclass object."""
         label = f"{self.file}, {path}" if path else self.file
         if not isinstance(row, dict):
             raise DocumentTable({path: row}, self.file).refuse(path, row, "a table")
@@ -160,11 +160,13 @@ class _Reader:
     def listed(
         self, kind: type[_T], table: DocumentTable, key: str, path: str = ""
     ) -> tuple[_T, ...]:
-        """A list of tables as objects of a dataclass."""
+        """A list of tables as dataclass objects."""
         rows, path = table.content.get(key, []), f"{path}.{key}".lstrip(".")
         if not isinstance(rows, list):
             raise table.refuse(key, rows, f"a table [[{path}]] for each")
-        return tuple(self.read(kind, row, f"{path} {at}") for at, row in enumerate(rows, start=1))
+        return tuple(
+            self.read(kind, row, f"{path} {number}") for number, row in enumerate(rows, start=1)
+        )
 
     def _value(self, table: DocumentTable, key: str, hint: object, kind: type, path: str) -> object:
         if hint in (Camera, Target):
@@ -190,7 +192,7 @@ class _Reader:
 
 
 def _number(table: DocumentTable, key: str) -> float:
-    """A number within the range of its field."""
+    """A number, checked against the range of its field."""
     value = table.number(key, positive=key in ("scale", "mass_share", "function_length_rad"))
     if key == "scale" and not 0.5 <= value <= 2.0:
         raise table.refuse(key, value, "a number from 0.5 to 2")

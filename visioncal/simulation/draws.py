@@ -1,4 +1,4 @@
-"""Sources of randomness of simulated cells, each independent of the others."""
+"""Independent sources of randomness of simulated cells."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class RandomStream(IntEnum):
-    """What is random in a cell; the numbers from 100 on are of whole cells, by their things."""
+    """Sources of randomness; those from 100 on are for cells with named things."""
 
     MOUNTING = 0
     POSES = 1
@@ -35,7 +35,7 @@ class RandomStream(IntEnum):
     SWEEPS = 111
 
 
-# What another draw of the same cell draws anew, and what another recording of it does not.
+# Sources that another draw of the same cell changes, and those that another recording keeps.
 _DRAWN_ANEW = (
     *(RandomStream.ARM, RandomStream.ROBOT, RandomStream.PIXELS),
     *(RandomStream.ARMS, RandomStream.ROBOTS, RandomStream.CORNERS),
@@ -44,21 +44,22 @@ _KEPT = (
     *(RandomStream.MOUNTING, RandomStream.ARM, RandomStream.LENS),
     *(RandomStream.MOUNTINGS, RandomStream.ARMS, RandomStream.LENS_VIEWS),
 )
-# Sets a recording's randomness apart from a draw's.
+# Distinguishes a recording's randomness from a draw's.
 _RECORDING = 1000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawOptions:
-    """Which of all cells is drawn, and how noisy corners are.
+    """Random seed of a cell, and the noise of corners.
 
     Attributes:
-        pixel_sigma_px: Noise of the simulated detections, per axis [px].
-        seed: Of everything random. Each source of randomness has a stream of its own, so that a
-            change of one option leaves the others' draws as they were.
-        draw: Which draw of the real arms and of all noise; the cell, and what robots move to, are
-            the same for all.
-        recording: Which recording of the same cell and arms: each has stops and noise of its own.
+        pixel_sigma_px: Noise of simulated detections, per axis [px].
+        seed: Seed of everything random. Each source of randomness has its own stream, so that
+            changing one option does not change the draws of others.
+        draw: Number of the draw of real arms and noise; the cell and the nominal postures are the
+            same for all.
+        recording: Number of the recording of the same cell and arms, with stops and noise of its
+            own.
     """
 
     pixel_sigma_px: float = 0.05
@@ -67,8 +68,8 @@ class DrawOptions:
     recording: int = 0
 
     def stream(self, purpose: RandomStream, *index: int) -> np.random.Generator:
-        """The generator of one source of randomness; `index` is of the thing or the view."""
-        again = [self.draw] if self.draw and purpose in _DRAWN_ANEW else []
+        """Generator of one source of randomness; `index` is of the thing or the view."""
+        extra = [self.draw] if self.draw and purpose in _DRAWN_ANEW else []
         if self.recording and purpose not in _KEPT:
-            again += [_RECORDING, self.recording]
-        return np.random.default_rng([self.seed, int(purpose), *again, *index])
+            extra += [_RECORDING, self.recording]
+        return np.random.default_rng([self.seed, int(purpose), *extra, *index])

@@ -1,7 +1,7 @@
-"""What a simulated arm's drives have to give: inertia, weight, friction and load.
+"""Dynamics of a simulated arm: inertia, weight, friction and load.
 
-A Newton-Euler recursion of its own in plain numpy, over the frames of the simulated arm; it shares
-nothing with the application's model of dynamics.
+A Newton-Euler recursion in plain numpy over the frames of the simulated arm, independent of the
+application's dynamic model.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,10 +14,10 @@ from visioncal.core.types import FloatArray
 from visioncal.simulation.arms import DhArm, link_frames, ur_arm
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])
-# By how much masses and inertias depart from what is published (standard deviation).
-_OFF_SHARE = 0.2
-# Mass [kg], its centre [m] and the main moments of inertia about that [kg m^2], in the frames of
-# the links: Universal Robots, "DH parameters for calculations of kinematics and dynamics", rounded.
+# Relative standard deviation of masses and inertias from the published values.
+_INERTIA_ERROR = 0.2
+# Mass [kg], centre of mass [m] and principal moments of inertia about it [kg m^2], in the link
+# frames: Universal Robots, "DH parameters for calculations of kinematics and dynamics", rounded.
 _BODIES: Mapping[str, Sequence[tuple[float, Sequence[float], Sequence[float]]]] = {
     "ur5e": (
         (3.761, (0.0, -0.0256, 0.0019), (0.0084, 0.0064, 0.0084)),
@@ -36,7 +36,7 @@ _BODIES: Mapping[str, Sequence[tuple[float, Sequence[float], Sequence[float]]]] 
         (0.615, (0.0, 0.0, -0.026), (0.0004, 0.0004, 0.0005)),
     ),
 }
-# Friction of each joint at first go [N m] and [N m s/rad], from the shoulder to the wrist.
+# Typical Coulomb [N m] and viscous friction [N m s/rad] of each joint.
 _COULOMB, _VISCOUS = (9.0, 10.0, 7.0, 1.6, 1.5, 1.4), (12.0, 13.0, 9.0, 1.5, 1.4, 1.3)
 _MOTOR_INERTIA = (1.1, 1.2, 0.9, 0.08, 0.08, 0.07)
 
@@ -46,9 +46,9 @@ class LinkBody:
     """A rigid body.
 
     Attributes:
-        kg: Its mass [kg].
-        centre_m: (3,) where its centre is, in its frame [m].
-        inertia_kg_m2: (3, 3) its inertia about the centre, along that frame's axes.
+        kg: Mass [kg].
+        centre_m: (3,) centre of mass in its frame [m].
+        inertia_kg_m2: (3, 3) inertia about the centre of mass, along that frame's axes.
     """
 
     kg: float
@@ -58,18 +58,18 @@ class LinkBody:
 
 @dataclass(frozen=True, eq=False)
 class Gears:
-    """What each of n drives takes for itself.
+    """Friction, offset and rotor inertia of n drives.
 
     `(coulomb + stribeck exp(-(dq / stribeck_speed)^2)) sign(dq) + viscous dq + offset
     + motor_inertia ddq`.
 
     Attributes:
-        coulomb: (n,) [N m].
-        viscous: (n,) [N m s/rad].
-        offset: (n,) [N m].
-        stribeck: (n,) what breaking loose takes beyond `coulomb` [N m].
-        stribeck_speed: (n,) the speed over which that fades [rad/s].
-        motor_inertia: (n,) of the rotors, on the joints' side [kg m^2].
+        coulomb: (n,) Coulomb friction [N m].
+        viscous: (n,) viscous friction [N m s/rad].
+        offset: (n,) torque offset [N m].
+        stribeck: (n,) static friction in addition to `coulomb` [N m].
+        stribeck_speed: (n,) speed over which it fades [rad/s].
+        motor_inertia: (n,) inertia of the rotors at the joints [kg m^2].
     """
 
     coulomb: FloatArray
@@ -80,7 +80,7 @@ class Gears:
     motor_inertia: FloatArray
 
     def torques(self, dq: FloatArray, ddq: FloatArray) -> FloatArray:
-        """(m, n) what the drives take [N m]."""
+        """(m, n) torques of friction, offset and rotors [N m]."""
         breaking = self.stribeck * np.exp(-((dq / self.stribeck_speed) ** 2))
         dry = (self.coulomb + breaking) * np.sign(dq)
         return np.asarray(dry + self.viscous * dq + self.offset + self.motor_inertia * ddq)
@@ -88,57 +88,62 @@ class Gears:
 
 @dataclass(frozen=True, eq=False)
 class DynamicArm:
-    """An arm with its bodies, one a link in the frame in which the link ends, and its drives."""
+    """An arm with its bodies, one per link in the frame at its end, and its drives."""
 
     arm: DhArm
     bodies: tuple[LinkBody, ...]
     gears: Gears
 
     def carrying(self, load: LinkBody) -> "DynamicArm":
-        """The arm with a load on its flange, in the flange's frame."""
+        """The arm with a load in the flange's frame."""
         return replace(self, bodies=(*self.bodies[:-1], joined(self.bodies[-1], load)))
 
 
 def joined(first: LinkBody, second: LinkBody) -> LinkBody:
-    """Two bodies of one frame as one (Huygens and Steiner)."""
+    """Two bodies in one frame as a single one (parallel axis theorem)."""
     kg = first.kg + second.kg
     centre = (first.kg * first.centre_m + second.kg * second.centre_m) / kg
     inertia = np.zeros((3, 3))
     for body in (first, second):
-        arm = body.centre_m - centre
-        inertia += body.inertia_kg_m2 + body.kg * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        lever = body.centre_m - centre
+        inertia += body.inertia_kg_m2 + body.kg * (
+            lever @ lever * np.eye(3) - np.outer(lever, lever)
+        )
     return LinkBody(kg, centre, inertia)
 
 
 def nominal_dynamics(name: str) -> DynamicArm:
-    """The arm of a name, `ur5e` or `ur10e`, as its maker publishes it, without friction.
+    """Arm by name, `ur5e` or `ur10e`, with published inertias and without friction.
 
     Raises:
-        DataError: Another name was given.
+        DataError: The arm's dynamics are unknown.
     """
     if name not in _BODIES:
         raise DataError(
             f"simulation: nothing is known of the dynamics of {name!r}, only of "
             f"{', '.join(sorted(_BODIES))}."
         )
-    bodies = tuple(LinkBody(kg, np.array(at), np.diag(main)) for kg, at, main in _BODIES[name])
-    still = np.zeros(len(bodies))
-    return DynamicArm(ur_arm(name), bodies, Gears(still, still, still, still, still + 1.0, still))
+    bodies = tuple(
+        LinkBody(kg, np.array(centre), np.diag(main)) for kg, centre, main in _BODIES[name]
+    )
+    zeros = np.zeros(len(bodies))
+    return DynamicArm(ur_arm(name), bodies, Gears(zeros, zeros, zeros, zeros, zeros + 1.0, zeros))
 
 
 def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False) -> DynamicArm:
-    """An arm as it may have been built: off from what is published, and with friction.
+    """Draws a real arm: deviations from the published inertias, and friction.
 
-    Masses are off by a fifth, the second moments about the centres of mass are stretched by half of
-    it along and across all axes, and the centres by 1 cm: what comes out is a body always.
+    Masses vary by a fifth, the second moments about the centres of mass are stretched by half of
+    that along and across all axes, and the centres move by 1 cm: the result is always physically
+    consistent.
 
     Args:
-        name: As for `nominal_dynamics`.
+        name: Name, as for `nominal_dynamics`.
         rng: Source of randomness.
-        stribeck: Whether breaking loose takes more than sliding.
+        stribeck: Whether static friction exceeds sliding friction.
 
     Raises:
-        DataError: Nothing is known of the arm.
+        DataError: The arm's dynamics are unknown.
     """
     nominal = nominal_dynamics(name)
     count = len(nominal.bodies)
@@ -157,11 +162,13 @@ def real_dynamics(name: str, rng: np.random.Generator, *, stribeck: bool = False
         around(_MOTOR_INERTIA),
     )
     return replace(
-        nominal, bodies=tuple(_off(body, _OFF_SHARE, rng) for body in nominal.bodies), gears=gears
+        nominal,
+        bodies=tuple(_disturbed(body, _INERTIA_ERROR, rng) for body in nominal.bodies),
+        gears=gears,
     )
 
 
-def _off(body: LinkBody, share: float, rng: np.random.Generator) -> LinkBody:
+def _disturbed(body: LinkBody, share: float, rng: np.random.Generator) -> LinkBody:
     kg = body.kg * np.exp(share * rng.standard_normal())
     second_moments = 0.5 * np.trace(body.inertia_kg_m2) * np.eye(3) - body.inertia_kg_m2
     stretch = np.sqrt(kg / body.kg) * (np.eye(3) + 0.5 * share * rng.standard_normal((3, 3)))
@@ -171,48 +178,56 @@ def _off(body: LinkBody, share: float, rng: np.random.Generator) -> LinkBody:
 
 
 def drive_torques(built: DynamicArm, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
-    """What the drives have to give for a motion (Luh, Walker and Paul 1980).
+    """(m, n) drive torques [N m] of a motion (Luh, Walker and Paul 1980).
 
-    All vectors are in the base's frame.
-
-    Args:
-        built: The arm.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-        ddq: (m, n) their accelerations [rad/s^2].
-
-    Returns:
-        (m, n) [N m].
+    `q`, `dq` and `ddq` are (m, n) joint angles [rad], speeds and accelerations. All vectors are in
+    the base frame.
     """
     frames = link_frames(built.arm, q)
     axes, origins = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
-    spin = turning = np.zeros((len(q), 3))
-    # Standing still against gravity is being pushed up.
-    push = np.broadcast_to(-_GRAVITY, (len(q), 3))
+    angular_velocity = angular_acceleration = np.zeros((len(q), 3))
+    # Gravity as an upward acceleration of the base.
+    acceleration = np.broadcast_to(-_GRAVITY, (len(q), 3))
     wrenches = []
     for joint, body in enumerate(built.bodies):
         axis = axes[:, joint]
-        turning = turning + ddq[:, joint, None] * axis
-        turning = turning + dq[:, joint, None] * np.cross(spin, axis)
-        spin = spin + dq[:, joint, None] * axis
+        angular_acceleration = angular_acceleration + ddq[:, joint, None] * axis
+        angular_acceleration = angular_acceleration + dq[:, joint, None] * np.cross(
+            angular_velocity, axis
+        )
+        angular_velocity = angular_velocity + dq[:, joint, None] * axis
         frame = frames[:, joint + 1]
-        at = frame[:, :3, :3] @ body.centre_m + frame[:, :3, 3]
-        force = body.kg * (push + _carried(at - origins[:, joint], spin, turning))
+        centre = frame[:, :3, :3] @ body.centre_m + frame[:, :3, 3]
+        force = body.kg * (
+            acceleration
+            + _relative_acceleration(
+                centre - origins[:, joint], angular_velocity, angular_acceleration
+            )
+        )
         inertia = frame[:, :3, :3] @ body.inertia_kg_m2 @ np.swapaxes(frame[:, :3, :3], 1, 2)
-        moment = _times(inertia, turning) + np.cross(spin, _times(inertia, spin))
-        wrenches.append((at, force, moment))
-        push = push + _carried(frame[:, :3, 3] - origins[:, joint], spin, turning)
+        moment = _times(inertia, angular_acceleration) + np.cross(
+            angular_velocity, _times(inertia, angular_velocity)
+        )
+        wrenches.append((centre, force, moment))
+        acceleration = acceleration + _relative_acceleration(
+            frame[:, :3, 3] - origins[:, joint], angular_velocity, angular_acceleration
+        )
     torques = built.gears.torques(dq, ddq)
     for joint in range(q.shape[1]):
-        for at, force, moment in wrenches[joint:]:
-            about = moment + np.cross(at - origins[:, joint], force)
-            torques[:, joint] += np.einsum("mi,mi->m", axes[:, joint], about)
+        for centre, force, moment in wrenches[joint:]:
+            joint_moment = moment + np.cross(centre - origins[:, joint], force)
+            torques[:, joint] += np.einsum("mi,mi->m", axes[:, joint], joint_moment)
     return torques
 
 
-def _carried(lever: FloatArray, spin: FloatArray, turning: FloatArray) -> FloatArray:
-    """Acceleration of a point of a turning body beyond that of another [m/s^2]."""
-    return np.asarray(np.cross(turning, lever) + np.cross(spin, np.cross(spin, lever)))
+def _relative_acceleration(
+    lever: FloatArray, angular_velocity: FloatArray, angular_acceleration: FloatArray
+) -> FloatArray:
+    """Acceleration of a point of a rotating body relative to another point [m/s^2]."""
+    return np.asarray(
+        np.cross(angular_acceleration, lever)
+        + np.cross(angular_velocity, np.cross(angular_velocity, lever))
+    )
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:

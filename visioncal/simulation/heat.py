@@ -1,9 +1,8 @@
-"""An arm that warms up while it works: what heats it, and how it grows.
+"""Thermal model of an arm that warms up while it works.
 
-Each joint is a heat source that its motor's current drives, with the air around it as its sink: a
-first-order RC element, stepped exactly for a duty that is constant from sample to sample. The link
-behind a joint follows the joint's temperature, grows in proportion to it, and the joint's zero
-drifts.
+Each joint is heated by its motor's current and cooled by the ambient air: a first-order RC element,
+integrated exactly for a duty that is constant between samples. The link after a joint follows the
+joint's temperature and expands in proportion, and the joint's zero drifts.
 """
 
 from dataclasses import dataclass, replace
@@ -17,24 +16,24 @@ from visioncal.session import Stream
 from visioncal.simulation.arms import DhArm, forward
 
 _JOINTS = 6
-# What a metre of steel and of aluminium grows by for a kelvin.
+# Thermal expansion of steel and of aluminium [1/K].
 STEEL_PER_K, ALUMINIUM_PER_K = 12e-6, 23e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Heat:
-    """What heats a real arm, and what that does to it.
+    """Thermal parameters of a real arm.
 
     Attributes:
-        duty_a: (n,) the motors' currents at work, as a root mean square [A].
-        k_per_a2: (n,) rise of a joint over the air for a squared current, once it rests [K/A^2].
+        duty_a: (n,) rms motor currents at work [A].
+        k_per_a2: (n,) steady temperature rise of a joint over ambient per squared current [K/A^2].
         tau_s: (n,) time constants of the joints [s].
-        lag_s: How far the links are behind their joints' sensors, as a time constant [s].
-        growth_per_k: (n,) relative growth of a joint's link [1/K].
-        drift_rad_per_k: (n,) drift of a joint's zero [rad/K].
-        ambient_c: The air at the start; cold, the whole arm is as warm as it.
-        ambient_swing_k: How far the air warms and cools again in the course of six hours [K].
-        sensor_sigma_k: Noise of a recorded temperature [K].
+        lag_s: Time constant by which the links lag behind their joints' sensors [s].
+        growth_per_k: (n,) thermal expansion of a joint's link [1/K].
+        drift_rad_per_k: (n,) thermal drift of a joint's zero [rad/K].
+        ambient_c: Ambient temperature at the start, which the cold arm has [deg C].
+        ambient_swing_k: Amplitude of the ambient temperature, with a period of six hours [K].
+        sensor_sigma_k: Noise of recorded temperatures [K].
     """
 
     duty_a: FloatArray
@@ -49,7 +48,7 @@ class Heat:
 
     @classmethod
     def drawn(cls, seed: int) -> "Heat":
-        """Draws an arm whose joints become 10 to 35 K warmer within hours."""
+        """Draws an arm whose joints warm up by 10 to 35 K within hours."""
         rng = np.random.default_rng([99, seed])
         duty = rng.uniform(1.5, 4.0, _JOINTS)
         return cls(
@@ -63,14 +62,14 @@ class Heat:
 
 @dataclass(frozen=True, eq=False)
 class Warming:
-    """The course of an arm's temperatures.
+    """Temperatures of an arm over time.
 
     Attributes:
-        stamps_s: (t,) [s].
-        currents_a: (t, n) as recorded [A].
-        sensors_c: (t, n) temperatures as recorded [deg C].
-        links_c: (t, n) what the links really have.
-        ambient_c: (t,) the air.
+        stamps_s: (t,) times [s].
+        currents_a: (t, n) recorded currents [A].
+        sensors_c: (t, n) recorded temperatures [deg C].
+        links_c: (t, n) true temperatures of the links [deg C].
+        ambient_c: (t,) ambient temperature [deg C].
     """
 
     stamps_s: FloatArray
@@ -80,12 +79,12 @@ class Warming:
     ambient_c: FloatArray
 
     def at(self, stamps_s: FloatArray) -> FloatArray:
-        """(m, n) temperatures of the links at some times."""
+        """(m, n) temperatures of the links at some times [deg C]."""
         columns = [np.interp(stamps_s, self.stamps_s, column) for column in self.links_c.T]
         return np.stack(columns, axis=1)
 
     def recorded(self, *, temperatures: bool, until_s: float = np.inf) -> Stream:
-        """The controller's stream up to a time: temperatures, or else currents."""
+        """The controller's stream up to a time: temperatures, or currents."""
         kept = self.stamps_s <= until_s
         signals = self.sensors_c if temperatures else self.currents_a
         form = "temp{}_c" if temperatures else "current{}_a"
@@ -95,13 +94,9 @@ class Warming:
 
 
 def warm_up(heat: Heat, hours: float, *, step_s: float = 10.0, seed: int = 0) -> Warming:
-    """Works an arm that was cold.
+    """Temperatures of an arm that starts cold and works for some hours, in steps of `step_s`.
 
-    Args:
-        heat: What heats it; the duty varies by a quarter from one piece of work to the next.
-        hours: For how long.
-        step_s: Time between two samples [s].
-        seed: Of the duty's variation and the sensors' noise.
+    The duty varies by a quarter between pieces of work.
     """
     if min(hours, step_s) <= 0.0:
         raise DataError("simulation: a warm-up needs a time and a step above 0.")
@@ -112,17 +107,17 @@ def warm_up(heat: Heat, hours: float, *, step_s: float = 10.0, seed: int = 0) ->
     ambient = heat.ambient_c + heat.ambient_swing_k * np.sin(2.0 * np.pi * stamps / 21600.0)
     joints, links = np.empty_like(duty), np.empty_like(duty)
     joints[0] = links[0] = heat.ambient_c
-    kept, followed = np.exp(-step_s / heat.tau_s), np.exp(-step_s / heat.lag_s)
-    for at in range(len(stamps) - 1):
-        rest = ambient[at] + heat.k_per_a2 * duty[at] ** 2
-        joints[at + 1] = rest + kept * (joints[at] - rest)
-        links[at + 1] = joints[at] + followed * (links[at] - joints[at])
+    joint_decay, link_decay = np.exp(-step_s / heat.tau_s), np.exp(-step_s / heat.lag_s)
+    for step in range(len(stamps) - 1):
+        steady = ambient[step] + heat.k_per_a2 * duty[step] ** 2
+        joints[step + 1] = steady + joint_decay * (joints[step] - steady)
+        links[step + 1] = joints[step] + link_decay * (links[step] - joints[step])
     measured = joints + heat.sensor_sigma_k * rng.standard_normal(joints.shape)
     return Warming(stamps, duty, measured, links, ambient)
 
 
 def heated_poses(arm: DhArm, heat: Heat, q: FloatArray, links_c: FloatArray) -> FloatArray:
-    """Where the flange stands (m, 4, 4) at (m, n) joint angles and temperatures of the links."""
+    """True flange poses (m, 4, 4) at (m, n) joint angles and link temperatures."""
     poses = []
     for row, rise in zip(q, links_c - heat.ambient_c, strict=True):
         grown = 1.0 + heat.growth_per_k * rise
@@ -135,5 +130,5 @@ def heated_poses(arm: DhArm, heat: Heat, q: FloatArray, links_c: FloatArray) -> 
 def heated_flanges(
     arm: DhArm, heat: Heat, q: FloatArray, links_c: FloatArray, cold: FloatArray
 ) -> FloatArray:
-    """Where a flange stands (m, 4, 4) once warm that stood at `cold` (m, 4, 4), by its joints."""
+    """Warm flange poses (m, 4, 4) for cold ones (m, 4, 4) at the same joint angles."""
     return heated_poses(arm, heat, q, links_c) @ (invert(forward(arm, q)) @ cold)

@@ -1,4 +1,4 @@
-"""What a simulated camera sees of a board, and a detector finds: corners without a picture."""
+"""Corners of a board in a simulated camera, exact and as detected, without rendering."""
 
 from dataclasses import replace
 
@@ -10,49 +10,49 @@ from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CameraOptions
 from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX
 
-# A corner nearer to the image's edge is not detected [px].
+# Corners closer to the image's edge are not detected [px].
 EDGE_PX = 2.0
-# A board is not looked at from farther aside.
+# Smallest cosine of the angle between view and board normal.
 _LEAST_COSINE = 0.5
 
 
 def looks_at(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
-    """(s,) in which of the stops a board is in view, not too much from the side."""
+    """(s,) mask of stops at which a board is in view and not too oblique."""
     points = corners_m(sheet) @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2)
     points = points + cam_from_target[:, None, :3, 3]
-    towards = points / np.linalg.norm(points, axis=2, keepdims=True)
-    facing = np.einsum("mni,mi->mn", towards, cam_from_target[:, :3, 2]) > _LEAST_COSINE
-    looks = facing.all(axis=1) & (towards[:, :, 2] > _LEAST_COSINE).all(axis=1)
-    if not looks.any():
-        return np.asarray(looks)
-    share = sees(camera, points[looks], MARGIN_PX).mean(axis=1)
-    looks[looks] = share >= (LEAST_SHARE if found_in_part(sheet.target) else 1.0)
-    return np.asarray(looks)
+    directions = points / np.linalg.norm(points, axis=2, keepdims=True)
+    facing = np.einsum("mni,mi->mn", directions, cam_from_target[:, :3, 2]) > _LEAST_COSINE
+    visible = facing.all(axis=1) & (directions[:, :, 2] > _LEAST_COSINE).all(axis=1)
+    if not visible.any():
+        return np.asarray(visible)
+    share = sees(camera, points[visible], MARGIN_PX).mean(axis=1)
+    visible[visible] = share >= (LEAST_SHARE if found_in_part(sheet.target) else 1.0)
+    return np.asarray(visible)
 
 
 def seen_in(camera: CameraOptions, sheet: Sheet, cam_from_target: FloatArray, view: int) -> Corners:
-    """Where the corners of a sheet are in the image of one view, without the ones outside it."""
+    """Exact corners of a sheet inside the image of one view."""
     points = corners_m(sheet) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     ids = np.flatnonzero(sees(camera.camera, points, EDGE_PX)).astype(np.int64)
     return Corners(view, ids, project(camera.camera, points[ids]), camera.blur_px)
 
 
 def detected(sheet: Sheet, exact: Corners, sigma_px: float, noise: np.random.Generator) -> Corners:
-    """The corners of a view as a detector reports them, with noise.
+    """Corners of a view as detected, with noise.
 
-    It begins a board that looks alike from both ends at the upper left.
+    The numbering of a symmetric board starts at the upper left.
     """
-    found = replace(exact, px=exact.px + sigma_px * noise.standard_normal(exact.px.shape))
-    if not is_symmetric(sheet.target) or not len(found.ids):
-        return found
-    if found.px[0].sum() <= found.px[-1].sum():
-        return found
+    corners = replace(exact, px=exact.px + sigma_px * noise.standard_normal(exact.px.shape))
+    if not is_symmetric(sheet.target) or not len(corners.ids):
+        return corners
+    if corners.px[0].sum() <= corners.px[-1].sum():
+        return corners
     last = sheet.target.columns * sheet.target.rows - 1
-    return replace(found, ids=(last - found.ids)[::-1], px=found.px[::-1])
+    return replace(corners, ids=(last - corners.ids)[::-1], px=corners.px[::-1])
 
 
 def is_symmetric(target: Target) -> bool:
-    """Whether a board looks alike when it is turned by half a turn."""
+    """Whether a board is invariant under a half turn."""
     if target.kind == "circles":
         return not target.asymmetric or target.rows % 2 == 0
     return target.kind == "checkerboard" and (target.columns + target.rows) % 2 == 0

@@ -1,4 +1,4 @@
-"""What simulated cells are made of, and their faults."""
+"""Components of simulated cells, and their faults."""
 
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -13,24 +13,24 @@ from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
 from visioncal.simulation.poses import Motion, Viewpoints
 from visioncal.simulation.sag import ArmOptions
 
-# Where robots meet [m].
+# Centre of the cell, which robots face [m].
 MIDDLE_M = (0.0, 0.0, 0.4)
 CELL = "cell"
-# An operator's pace: a stop every so many seconds [s].
+# Time between stops, at an operator's pace [s].
 _PACE_S = 4.0
-# What a session calls the boards of a cell with a second one.
+# Board names in the session of a cell with two boards.
 _TWO_BOARDS = ("first", "second")
 
 
 @dataclass(frozen=True)
 class RobotAt(ArmOptions):
-    """A robot that stands in the cell and turns its front to the middle.
+    """A robot in the cell, facing the centre.
 
     Attributes:
-        name: What the session calls it.
-        place_m: Where its base stands in the cell [m].
-        warms_up: Whether it is cold at the first stop, and warms up by work.
-        wrong_stops: Number of stops at which its report is off by 5 to 30 mm and 1 to 5 degrees.
+        name: Name in the session.
+        place_m: Position of its base in the cell [m].
+        warms_up: Whether it is cold at the first stop and warms up while it works.
+        wrong_stops: Number of stops whose report is off by 5 to 30 mm and 1 to 5 degrees.
     """
 
     name: str
@@ -42,14 +42,14 @@ class RobotAt(ArmOptions):
 
 @dataclass(frozen=True, eq=False)
 class CameraAt(CameraOptions):
-    """A camera on a robot's flange, or one that stands in the cell and looks at a place of it.
+    """A camera on a robot's flange, or fixed in the cell.
 
     Attributes:
-        name: What the session calls it.
-        on: The robot on whose flange it is, or `cell`.
-        place_m: Where it stands in the cell, if it does [m].
-        looks_at_m: The place at which one in the cell looks [m].
-        at_stops: Whether it takes images at the robots' stops, and not in sweeps alone.
+        name: Name in the session.
+        on: The robot that carries it, or `cell`.
+        place_m: Position in the cell, if fixed [m].
+        looks_at_m: Point that a fixed one looks at [m].
+        at_stops: Whether it takes images at the robots' stops, and not only in sweeps.
     """
 
     name: str
@@ -61,13 +61,13 @@ class CameraAt(CameraOptions):
 
 @dataclass(frozen=True)
 class BoardAt(Sheet):
-    """A board on a robot's flange, or one that lies in the cell.
+    """A board on a robot's flange, or fixed in the cell.
 
     Attributes:
-        name: What the session calls it.
-        on: The robot on whose flange it is, or `cell`.
-        place_m: Where its middle lies in the cell, if it does [m].
-        tilt_rad: How far it leans towards the middle of the cell [rad].
+        name: Name in the session.
+        on: The robot that carries it, or `cell`.
+        place_m: Position of its centre in the cell, if fixed [m].
+        tilt_rad: Tilt towards the centre of the cell [rad].
     """
 
     name: str
@@ -79,12 +79,12 @@ class BoardAt(Sheet):
 
 @dataclass(frozen=True)
 class PointAt:
-    """A point that instruments read, on a flange or in the cell.
+    """A point read by instruments, on a flange or in the cell.
 
     Attributes:
-        name: What the session calls it.
-        on: The robot on whose flange it is, or `cell`.
-        place_m: Where it is in the frame of that flange, or of the cell [m].
+        name: Name in the session.
+        on: The robot that carries it, or `cell`.
+        place_m: Position in the frame of that flange, or of the cell [m].
     """
 
     name: str
@@ -94,16 +94,16 @@ class PointAt:
 
 @dataclass(frozen=True)
 class InstrumentAt:
-    """An instrument that stands upright in the cell and reads every point at every stop.
+    """An upright instrument in the cell that reads every point at every stop.
 
-    Where it reads the rotation of a point, too, that is a probe's, whose axes are the flange's.
+    If it also reads rotations, points are probes, with the axes of the flange.
 
     Attributes:
-        name: What the session calls it.
-        place_m: Where it stands [m].
-        turn_rad: How far it is turned about the vertical [rad].
-        sigma_m: Noise of its readings, per axis [m].
-        sigma_rad: Noise of rotations that it reads, too [rad]; 0 where it reads none.
+        name: Name in the session.
+        place_m: Position in the cell [m].
+        turn_rad: Rotation about the vertical [rad].
+        sigma_m: Noise of readings, per axis [m].
+        sigma_rad: Noise of rotation readings [rad]; 0 if it reads no rotations.
     """
 
     name: str
@@ -115,13 +115,13 @@ class InstrumentAt:
 
 @dataclass(frozen=True)
 class Moved:
-    """Something that is pushed in the course of the recording.
+    """A component that is pushed during the recording.
 
     Attributes:
-        frame: The frame that hangs otherwise from then on, as `target_floor` or `cam_left`.
-        from_stop: The first stop after the push; None for half-way.
-        shift_m: How far it is pushed, in a direction of chance [m].
-        turn_rad: How far it is turned [rad].
+        frame: Frame that moves on its parent, as `target_floor` or `cam_left`.
+        from_stop: First stop after the push; None for half way.
+        shift_m: Length of the displacement, in a random direction [m].
+        turn_rad: Angle of the rotation, about a random axis [rad].
     """
 
     frame: str
@@ -132,11 +132,11 @@ class Moved:
 
 @dataclass(frozen=True)
 class Swept(SweepOptions):
-    """A camera that sees a target while a robot, which carries one of the two, moves.
+    """A camera that observes a target during a robot's motion, which carries one of the two.
 
     Attributes:
         camera: The camera.
-        robot: The robot, which goes through its stops on a smooth way.
+        robot: The robot, which moves smoothly through its stops.
         target: The target.
     """
 
@@ -149,31 +149,27 @@ class Swept(SweepOptions):
 
 @dataclass(frozen=True, eq=False)
 class NetworkOptions(DrawOptions):
-    """A simulated cell with several of a kind: two robots, two fixed cameras and three boards.
+    """A simulated cell of several robots, cameras and boards; by default two, two and three.
 
-    All stand where they are said to, but for a little. Nothing hides anything else: what is in a
-    camera's image is seen.
+    All poses deviate slightly from the stated ones. There is no occlusion.
 
     Attributes:
         robots: The robots.
         cameras: The cameras.
         boards: The boards.
-        instruments: Instruments, if there are any.
-        points: The points that these read.
-        stops: How often all robots stand still together.
-        pace_s: Time from one stop to the next [s]; 0 for rows without a time.
-        share_seen: Share of what could be seen that is recorded; the rest is left out by chance.
-        lens_views: Images of each camera that are of its lens alone, as the board is held by hand.
-        moved: What is pushed in the course of the recording.
-        sweeps: What cameras see of robots in motion, after the stops.
-        swapped_rows: Pairs of rows of one camera and board whose images are exchanged.
-        stray_images: Rows whose image is from another stop.
+        instruments: The instruments.
+        points: Points that these read.
+        stops: Number of stops, common to all robots.
+        pace_s: Time between stops [s]; 0 for rows without a time.
+        share_seen: Share of the possible observations that is recorded, at random.
+        lens_views: Number of images of each camera for its intrinsics only, with a hand-held board.
+        moved: Components that are pushed during the recording.
+        sweeps: Sweeps after the stops.
+        swapped_rows: Number of pairs of rows of one camera and board whose images are exchanged.
+        stray_images: Number of rows whose image is from another stop.
     """
 
-    robots: tuple[RobotAt, ...] = (
-        RobotAt("a", (-0.6, 0.0, 0.0)),
-        RobotAt("b", (0.6, 0.05, 0.02)),
-    )
+    robots: tuple[RobotAt, ...] = (RobotAt("a", (-0.6, 0.0, 0.0)), RobotAt("b", (0.6, 0.05, 0.02)))
     cameras: tuple[CameraAt, ...] = (
         CameraAt("left", place_m=(0.0, -1.0, 1.1)),
         CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera()),
@@ -215,34 +211,34 @@ class NetworkOptions(DrawOptions):
         if len(set(swept)) < len(swept):
             raise DataError("simulation: a robot moves in one sweep; in two its streams are one.")
         known = {CELL, *(robot.name for robot in self.robots)}
-        on = [(camera.name, camera.on) for camera in self.cameras]
-        on += [(board.name, board.on) for board in self.boards] + [
+        carriers = [(camera.name, camera.on) for camera in self.cameras]
+        carriers += [(board.name, board.on) for board in self.boards] + [
             (point.name, point.on) for point in self.points
         ]
-        for name, carrier in on:
+        for name, carrier in carriers:
             if carrier not in known:
                 raise DataError(
                     f"simulation: {name} is on {carrier!r}; there are {', '.join(sorted(known))}."
                 )
 
     def first_pushed(self, moved: Moved) -> int:
-        """The first stop after a push."""
+        """First stop after a push."""
         return self.stops // 2 if moved.from_stop is None else moved.from_stop
 
     @property
     def layout(self) -> "NetworkOptions":
-        """What there is, as of every cell."""
+        """Layout of the cell, as for every cell."""
         return self
 
 
 @dataclass(frozen=True, kw_only=True)
 class Second(Sheet):
-    """A second board of a cell. Every other stop looks at it; it is seen wherever it is in view.
+    """A second board of a cell, at which every other stop aims; it is observed whenever in view.
 
     Attributes:
-        turn_rad: How far around the base it lies from the first (eye-in-hand), or to which side of
-            the flange it leans (eye-to-hand) [rad].
-        tilt_rad: How far it leans: towards the base, or aside [rad].
+        turn_rad: Angle around the base from the first board (eye-in-hand), or direction of its
+            offset on the flange (eye-to-hand) [rad].
+        tilt_rad: Tilt: towards the base, or sideways [rad].
     """
 
     target: Target = BOARDS["checkerboard"]
@@ -252,29 +248,28 @@ class Second(Sheet):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CellOptions(ArmOptions, CameraOptions, DrawOptions):
-    """A simulated cell of one robot and one camera, in places of chance.
+    """A simulated cell of one robot and one camera at random poses.
 
-    The defaults are a well-kept one.
+    The defaults are a well-maintained cell.
 
     Attributes:
         mount: Where the camera is.
         views: Number of views.
-        target: The board as its file states it.
-        distance_m: Least and greatest distance of the camera from the board's centre [m]; None
-            takes a range in which the board fills the image well, for a camera beside the robot
-            within 0.7 to 1.2 m.
-        tilt_rad: Least and greatest angle between the view and the board's normal [rad].
-        roll_rad: Greatest turn about the optical axis, either way [rad].
-        motion: `free`; or, too poor for hand-eye calibration, turning about `one_axis` only or
-            `translation` alone.
-        branches: Whether the arm takes its elbow, shoulder and wrist either way, from view to view;
-            else all postures are near one another, as an operator would teach them.
-        cut_views: Share of the views in which the image's edge may cut a ChArUco board.
+        target: Board as its file describes it.
+        distance_m: Range of the camera's distance from the board's centre [m]; None for a range in
+            which the board fills the image well, limited to 0.7 to 1.2 m for a fixed camera.
+        tilt_rad: Range of the angle between view and board normal [rad].
+        roll_rad: Largest rotation about the optical axis, either way [rad].
+        motion: `free`; or, degenerate for hand-eye calibration, rotation about `one_axis` only, or
+            `translation` only.
+        branches: Whether elbow, shoulder and wrist configurations vary between views; else all
+            postures are close to each other, as an operator would teach them.
+        cut_views: Share of views in which the image's edge may cut a ChArUco board.
         wrong_views: Number of views whose report is off by 5 to 30 mm and 1 to 5 degrees.
         board_scale: Printed size over stated size.
-        board_bow_m: How far the board's corners are bent away from the camera [m].
-        second: A second board; None for a cell with one.
-        camera_moved_m: How far the camera was pushed from where it sits in this cell [m].
+        board_bow_m: Depth of the board's corners relative to its centre, away from the camera [m].
+        second: Second board; None for a single board.
+        camera_moved_m: Displacement of the camera from its usual pose in this cell [m].
     """
 
     mount: Mount = "eye-in-hand"
@@ -308,7 +303,7 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
 
     @property
     def layout(self) -> NetworkOptions:
-        """What there is, as of every cell: a robot, a camera and an only board have no names."""
+        """Layout of the cell; robot, camera and a single board have no names."""
         camera_on, board_on = ("", CELL) if self.mount == "eye-in-hand" else (CELL, "")
         sheets = [Sheet(target=self.target, scale=self.board_scale, bow_m=self.board_bow_m)]
         sheets += [self.second] if self.second else []
@@ -328,5 +323,5 @@ class CellOptions(ArmOptions, CameraOptions, DrawOptions):
         )
 
     def part(self, kind: type[ArmOptions | CameraOptions | DrawOptions]) -> dict[str, Any]:
-        """The fields of a part by their names, for options that have such a part likewise."""
+        """Fields of a base class by name, for options with the same base class."""
         return {entry.name: getattr(self, entry.name) for entry in fields(kind)}

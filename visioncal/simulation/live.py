@@ -1,4 +1,4 @@
-"""What the camera of a simulated cell sees while the arm stands or moves, picture by picture."""
+"""Images of a simulated cell's camera while the arm stands or moves."""
 
 import cv2
 import numpy as np
@@ -15,21 +15,22 @@ from visioncal.simulation.rasters import Float32Array, Patch, between, trace
 from visioncal.simulation.render import developed, light_on, prepare_scene
 from visioncal.simulation.textures import margin_m
 
-# No corner is found so well that such a shift shows [px].
+# Image shift below the accuracy of corner detection [px].
 _STILL_PX = 0.003
-# A shorter smear may pass for rest, so it is made of exact pictures; a longer one of shifted ones.
+# Shorter motion blur is averaged from exact images, as it may count as standstill; longer blur from
+# shifted ones.
 _SHORT_PX = 2.0
 _MOST_PARTS = 24
-# What stands in for the distance of the board where it is not before the camera [m].
+# Substitute for the distance of a board that is not in front of the camera [m].
 _FAR_M = 1.0
 
 
 class LiveView:
-    """Takes pictures of a cell's board from wherever its arm is.
+    """Takes images of a cell's board for any posture of its arm.
 
     Args:
-        cell: The cell, of one robot, one camera and one board. Its true arm, mountings, lens and
-            noise are what counts; the views that it was built with do not matter.
+        cell: Cell of one robot, one camera and one board. Its real arm, mountings, optics and noise
+            are used, not its views.
 
     Raises:
         DataError: The cell has two boards, or OpenCV does not have the target's dictionary.
@@ -45,18 +46,14 @@ class LiveView:
         self._before = cell.seen_from("", "", "")
         self._scene = prepare_scene(cell)
         self._count = 0
-        # The light of the last posture at rest; the noise alone is drawn anew for each picture.
+        # Light of the last stationary posture; only the noise differs between its images.
         self._rest: tuple[FloatArray, Float32Array] | None = None
 
     def picture(self, joints: FloatArray) -> Image:
-        """Takes a picture.
+        """A (height, width) grey image with motion blur and independent noise.
 
-        Args:
-            joints: (k, n) where the arm's joints really are, at even steps from the beginning of
-                the exposure to its end; one row for an arm that stands [rad].
-
-        Returns:
-            (height, width) grey image, smeared by what moved, with noise of its own.
+        The true joint angles (k, n) [rad] are at equal intervals during the exposure; one row
+        stands for a stationary arm.
         """
         poses = self.cam_from_target(joints)
         smear_px = float(self._moved_px(poses[:-1], poses[1:]).sum())
@@ -69,7 +66,7 @@ class LiveView:
         return developed(light, self._cell.camera(), noise)
 
     def cam_from_target(self, joints: FloatArray) -> FloatArray:
-        """Where the board really is before the camera: (k, n) joints [rad] to (k, 4, 4)."""
+        """True board poses: (k, n) joints [rad] to (k, 4, 4)."""
         return self._before(forward(self._cell.robot.true_arm, joints))
 
     def _still(self, pose: FloatArray, posture: FloatArray) -> Float32Array:
@@ -82,18 +79,18 @@ class LiveView:
         return light_on(self._scene, pose, posture, shows_board=shows_board, **more)
 
     def _smeared(self, joints: FloatArray, smear_px: float) -> Float32Array:
-        """The mean of what fell on the sensor in even parts of the exposure."""
+        """Mean light over equal parts of the exposure."""
         parts = int(np.clip(np.ceil(smear_px), 3, _MOST_PARTS))
-        at = (np.arange(parts) + 0.5) / parts * (len(joints) - 1)
+        positions = (np.arange(parts) + 0.5) / parts * (len(joints) - 1)
         steps = np.arange(len(joints))
-        between_them = np.stack([np.interp(at, steps, column) for column in joints.T], axis=1)
-        poses = self.cam_from_target(between_them)
+        postures = np.stack([np.interp(positions, steps, column) for column in joints.T], axis=1)
+        poses = self.cam_from_target(postures)
         if smear_px < _SHORT_PX:
-            lights = (self._light(*pair) for pair in zip(poses, between_them, strict=True))
+            lights = (self._light(*pair) for pair in zip(poses, postures, strict=True))
         else:
             middle = self.cam_from_target(joints[len(joints) // 2, None])[0]
-            whole = self._light(middle, joints[len(joints) // 2], samples=1)
-            lights = (self._shifted(whole, pose @ invert(middle), middle) for pose in poses)
+            sharp = self._light(middle, joints[len(joints) // 2], samples=1)
+            lights = (self._shifted(sharp, pose @ invert(middle), middle) for pose in poses)
         total = next(lights).copy()
         for light in lights:
             total += light
@@ -102,35 +99,35 @@ class LiveView:
     def _shifted(
         self, light: Float32Array, now_from_middle: FloatArray, middle: FloatArray
     ) -> Float32Array:
-        """Moves a picture as if all that it shows were as far away as the board."""
-        # A smear is as long as it should be at the board's middle, and symmetric to the true place
-        # of every corner everywhere.
+        """Transforms an image as if all its content were at the board's distance."""
+        # Motion blur is then correct at the board's centre, and symmetric about each corner's true
+        # position everywhere.
         camera = self._cell.camera().camera
         raster = trace(camera, Patch(0, 0, *camera.resolution), 1)
         depth = float((middle[:3, :3] @ centre_m(self._cell.board()) + middle[:3, 3])[2])
         plane = compose(np.eye(3), np.array([0.0, 0.0, depth if depth > 0.0 else _FAR_M]))
         plane_from_now = invert(now_from_middle @ plane)
-        aims = raster.directions @ plane_from_now[:3, :3].T
+        directions = raster.directions @ plane_from_now[:3, :3].T
         start = plane_from_now[:3, 3]
-        struck = start - aims * (start[2] / aims[..., 2])[..., None]
-        px = project(camera, struck @ plane[:3, :3].T + plane[:3, 3])
-        across, down = between(raster, px[..., 0]), between(raster, px[..., 1])
-        moved = cv2.remap(light, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(moved, np.float32)
+        hits = start - directions * (start[2] / directions[..., 2])[..., None]
+        px = project(camera, hits @ plane[:3, :3].T + plane[:3, 3])
+        map_x, map_y = between(raster, px[..., 0]), between(raster, px[..., 1])
+        shifted = cv2.remap(light, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(shifted, np.float32)
 
     def _moved_px(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """(k,) bounds on how far the picture moves between poses (k, 4, 4) of the board [px]."""
+        """(k,) bounds of the image motion between board poses (k, 4, 4) [px]."""
         centre = centre_m(self._cell.board())
-        ahead = first[:, :3, :3] @ centre + first[:, :3, 3]
-        behind = second[:, :3, :3] @ centre + second[:, :3, 3]
-        distance = np.maximum(np.linalg.norm(ahead, axis=1), 0.1)
-        shift = np.linalg.norm(behind - ahead, axis=1) / distance
-        turn = rotation_angle(second @ invert(first))
-        return np.asarray(self._cell.camera().camera.matrix[0] * (shift + turn))
+        before = first[:, :3, :3] @ centre + first[:, :3, 3]
+        after = second[:, :3, :3] @ centre + second[:, :3, 3]
+        distance = np.maximum(np.linalg.norm(before, axis=1), 0.1)
+        shift = np.linalg.norm(after - before, axis=1) / distance
+        rotation = rotation_angle(second @ invert(first))
+        return np.asarray(self._cell.camera().camera.matrix[0] * (shift + rotation))
 
 
 def _faces(cell: SimulatedCell, cam_from_target: FloatArray) -> bool:
-    """Tells whether the board's printed side may be in the picture, at least in part."""
+    """Whether the board's printed side may be in the image, at least in part."""
     board = cell.board()
     points = np.concatenate([corners_m(board), outline_m(board, margin_m(board.target))])
     points_cam = points @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]

@@ -1,4 +1,4 @@
-"""Simulates a cell: mounts it, moves its robots, and looks at its boards; faults of recordings."""
+"""Simulation of a cell: mounting, robot motion, observations, and recording faults."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -26,7 +26,7 @@ from visioncal.simulation.layout import CellOptions, NetworkOptions
 from visioncal.simulation.passage import with_sweep
 from visioncal.simulation.poses import Viewpoints, filling_m
 
-# The same sources of randomness in cells of several robots.
+# Corresponding sources of randomness in cells with several robots.
 _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomStream.ROBOTS}
 
 
@@ -34,68 +34,70 @@ _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomSt
 def simulate(
     options: CellOptions | NetworkOptions, postures: FloatArray | None = None
 ) -> SimulatedCell:
-    """Builds a cell, moves its robots and looks at the boards.
+    """Builds a cell, moves its robots and observes its boards.
 
     Args:
-        options: What the cell is made of. The same options give the same cell.
-        postures: (m, n) joint angles to which the robot of `CellOptions` moves, one a stop,
-            whatever the camera sees there [rad]; None draws as many as the options say, from which
-            a board is in the image.
+        options: Options of the cell. The same options give the same cell.
+        postures: (m, n) joint angles of the robot of `CellOptions`, one row per stop, whether or
+            not the camera sees the board there [rad]; None draws postures with a board in the
+            image.
 
     Returns:
-        The truth and the reports.
+        The cell with true and reported values.
 
     Raises:
         DataError: An arm is unknown, a camera's coefficients do not fit its model, or a robot
-            cannot reach enough poses at which it shows a board to a camera.
+            cannot reach enough poses with a board in view.
     """
     if isinstance(options, CellOptions):
-        cell = observed(_of_one(options, postures))
+        cell = observed(_one_robot_cell(options, postures))
         wrong = [sight.view for sight in cell.sights if sight.stop in cell.robot.wrong_stops]
         return replace(cell, wrong_views=tuple(wrong))
     if postures is not None:
         raise DataError("simulation: postures are taken by a cell of one robot alone.")
     mountings = standing.mounted(options)
-    cell = observed(_stood(options, mountings, standing.postures(options, mountings)))
+    cell = observed(_moved_cell(options, mountings, standing.postures(options, mountings)))
     cell = with_faults(cell)
-    last = replace(cell, mountings={name: array[-1] for name, array in _hanging(cell).items()})
+    pushed = replace(
+        cell, mountings={name: array[-1] for name, array in _parent_poses(cell).items()}
+    )
     for swept in options.sweeps:
-        cell = with_sweep(cell, swept, last)
+        cell = with_sweep(cell, swept, pushed)
     return cell
 
 
-def _of_one(options: CellOptions, postures: FloatArray | None) -> SimulatedCell:
-    """A cell of one robot and one camera, before anything is seen."""
+def _one_robot_cell(options: CellOptions, postures: FloatArray | None) -> SimulatedCell:
+    """A cell of one robot and one camera, before observations."""
     mountings = one_robot.mounted(options)
     if postures is None:
-        moved = one_robot.postures(options, mountings)
+        joints = one_robot.postures(options, mountings)
     else:
-        moved = np.array(postures, dtype=float)
-        options = replace(options, views=len(moved))
-    return _stood(options, one_robot.pushed(options, mountings), {"": moved})
+        joints = np.array(postures, dtype=float)
+        options = replace(options, views=len(joints))
+    return _moved_cell(options, one_robot.pushed(options, mountings), {"": joints})
 
 
-def _stood(
+def _moved_cell(
     options: CellOptions | NetworkOptions,
     mountings: Mapping[str, FloatArray],
-    moved: Mapping[str, FloatArray],
+    joints_by_robot: Mapping[str, FloatArray],
 ) -> SimulatedCell:
-    """A cell whose robots moved to (s, n) joint angles each [rad], before anything is seen."""
+    """A cell whose robots moved to (s, n) joint angles each [rad], before observations."""
     layout = options.layout
     stamps_s = np.arange(layout.stops, dtype=np.float64) * layout.pace_s
     robots, heat = {}, {}
-    for at, robot in enumerate(layout.robots):
-        arm, q = arm_named(robot.robot), moved[robot.name]
-        true_arm = robot.built(_stream(options, RandomStream.ARM, at))
+    for index, robot in enumerate(layout.robots):
+        arm, q = arm_named(robot.robot), joints_by_robot[robot.name]
+        true_arm = robot.built(_stream(options, RandomStream.ARM, index))
         loads, approach = robot.loads(layout.stops), robot.approach(layout.stops)
-        stood = robot.flange_at(true_arm, q, loads, approach)
+        flange_poses = robot.flange_at(true_arm, q, loads, approach)
         if robot.warms_up:
-            heats, hours = Heat.drawn(options.seed + at), stamps_s[-1] / 3600.0
-            warming = warm_up(heats, hours, seed=options.seed + at)
-            stood = heated_flanges(true_arm, heats, q, warming.at(stamps_s), stood)
+            heats, hours = Heat.drawn(options.seed + index), stamps_s[-1] / 3600.0
+            warming = warm_up(heats, hours, seed=options.seed + index)
+            flange_poses = heated_flanges(true_arm, heats, q, warming.at(stamps_s), flange_poses)
             heat[f"{robot.name}_heat"] = warming.recorded(temperatures=True)
-        jitter = robot.jitter(layout.stops, _stream(options, RandomStream.ROBOT, at))
-        rng = _stream(options, RandomStream.WRONG, at)
+        jitter = robot.jitter(layout.stops, _stream(options, RandomStream.ROBOT, index))
+        rng = _stream(options, RandomStream.WRONG, index)
         joints, wrong_stops = misreported(arm, q, robot.wrong_stops, rng)
         robots[robot.name] = SimulatedRobot(
             options=robot,
@@ -103,7 +105,7 @@ def _stood(
             true_arm=true_arm,
             joints=joints,
             base_from_flange=forward(arm, joints),
-            true_base_from_flange=stood @ jitter,
+            true_base_from_flange=flange_poses @ jitter,
             wrong_stops=wrong_stops,
             loads=loads,
             approach=approach,
@@ -114,8 +116,8 @@ def _stood(
         mountings=mountings,
         robots=robots,
         stated={
-            camera.name: camera.stated(_stream(options, RandomStream.LENS, at))
-            for at, camera in enumerate(layout.cameras)
+            camera.name: camera.stated(_stream(options, RandomStream.LENS, index))
+            for index, camera in enumerate(layout.cameras)
         },
         stamps_s=stamps_s if layout.pace_s else None,
         streams=heat,
@@ -123,20 +125,20 @@ def _stood(
 
 
 def _stream(
-    options: CellOptions | NetworkOptions, purpose: RandomStream, at: int
+    options: CellOptions | NetworkOptions, purpose: RandomStream, index: int
 ) -> np.random.Generator:
-    """The randomness of a thing by its number; the only one of its kind has none."""
+    """Randomness of a component by its index; that of a single robot's cell has no index."""
     if isinstance(options, CellOptions):
         return options.stream(purpose)
-    return options.stream(_OF_SEVERAL.get(purpose, purpose), at)
+    return options.stream(_OF_SEVERAL.get(purpose, purpose), index)
 
 
 def observed(cell: SimulatedCell) -> SimulatedCell:
-    """Adds what cameras and instruments see, stop by stop, and numbers the rows."""
-    layout, where = cell.layout, _places(cell)
+    """Adds the observations of cameras and instruments, stop by stop, and numbers the rows."""
+    layout, frames = cell.layout, _cell_poses(cell)
     poses = {
-        (camera.name, board.name): invert(where[frame_name("camera", camera.name)])
-        @ where[frame_name("target", board.name)]
+        (camera.name, board.name): invert(frames[frame_name("camera", camera.name)])
+        @ frames[frame_name("target", board.name)]
         for camera in layout.cameras
         for board in layout.boards
         if camera.at_stops
@@ -153,14 +155,14 @@ def observed(cell: SimulatedCell) -> SimulatedCell:
                 sights.append(_sight(cell, view, stop, camera, board, pose[stop]))
                 _need(cell, needed, frame_name("camera", camera), frame_name("target", board))
                 view += 1
-        for reading in _read(cell, where, stop, view):
+        for reading in _read(cell, frames, stop, view):
             readings.append(reading)
             _need(cell, needed, frame_name("point", reading.point), "")
             view += 1
         for robot in [name for name, is_given in needed.items() if not is_given]:
             pose_rows.append((view, stop, robot))
             view += 1
-    sights += _of_lenses(cell, view)
+    sights += _lens_sights(cell, view)
     cell = replace(cell, readings=tuple(readings), pose_rows=tuple(pose_rows))
     return with_detections(replace(cell, sights=tuple(sights)))
 
@@ -168,74 +170,73 @@ def observed(cell: SimulatedCell) -> SimulatedCell:
 def _sight(
     cell: SimulatedCell, view: int, stop: int, camera: str, board: str, pose: FloatArray
 ) -> SimulatedSight:
-    """What a camera sees of a board, before a detector looks at it."""
     exact = seen_in(cell.camera(camera), cell.board(board), pose, view)
     return SimulatedSight(view, stop, camera, board, pose, exact, exact)
 
 
 def with_detections(cell: SimulatedCell) -> SimulatedCell:
-    """The cell with the corners of all its images as a detector reports them."""
-    options, found = cell.options, []
-    # One camera's noise is drawn row after row.
-    one = options.stream(RandomStream.PIXELS)
+    """The cell with detected corners in all its images."""
+    options, sights = cell.options, []
+    # With one camera, all noise is from one stream.
+    common = options.stream(RandomStream.PIXELS)
     for sight in cell.sights:
-        alone = isinstance(options, CellOptions)
-        rng = one if alone else options.stream(RandomStream.CORNERS, sight.view)
+        is_single = isinstance(options, CellOptions)
+        rng = common if is_single else options.stream(RandomStream.CORNERS, sight.view)
         corners = detected(cell.board(sight.board), sight.exact, options.pixel_sigma_px, rng)
-        found.append(replace(sight, corners=corners))
-    return replace(cell, sights=tuple(found))
+        sights.append(replace(sight, corners=corners))
+    return replace(cell, sights=tuple(sights))
 
 
 def _need(cell: SimulatedCell, needed: dict[str, bool], first: str, second: str) -> None:
-    """Notes the robots between two frames, and that the row has the pose of the first of them."""
+    """Marks robots between two frames as needed; the row states the pose of the first one."""
     carried = (cell.robot_of(frame) for frame in (first, second) if frame)
     robots = [robot for robot in carried if robot is not None]
     if len(set(robots)) < len(robots):
         return
-    for place, robot in enumerate(robots):
-        needed[robot] = needed.get(robot, False) or place == 0
+    for position, robot in enumerate(robots):
+        needed[robot] = needed.get(robot, False) or position == 0
 
 
-def _hanging(cell: SimulatedCell) -> dict[str, FloatArray]:
-    """(s, 4, 4) where each frame hangs in its parent, stop by stop."""
+def _parent_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
+    """(s, 4, 4) poses of the frames on their parents at each stop."""
     layout = cell.layout
-    hangs = {
+    poses = {
         name: np.tile(mounting, (layout.stops, 1, 1)) for name, mounting in cell.mountings.items()
     }
-    for at, moved in enumerate(layout.moved):
-        if moved.frame not in hangs:
+    for index, push in enumerate(layout.moved):
+        if push.frame not in poses:
             raise DataError(
-                f"simulation: {moved.frame!r} cannot be pushed; there are {', '.join(hangs)}."
+                f"simulation: {push.frame!r} cannot be pushed; there are {', '.join(poses)}."
             )
-        start = layout.first_pushed(moved)
-        twist = cell.options.stream(RandomStream.FAULTS, 10 + at).standard_normal((2, 3))
-        twist *= np.array([[moved.turn_rad], [moved.shift_m]]) / np.linalg.norm(
+        start = layout.first_pushed(push)
+        twist = cell.options.stream(RandomStream.FAULTS, 10 + index).standard_normal((2, 3))
+        twist *= np.array([[push.turn_rad], [push.shift_m]]) / np.linalg.norm(
             twist, axis=1, keepdims=True
         )
-        hangs[moved.frame][start:] = hangs[moved.frame][start:] @ exp(twist.ravel())
-    return hangs
+        poses[push.frame][start:] = poses[push.frame][start:] @ exp(twist.ravel())
+    return poses
 
 
-def _places(cell: SimulatedCell) -> dict[str, FloatArray]:
-    """(s, 4, 4) where each frame really is in the cell, stop by stop."""
-    hangs = _hanging(cell)
+def _cell_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
+    """(s, 4, 4) true poses of the frames in the cell at each stop."""
+    poses = _parent_poses(cell)
     flanges = {frame_name("flange", name): robot for name, robot in cell.robots.items()}
     for (flange, robot), name in zip(flanges.items(), cell.robots, strict=True):
-        base = hangs.get(frame_name("base", name), np.eye(4))
-        hangs[flange] = base @ robot.true_base_from_flange
+        base = poses.get(frame_name("base", name), np.eye(4))
+        poses[flange] = base @ robot.true_base_from_flange
     for frame, parent in cell.parents.items():
         if parent in flanges:
-            hangs[frame] = hangs[parent] @ hangs[frame]
-    return hangs
+            poses[frame] = poses[parent] @ poses[frame]
+    return poses
 
 
 def _shown(cell: SimulatedCell, camera: str, board: str, pose: FloatArray) -> Mask:
-    """(s,) at which stops a camera has a board in its image, and it is recorded."""
+    """(s,) mask of stops at which a camera's image of a board is recorded."""
     layout, options = cell.layout, cell.options
     seen = looks_at(cell.camera(camera).camera, cell.board(board), pose)
     at_board = [board_at.name for board_at in layout.boards].index(board)
     if isinstance(options, CellOptions):
-        # What a stop was made for is in view.
+        # The board that a stop aims at is in view.
         aimed = np.arange(layout.stops) % len(layout.boards) == at_board
         return np.asarray(seen | aimed)
     at_camera = [camera_at.name for camera_at in layout.cameras].index(camera)
@@ -243,63 +244,62 @@ def _shown(cell: SimulatedCell, camera: str, board: str, pose: FloatArray) -> Ma
     return np.asarray(seen & (share < options.share_seen))
 
 
-def _of_lenses(cell: SimulatedCell, first_view: int) -> list[SimulatedSight]:
-    """Images of a board that is held by hand before each camera, for its lens alone."""
+def _lens_sights(cell: SimulatedCell, first_view: int) -> list[SimulatedSight]:
+    """Images of a hand-held board before each camera, for its intrinsics only."""
     layout = cell.layout
-    found: list[SimulatedSight] = []
-    for at, camera in enumerate(layout.cameras if layout.lens_views else ()):
+    sights: list[SimulatedSight] = []
+    for index, camera in enumerate(layout.cameras if layout.lens_views else ()):
         board = layout.boards[0]
         distance_m = filling_m(camera.camera, board)
         drawn = Viewpoints(camera=camera.camera, board=board, distance_m=distance_m, cut_views=0.0)
-        rng, views = cell.options.stream(RandomStream.LENS_VIEWS, at), np.empty((0, 4, 4))
+        rng, views = cell.options.stream(RandomStream.LENS_VIEWS, index), np.empty((0, 4, 4))
         while len(views) < layout.lens_views:
             views = np.concatenate([views, drawn.draw(4 * layout.lens_views, rng)])
         for pose in views[: layout.lens_views]:
-            view = first_view + len(found)
-            found.append(_sight(cell, view, -1, camera.name, board.name, pose))
-    return found
+            view = first_view + len(sights)
+            sights.append(_sight(cell, view, -1, camera.name, board.name, pose))
+    return sights
 
 
 def _read(
-    cell: SimulatedCell, where: Mapping[str, FloatArray], stop: int, first_view: int
+    cell: SimulatedCell, frames: Mapping[str, FloatArray], stop: int, first_view: int
 ) -> list[InstrumentReading]:
-    """What instruments read at a stop."""
-    found: list[InstrumentReading] = []
+    readings: list[InstrumentReading] = []
     for instrument in cell.layout.instruments:
-        instrument_from_cell = invert(where[frame_name("instrument", instrument.name)][stop])
+        instrument_from_cell = invert(frames[frame_name("instrument", instrument.name)][stop])
         for point in cell.layout.points:
-            view = first_view + len(found)
+            view = first_view + len(readings)
             rng = cell.options.stream(RandomStream.READINGS, view)
-            read = instrument_from_cell @ where[frame_name("point", point.name)][stop]
+            read = instrument_from_cell @ frames[frame_name("point", point.name)][stop]
             read[:3, 3] += instrument.sigma_m * rng.standard_normal(3)
-            turn = instrument.sigma_rad * rng.standard_normal(3)
-            read[:3, :3] = read[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
-            found.append(InstrumentReading(view, stop, instrument.name, point.name, read))
-    return found
+            rotvec = instrument.sigma_rad * rng.standard_normal(3)
+            read[:3, :3] = read[:3, :3] @ Rotation.from_rotvec(rotvec).as_matrix()
+            readings.append(InstrumentReading(view, stop, instrument.name, point.name, read))
+    return readings
 
 
 def misreported(
     arm: DhArm, moved: FloatArray, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, tuple[int, ...]]:
-    """Joints as reported: those moved to, but for some stops whose report belongs elsewhere.
+    """Reported joint angles: the true ones, except for some stops with a wrong report.
 
     Args:
-        arm: The nominal arm.
-        moved: (s, n) joint angles moved to [rad].
-        count: How many stops are reported 5 to 30 mm and 1 to 5 degrees away.
+        arm: Nominal arm.
+        moved: (s, n) true joint angles [rad].
+        count: Number of stops whose report is off by 5 to 30 mm and 1 to 5 degrees.
         rng: Source of randomness.
 
     Returns:
-        (s, n) joint angles as reported [rad], and those stops, ascending.
+        (s, n) reported joint angles [rad], and the wrong stops, ascending.
     """
     chosen = np.sort(rng.permutation(len(moved))[:count])
     joints = moved.copy()
     for stop in chosen:
         for _ in range(20):
-            turn, shift = rng.normal(size=(2, 3))
-            turn *= np.deg2rad(rng.uniform(1.0, 5.0)) / np.linalg.norm(turn)
+            rotvec, shift = rng.normal(size=(2, 3))
+            rotvec *= np.deg2rad(rng.uniform(1.0, 5.0)) / np.linalg.norm(rotvec)
             shift *= rng.uniform(0.005, 0.030) / np.linalg.norm(shift)
-            error = compose(Rotation.from_rotvec(turn).as_matrix(), shift)
+            error = compose(Rotation.from_rotvec(rotvec).as_matrix(), shift)
             reach = inverse(arm, forward(arm, moved[stop, None]) @ error, moved[stop, None])
             if reach.solved[0]:
                 joints[stop] = reach.joints[0]
@@ -310,7 +310,7 @@ def misreported(
 
 
 def with_faults(cell: SimulatedCell) -> SimulatedCell:
-    """Exchanges images of rows, and takes some from other stops."""
+    """Exchanges the images of some rows, and takes some from other stops."""
     layout, rng = cell.layout, cell.options.stream(RandomStream.FAULTS)
     sights = list(cell.sights)
     groups: dict[tuple[str, str], list[int]] = {}
@@ -338,7 +338,6 @@ def with_faults(cell: SimulatedCell) -> SimulatedCell:
 
 
 def _moves(cell: SimulatedCell, sight: SimulatedSight) -> bool:
-    """Whether a board moves before a camera."""
     carriers = [
         cell.parents[frame_name("camera", sight.camera)],
         cell.parents[frame_name("target", sight.board)],

@@ -1,4 +1,4 @@
-"""A cell of one robot and one camera in places of chance, and the postures that it moves to."""
+"""Random poses and postures of a cell of one robot and one camera."""
 
 from collections.abc import Mapping
 
@@ -16,15 +16,15 @@ from visioncal.simulation.layout import CellOptions, Second
 from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
 from visioncal.simulation.reach import home_posture, reached
 
-# How far aside the flange carries its second board [m].
+# Offset of a second board on the flange [m].
 _ASIDE_M = 0.10
-# Bounds of the least and of the greatest distance of a camera beside the robot [m].
+# Bounds of the smallest and of the largest distance of a fixed camera [m].
 _NEAR_M, _FAR_M = (0.7, 1.0), (1.0, 1.2)
 _TRIES = 50
 
 
 def mounted(options: CellOptions) -> dict[str, FloatArray]:
-    """(4, 4) where camera and boards hang, plausible for the arm's size, before any push."""
+    """(4, 4) poses of camera and boards on their parents, plausible for the arm's size."""
     rng, reach = options.stream(RandomStream.MOUNTING), reach_m(arm_named(options.robot))
     first, *further = options.layout.boards
     front, spin = rng.uniform(-0.5, 0.5), rng.uniform(-0.4, 0.4)
@@ -35,16 +35,16 @@ def mounted(options: CellOptions) -> dict[str, FloatArray]:
         aside = rng.uniform([0.05, -0.02, 0.03], [0.09, 0.02, 0.07])
         cam = compose((Rotation.from_euler("z", 0.5 * np.pi) * skewed).as_matrix(), aside)
         # The target's z points into the table.
-        turn = Rotation.from_euler("ZX", [front + spin, np.pi]).as_matrix()
-        # A table so low that the arm has the board in view from a comfortable height.
+        rotation = Rotation.from_euler("ZX", [front + spin, np.pi]).as_matrix()
+        # The table is low enough to view the board from a comfortable height.
         middle = np.array([*ahead[:2], min(0.0, 0.4 * reach - float(straight[2, 3]))])
     else:
-        turn = (Rotation.from_euler("ZX", [spin, np.pi]) * skewed).as_matrix()
+        rotation = (Rotation.from_euler("ZX", [spin, np.pi]) * skewed).as_matrix()
         middle = np.array([0.0, 0.0, 0.06]) + rng.normal(0.0, 0.005, 3)
-        away = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
+        direction = np.array([np.cos(front + spin), np.sin(front + spin), 0.35])
         distance_m = float(np.linalg.norm(straight[:3, 3]))
-        cam = looking_at(ahead, away / np.linalg.norm(away), distance_m)
-    target = compose(turn, middle - turn @ centre_m(first))
+        cam = looking_at(ahead, direction / np.linalg.norm(direction), distance_m)
+    target = compose(rotation, middle - rotation @ centre_m(first))
     placed = {"cam": cam, frame_name("target", first.name): target}
     if options.second is not None:
         placed[frame_name("target", further[0].name)] = _second(
@@ -54,46 +54,50 @@ def mounted(options: CellOptions) -> dict[str, FloatArray]:
 
 
 def _second(second: Second, first: Sheet, pose: FloatArray, mount: Mount) -> FloatArray:
-    """(4, 4) where a second board hangs beside the first, which hangs at a pose (4, 4)."""
+    """(4, 4) pose of a second board, given that of the first."""
     middle = pose[:3, :3] @ centre_m(first) + pose[:3, 3]
-    around = Rotation.from_euler("z", second.turn_rad).as_matrix()
+    rotation_z = Rotation.from_euler("z", second.turn_rad).as_matrix()
     if mount == "eye-in-hand":
-        place = around @ middle
-        lean = np.cross([0.0, 0.0, 1.0], place / np.linalg.norm(place))
+        position = rotation_z @ middle
+        lean = np.cross([0.0, 0.0, 1.0], position / np.linalg.norm(position))
         # The print faces the base, as the arm comes from there.
-        turn = Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ around @ pose[:3, :3]
+        rotation = (
+            Rotation.from_rotvec(-second.tilt_rad * lean).as_matrix() @ rotation_z @ pose[:3, :3]
+        )
     else:
-        aside = around @ np.array([1.0, 0.0, 0.0])
-        place = middle + _ASIDE_M * aside
+        aside = rotation_z @ np.array([1.0, 0.0, 0.0])
+        position = middle + _ASIDE_M * aside
         lean = np.cross([0.0, 0.0, 1.0], aside)
-        turn = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix() @ pose[:3, :3]
-    return compose(turn, place - turn @ centre_m(second))
+        rotation = Rotation.from_rotvec(second.tilt_rad * lean).as_matrix() @ pose[:3, :3]
+    return compose(rotation, position - rotation @ centre_m(second))
 
 
 def pushed(options: CellOptions, mountings: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """The mountings once the camera was pushed, in a direction of chance."""
-    away = options.stream(RandomStream.BUMP).standard_normal(3)
-    away *= options.camera_moved_m / np.linalg.norm(away)
-    return {**mountings, "cam": mountings["cam"] @ compose(np.eye(3), away)}
+    """Mountings after the camera was displaced in a random direction."""
+    shift = options.stream(RandomStream.BUMP).standard_normal(3)
+    shift *= options.camera_moved_m / np.linalg.norm(shift)
+    return {**mountings, "cam": mountings["cam"] @ compose(np.eye(3), shift)}
 
 
 def postures(options: CellOptions, mountings: Mapping[str, FloatArray]) -> FloatArray:
-    """(s, n) postures of the nominal arm, which look at the boards in turn [rad].
+    """(s, n) postures of the nominal arm, aimed at the boards in turn [rad].
 
     Raises:
-        DataError: The arm cannot reach enough poses from which a board is in the image.
+        DataError: The arm cannot reach enough poses with a board in the image.
     """
     arm, boards = arm_named(options.robot), options.layout.boards
     joints = np.zeros((options.views, arm.a.size))
-    for at, board in enumerate(boards):
-        mine = np.arange(at, options.views, len(boards))
+    for index, board in enumerate(boards):
+        stops = np.arange(index, options.views, len(boards))
         target = mountings[frame_name("target", board.name)]
-        rng = options.stream(RandomStream.POSES, *([at] if at else []))
-        joints[mine] = _looking(options, arm, board, (mountings["cam"], target), len(mine), rng)
+        rng = options.stream(RandomStream.POSES, *([index] if index else []))
+        joints[stops] = _aimed_postures(
+            options, arm, board, (mountings["cam"], target), len(stops), rng
+        )
     return joints
 
 
-def _looking(
+def _aimed_postures(
     options: CellOptions,
     arm: DhArm,
     board: Sheet,
@@ -101,20 +105,20 @@ def _looking(
     count: int,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """(count, n) postures of the nominal arm that bring a board into the image [rad].
+    """(count, n) postures of the nominal arm with a board in the image [rad].
 
-    The ends are where camera and board hang, (4, 4) each.
+    `ends` are the poses of camera and board on their parents, (4, 4) each.
     """
     cam, target = ends
     in_hand = options.mount == "eye-in-hand"
 
     def flange(cam_from_target: FloatArray) -> FloatArray:
-        """(m, 4, 4) `base_from_flange` at which the camera sees the board so."""
+        """(m, 4, 4) `base_from_flange` for board poses in the camera frame."""
         if in_hand:
             return target @ invert(cam_from_target) @ invert(cam)
         return cam @ cam_from_target @ invert(target)
 
-    # Nothing of the arm may sink into the table under the board, or under the robot.
+    # The arm must stay above the table under the board, and above the robot's own.
     floor_m = min(0.0, float(target[2, 3]) if in_hand else 0.0) + 0.05
     views = _viewpoints(options, board)
     home = home_posture(arm, flange(views.mean()[None]), rng)
@@ -138,7 +142,7 @@ def _looking(
 
 
 def _viewpoints(options: CellOptions, board: Sheet) -> Viewpoints:
-    """From where the camera is to look at a board."""
+    """Range of viewpoints towards a board."""
     distance_m = options.distance_m
     if distance_m is None:
         near, far = filling_m(options.camera, board)

@@ -1,7 +1,7 @@
-"""Simulated optics: projection and back-projection, written independently of the application.
+"""Simulated optics: projection and its inverse, independent of the application.
 
-Models: Brown (1971) with the rational radial term that OpenCV uses, and the equidistant fisheye
-polynomial of Kannala and Brandt (2006) in OpenCV's parametrisation. Pixel centres at integers.
+Models: Brown (1971) with OpenCV's rational radial term, and the equidistant fisheye polynomial of
+Kannala and Brandt (2006) in OpenCV's parametrisation. Pixel centres are at integers.
 """
 
 from collections.abc import Mapping
@@ -45,33 +45,27 @@ def fisheye_camera() -> Camera:
 
 
 def mistaken(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
-    """A camera as a calibration that is a little off would state it.
-
-    Args:
-        camera: The true camera.
-        rms_px: By how much its pixels are elsewhere, as a root mean square over the image [px].
-        rng: Source of randomness.
-    """
+    """Intrinsics from a slightly inaccurate calibration, with an rms pixel error over the image."""
     if rms_px == 0.0:
         return camera
-    # What moves pixels near the image's edge by about one each.
+    # Errors that each move pixels at the image's edge by about one pixel.
     focal, count = float(camera.matrix[0]), len(camera.distortion)
     draws = rng.standard_normal(4 + count)
-    matrix, bent = draws[:4], draws[4:] * (2.0 / focal)
-    middles = (np.arange(24) + 0.5) / 24
-    grid = np.meshgrid(*(middles * index - 0.5 for index in camera.resolution))
-    looks = rays(camera, np.stack(grid, axis=-1))
+    matrix, distortion = draws[:4], draws[4:] * (2.0 / focal)
+    centres = (np.arange(24) + 0.5) / 24
+    grid = np.meshgrid(*(centres * size - 0.5 for size in camera.resolution))
+    directions = rays(camera, np.stack(grid, axis=-1))
 
-    def off(share: float) -> Camera:
+    def disturbed(share: float) -> Camera:
         return replace(
             camera,
             matrix=camera.matrix + share * matrix,
-            distortion=camera.distortion + share * bent,
+            distortion=camera.distortion + share * distortion,
         )
 
-    moved = project(off(1e-3), looks) - project(camera, looks)
-    unit = 1e3 * float(np.sqrt(np.mean(np.sum(moved**2, axis=-1))))
-    return off(rms_px / unit)
+    errors_px = project(disturbed(1e-3), directions) - project(camera, directions)
+    unit = 1e3 * float(np.sqrt(np.mean(np.sum(errors_px**2, axis=-1))))
+    return disturbed(rms_px / unit)
 
 
 def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
@@ -79,35 +73,28 @@ def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
 
     Args:
         camera: The camera.
-        points_cam: (..., 3) points in the camera frame [m], in front of the camera.
+        points_cam: (..., 3) points in front of the camera, in its frame [m].
 
     Returns:
         (..., 2) pixels [px].
 
     Raises:
-        DataError: The camera's model and its number of coefficients do not fit together.
+        DataError: The number of coefficients does not fit the camera's model.
     """
     x, y, z = np.moveaxis(np.asarray(points_cam, dtype=float), -1, 0)
     if camera.model == "fisheye":
         radius = np.hypot(x, y)
-        bent = _fisheye_radius(_coefficients(camera), np.arctan2(radius, z))
-        stretch = bent / np.where(radius > 0.0, radius, 1.0)
-        return _to_pixels(camera, x * stretch, y * stretch)
+        distorted = _fisheye_radius(_coefficients(camera), np.arctan2(radius, z))
+        scale = distorted / np.where(radius > 0.0, radius, 1.0)
+        return _to_pixels(camera, x * scale, y * scale)
     return _to_pixels(camera, *_brown(_coefficients(camera), x / z, y / z))
 
 
 def rays(camera: Camera, px: FloatArray) -> FloatArray:
-    """Directions in which pixels look.
+    """(..., 3) unit vectors in the camera frame, from (..., 2) pixels.
 
     Newton's method on the distortion. Outside the region where the distortion is monotonic, which
-    no lens has inside its image, the directions are not meaningful.
-
-    Args:
-        camera: The camera.
-        px: (..., 2) pixels [px].
-
-    Returns:
-        (..., 3) unit vectors in the camera frame.
+    contains the image of any real lens, the directions are meaningless.
     """
     fx, fy, cx, cy = camera.matrix
     x_bent, y_bent = (px[..., 0] - cx) / fx, (px[..., 1] - cy) / fy
@@ -126,22 +113,13 @@ CAMERAS: Mapping[str, Camera] = {
 
 
 def sees(camera: Camera, points_cam: FloatArray, margin_px: float) -> npt.NDArray[np.bool_]:
-    """Tells which points are in the image.
-
-    Args:
-        camera: The camera.
-        points_cam: (..., 3) points in the camera frame [m].
-        margin_px: How far from the image's edge they must stay [px].
-
-    Returns:
-        (...) booleans.
-    """
+    """(...) mask of (..., 3) points in the camera frame [m] inside the image, by a margin [px]."""
     px = project(camera, points_cam)
     width, height = camera.resolution
     inside = (px >= margin_px - 0.5) & (px <= np.array([width, height]) - 0.5 - margin_px)
     seen = np.asarray(inside.all(axis=-1) & (points_cam[..., 2] > 0.0))
     if seen.any():
-        # From far outside the image a polynomial can fold a point back into it; its ray disagrees.
+        # The polynomial can fold points from far outside back into the image; their rays differ.
         points = points_cam[seen]
         unit = points / np.linalg.norm(points, axis=-1, keepdims=True)
         seen[seen] = np.einsum("ni,ni->n", rays(camera, px[seen]), unit) > 1.0 - 1e-9
@@ -154,7 +132,7 @@ def _to_pixels(camera: Camera, x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _coefficients(camera: Camera) -> FloatArray:
-    """The 8 Brown (missing ones zero) or 4 fisheye coefficients."""
+    """The 8 Brown coefficients (missing ones zero), or the 4 fisheye coefficients."""
     given = np.asarray(camera.distortion, dtype=float).ravel()
     allowed = (4,) if camera.model == "fisheye" else (5, 8)
     if given.size not in allowed:
@@ -180,16 +158,16 @@ def _undo_brown(
     x, y = x_bent.copy(), y_bent.copy()
     h = 1e-6
     for _ in range(20):
-        now_x, now_y = _brown(coefficients, x, y)
-        off_x, off_y = x_bent - now_x, y_bent - now_y
+        distorted_x, distorted_y = _brown(coefficients, x, y)
+        error_x, error_y = x_bent - distorted_x, y_bent - distorted_y
         right_x, right_y = _brown(coefficients, x + h, y)
         down_x, down_y = _brown(coefficients, x, y + h)
-        a, b = (right_x - now_x) / h, (down_x - now_x) / h
-        c, d = (right_y - now_y) / h, (down_y - now_y) / h
+        a, b = (right_x - distorted_x) / h, (down_x - distorted_x) / h
+        c, d = (right_y - distorted_y) / h, (down_y - distorted_y) / h
         determinant = a * d - b * c
-        # A bounded step keeps pixels at the rim of a strong distortion from flying off.
-        step_x = np.clip((d * off_x - b * off_y) / determinant, -0.3, 0.3)
-        step_y = np.clip((a * off_y - c * off_x) / determinant, -0.3, 0.3)
+        # Limited steps, against divergence at the rim of strong distortion.
+        step_x = np.clip((d * error_x - b * error_y) / determinant, -0.3, 0.3)
+        step_y = np.clip((a * error_y - c * error_x) / determinant, -0.3, 0.3)
         x, y = x + step_x, y + step_y
         if max(np.abs(step_x).max(), np.abs(step_y).max()) < 1e-14:
             break
@@ -203,15 +181,17 @@ def _fisheye_radius(coefficients: FloatArray, angle: FloatArray) -> FloatArray:
 
 
 def _fisheye_rays(coefficients: FloatArray, x_bent: FloatArray, y_bent: FloatArray) -> FloatArray:
-    bent = np.hypot(x_bent, y_bent)
-    slopes = coefficients * np.array([3.0, 5.0, 7.0, 9.0])
-    angle = bent.copy()
+    radius = np.hypot(x_bent, y_bent)
+    factors = coefficients * np.array([3.0, 5.0, 7.0, 9.0])
+    angle = radius.copy()
     for _ in range(20):
         a2 = angle * angle
-        slope = 1.0 + a2 * (slopes[0] + a2 * (slopes[1] + a2 * (slopes[2] + a2 * slopes[3])))
-        step = np.clip((bent - _fisheye_radius(coefficients, angle)) / slope, -0.3, 0.3)
+        derivative = 1.0 + a2 * (
+            factors[0] + a2 * (factors[1] + a2 * (factors[2] + a2 * factors[3]))
+        )
+        step = np.clip((radius - _fisheye_radius(coefficients, angle)) / derivative, -0.3, 0.3)
         angle = angle + step
         if np.abs(step).max() < 1e-14:
             break
-    stretch = np.sin(angle) / np.where(bent > 0.0, bent, 1.0)
-    return np.stack([x_bent * stretch, y_bent * stretch, np.cos(angle)], axis=-1)
+    scale = np.sin(angle) / np.where(radius > 0.0, radius, 1.0)
+    return np.stack([x_bent * scale, y_bent * scale, np.cos(angle)], axis=-1)

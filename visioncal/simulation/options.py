@@ -1,4 +1,4 @@
-"""Boards, cameras and sweeps of simulated cells, and how good or bad they are."""
+"""Boards, cameras and sweeps of simulated cells, with their errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,16 +13,16 @@ _APRILTAGS = "DICT_APRILTAG_36h11"
 
 
 def _tags() -> Target:
-    """Seven tags of 40 to 60 mm on a plate, whose corners were measured."""
+    """Seven tags of 40 to 60 mm on a plate, with measured corners."""
     tags = (
         *((3, 0.000, 0.000, 0.050), (17, 0.085, 0.010, 0.040), (42, 0.160, 0.000, 0.060)),
         *((5, 0.010, 0.075, 0.040), (101, 0.140, 0.085, 0.050), (64, 0.075, 0.070, 0.045)),
         (9, 0.205, 0.090, 0.040),
     )
     points = [
-        (x + across * side, y + down * side, 0.0)
+        (x + dx * side, y + dy * side, 0.0)
         for _, x, y, side in tags
-        for across, down in ((0, 0), (1, 0), (1, 1), (0, 1))
+        for dx, dy in ((0, 0), (1, 0), (1, 1), (0, 1))
     ]
     return Target(
         name="tags",
@@ -38,9 +38,9 @@ def _tags() -> Target:
     )
 
 
-# Boards with the sides of their squares and how well these are known [m]: a ChArUco board, a
-# checkerboard whose colours determine corner 0, an AprilGrid as Kalibr prints them, circles of
-# 14 mm in shifted rows, and circles of 15 mm that look the same upside down.
+# Boards with square sides and their sigmas [m]: a ChArUco board, a checkerboard whose colours
+# determine corner 0, an AprilGrid as on Kalibr's pages, circles of 14 mm in shifted rows, and a
+# symmetric grid of circles of 15 mm.
 _CHARUCO = Target(
     "charuco_9x6_30mm", "charuco", 9, 6, 0.030, 3e-5, marker_m=0.022, dictionary="DICT_5X5_100"
 )
@@ -74,16 +74,15 @@ TARGETS: Mapping[str, Target] = {board.name: board for board in BOARDS.values()}
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraOptions:
-    """A camera, what a session states of it, and how well it takes images.
+    """A camera with its stated intrinsics and the quality of its images.
 
     Attributes:
-        camera: Its true optics.
-        state_intrinsics: Whether the session states them.
-        lens_mismatch_px: How far the stated intrinsics put pixels elsewhere, as a root mean square
-            over the image [px].
+        camera: True optics.
+        state_intrinsics: Whether the session states the intrinsics.
+        lens_mismatch_px: Error of the stated intrinsics, as root mean square over the image [px].
         blur_px: Defocus of rendered images, as a Gaussian's sigma [px].
         image_noise: Noise of rendered images [grey levels].
-        vignetting: Loss of light in the image's corners, as a share.
+        vignetting: Relative loss of light in the image's corners.
         jpeg_quality: 1 to 100; None writes lossless PNG.
     """
 
@@ -96,24 +95,24 @@ class CameraOptions:
     jpeg_quality: int | None = None
 
     def stated(self, rng: np.random.Generator) -> Camera:
-        """The optics as the session states them."""
+        """The intrinsics as the session states them."""
         return mistaken(self.camera, self.lens_mismatch_px, rng)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions:
-    """How a sweep is made.
+    """Timing and noise of a sweep.
 
     Attributes:
-        stops: Through how many postures it goes.
-        pace_s: How long it takes from one to the next [s].
-        robot_hz: Samples of the controller in a second.
-        frames_hz: Frames of the camera in a second.
-        readout_s: How long after the image's first row the last is taken, the stamp being that of
-            the middle [s]; 0 for a global shutter.
-        camera_minus_robot_s: What the camera's stamps are ahead of the controller's [s].
-        jitter_s: Noise of the camera's stamps, as a standard deviation [s].
-        encoder_sigma_rad: Noise of the joint angles that the controller reports [rad].
+        stops: Number of postures on its path.
+        pace_s: Time between postures [s].
+        robot_hz: Samples of the controller per second.
+        frames_hz: Frames of the camera per second.
+        readout_s: Time from an image's first row to its last, with the stamp at the middle [s]; 0
+            for a global shutter.
+        camera_minus_robot_s: Offset of the camera's clock relative to the controller's [s].
+        jitter_s: Standard deviation of the camera's stamps [s].
+        encoder_sigma_rad: Noise of the reported joint angles [rad].
     """
 
     stops: int = 12

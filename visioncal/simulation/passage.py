@@ -1,8 +1,7 @@
-"""A robot's way through its stops without a rest, and the frames and reports of it.
+"""A continuous motion of a robot through its stops, with camera frames and controller reports.
 
-Camera and controller stamp by clocks of their own. The joints are of continuous acceleration; the
-camera takes frames at its rate, wherever the robot is; the controller reports its joints and poses
-at a higher one.
+Camera and controller have separate clocks. The joints have continuous acceleration; the camera
+takes frames at its own rate, and the controller reports joints and poses at a higher one.
 """
 
 from collections.abc import Callable
@@ -28,21 +27,21 @@ from visioncal.simulation.layout import CELL, Swept
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CameraOptions, SweepOptions
 
-# A frame of a whole cell that shows less of the board, or shows it more askew, is not recorded.
+# Minimum number of corners, and smallest cosine of obliqueness, of a recorded frame.
 _FEWEST_OF_CELL, _FACING = 12, 0.5
-# When a row is taken depends on where its corner is then: by a few thousandths less each time.
+# Iterations of a corner's row and its time, which converge by some thousandths each.
 _ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """A smooth way of a robot's joints through its stops, and when it is sampled.
+    """A smooth joint path through a robot's stops, and its sampling times.
 
     Attributes:
-        options: How the sweep is made.
-        way: Joint angles (k, n) [rad] at k times [s], of continuous acceleration.
-        robot_s: When the controller reports, by its own clock [s].
-        taken_s: When the camera takes the middles of its frames, by that clock [s].
+        options: Options of the sweep.
+        way: Joint path (k, n) [rad] over k times [s], with continuous acceleration.
+        robot_s: Times of the controller's reports, by its own clock [s].
+        taken_s: Times of the frames' middle rows, by that clock [s].
     """
 
     options: SweepOptions
@@ -51,27 +50,29 @@ class Passage:
     taken_s: FloatArray
 
     @classmethod
-    def through(cls, stops: FloatArray, how: SweepOptions) -> "Passage":
-        """The way through (s, n) postures [rad], each time to the nearest that is left."""
-        way = CubicSpline(how.pace_s * np.arange(len(stops)), _in_turn(stops), bc_type="clamped")
-        end_s = how.pace_s * (len(stops) - 1)
+    def through(cls, stops: FloatArray, options: SweepOptions) -> "Passage":
+        """A path through (s, n) postures [rad], in nearest-neighbour order."""
+        way = CubicSpline(
+            options.pace_s * np.arange(len(stops)), _nearest_order(stops), bc_type="clamped"
+        )
+        end_s = options.pace_s * (len(stops) - 1)
         return cls(
-            how,
+            options,
             way,
-            np.arange(0.0, end_s, 1.0 / how.robot_hz),
-            np.arange(0.5 / how.frames_hz, end_s, 1.0 / how.frames_hz),
+            np.arange(0.0, end_s, 1.0 / options.robot_hz),
+            np.arange(0.5 / options.frames_hz, end_s, 1.0 / options.frames_hz),
         )
 
     def reported(self, arm: DhArm, rng: np.random.Generator) -> Recorded:
-        """The controller's stream, by the nominal arm and encoders with noise."""
+        """The controller's stream, from the nominal arm and noisy encoders."""
         joints = self.way(self.robot_s)
         joints = joints + self.options.encoder_sigma_rad * rng.standard_normal(joints.shape)
         poses = forward(arm, joints)
         quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-        # A quaternion does not jump to its negative.
-        turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
-        quaternions[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
-        names = [f"q{at + 1}_rad" for at in range(joints.shape[1])]
+        # Quaternions keep their sign.
+        flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
+        quaternions[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+        names = [f"q{joint + 1}_rad" for joint in range(joints.shape[1])]
         values = np.hstack([self.robot_s[:, None], poses[:, :3, 3], quaternions, joints])
         return Recorded(("stamp_s", *POSE, *names), values)
 
@@ -83,95 +84,95 @@ class Passage:
         sheet: Sheet,
         view: int,
     ) -> Corners:
-        """The corners of one frame, each where it was when its row of the image was taken.
+        """Corners of one frame, each at the time of its image row.
 
-        Args:
-            taken_s: When its middle row was taken [s].
-            before: `cam_from_target` (k, 4, 4) at k postures (k, n) [rad].
-            camera: The camera.
-            sheet: The board.
-            view: The frame's number.
+        `before` maps k postures (k, n) [rad] to `cam_from_target` (k, 4, 4); `taken_s` is the time
+        of the middle row.
         """
         corners, optics = corners_m(sheet), camera.camera
-        late_s = np.zeros(len(corners))
+        delays_s = np.zeros(len(corners))
         for _ in range(_ROUNDS if self.options.readout_s else 1):
-            points = apply_each(before(self.way(taken_s + late_s)), corners)
+            points = apply_each(before(self.way(taken_s + delays_s)), corners)
             px = project(optics, points)
-            late_s = self.options.readout_s * (px[:, 1] / (optics.resolution[1] - 1) - 0.5)
+            delays_s = self.options.readout_s * (px[:, 1] / (optics.resolution[1] - 1) - 0.5)
         ids = np.flatnonzero(sees(optics, points, EDGE_PX)).astype(np.int64)
         return Corners(view, ids, px[ids], camera.blur_px)
 
 
-def _in_turn(stops: FloatArray) -> FloatArray:
-    """Orders postures so that each is the nearest to the one before of those that are left."""
+def _nearest_order(stops: FloatArray) -> FloatArray:
+    """Orders postures by nearest neighbours."""
     left = list(range(1, len(stops)))
     order = [0]
     while left:
-        away = [float(np.abs(stops[at] - stops[order[-1]]).max()) for at in left]
-        order.append(left.pop(int(np.argmin(away))))
+        distances = [float(np.abs(stops[index] - stops[order[-1]]).max()) for index in left]
+        order.append(left.pop(int(np.argmin(distances))))
     return stops[order]
 
 
 def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> SimulatedCell:
-    """A cell with the frames of one camera while one robot goes through its stops.
+    """A cell with the frames of one camera during a sweep of one robot.
 
     Args:
         cell: The cell at its stops.
-        swept: What moves, and what is seen.
-        pushed: The cell once all is pushed that is pushed in its course.
+        swept: The sweep.
+        pushed: The cell after all pushes.
 
     Raises:
-        DataError: There is no such thing, or that robot does not move the one before the other.
+        DataError: A component is unknown, or the robot does not move target and camera relative to
+            each other.
     """
     _check(cell, swept)
     options, robot = cell.options, cell.robots[swept.robot]
-    at = list(cell.robots).index(swept.robot)
-    rng, ticks = options.stream(RandomStream.SWEEPS, at), options.stream(RandomStream.SWEEPS, at, 1)
+    index = list(cell.robots).index(swept.robot)
+    rng, stamp_noise = (
+        options.stream(RandomStream.SWEEPS, index),
+        options.stream(RandomStream.SWEEPS, index, 1),
+    )
     passage = Passage.through(robot.joints[: swept.stops], swept)
     recorded = passage.reported(robot.arm, rng)
     camera, board = cell.camera(swept.camera), cell.board(swept.target)
-    fewest = _FEWEST_OF_CELL if found_in_part(board.target) else len(corners_m(board))
+    min_corners = _FEWEST_OF_CELL if found_in_part(board.target) else len(corners_m(board))
     seen_from = pushed.seen_from(swept.robot, swept.camera, swept.target)
-    taken = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
-    first_view = 1 + max([*taken, *(row[0] for row in cell.pose_rows)], default=-1)
+    used_views = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
+    first_view = 1 + max([*used_views, *(row[0] for row in cell.pose_rows)], default=-1)
     sights: list[SimulatedSight] = []
 
-    def before(off: FloatArray, q: FloatArray) -> FloatArray:
-        return seen_from(robot.flange_at(q) @ off)
+    def before(jitter: FloatArray, q: FloatArray) -> FloatArray:
+        return seen_from(robot.flange_at(q) @ jitter)
 
     for taken_s in passage.taken_s.tolist():
         seen = partial(before, robot.options.jitter(1, rng))
         exact = passage.frame(taken_s, seen, camera, board, first_view + len(sights))
         middle = seen(passage.way([taken_s]))[0]
-        if len(exact.ids) < fewest or middle[2, 2] < _FACING:
+        if len(exact.ids) < min_corners or middle[2, 2] < _FACING:
             continue
-        found = detected(board, exact, options.pixel_sigma_px, rng)
-        ahead_s = swept.camera_minus_robot_s + swept.jitter_s * ticks.standard_normal()
+        corners = detected(board, exact, options.pixel_sigma_px, rng)
+        ahead_s = swept.camera_minus_robot_s + swept.jitter_s * stamp_noise.standard_normal()
         names = swept.camera, swept.target
         stamp_s, at_once = taken_s + ahead_s, not swept.readout_s
         sights.append(
-            SimulatedSight(exact.view, -1, *names, middle, exact, found, stamp_s, at_once)
+            SimulatedSight(exact.view, -1, *names, middle, exact, corners, stamp_s, at_once)
         )
     streams = {**cell.streams, swept.robot: recorded}
     return replace(cell, sights=(*cell.sights, *sights), streams=streams)
 
 
 def _check(cell: SimulatedCell, swept: Swept) -> None:
-    """Refuses a sweep of what there is not, or of a camera and a target that do not move so."""
+    """Checks that the components of a sweep exist and move relative to each other."""
     layout = cell.layout
     for kind, name, things in (
         ("robot", swept.robot, layout.robots),
         ("camera", swept.camera, layout.cameras),
         ("target", swept.target, layout.boards),
     ):
-        there = [thing.name for thing in things]
-        if name not in there:
+        known = [thing.name for thing in things]
+        if name not in known:
             raise DataError(
-                f"simulation: a sweep is of {kind} {name!r}; there are {', '.join(there)}."
+                f"simulation: a sweep is of {kind} {name!r}; there are {', '.join(known)}."
             )
     ends = frame_name("camera", swept.camera), frame_name("target", swept.target)
-    on = [cell.parents[end] for end in ends]
-    if sorted(on) != sorted((CELL, frame_name("flange", swept.robot))):
+    carriers = [cell.parents[end] for end in ends]
+    if sorted(carriers) != sorted((CELL, frame_name("flange", swept.robot))):
         raise DataError(
             f"simulation: of camera {swept.camera} and target {swept.target} of a sweep, one has "
             f"to be on robot {swept.robot} and the other in the cell."

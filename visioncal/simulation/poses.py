@@ -1,4 +1,4 @@
-"""Where a simulated camera stands to look at a board: views on a cap above it."""
+"""Viewpoints of a simulated camera towards a board."""
 
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -20,25 +20,25 @@ from visioncal.simulation.optics import rays, sees
 
 Motion: TypeAlias = Literal["free", "one_axis", "translation"]
 
-# The print stays this far from the image's edge in views that show it whole [px].
+# Distance of the print from the image's edge in complete views [px].
 MARGIN_PX = 12.0
-# A view that the image's edge may cut still shows this share of the corners.
+# Share of corners that a view cut by the image's edge still shows.
 LEAST_SHARE = 0.6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Viewpoints:
-    """From where a camera looks at a board.
+    """Range of viewpoints of a camera towards a board.
 
     Attributes:
-        camera: The camera's optics.
+        camera: Optics of the camera.
         board: The board.
-        distance_m: Least and greatest distance of the camera from the board's centre [m].
-        tilt_rad: Least and greatest angle between the view and the board's normal [rad].
-        roll_rad: Greatest turn about the optical axis, either way [rad].
-        motion: `free`; or, too poor for hand-eye calibration, turning about `one_axis` only or
-            `translation` alone.
-        cut_views: Share of the views in which the image's edge may cut a board that is found in
+        distance_m: Range of the camera's distance from the board's centre [m].
+        tilt_rad: Range of the angle between view and board normal [rad].
+        roll_rad: Largest rotation about the optical axis, either way [rad].
+        motion: `free`; or, degenerate for hand-eye calibration, rotation about `one_axis` only, or
+            `translation` only.
+        cut_views: Share of views in which the image's edge may cut a board that can be detected in
             part.
     """
 
@@ -51,19 +51,19 @@ class Viewpoints:
     cut_views: float = 0.1
 
     def mean(self) -> FloatArray:
-        """The view that the others are spread around: straight, at the mean distance, (4, 4)."""
+        """Central viewpoint: without tilt, at the mean distance, (4, 4)."""
         middle = 0.5 * sum(self.distance_m)
         return compose(np.eye(3), np.array([0.0, 0.0, middle]) - centre_m(self.board))
 
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draws views and keeps those in which the board is where it should be in the image.
+        """Draws views, and keeps those with the board inside the image.
 
         Returns:
             (k, 4, 4) `cam_from_target`, k <= count.
         """
         rotation = self._rotations(count, rng)
         distance = rng.uniform(*self.distance_m, size=count)
-        # At most this share of the views may be cut.
+        # Largest share of views that may be cut.
         share = self.cut_views if found_in_part(self.board.target) else 0
         may_be_cut = rng.random(count) < share
         reach = np.where(may_be_cut, 0.4, 0.3)[:, None]
@@ -72,15 +72,17 @@ class Viewpoints:
         )
         centre = distance[:, None] * rays(self.camera, aim)
         cam_from_target = compose(rotation, centre - rotation @ centre_m(self.board))
-        whole = sees(self.camera, _place(cam_from_target, outline_m(self.board, 0.0)), MARGIN_PX)
+        outline_seen = sees(
+            self.camera, _place(cam_from_target, outline_m(self.board, 0.0)), MARGIN_PX
+        )
         seen = sees(self.camera, _place(cam_from_target, corners_m(self.board)), MARGIN_PX)
-        fits = whole.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
+        fits = outline_seen.all(axis=1) | (may_be_cut & (seen.mean(axis=1) > LEAST_SHARE))
         return np.asarray(cam_from_target[fits])
 
     def _rotations(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """(count, 3, 3) rotations: the board's tilt about an axis in its plane, then the roll."""
+        """(count, 3, 3) rotations: tilt about an axis in the board's plane, then roll."""
         low, high = self.tilt_rad
-        # Uniform on the cap's area: the cosine of the tilt is uniform.
+        # Uniform on the spherical cap: the cosine of the tilt is uniform.
         tilt = np.arccos(rng.uniform(np.cos(high), np.cos(low), size=count))
         azimuth = rng.uniform(-np.pi, np.pi, size=count)
         roll = rng.uniform(-self.roll_rad, self.roll_rad, size=count)
@@ -90,17 +92,17 @@ class Viewpoints:
         tilted = Rotation.from_rotvec(tilt[:, None] * axis)
         along_z = roll[:, None] * np.array([0.0, 0.0, 1.0])
         if self.motion == "translation":
-            turned = tilted
+            rotations = tilted
         elif self.motion == "one_axis":
-            # The board turns about its own normal, so that all relative rotations share that axis.
-            turned = tilted * Rotation.from_rotvec(along_z)
+            # Rotation about the board's normal, so that all relative rotations share that axis.
+            rotations = tilted * Rotation.from_rotvec(along_z)
         else:
-            turned = Rotation.from_rotvec(along_z) * tilted
-        return np.asarray(turned.as_matrix(), dtype=float)
+            rotations = Rotation.from_rotvec(along_z) * tilted
+        return np.asarray(rotations.as_matrix(), dtype=float)
 
 
 def looking_at(point: FloatArray, away: FloatArray, distance_m: float) -> FloatArray:
-    """(4, 4) where an upright camera is that looks at a point along -`away` from so far."""
+    """(4, 4) pose of an upright camera that looks along -`away` at a point, `distance_m` away."""
     right = np.cross(-away, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(-away, right), -away], axis=1)
@@ -108,7 +110,7 @@ def looking_at(point: FloatArray, away: FloatArray, distance_m: float) -> FloatA
 
 
 def filling_m(camera: Camera, board: Sheet) -> tuple[float, float]:
-    """Least and greatest distance at which a board fills a camera's image well [m]."""
+    """Smallest and largest distance at which a board fills a camera's image well [m]."""
     left, top, right, bottom = pattern_box(board.target)
     focal, short_side = float(camera.matrix[0]), min(camera.resolution)
     full = focal * float(np.hypot(right - left, bottom - top)) / short_side
@@ -116,7 +118,7 @@ def filling_m(camera: Camera, board: Sheet) -> tuple[float, float]:
 
 
 def _place(cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
-    """(k, n, 3) points in the camera frame, from (n, 3) in the target frame."""
+    """Maps (n, 3) points in the target frame to (k, n, 3) points in the camera frame."""
     return np.asarray(
         points @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2) + cam_from_target[:, None, :3, 3]
     )

@@ -1,7 +1,7 @@
-"""From pixels to sub-pixels: rays at the knots of a grid, and splines between them.
+"""Interpolation from rays at the knots of a grid to sub-pixels.
 
 Over a hundredth of a radian perspective and distortion are so smooth that a cubic spline through
-exactly traced rays is right to far below a thousandth of a pixel, at a small part of the cost.
+exactly traced rays is accurate to far below a thousandth of a pixel, at a fraction of the cost.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from visioncal.simulation.optics import rays
 Float32Array: TypeAlias = npt.NDArray[np.float32]
 
 _KNOT_RAD = 0.01
-# Cubic splines that overlap.
+# Number of overlapping cubic splines.
 _TAPS = 4
 
 
@@ -38,12 +38,12 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class _Spline:
-    """Cubic B-splines along one side of a patch (de Boor 1978); four overlap at any place.
+    """Cubic B-splines along one side of a patch (de Boor 1978); four overlap at any point.
 
     Attributes:
-        coefficients: (k, k) of the splines that have given values at the knots.
-        first: (n,) the first of the four splines at each sub-pixel.
-        weights: (n, 4) the values of the four there.
+        coefficients: (k, k) operator from values at the knots to spline coefficients.
+        first: (n,) first of the four splines at each sub-pixel.
+        weights: (n, 4) values of the four splines there.
     """
 
     coefficients: FloatArray
@@ -53,7 +53,7 @@ class _Spline:
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """Rays at the knots of a grid over a patch, and the way from knots to sub-pixels.
+    """Rays at the knots of a grid over a patch, and their interpolation to sub-pixels.
 
     Attributes:
         px: (a, b, 2) knots [px].
@@ -70,10 +70,10 @@ class Raster:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Values of a grid at all columns of sub-pixels, as coefficients of the splines along them.
+    """Values of a grid at all sub-pixel columns, as spline coefficients along the columns.
 
     Attributes:
-        mean: Taken off: single precision is spent on the differences.
+        mean: Mean of the values, subtracted to preserve single precision.
         coefficients: (a, columns).
     """
 
@@ -82,13 +82,7 @@ class Columns:
 
 
 def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
-    """Traces rays over a patch.
-
-    Args:
-        camera: The camera.
-        patch: Part of its image.
-        samples: Sub-pixels along a pixel's side; they lie evenly around the pixel's centre.
-    """
+    """Traces rays over a patch, with `samples` sub-pixels along a pixel's side."""
     knot_px = _KNOT_RAD * float(camera.matrix[0])
     x, across = _spline(patch.left, patch.right, knot_px, samples)
     y, down = _spline(patch.top, patch.bottom, knot_px, samples)
@@ -97,7 +91,7 @@ def trace(camera: Camera, patch: Patch, samples: int) -> Raster:
 
 
 def between(raster: Raster, values: FloatArray) -> Float32Array:
-    """Interpolates values (a, b) at the knots: (rows, columns) values at the sub-pixels."""
+    """Interpolates values (a, b) at the knots to (rows, columns) values at the sub-pixels."""
     return between_rows(raster, columns_of(raster, values), slice(0, len(raster.down.first)))
 
 
@@ -105,33 +99,33 @@ def columns_of(raster: Raster, values: FloatArray) -> Columns:
     """Interpolates values (a, b) at the knots along the rows of knots."""
     mean = values.mean()
     across = raster.across
-    found = raster.down.coefficients @ (values - mean) @ across.coefficients.T
-    taps = [found.astype(np.float32)[:, across.first + index] for index in range(_TAPS)]
+    coefficients = raster.down.coefficients @ (values - mean) @ across.coefficients.T
+    taps = [coefficients.astype(np.float32)[:, across.first + index] for index in range(_TAPS)]
     return Columns(np.float32(mean), np.einsum("tac,ct->ac", taps, across.weights))
 
 
 def between_rows(raster: Raster, columns: Columns, rows: slice) -> Float32Array:
-    """Interpolates between knots of columns: (rows, columns) values at some rows of sub-pixels."""
+    """Interpolates along columns: (rows, columns) values at some sub-pixel rows."""
     first, weights = raster.down.first[rows], raster.down.weights[rows]
-    found = np.empty((len(first), columns.coefficients.shape[1]), np.float32)
+    values = np.empty((len(first), columns.coefficients.shape[1]), np.float32)
     starts = np.flatnonzero(np.diff(first, prepend=-1)).tolist()
     for start, end in zip(starts, [*starts[1:], len(first)], strict=True):
         four = columns.coefficients[first[start] : first[start] + _TAPS]
-        np.matmul(weights[start:end], four, out=found[start:end])
-    found += columns.mean
-    return found
+        np.matmul(weights[start:end], four, out=values[start:end])
+    values += columns.mean
+    return values
 
 
 def _spline(first: int, end: int, knot_px: float, samples: int) -> tuple[FloatArray, _Spline]:
-    """Knots over pixels first ... end - 1, and splines through them."""
+    """Knots over pixels first ... end - 1, and the splines on them."""
     count = max(int((end - first) / knot_px), 3) + 1
     knots = np.linspace(first - 0.5, end - 0.5, count)
-    # A pixel reaches from half a pixel before its centre, the integer, to half a pixel after it.
-    places = first - 0.5 + (np.arange((end - first) * samples) + 0.5) / samples
-    through = make_interp_spline(knots, np.eye(count))
-    weights = through.design_matrix(places, through.t, through.k)
+    # Pixel centres are at integers.
+    sub_pixels = first - 0.5 + (np.arange((end - first) * samples) + 0.5) / samples
+    interpolant = make_interp_spline(knots, np.eye(count))
+    weights = interpolant.design_matrix(sub_pixels, interpolant.t, interpolant.k)
     return knots, _Spline(
-        through.c,
+        interpolant.c,
         weights.indices[::_TAPS].astype(np.int64),
         weights.data.reshape(-1, _TAPS).astype(np.float32),
     )

@@ -6,12 +6,12 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mask
 from visioncal.simulation.arms import DhArm, inverse, link_frames
 
-# Postures with a smaller dexterity are so near a singularity that no operator would choose them.
+# Smallest dexterity at which a posture is far enough from a singularity.
 LEAST_DEXTERITY = 0.04
 
 
 def home_posture(arm: DhArm, base_from_flange: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(n,) the most dexterous posture at one pose (1, 4, 4); all views start from it."""
+    """(n,) most dexterous posture at one pose (1, 4, 4), from which all views start."""
     starts = rng.uniform(-np.pi, np.pi, size=(64, arm.a.size))
     reach = inverse(arm, np.tile(base_from_flange, (64, 1, 1)), starts)
     elbow_up = link_frames(arm, reach.joints)[:, 2, 2, 3] > arm.d[0]
@@ -22,16 +22,16 @@ def home_posture(arm: DhArm, base_from_flange: FloatArray, rng: np.random.Genera
             next_step="Take another working distance, board or robot.",
         )
     best = reach.joints[np.argmax(merit)]
-    # All joints within half a turn: the middle of their range.
+    # All joints within half a turn.
     return np.asarray((best + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def reached(
     arm: DhArm, base_from_flange: FloatArray, starts: FloatArray, floor_m: float
 ) -> tuple[FloatArray, Mask]:
-    """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) which an operator would choose.
+    """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) mask of acceptable ones.
 
-    They are sought from (m, n) starts [rad]; no link comes lower over the base than the floor.
+    The search starts at (m, n) postures [rad]; links must stay above the floor.
     """
     reach = inverse(arm, base_from_flange, starts)
     good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
@@ -39,5 +39,5 @@ def reached(
 
 
 def lowest_m(arm: DhArm, joints: FloatArray) -> FloatArray:
-    """(m,) height over the base of the lowest of elbow, wrists and flange [m]."""
+    """(m,) height of the lowest of elbow, wrists and flange over the base [m]."""
     return np.asarray(link_frames(arm, joints)[:, 2:, 2, 3].min(axis=1))

@@ -1,6 +1,6 @@
-"""Simulated cells on disk: the session that calibration reads, and the truth beside it.
+"""Simulated cells on disk: the session that calibration reads, and the ground truth beside it.
 
-One robot with one camera is a cell whose things have no names: its session has the singular tables.
+A single robot with one camera has no names; its session has singular tables.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,12 +26,13 @@ from visioncal.simulation.render import RenderScene, encode, prepare_scene, rend
 from visioncal.simulation.touching import Touching, write_touches
 from visioncal.simulation.truth import truth_of, write_truth
 
-# What rows have of what was seen: rendered images, the names of images that are not there, the
-# corners that a detector found, or the board's pose as it was measured.
+# Content of rows: rendered images, names of images that do not exist, detected corners, or measured
+# board poses.
 Seen: TypeAlias = Literal["images", "names", "corners", "poses"]
 Progress: TypeAlias = Callable[[float], None]
 
-# A step of a pose for differences, and it ahead and behind along each axis: (2, 6, 4, 4).
+# Step of finite differences, and perturbations forwards and backwards along each axis: (2, 6, 4,
+# 4).
 _STEP = 1e-6
 _STEPS = exp(_STEP * np.stack([np.eye(6), -np.eye(6)]))
 
@@ -45,16 +46,16 @@ def write_session(
     images: bool = True,
     touched: Mapping[str, Touching] | None = None,
 ) -> Path:
-    """Writes a cell as a session's folder, and its truth as `<folder>.truth.json` beside it.
+    """Writes a cell as a session's folder, with its truth in `<folder>.truth.json` beside it.
 
     Args:
         cell: The cell.
-        folder: The session's folder; it must not hold anything yet.
-        progress: Called with the share of the images that is done, 0 to 1.
-        images: Whether to render images. Without them rows have cam_from_target as a PnP with
-            `pixel_sigma_px` of noise would measure it; or corners, where a camera takes its images
-            row by row.
-        touched: What its robots touched, by their names.
+        folder: Folder of the session; it must be empty or missing.
+        progress: Called with the finished share of the images, 0 to 1.
+        images: Whether to render images. Otherwise rows have cam_from_target as a PnP with
+            `pixel_sigma_px` of noise would measure it, or corners if a camera has a rolling
+            shutter.
+        touched: Touches of its robots, by robot name.
 
     Returns:
         The session's folder.
@@ -80,8 +81,8 @@ def cell_session(
 ) -> Session:
     """The session of a cell; see `write_session`.
 
-    With `seen="names"`, `SimulatedCell.corners` is what was detected in the images that are not
-    there. With poses of an only camera and an only board it has neither of the two.
+    With `seen="names"`, `SimulatedCell.corners` are the detections in the images that do not exist.
+    With poses of a single camera and board, the session states neither of the two.
     """
     if seen in ("images", "poses") and not all(sight.at_once for sight in cell.sights):
         raise DataError(
@@ -117,15 +118,17 @@ def cell_session(
 
 
 def _rows(cell: SimulatedCell, sights: Sequence[SimulatedSight], seen: Seen) -> list[View]:
-    """The rows of what cameras saw, of what instruments read, and of poses alone."""
+    """Rows of camera observations, of instrument readings, and of poses only."""
     poses = measured_poses(cell) if seen == "poses" else [None] * len(sights)
     views = {
         sight.view: _row(cell, sight, seen, pose) for sight, pose in zip(sights, poses, strict=True)
     }
-    turned = {instrument.name for instrument in cell.layout.instruments if instrument.sigma_rad}
+    with_rotation = {
+        instrument.name for instrument in cell.layout.instruments if instrument.sigma_rad
+    }
     for reading in cell.readings:
         robot = cell.robot_of(frame_name("point", reading.point))
-        keys = POSE if reading.instrument in turned else POSE[:3]
+        keys = POSE if reading.instrument in with_rotation else POSE[:3]
         read = pose_row(reading.instrument_from_point)
         numbers = {f"meas_{key}": read[key] for key in keys}
         text = {"instrument": reading.instrument, "point": reading.point}
@@ -136,7 +139,7 @@ def _rows(cell: SimulatedCell, sights: Sequence[SimulatedSight], seen: Seen) -> 
 
 
 def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
-    """What session.toml says."""
+    """Content of session.toml."""
     layout = cell.layout
     document: dict[str, Any] = {"schema": 1, "name": name}
     if any(not camera.name for camera in layout.cameras):
@@ -146,9 +149,9 @@ def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
     cameras = {
         camera.name: _camera_table(camera, cell.stated[camera.name]) for camera in layout.cameras
     }
-    boards = {board.name: {"target": _target_place(board)} for board in layout.boards}
+    boards = {board.name: {"target": _target_reference(board)} for board in layout.boards}
     if seen == "poses":
-        # Of the only camera and the only board, measured poses say all.
+        # Measured poses need neither a single camera's table nor a single board's.
         cameras.pop("", None)
         boards.pop("", None)
     document |= _tables("robot", robots)
@@ -156,7 +159,7 @@ def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
     document |= _tables("camera", cameras)
     if any(robot.name for robot in layout.robots):
         document["frames"] = {
-            word: on for word, on in cell.parents.items() if not word.startswith("base")
+            frame: parent for frame, parent in cell.parents.items() if not frame.startswith("base")
         }
     instruments = {
         instrument.name: {"sigma_m": instrument.sigma_m}
@@ -167,7 +170,7 @@ def _document(cell: SimulatedCell, name: str, seen: Seen) -> dict[str, Any]:
 
 
 def _tables(kind: str, tables: Mapping[str, Any]) -> dict[str, Any]:
-    """The tables of one kind: of the only one, which has no name, or by names."""
+    """Tables of one kind: a singular one without a name, or by names."""
     if not tables:
         return {}
     return {kind: tables[""]} if "" in tables else {f"{kind}s": dict(tables)}
@@ -181,8 +184,8 @@ def _camera_table(camera: CameraAt, stated: Camera) -> dict[str, Any]:
     return table
 
 
-def _target_place(board: BoardAt) -> str:
-    """Names a board that comes with visioncal, or the file that is written."""
+def _target_reference(board: BoardAt) -> str:
+    """Name of a board that comes with visioncal, or of the file that is written."""
     shipped = board.target in (BOARDS["charuco"], BOARDS["checkerboard"])
     return board.target.name if shipped else f"{frame_name('target', board.name)}.toml"
 
@@ -190,12 +193,12 @@ def _target_place(board: BoardAt) -> str:
 def _row(
     cell: SimulatedCell, sight: SimulatedSight, seen: Seen, measured: FloatArray | None
 ) -> View:
-    """The row of what a camera saw, with the board's pose where that was measured."""
+    """Row of a camera observation, with the measured board pose if given."""
     text = {"camera": sight.camera, "target": sight.board}
     numbers = {} if sight.stamp_s is None else {"stamp_s": sight.stamp_s}
     if measured is not None:
         numbers |= {f"cft_{key}": value for key, value in pose_row(measured).items()}
-    image = _image(cell, sight) if seen in ("images", "names") else ""
+    image = _image_name(cell, sight) if seen in ("images", "names") else ""
     if sight.stamp_s is not None:
         return View(sight.view, image, numbers=numbers, text=_named(text))
     if sight.is_of_lens:
@@ -219,25 +222,25 @@ def _view(
     state = {} if cell.stamps_s is None else {"stamp_s": float(cell.stamps_s[stop])}
     words = dict(text)
     if robot is not None:
-        stood = cell.robots[robot]
-        state |= pose_row(stood.base_from_flange[stop])
-        joints = stood.joints[stop].tolist()
+        robot_state = cell.robots[robot]
+        state |= pose_row(robot_state.base_from_flange[stop])
+        joints = robot_state.joints[stop].tolist()
         state |= {f"q{at}_rad": angle for at, angle in enumerate(joints, start=1)}
-        if stood.loads:
-            state |= stood.loads[stop].row()
+        if robot_state.loads:
+            state |= robot_state.loads[stop].row()
         words = {"robot": robot, **words}
-        if stood.approach is not None:
-            words["approach"] = "+" if stood.approach[stop] > 0 else "-"
+        if robot_state.approach is not None:
+            words["approach"] = "+" if robot_state.approach[stop] > 0 else "-"
     return View(number, image, stop=stop, numbers={**state, **numbers}, text=_named(words))
 
 
 def _named(text: Mapping[str, str]) -> dict[str, str]:
-    """A row's words but for those of the only one of its kind, which has no name."""
+    """A row's texts, without empty names."""
     return {column: name for column, name in text.items() if name}
 
 
 def _corners(sights: Sequence[SimulatedSight]) -> CornerTable:
-    """The table of the corners that a detector found."""
+    """Table of the detected corners."""
     counts = [len(sight.corners.ids) for sight in sights]
     return CornerTable(
         np.repeat([sight.view for sight in sights], counts),
@@ -248,14 +251,14 @@ def _corners(sights: Sequence[SimulatedSight]) -> CornerTable:
 
 
 def measured_poses(cell: SimulatedCell) -> FloatArray:
-    """`cam_from_target` as a PnP on the noisy corners of each image would give it.
+    """`cam_from_target` as a PnP on the noisy corners of each image would estimate it.
 
-    It knows a board by its stated size: one that is larger is seen so much nearer. The error is
-    drawn from the covariance of a least-squares fit of the pose to the corners that are seen,
-    `pixel_sigma_px` squared times the inverse of their Gram matrix.
+    PnP uses the board's stated size, so that a larger board appears closer. The error is drawn from
+    the covariance of a least-squares fit of the pose to the visible corners, `pixel_sigma_px`
+    squared times the inverse normal matrix.
 
     Returns:
-        (m, 4, 4), of all images but those of lenses alone.
+        (m, 4, 4), for all images except those for intrinsics only.
 
     Raises:
         DataError: An image shows too few corners for a pose.
@@ -272,7 +275,7 @@ def measured_poses(cell: SimulatedCell) -> FloatArray:
 
 
 def _measured_pose(cell: SimulatedCell, sight: SimulatedSight, white: FloatArray) -> FloatArray:
-    """(4, 4) `cam_from_target` as measured, by (6,) white noise."""
+    """(4, 4) measured `cam_from_target`, with (6,) white noise."""
     ids, board = sight.exact.ids, cell.board(sight.board)
     if ids.size < 4:
         raise DataError(f"simulation: view {sight.view} shows {ids.size} corners, a pose needs 4.")
@@ -280,21 +283,21 @@ def _measured_pose(cell: SimulatedCell, sight: SimulatedSight, white: FloatArray
     jacobian = _pose_jacobian(camera, sight.cam_from_target, corners_m(board)[ids])
     # R^-1 maps white noise to noise with the covariance (R^T R)^-1.
     factor = np.linalg.qr(jacobian, mode="r")
-    off = exp(cell.options.pixel_sigma_px * np.linalg.solve(factor, white))
-    measured = sight.cam_from_target @ off
+    error = exp(cell.options.pixel_sigma_px * np.linalg.solve(factor, white))
+    measured = sight.cam_from_target @ error
     measured[:3, 3] /= board.scale
     return np.asarray(measured)
 
 
 def _pose_jacobian(camera: Camera, cam_from_target: FloatArray, points: FloatArray) -> FloatArray:
-    """(2n, 6) derivative of the pixels by the pose's right perturbation, by differences."""
+    """(2n, 6) Jacobian of the pixels by the pose's right perturbation, by finite differences."""
     poses = cam_from_target @ _STEPS
     turns, places = np.swapaxes(poses[..., :3, :3], -1, -2), poses[..., None, :3, 3]
-    ahead, behind = project(camera, points @ turns + places).reshape(2, 6, -1)
-    return np.asarray((ahead - behind).T / (2.0 * _STEP))
+    forward, backward = project(camera, points @ turns + places).reshape(2, 6, -1)
+    return np.asarray((forward - backward).T / (2.0 * _STEP))
 
 
-def _image(cell: SimulatedCell, sight: SimulatedSight) -> str:
+def _image_name(cell: SimulatedCell, sight: SimulatedSight) -> str:
     quality = cell.camera(sight.camera).jpeg_quality
     suffix = "png" if quality is None else "jpg"
     if not sight.camera:
@@ -304,14 +307,16 @@ def _image(cell: SimulatedCell, sight: SimulatedSight) -> str:
 
 
 def _rendered(cell: SimulatedCell, progress: Progress | None) -> dict[str, bytes]:
-    """Takes the pictures, each of which shows one board."""
+    """Renders all images, each with one board."""
     scenes: dict[tuple[str, str], RenderScene] = {}
     files: dict[str, bytes] = {}
     for camera in cell.layout.cameras:
-        for at, sight in enumerate(sight for sight in cell.sights if sight.camera == camera.name):
-            seen = sight.camera, sight.board
-            scene = scenes.get(seen) or scenes.setdefault(seen, prepare_scene(cell, *seen))
-            files[_image(cell, sight)] = encode(render(scene, at), camera.jpeg_quality)
+        for index, sight in enumerate(
+            sight for sight in cell.sights if sight.camera == camera.name
+        ):
+            key = sight.camera, sight.board
+            scene = scenes.get(key) or scenes.setdefault(key, prepare_scene(cell, *key))
+            files[_image_name(cell, sight)] = encode(render(scene, index), camera.jpeg_quality)
             if progress is not None:
                 progress(len(files) / len(cell.sights))
     return files

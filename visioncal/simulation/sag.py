@@ -1,7 +1,7 @@
-"""How a simulated arm is built and gives way: gears that yield to weight, payload and force; play.
+"""Elastic deflection, backlash and manufacturing errors of a simulated arm.
 
-Torques come from the simulated arm's own frames, by moments about its axes, and share nothing with
-the application's.
+Torques are computed from the simulated arm's own frames, by moments about its axes, independent of
+the application's model.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,10 +15,10 @@ from visioncal.core.types import FloatArray
 from visioncal.simulation.arms import ArmErrors, DhArm, arm_named, disturb, forward, link_frames
 
 _GRAVITY = np.array([0.0, 0.0, -9.80665])
-# Yielding changes the levers by a hundredth, and the torques as much: enough to be exact.
+# Iterations of deflection and torques: each changes the levers by about a hundredth.
 _ROUNDS = 8
-# Masses [kg] and their centres [m] in the frames of the links, after Universal Robots, "DH
-# parameters for calculations of kinematics and dynamics"; round numbers for the other arm.
+# Masses [kg] and centres of mass [m] in the link frames, from Universal Robots, "DH parameters for
+# calculations of kinematics and dynamics"; round numbers for the other arm.
 _BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
     "ur3e": (
         (1.98, (0.0, -0.02, 0.0)),
@@ -57,12 +57,12 @@ _BODIES: Mapping[str, Sequence[tuple[float, Sequence[float]]]] = {
 
 @dataclass(frozen=True)
 class Payload:
-    """What hangs on the flange, and pushes at it.
+    """A load on the flange, and a force on it.
 
     Attributes:
-        kg: Its mass [kg].
-        centre_m: Where its centre is in the flange's frame [m].
-        force_n: A force on the flange's origin, in the base's frame [N].
+        kg: Mass [kg].
+        centre_m: Centre of mass in the flange frame [m].
+        force_n: Force on the flange's origin, in the base frame [N].
     """
 
     kg: float = 0.0
@@ -70,20 +70,22 @@ class Payload:
     force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def row(self) -> dict[str, float]:
-        """The values of its columns."""
-        centre = {f"payload_{name}_m": at for name, at in zip("xyz", self.centre_m, strict=True)}
-        force = {f"force_{name}_n": at for name, at in zip("xyz", self.force_n, strict=True)}
+        """Values of a session's payload columns."""
+        centre = {
+            f"payload_{name}_m": value for name, value in zip("xyz", self.centre_m, strict=True)
+        }
+        force = {f"force_{name}_n": value for name, value in zip("xyz", self.force_n, strict=True)}
         return {"payload_kg": self.kg} | centre | force
 
 
 @dataclass(frozen=True, eq=False)
 class Giving:
-    """How an arm gives way.
+    """Compliance and backlash of an arm.
 
     Attributes:
-        compliance: (n,) what each joint yields to a torque [rad/(N m)].
-        mass_share: Real over published masses of the links.
-        backlash: (n,) play of each joint [rad].
+        compliance: (n,) compliance of each joint [rad/(N m)].
+        mass_share: Ratio of real to published masses of the links.
+        backlash: (n,) backlash of each joint [rad].
     """
 
     compliance: FloatArray
@@ -98,41 +100,41 @@ def sagging(
     payloads: Sequence[Payload] = (),
     approach: FloatArray | None = None,
 ) -> FloatArray:
-    """Where the joints stand when the arm gives way.
+    """True joint angles under load and backlash.
 
     Args:
-        arm: The arm as it was built.
-        giving: How it gives way.
-        joints: (m, n) joint angles as the encoders have them [rad].
-        payloads: m loads, one a stop; none where empty.
-        approach: (m,) the side from which all joints came to each stop, +1 from above or -1; zero
-            for the middle of their play.
+        arm: Real arm.
+        giving: Compliance and backlash.
+        joints: (m, n) encoder angles [rad].
+        payloads: m payloads, one per stop; empty for none.
+        approach: (m,) side from which all joints approached each stop, +1 from above or -1; zero
+            for the middle of the backlash.
 
     Returns:
-        (m, n) angles at which a rigid arm without play stands likewise [rad].
+        (m, n) equivalent angles of a rigid arm without backlash [rad].
     """
     side = np.zeros(len(joints)) if approach is None else approach
-    # A joint that came down from above stops short of where its encoder has it.
-    at_rest = joints + 0.5 * side[:, None] * giving.backlash
-    sagged = at_rest
+    # A joint that approached from above stops short of its encoder angle.
+    unloaded = joints + 0.5 * side[:, None] * giving.backlash
+    sagged = unloaded
     if giving.compliance.any():
         for _ in range(_ROUNDS):
-            sagged = at_rest + giving.compliance * load_torques(arm, giving, sagged, payloads)
+            sagged = unloaded + giving.compliance * load_torques(arm, giving, sagged, payloads)
     return np.asarray(sagged)
 
 
 def giving_of(
     arm: DhArm, compliance: Sequence[float], mass_share: float, backlash: Sequence[float]
 ) -> Giving:
-    """How an arm gives way; empty sequences stand for a rigid arm and for one without play.
+    """Compliance and backlash of an arm; empty sequences stand for none.
 
     Raises:
-        DataError: The values are not one a joint.
+        DataError: There is not one value per joint.
     """
     count = len(arm.offset)
-    for what, values in (("compliance", compliance), ("backlash", backlash)):
+    for name, values in (("compliance", compliance), ("backlash", backlash)):
         if len(values) not in (0, count):
-            raise DataError(f"simulation: {len(values)} values of {what} for {count} joints.")
+            raise DataError(f"simulation: {len(values)} values of {name} for {count} joints.")
     return Giving(
         np.array(compliance) if compliance else np.zeros(count),
         mass_share,
@@ -143,25 +145,25 @@ def giving_of(
 def load_torques(
     arm: DhArm, giving: Giving, joints: FloatArray, payloads: Sequence[Payload]
 ) -> FloatArray:
-    """(m, n) by which weight and force turn the joints [N m]: their moments about the axes."""
+    """(m, n) torques of weight and force on the joints [N m]: moments about the axes."""
     frames = link_frames(arm, joints)
     kg, centres = (np.array(pair) for pair in zip(*_BODIES[arm.name], strict=True))
     weights = giving.mass_share * kg[:, None] * _GRAVITY
-    at = frames[:, 1:, :3, :3] @ centres[:, :, None]
-    places = at[..., 0] + frames[:, 1:, :3, 3]
+    lever = frames[:, 1:, :3, :3] @ centres[:, :, None]
+    places = lever[..., 0] + frames[:, 1:, :3, 3]
     forces = np.broadcast_to(weights, places.shape)
     if payloads:
         tip = frames[:, -1]
-        hung = np.array([payload.centre_m for payload in payloads])
-        held = np.einsum("mij,mj->mi", tip[:, :3, :3], hung) + tip[:, :3, 3]
+        payload_centres = np.array([payload.centre_m for payload in payloads])
+        payload_places = np.einsum("mij,mj->mi", tip[:, :3, :3], payload_centres) + tip[:, :3, 3]
         load = np.array([payload.kg for payload in payloads])[:, None] * _GRAVITY
-        pushed = np.array([payload.force_n for payload in payloads])
-        places = np.concatenate([places, held[:, None], tip[:, None, :3, 3]], axis=1)
-        forces = np.concatenate([forces, load[:, None], pushed[:, None]], axis=1)
+        flange_forces = np.array([payload.force_n for payload in payloads])
+        places = np.concatenate([places, payload_places[:, None], tip[:, None, :3, 3]], axis=1)
+        forces = np.concatenate([forces, load[:, None], flange_forces[:, None]], axis=1)
     torques = np.empty(joints.shape)
     for joint in range(joints.shape[1]):
         axis, origin = frames[:, joint, :3, 2], frames[:, joint, :3, 3]
-        # Links behind the joint pull at it; payload and force are behind all.
+        # Links after the joint load it; payload and force come after all links.
         moments = np.cross(places[:, joint:] - origin[:, None], forces[:, joint:])
         torques[:, joint] = np.einsum("mi,mki->m", axis, moments)
     return torques
@@ -169,17 +171,17 @@ def load_torques(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArmOptions(ArmErrors):
-    """An arm, how the real one departs from it, and what it carries.
+    """An arm, deviations of the real one, and its payloads.
 
     Attributes:
         robot: `ur3e`, `ur5e`, `ur10e` or `generic-6r-1800`.
-        robot_sigma_m: Repeatability: where the flange really stands, per axis [m].
-        robot_sigma_rad: The same for its rotation [rad].
-        compliance_rad_per_nm: What each joint yields to a torque; empty for a rigid arm.
-        payloads: What the arm carries, stop by stop in turn; empty for nothing.
-        mass_share: Real over published masses of the links.
-        backlash_rad: Play of each joint; empty for none. With play, stops are approached from
-            either side in turn.
+        robot_sigma_m: Repeatability of the flange's position, per axis [m].
+        robot_sigma_rad: Repeatability of its rotation, per axis [rad].
+        compliance_rad_per_nm: Compliance of each joint; empty for a rigid arm.
+        payloads: Payloads, cycled over the stops; empty for none.
+        mass_share: Ratio of real to published masses of the links.
+        backlash_rad: Backlash of each joint; empty for none. With backlash, stops are approached
+            from alternating sides.
     """
 
     robot: str = "ur10e"
@@ -196,16 +198,16 @@ class ArmOptions(ArmErrors):
         return np.repeat([self.robot_sigma_rad, self.robot_sigma_m], 3)
 
     def loads(self, stops: int) -> tuple[Payload, ...]:
-        """What the arm carries at so many stops; empty where it carries nothing."""
+        """Payload of each of `stops` stops; empty without payloads."""
         loads = self.payloads
         return tuple(loads[at % len(loads)] for at in range(stops)) if loads else ()
 
     def approach(self, stops: int) -> FloatArray | None:
-        """(stops,) the sides from which stops are approached, +1 or -1; None without play."""
+        """(stops,) side from which stops are approached, +1 or -1; None without backlash."""
         return np.where(np.arange(stops) % 2, 1.0, -1.0) if self.backlash_rad else None
 
     def built(self, rng: np.random.Generator) -> DhArm:
-        """Draws the arm as it was built."""
+        """Draws the real arm."""
         return disturb(arm_named(self.robot), self, rng)
 
     def flange_at(
@@ -215,20 +217,14 @@ class ArmOptions(ArmErrors):
         payloads: Sequence[Payload] = (),
         approach: FloatArray | None = None,
     ) -> FloatArray:
-        """Where the flange of an arm of this kind stands, before the error of its repeatability.
+        """Flange poses (k, 4, 4) of a real arm, before repeatability errors.
 
-        Args:
-            arm: The arm as it was built.
-            q: (k, n) joint angles as the encoders have them [rad].
-            payloads: k loads; none where empty.
-            approach: (k,) the side from which it came; None for the middle of its play.
-
-        Returns:
-            (k, 4, 4) `base_from_flange`.
+        `q` are (k, n) encoder angles [rad]. Without payloads there are none; without sides of
+        approach (k,), the arm is in the middle of its backlash.
         """
         giving = giving_of(arm, self.compliance_rad_per_nm, self.mass_share, self.backlash_rad)
         return forward(arm, sagging(arm, giving, q, payloads, approach))
 
     def jitter(self, stops: int, rng: np.random.Generator) -> FloatArray:
-        """(stops, 4, 4) `flange_from_stood`: by how much the flange does not repeat."""
+        """(stops, 4, 4) repeatability errors of the flange, in its own frame."""
         return exp(rng.standard_normal((stops, 6)) * self.sigma)

@@ -1,4 +1,4 @@
-"""A sweep of a cell's only robot: frames of its camera, and no stops."""
+"""A sweep of a single robot: camera frames during its motion, without stops."""
 
 from dataclasses import replace
 from functools import partial
@@ -13,20 +13,20 @@ from visioncal.simulation.observing import simulate, with_detections
 from visioncal.simulation.options import SweepOptions
 from visioncal.simulation.passage import Passage
 
-# A frame that shows less of the board gives no pose.
+# Minimum number of corners for a pose.
 _FEWEST_CORNERS = 8
 
 
 def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCell:
-    """Sweeps a cell's robot through as many of its stops as are asked for.
+    """Simulates a sweep of a cell's robot.
 
     Args:
         options: The cell; `views` is set by the sweep.
-        how: How it is swept.
+        how: Options of the sweep.
 
     Returns:
-        The cell at the frames, each of them a view with its time; the controller's stream, by a
-        clock of its own, is `robot`.
+        The cell at the frames, each of which is a view with a time; the controller's stream, with
+        its own clock, is `robot`.
 
     Raises:
         DataError: As `simulate`; or fewer than two frames show the board.
@@ -37,16 +37,16 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCel
     options = replace(options, views=len(passage.taken_s), wrong_views=0)
     frames = simulate(options, passage.way(passage.taken_s))
     if how.readout_s:
-        frames = _by_rows(frames, passage)
+        frames = _rolling_shutter(frames, passage)
     seen = [sight.view for sight in frames.sights if len(sight.exact.ids) >= _FEWEST_CORNERS]
     if len(seen) < 2:
         raise DataError(f"simulation: {len(seen)} frames of the sweep show the board.")
-    taken_s = passage.taken_s[[frames.sights[index].stop for index in seen]]
+    taken_s = passage.taken_s[[frames.sights[view].stop for view in seen]]
     rng = options.stream(RandomStream.SWEEP)
     recorded = passage.reported(frames.robot.arm, rng)
-    ahead_s = how.camera_minus_robot_s + how.jitter_s * rng.standard_normal(len(taken_s))
+    offsets_s = how.camera_minus_robot_s + how.jitter_s * rng.standard_normal(len(taken_s))
     kept = frames.only(seen)
-    sights = zip(kept.sights, (taken_s + ahead_s).tolist(), strict=True)
+    sights = zip(kept.sights, (taken_s + offsets_s).tolist(), strict=True)
     return replace(
         kept,
         options=replace(options, views=len(seen)),
@@ -56,16 +56,16 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCel
     )
 
 
-def _by_rows(frames: SimulatedCell, passage: Passage) -> SimulatedCell:
-    """The frames with every corner where it was when its row was taken."""
+def _rolling_shutter(frames: SimulatedCell, passage: Passage) -> SimulatedCell:
+    """The frames of a rolling shutter, with every corner at the time of its row."""
     robot = frames.robot
     jitter = invert(robot.flange_at(robot.joints)) @ robot.true_base_from_flange
 
-    def taken(sight: SimulatedSight) -> SimulatedSight:
+    def rolled(sight: SimulatedSight) -> SimulatedSight:
         seen_from = frames.seen_from("", sight.camera, sight.board)
 
-        def before(off: FloatArray, q: FloatArray) -> FloatArray:
-            return seen_from(robot.flange_at(q) @ off)
+        def before(row_jitter: FloatArray, q: FloatArray) -> FloatArray:
+            return seen_from(robot.flange_at(q) @ row_jitter)
 
         exact = passage.frame(
             float(passage.taken_s[sight.stop]),
@@ -76,4 +76,4 @@ def _by_rows(frames: SimulatedCell, passage: Passage) -> SimulatedCell:
         )
         return replace(sight, exact=exact, at_once=False)
 
-    return with_detections(replace(frames, sights=tuple(taken(sight) for sight in frames.sights)))
+    return with_detections(replace(frames, sights=tuple(rolled(sight) for sight in frames.sights)))

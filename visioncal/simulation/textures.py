@@ -1,4 +1,4 @@
-"""What a simulated camera looks at: the printed sheet on its plate, and a table-top."""
+"""Textures of a simulated scene: the printed sheet on its plate, a table-top and a wall."""
 
 import math
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ _SHADOW_STRENGTH = 0.7
 
 @dataclass(frozen=True, eq=False)
 class SheetTexture:
-    """The sheet, seen straight, at halving resolutions.
+    """Frontal image of the sheet at halving resolutions.
 
     Attributes:
         origin_m: (2,) outer corner of texel (0, 0) in the flat, unscaled target frame [m].
         texel_m: Side of a texel at each level [m], ascending.
-        levels: (h, w, 2) images at each level: brightness times coverage, and coverage. Where the
-            coverage is partial, what lies behind shines through.
+        levels: (h, w, 2) images at each level: brightness times coverage, and coverage. Where
+            coverage is partial, the background shows through.
     """
 
     origin_m: FloatArray
@@ -47,7 +47,7 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
         DataError: OpenCV does not have the target's dictionary.
     """
     left, top, right, bottom = pattern_box(target)
-    # Whole squares of most boards; what is left over of a texel stays white.
+    # Whole squares for most boards; a remaining part of a texel stays white.
     width, height = (
         math.ceil(round((b - a) / unit_m(target) * texels, 6))
         for a, b in ((left, right), (top, bottom))
@@ -64,7 +64,7 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
     levels = [np.stack([grey, coverage], axis=-1)]
     while levels[-1].shape[0] > 128:
         height, width = levels[-1].shape[:2]
-        # Odd rows and columns at the shadow's far end are dropped, so that halves stay halves.
+        # Odd rows and columns at the shadow's end are dropped, so that levels halve exactly.
         even = levels[-1][: height // 2 * 2, : width // 2 * 2]
         levels.append(
             np.asarray(
@@ -80,20 +80,14 @@ def draw_sheet(target: Target, texels: int) -> SheetTexture:
 
 
 def margin_m(target: Target) -> float:
-    """How far the drawn sheet, its shadow included, reaches beyond the print [m]."""
+    """Width of the drawn sheet and its shadow beyond the print [m]."""
     return _SHADOW_MARGIN * unit_m(target)
 
 
 def draw_table(rng: np.random.Generator, size: int) -> Image:
-    """Draws a piece of a used table-top that can be repeated in both directions.
+    """Draws a used table-top, (size, size), periodic in both directions.
 
-    Args:
-        rng: Source of randomness.
-        size: Side of the image [texels].
-
-    Returns:
-        (size, size) image: brushed grain, stains, scratches and a few small parts, all of low
-        contrast.
+    It has brushed grain, stains, scratches and a few small parts, all of low contrast.
     """
     grain = _smooth_noise(rng, size, 60.0, 0.7)
     mottling = _smooth_noise(rng, size, 40.0, 40.0)
@@ -106,7 +100,7 @@ def draw_table(rng: np.random.Generator, size: int) -> Image:
 
 
 def draw_wall(rng: np.random.Generator, size: int) -> Image:
-    """Draws a wall far out of focus, with cabinets and doors, that can be repeated."""
+    """Draws a periodic wall, far out of focus, with cabinets and doors."""
     canvas = np.asarray(118.0 + 7.0 * _smooth_noise(rng, size, 80.0, 80.0), np.float32)
     for _ in range(16):
         x, y = rng.uniform(0.04, 0.9, 2) * size
@@ -117,7 +111,7 @@ def draw_wall(rng: np.random.Generator, size: int) -> Image:
 
 
 def _draw_label(strip: Image, target: Target, texels: int) -> None:
-    """Writes what was printed under the print, small and grey, into the free strip there."""
+    """Writes a small grey description of the print into the strip below it."""
     square_mm = f"{1000.0 * unit_m(target):g} mm"
     words = f"{target.kind} {target.columns}x{target.rows}, {square_mm} {target.dictionary}"
     scale = texels / 160.0
@@ -128,7 +122,7 @@ def _draw_label(strip: Image, target: Target, texels: int) -> None:
 
 
 def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
-    """The print itself, of so many texels down and across."""
+    """The print, of `shape` texels down and across."""
     if target.kind == "marker":
         return _marker(target, target.marker_id, texels)
     if target.kind == "aprilgrid":
@@ -139,13 +133,13 @@ def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
         return _inked(_circles(target, shape, texels))
     rows, columns = (index // texels for index in shape)
     row, column = np.mgrid[:rows, :columns]
-    # Boards from before OpenCV 4.6 start with a white square where the number of rows is even.
+    # OpenCV's layout before 4.6 starts with a white square for an even number of rows.
     shift = int(target.kind == "charuco" and target.legacy and rows % 2 == 0)
     white = (row + column + shift) % 2 == 1
     image = np.kron(np.where(white, _PAPER, _INK), np.ones((texels, texels))).astype(np.uint8)
     if target.kind == "checkerboard":
         return image
-    # An even inset keeps the marker in the middle of its square.
+    # An even inset centres the marker in its square.
     inset = round(0.5 * (1.0 - target.marker_m / target.square_m) * texels)
     for number, (row_at, column_at) in enumerate(np.argwhere(white)):
         y, x = row_at * texels + inset, column_at * texels + inset
@@ -155,12 +149,12 @@ def _print(target: Target, shape: tuple[int, int], texels: int) -> Image:
 
 
 def _inked(dark: FloatArray) -> Image:
-    """Grey levels where a share (h, w) of each texel is dark."""
+    """Grey levels from the dark share (h, w) of each texel."""
     return np.asarray(np.rint(_PAPER + (_INK - _PAPER) * dark), np.uint8)
 
 
 def _aprilgrid(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
-    """Which share (h, w) of each texel is dark."""
+    """Dark share (h, w) of each texel."""
     dark = np.zeros(shape)
     gap = target.spacing * texels
     for number, corner in tags_m(target):
@@ -175,25 +169,25 @@ def _aprilgrid(target: Target, shape: tuple[int, int], texels: int) -> FloatArra
 
 
 def _tags(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
-    """Likewise of free tags that stand upright, each four points from its upper left corner on."""
+    """Likewise for upright free tags, with four points each from the upper left corner."""
     dark = np.zeros(shape)
     scale = texels / unit_m(target)
     low = np.array(pattern_box(target)[:2])
-    for at in range(0, len(target.points_m), 4):
-        corner, beside = (np.array(target.points_m[at + next_to])[:2] for next_to in (0, 1))
-        cells = _modules(target, target.point_tags[at][0]) == 0
-        _stamp(dark, cells, scale * (corner - low), scale * (beside - corner)[0] / len(cells))
+    for first in range(0, len(target.points_m), 4):
+        corner, neighbour = (np.array(target.points_m[first + offset])[:2] for offset in (0, 1))
+        cells = _modules(target, target.point_tags[first][0]) == 0
+        _stamp(dark, cells, scale * (corner - low), scale * (neighbour - corner)[0] / len(cells))
     return dark
 
 
 def _circles(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
-    """Which share (h, w) of each texel is dark: a texel is so small that its side is straight."""
+    """Dark share (h, w) of each texel, with circles' edges straight within a texel."""
     dark = np.zeros(shape)
     radius = 0.5 * target.diameter_m / target.square_m * texels
-    for middle in radius + circles_m(target) / target.square_m * texels:
-        low, high = (np.clip(middle + value, 0, shape[::-1]) for value in (-radius - 1, radius + 2))
+    for centre in radius + circles_m(target) / target.square_m * texels:
+        low, high = (np.clip(centre + value, 0, shape[::-1]) for value in (-radius - 1, radius + 2))
         (left, top), (right, bottom) = low.astype(int), high.astype(int)
-        x, y = np.arange(left, right) + 0.5 - middle[0], np.arange(top, bottom) + 0.5 - middle[1]
+        x, y = np.arange(left, right) + 0.5 - centre[0], np.arange(top, bottom) + 0.5 - centre[1]
         inside = np.clip(radius - np.hypot(x[None], y[:, None]) + 0.5, 0.0, 1.0)
         window = dark[top:bottom, left:right]
         np.maximum(window, inside, out=window)
@@ -201,26 +195,28 @@ def _circles(target: Target, shape: tuple[int, int], texels: int) -> FloatArray:
 
 
 def _stamp(dark: FloatArray, cells: Mask, corner: FloatArray, cell: float) -> None:
-    """Adds the dark of a grid of cells, whose first begins at a place [texels], by its area."""
-    down, across = (
+    """Adds the dark area of a grid of cells that starts at `corner` [texels]."""
+    row_overlaps, column_overlaps = (
         _overlaps(start, cell, cells.shape[axis], dark.shape[axis])
         for axis, start in enumerate(corner[::-1].tolist())
     )
-    rows, columns = (slice(pair[0], pair[0] + pair[1].shape[1]) for pair in (down, across))
-    dark[rows, columns] += down[1].T @ cells @ across[1]
+    rows, columns = (
+        slice(pair[0], pair[0] + pair[1].shape[1]) for pair in (row_overlaps, column_overlaps)
+    )
+    dark[rows, columns] += row_overlaps[1].T @ cells @ column_overlaps[1]
 
 
 def _overlaps(start: float, cell: float, count: int, texels: int) -> tuple[int, FloatArray]:
-    """The first texel that cells in a row touch, and (cells, texels) how much of each they have."""
+    """First texel that a row of cells touches, and (cells, texels) overlaps."""
     edges = start + cell * np.arange(count + 1)
     first, end = math.floor(edges[0]), min(math.ceil(edges[-1]), texels)
     texel = np.arange(first, end)
-    low, high = (np.clip(texel[None] + more, edges[:-1, None], edges[1:, None]) for more in (0, 1))
+    low, high = (np.clip(texel[None] + side, edges[:-1, None], edges[1:, None]) for side in (0, 1))
     return first, high - low
 
 
 def _modules(target: Target, number: int) -> Image:
-    """The modules of a marker with a border of one, light ones above zero."""
+    """Modules of a marker with a border of one; light ones are above zero."""
     if not hasattr(cv2.aruco, target.dictionary):
         raise DataError(f"simulation: OpenCV has no dictionary {target.dictionary!r}.")
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
@@ -229,14 +225,14 @@ def _modules(target: Target, number: int) -> Image:
 
 def _marker(target: Target, number: int, side: int) -> Image:
     modules = _modules(target, number)
-    # Edges between modules are rounded to texels; the corners of a target are not among them.
+    # Edges between modules are rounded to texels; they are no corners of a target.
     bits = cv2.resize(modules, (side, side), interpolation=cv2.INTER_NEAREST)
     return np.where(bits > 0, _PAPER, _INK).astype(np.uint8)
 
 
 def _shadow(shape: tuple[int, ...], plate: int, texels: int) -> Image:
     """Coverage: 255 on the plate, fading in the shadow around it."""
-    # Small, because it is smooth, and then enlarged.
+    # Computed at low resolution, as it is smooth.
     factor = max(texels // 16, 1)
     small = np.zeros((-(-shape[0] // factor), -(-shape[1] // factor)), np.float32)
     inner = plate // factor
@@ -250,7 +246,7 @@ def _shadow(shape: tuple[int, ...], plate: int, texels: int) -> Image:
 def _smooth_noise(
     rng: np.random.Generator, size: int, sigma_x: float, sigma_y: float
 ) -> FloatArray:
-    """Unit-variance noise, smoothed by a Gaussian [texels], periodic in both directions."""
+    """Unit-variance noise with Gaussian smoothing [texels], periodic in both directions."""
     frequency = 2.0 * np.pi * np.fft.rfftfreq(size)
     frequency_y = 2.0 * np.pi * np.fft.fftfreq(size)
     damping = np.exp(
@@ -272,7 +268,7 @@ def _draw_scratch(canvas: _Canvas, rng: np.random.Generator) -> None:
 
 
 def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:
-    """A washer, a bar or a cable, with a soft shadow beside it."""
+    """Draws a washer, a bar or a cable, with a soft shadow beside it."""
     size = canvas.shape[0]
     centre = rng.uniform(0.15, 0.85, 2) * size
     shape = np.zeros_like(canvas)
@@ -290,7 +286,7 @@ def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:
         path = cv2.GaussianBlur(centre + steps, (1, 5), 1.5)
         curve = np.clip(path, 0.03 * size, 0.97 * size).round().astype(np.int32)
         cv2.polylines(shape, [curve], False, 1.0, max(size // 180, 1))
-    # A shadow reaches its shift and four of its sigmas beyond a part.
+    # A shadow extends beyond a part by its shift and four sigmas.
     part = _around(shape, size // 24)
     shape, under = shape[part], canvas[part]
     shape = np.asarray(cv2.GaussianBlur(shape, (0, 0), 0.6), np.float32)
@@ -300,13 +296,13 @@ def _draw_part(canvas: _Canvas, rng: np.random.Generator) -> None:
 
 
 def _around(layer: _Canvas, margin: int) -> tuple[slice, slice]:
-    """The rows and columns in which something is drawn, and so many beside them [texels]."""
+    """Rows and columns of a layer's content, with a margin [texels]."""
     rows, columns = (np.flatnonzero(layer.any(axis=axis)) for axis in (1, 0))
-    down, across = (
+    row_range, column_range = (
         slice(max(int(array[0]) - margin, 0), int(array[-1]) + margin + 1)
         for array in (rows, columns)
     )
-    return down, across
+    return row_range, column_range
 
 
 def _point(place: FloatArray) -> tuple[int, int]:

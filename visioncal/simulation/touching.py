@@ -1,4 +1,4 @@
-"""Touches by the arm of a simulated cell: with a tool's tip, of a fixed point and of a fixture."""
+"""Simulated touches with a tool's tip: of a fixed point and of a fixture."""
 
 import csv
 import io
@@ -20,9 +20,9 @@ from visioncal.simulation.cell import SimulatedCell, SimulatedRobot
 from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.reach import LEAST_DEXTERITY, home_posture, lowest_m
 
-# How far off a contact is, per axis [m], and how far the flange tilts from straight down [rad].
+# Contact error per axis [m], and largest tilt of the flange from vertical [rad].
 _CONTACT_M, _CONE_RAD = 5e-5, 0.75
-# The drawn points, in the fixture's frame [m].
+# Points of the drawing, in the fixture's frame [m].
 _DRAWN_M = np.array(
     [
         [0.0, 0.0, 0.0],
@@ -35,7 +35,7 @@ _DRAWN_M = np.array(
         [0.06, 0.11, 0.02],
     ]
 )
-# Aiming anew for what gives way converges by the share of the yielding in each round.
+# Iterations that compensate deflection; each reduces the error by the ratio of deflection.
 _ROUNDS = 6
 _EXACT = 1e-8
 _TRIES = 40
@@ -46,9 +46,9 @@ class Touched:
     """Touches of one table.
 
     Attributes:
-        columns: What the rows have beside the pose and the joints, by the columns' names.
-        base_from_flange: (n, 4, 4) poses as reported.
-        joints: (n, k) joint angles as reported [rad].
+        columns: Further columns of the rows, beside pose and joints.
+        base_from_flange: (n, 4, 4) reported poses.
+        joints: (n, k) reported joint angles [rad].
     """
 
     columns: Mapping[str, tuple[str, ...]]
@@ -58,14 +58,14 @@ class Touched:
 
 @dataclass(frozen=True, eq=False)
 class Touching:
-    """What the arm of a cell touched.
+    """Touches by the arm of a cell.
 
     Attributes:
-        flange_from_tool: (4, 4) the tool; its tip is the origin.
-        base_from_fixture: (4, 4) the fixture.
-        tip: Touches of one point, for the tool.
-        features: Touches of the fixture's origin, x axis and xy plane, with that tool.
-        points: Touches of the drawn points, with that tool.
+        flange_from_tool: (4, 4) pose of the tool; its tip is the origin.
+        base_from_fixture: (4, 4) pose of the fixture.
+        tip: Touches of one point, to calibrate the tool.
+        features: Touches of the fixture's origin, x axis and xy plane.
+        points: Touches of the drawing's points.
     """
 
     flange_from_tool: FloatArray
@@ -75,7 +75,7 @@ class Touching:
     points: Touched
 
     def transforms(self, robot: str = "") -> dict[str, FloatArray]:
-        """The tool and the fixture, by the names of a result, in the frames of the robot named."""
+        """Poses of tool and fixture by the names of a result, for a robot by name."""
         return {
             f"{frame_name('flange', robot)}_from_tool": self.flange_from_tool,
             f"{frame_name('base', robot)}_from_fixture": self.base_from_fixture,
@@ -83,37 +83,41 @@ class Touching:
 
     @property
     def drawing(self) -> list[dict[str, object]]:
-        """The drawing's rows: `point`, `x_mm`, `y_mm`, `z_mm`."""
+        """Rows of the drawing: `point`, `x_mm`, `y_mm`, `z_mm`."""
         rows = (1e3 * _DRAWN_M).round(6).tolist()
         return [
-            {"point": _name(at), "x_mm": x, "y_mm": y, "z_mm": z}
+            {"point": _point_name(at), "x_mm": x, "y_mm": y, "z_mm": z}
             for at, (x, y, z) in enumerate(rows)
         ]
 
 
 def touch(cell: SimulatedCell) -> dict[str, Touching]:
-    """What each robot of a cell touches: with a tool of its own, a fixture before it.
+    """Touches by each robot of a cell, with a tool of its own, of a fixture before it.
 
-    A point by the tool's tip, axis and plane, and then the fixture by the tip. The arm touches
-    without a load, and errs as it does before the camera.
+    The tool is calibrated with tip, axis and plane; its tip then touches the fixture. The arm is
+    without a payload, and has the same errors as with the camera.
 
     Raises:
-        DataError: An arm does not reach enough postures.
+        DataError: An arm cannot reach enough postures.
     """
-    found = {}
-    for at, (name, robot) in enumerate(cell.robots.items()):
-        # The first draws as the only one does.
-        rng = cell.options.stream(RandomStream.TOUCHES, *((at,) if at else ()))
-        found[name] = _touching(robot, rng)
-    return found
+    touching = {}
+    for index, (name, robot) in enumerate(cell.robots.items()):
+        # The first robot has the same random stream as a single one.
+        rng = cell.options.stream(RandomStream.TOUCHES, *((index,) if index else ()))
+        touching[name] = _touching(robot, rng)
+    return touching
 
 
 def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
-    turn = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix()
-    flange_from_tool = compose(turn, rng.uniform([-0.04, -0.04, 0.12], [0.04, 0.04, 0.18]))
-    lies = Rotation.from_rotvec([*rng.normal(0.0, 0.03, 2), rng.uniform(-0.5, 0.5)]).as_matrix()
+    rotation = Rotation.from_rotvec(rng.normal(0.0, 0.3, 3)).as_matrix()
+    flange_from_tool = compose(rotation, rng.uniform([-0.04, -0.04, 0.12], [0.04, 0.04, 0.18]))
+    fixture_rotation = Rotation.from_rotvec(
+        [*rng.normal(0.0, 0.03, 2), rng.uniform(-0.5, 0.5)]
+    ).as_matrix()
     reach = reach_m(robot.arm)
-    base_from_fixture = compose(lies, np.array([0.45 * reach, -0.1 * reach, 0.12 * reach]))
+    base_from_fixture = compose(
+        fixture_rotation, np.array([0.45 * reach, -0.1 * reach, 0.12 * reach])
+    )
 
     far, aside = rng.uniform(0.08, 0.12, 4), rng.uniform(-0.02, 0.02, 2)
     along = [[0.0, 0.0, value] for value in far[:2]]
@@ -128,10 +132,10 @@ def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
     features = ("origin",) * 3 + ("x",) * 3 + ("xy",) * 3
 
     def on_fixture(places: FloatArray, columns: Mapping[str, tuple[str, ...]]) -> Touched:
-        met = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
-        return _touched(robot, flange_from_tool, met, np.zeros_like(met), columns, rng)
+        contacts = places @ base_from_fixture[:3, :3].T + base_from_fixture[:3, 3]
+        return _touched(robot, flange_from_tool, contacts, np.zeros_like(contacts), columns, rng)
 
-    names = tuple(_name(at) for at in range(len(_DRAWN_M)))
+    names = tuple(_point_name(at) for at in range(len(_DRAWN_M)))
     return Touching(
         flange_from_tool,
         base_from_fixture,
@@ -141,7 +145,7 @@ def _touching(robot: SimulatedRobot, rng: np.random.Generator) -> Touching:
     )
 
 
-def _name(at: int) -> str:
+def _point_name(at: int) -> str:
     return f"P{at + 1}"
 
 
@@ -153,50 +157,50 @@ def _touched(
     columns: Mapping[str, tuple[str, ...]],
     rng: np.random.Generator,
 ) -> Touched:
-    """Brings places of the tool (n, 3) to places in the base (n, 3) [m], tilted each its way."""
-    met = places + _CONTACT_M * rng.standard_normal(places.shape)
-    reached = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
+    """Touches points in the base (n, 3) with points of the tool (n, 3) [m], at random tilts."""
+    contacts = places + _CONTACT_M * rng.standard_normal(places.shape)
+    on_flange = in_tool @ flange_from_tool[:3, :3].T + flange_from_tool[:3, 3]
     down = Rotation.from_rotvec([np.pi, 0.0, 0.0])
-    straight = compose(down.as_matrix(), met[0] - down.apply(reached[0]))
+    straight = compose(down.as_matrix(), contacts[0] - down.apply(on_flange[0]))
     home = home_posture(robot.arm, straight[None], rng)
-    joints = np.zeros((len(met), robot.arm.a.size))
-    left = np.ones(len(met), dtype=bool)
+    joints = np.zeros((len(contacts), robot.arm.a.size))
+    pending = np.ones(len(contacts), dtype=bool)
     for _ in range(_TRIES):
-        count = int(left.sum())
+        count = int(pending.sum())
         tilt = _CONE_RAD * np.sqrt(rng.uniform(0.0, 1.0, count))
         lean, spin = rng.uniform(0.0, 2.0 * np.pi, count), rng.uniform(-1.0, 1.0, count)
         axes = np.stack([np.cos(lean), np.sin(lean), np.zeros(count)], axis=1)
-        turns = Rotation.from_rotvec(tilt[:, None] * axes) * down
-        turns = turns * Rotation.from_rotvec(np.outer(spin, [0.0, 0.0, 1.0]))
+        rotations = Rotation.from_rotvec(tilt[:, None] * axes) * down
+        rotations = rotations * Rotation.from_rotvec(np.outer(spin, [0.0, 0.0, 1.0]))
         goals = np.tile(np.eye(4), (count, 1, 1))
-        goals[:, :3, :3] = turns.as_matrix()
-        goals[:, :3, 3] = met[left] - turns.apply(reached[left])
-        # Once the joints are where they read, the flange stands off by its repeatability.
+        goals[:, :3, :3] = rotations.as_matrix()
+        goals[:, :3, 3] = contacts[pending] - rotations.apply(on_flange[pending])
+        # The true flange pose deviates by its repeatability.
         goals = goals @ exp(-robot.options.sigma * rng.standard_normal((count, 6)))
-        found, good = _standing(robot, goals, home)
-        joints[np.flatnonzero(left)[good]] = found[good]
-        left[left] = np.logical_not(good)
-        if not left.any():
+        solutions, good = _inverse_with_deflection(robot, goals, home)
+        joints[np.flatnonzero(pending)[good]] = solutions[good]
+        pending[pending] = np.logical_not(good)
+        if not pending.any():
             return Touched(columns, forward(robot.arm, joints), joints)
     raise DataError(
-        f"simulation: the {robot.arm.name} reaches {len(met) - int(left.sum())} of {len(met)} "
-        "touches.",
+        f"simulation: the {robot.arm.name} reaches {len(contacts) - int(pending.sum())} of "
+        f"{len(contacts)} touches.",
         next_step="Take another robot or seed.",
     )
 
 
-def _standing(
+def _inverse_with_deflection(
     robot: SimulatedRobot, goals: FloatArray, home: FloatArray
 ) -> tuple[FloatArray, Mask]:
-    """(m, n) joints at which the real arm stands at (m, 4, 4), and (m,) which of them serve."""
+    """(m, n) joints that bring the real arm to (m, 4, 4), and (m,) mask of valid ones."""
     joints, aims = np.tile(home, (len(goals), 1)), goals
     for _ in range(_ROUNDS):
         reach = inverse(robot.true_arm, aims, joints)
         joints = reach.joints
-        stands = robot.flange_at(joints)
-        aims = goals @ invert(stands) @ aims
+        poses = robot.flange_at(joints)
+        aims = goals @ invert(poses) @ aims
     good = reach.solved & (reach.dexterity > LEAST_DEXTERITY)
-    good &= np.abs(stands - goals).max(axis=(1, 2)) < _EXACT
+    good &= np.abs(poses - goals).max(axis=(1, 2)) < _EXACT
     return joints, good & (lowest_m(robot.arm, joints) > 0.0)
 
 
@@ -204,8 +208,8 @@ def write_touches(touched: Mapping[str, Touching], folder: Path) -> None:
     """Writes `touches.csv`, `features.csv`, `points.csv` and the drawing, `cad.csv`.
 
     Args:
-        touched: By robot; rows have the robot's name in a column `robot`, where it has one.
-        folder: Where to.
+        touched: Touches by robot name; rows of named robots have a column `robot`.
+        folder: Output folder.
 
     Raises:
         DataError: The folder cannot be written.

@@ -1,4 +1,4 @@
-"""Readings of an instrument: an arm that errs, a tracker beside it, a tool on its flange."""
+"""Simulated instrument readings: an imperfect arm with a tool, and a tracker beside it."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,15 +16,15 @@ from visioncal.simulation.truth import write_truth
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked(ArmOptions):
-    """What a session is drawn from.
+    """Options of a simulated session with an instrument.
 
     Attributes:
-        stops: How many.
-        points: Places of the points on the flange [m]; one alone where poses are read.
-        poses: Whether the first point is a probe whose rotation is read, too.
+        stops: Number of stops.
+        points: Positions of the points on the flange [m]; a single one if poses are read.
+        poses: Whether the first point is a probe whose rotation is read as well.
         sigma_m: Noise of a coordinate [m].
         sigma_rad: Noise of a probe's rotation [rad].
-        seed: Of everything random.
+        seed: Seed of everything random.
     """
 
     stops: int = 30
@@ -41,16 +41,17 @@ THREE = ((0.03, -0.02, 0.12), (0.10, 0.05, 0.08), (-0.08, 0.06, 0.10))
 
 @dataclass(frozen=True, eq=False)
 class Shop:
-    """The truth and what was read.
+    """Ground truth and readings.
 
     Attributes:
-        options: What it was drawn from.
-        arm: The nominal arm.
-        true_arm: The real one.
-        base_from_instrument: (4, 4).
-        flange_from_probe: (4, 4); the first point's place, without a turn where places are read.
-        joints: (s, n) [rad].
-        rows: Each reading's stop, point, and (4, 4) pose in the instrument's frame.
+        options: Options of the session.
+        arm: Nominal arm.
+        true_arm: Real arm.
+        base_from_instrument: (4, 4) pose of the instrument.
+        flange_from_probe: (4, 4) pose of the probe; the first point, without rotation, if only
+            positions are read.
+        joints: (s, n) joint angles [rad].
+        rows: Readings: stop, point, and (4, 4) pose in the instrument's frame.
     """
 
     options: Tracked
@@ -63,13 +64,13 @@ class Shop:
 
 
 def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
-    """Moves the arm all over its workspace, or to (s, n) joints [rad], and reads."""
+    """Moves the arm over its workspace, or to (s, n) joint angles [rad], and reads the points."""
     rng = np.random.default_rng([7, options.seed])
     arm = arm_named(options.robot)
     true_arm = options.built(rng)
     x = compose(exp(np.array([[0.1, -0.2, 2.5, 0, 0, 0]]))[0, :3, :3], np.array([2.5, -1.0, 0.4]))
-    turn = exp(np.array([[0.5, 1.0, -0.3, 0, 0, 0]]))[0, :3, :3] if options.poses else np.eye(3)
-    z = compose(turn, np.array(options.points[0]))
+    rotation = exp(np.array([[0.5, 1.0, -0.3, 0, 0, 0]]))[0, :3, :3] if options.poses else np.eye(3)
+    z = compose(rotation, np.array(options.points[0]))
     if joints is None:
         joints = above(arm, options.stops, rng)
     count = len(joints)
@@ -80,14 +81,14 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
         for point, place in enumerate(options.points):
             on_flange = z if point == 0 else compose(np.eye(3), np.array(place))
             true = invert(x) @ pose @ on_flange
-            turned = exp(np.r_[rng.normal(size=3) * options.sigma_rad, 0, 0, 0][None])[0, :3, :3]
+            noise = exp(np.r_[rng.normal(size=3) * options.sigma_rad, 0, 0, 0][None])[0, :3, :3]
             place_read = true[:3, 3] + options.sigma_m * rng.normal(size=3)
-            rows.append((stop, point, compose(true[:3, :3] @ turned, place_read)))
+            rows.append((stop, point, compose(true[:3, :3] @ noise, place_read)))
     return Shop(options, arm, true_arm, x, z, joints, tuple(rows))
 
 
 def above(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatArray:
-    """Postures all over the workspace, above the table [rad]."""
+    """Random postures over the workspace, above the table [rad]."""
     kept: list[FloatArray] = []
     while len(kept) < stops:
         q = rng.uniform(-2.5, 2.5, (1, len(arm.offset)))
@@ -99,13 +100,9 @@ def above(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatArray:
 def session_of(
     shop: Shop, *, joints: bool = True, poses: bool = False, **document: object
 ) -> Session:
-    """The session as it stands in memory.
+    """The session in memory, with joint angles or the nominal arm's poses.
 
-    Args:
-        shop: What was read.
-        joints: Whether rows have joint angles and the session names the robot.
-        poses: Whether rows have the nominal arm's poses.
-        document: Tables of session.toml, in the place of the right ones.
+    `document` are tables of session.toml that replace the correct ones.
     """
     options = shop.options
     nominal = forward(shop.arm, shop.joints)
@@ -134,7 +131,7 @@ def session_of(
 
 
 def write_tracked(shop: Shop, folder: Path | str) -> Path:
-    """Writes readings as a session's folder, and the truth as `<folder>.truth.json` beside it.
+    """Writes a session's folder, and the truth in `<folder>.truth.json` beside it.
 
     Raises:
         DataError: The folder cannot be written.

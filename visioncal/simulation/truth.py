@@ -1,4 +1,4 @@
-"""The truth of a simulated session, in a file beside its folder."""
+"""Ground truth of a simulated session, in a file beside its folder."""
 
 import json
 from collections.abc import Mapping
@@ -17,17 +17,17 @@ from visioncal.simulation.layout import CellOptions
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a simulated session should yield.
+    """Ground truth of a simulated session.
 
     Attributes:
-        transforms: True edges by their contract names, each (4, 4).
-        camera: The true intrinsics.
-        base_from_flange: (m, 4, 4) where the flange really stood.
-        cam_from_target: (m, 4, 4) where the board really stood.
-        wrong_views: Views whose reported pose is wrong.
-        arm: The arm as it was built, Denavit-Hartenberg tables by their names; a, d [m],
-            alpha, beta, offset [rad], each (n,).
-        options: The cell's options as plain numbers and words, noise levels among them.
+        transforms: True edges by their names in results, each (4, 4).
+        camera: True intrinsics.
+        base_from_flange: (m, 4, 4) true flange poses.
+        cam_from_target: (m, 4, 4) true board poses.
+        wrong_views: Views with a wrong report.
+        arm: Real arm: Denavit-Hartenberg parameters by name; a, d [m], alpha, beta, offset [rad],
+            each (n,).
+        options: Options of the cell as plain values, including noise levels.
     """
 
     transforms: Mapping[str, FloatArray]
@@ -40,19 +40,19 @@ class Truth:
 
 
 def truth_path(folder: Path | str) -> Path:
-    """Where the truth of a simulated session lies: beside its folder, never inside."""
+    """Path of a simulated session's ground truth: beside its folder, never inside."""
     folder = Path(folder)
     return folder.with_name(f"{folder.name}.truth.json")
 
 
 def read_truth(path: Path | str) -> Truth:
-    """Reads the truth of a simulated session.
+    """Reads the ground truth of a simulated session.
 
     Args:
-        path: The session's folder, or its `.truth.json`.
+        path: Folder of the session, or its `.truth.json`.
 
     Raises:
-        DataError: The file is missing or is not such a truth.
+        DataError: The file is missing or has other content.
     """
     path = Path(path)
     if path.suffix != ".json":
@@ -83,13 +83,13 @@ def read_truth(path: Path | str) -> Truth:
 
 
 def truth_of(cell: SimulatedCell) -> dict[str, Any]:
-    """What a truth's file says of a cell."""
+    """Content of a cell's ground truth file."""
     of_cell = _of_one if isinstance(cell.options, CellOptions) else _of_several
     return {"schema": 1} | of_cell(cell) | dict(cell.facts)
 
 
 def _of_one(cell: SimulatedCell) -> dict[str, Any]:
-    """Of a cell of one robot and one camera, view by view."""
+    """For a cell of one robot and one camera, view by view."""
     options, arm = asdict(cell.options), asdict(cell.robot.true_arm)
     camera = options.pop("camera")
     del arm["name"]
@@ -105,7 +105,7 @@ def _of_one(cell: SimulatedCell) -> dict[str, Any]:
 
 
 def _of_several(cell: SimulatedCell) -> dict[str, Any]:
-    """Of a cell whose things have names, stop by stop."""
+    """For a cell with named components, stop by stop."""
     layout, robots = cell.layout, cell.robots
     return {
         "parents": cell.parents,
@@ -122,6 +122,6 @@ def _of_several(cell: SimulatedCell) -> dict[str, Any]:
 
 
 def write_truth(folder: Path, content: Mapping[str, Any]) -> None:
-    """Writes the truth of a session beside its folder; arrays as lists."""
+    """Writes the ground truth of a session beside its folder; arrays as lists."""
     text = json.dumps(content, indent=1, default=np.ndarray.tolist)
     write_atomically(truth_path(folder), text + "\n")

@@ -1,4 +1,4 @@
-"""A cell in which an arm warms up, and looks at its board meanwhile."""
+"""A cell whose arm warms up while it observes its board."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -14,14 +14,14 @@ from visioncal.simulation.observing import observed, simulate
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """When what is looked at.
+    """Schedule of views during a warm-up.
 
     Attributes:
-        first: Views all over, one after the other, before the arm is warm.
-        references: How many of them are looked at again and again.
-        every_s: Time from one round of these to the next [s].
-        minutes: How long that goes on.
-        pace_s: Time from view to view [s].
+        first: Number of different views at the start, before the arm is warm.
+        references: Number of them that are repeated.
+        every_s: Time between repetitions [s].
+        minutes: Duration of the repetitions [min].
+        pace_s: Time between views [s].
     """
 
     first: int = 24
@@ -31,7 +31,7 @@ class Round:
     pace_s: float = 5.0
 
     def schedule(self) -> tuple[FloatArray, Sequence[int]]:
-        """(m,) times [s], and which of the first views is looked at."""
+        """(m,) times [s], and indices of the views."""
         stamps = list(self.pace_s * np.arange(self.first))
         shown = list(range(self.first))
         again = np.linspace(0, self.first - 1, self.references).astype(int).tolist()
@@ -43,14 +43,14 @@ class Round:
 
 @dataclass(frozen=True, eq=False)
 class WarmUpOptions:
-    """A cell in which an arm warms up.
+    """Options of a cell whose arm warms up.
 
     Attributes:
         cell: The cell.
-        heat: What heats the arm; None draws it by the cell's seed.
-        round: When what is looked at.
-        hours: How long the temperatures go on.
-        temperatures: Whether the controller reports temperatures; else currents.
+        heat: Thermal parameters of the arm; None draws them by the cell's seed.
+        round: Schedule of views.
+        hours: Duration of the temperature record [h].
+        temperatures: Whether the controller reports temperatures; otherwise currents.
     """
 
     cell: CellOptions = field(default_factory=CellOptions)
@@ -61,20 +61,20 @@ class WarmUpOptions:
 
     @property
     def heats(self) -> Heat:
-        """What heats the arm."""
+        """Thermal parameters of the arm."""
         return self.heat or Heat.drawn(self.cell.seed)
 
     def warming(self) -> Warming:
-        """The temperatures, all through."""
+        """Temperatures over the whole duration."""
         return warm_up(self.heats, self.hours, seed=self.cell.seed)
 
 
 def simulate_warm_up(options: WarmUpOptions) -> SimulatedCell:
-    """Looks at a cell's board while its arm warms up.
+    """Observes a cell's board while its arm warms up.
 
     Returns:
-        What was seen, view by view, by an arm as warm as it was then; temperatures or currents
-        until the last view are in the stream `heat`.
+        The views, each with the arm's temperature at its time; temperatures or currents until the
+        last view are in the stream `heat`.
 
     Raises:
         DataError: As `simulate`.
@@ -84,10 +84,10 @@ def simulate_warm_up(options: WarmUpOptions) -> SimulatedCell:
     postures = simulate(replace(options.cell, views=options.round.first)).robot.joints
     cold = simulate(options.cell, postures[list(shown)])
     robot, links_c = cold.robot, warming.at(stamps_s)
-    stands = heated_flanges(
+    warm_poses = heated_flanges(
         robot.true_arm, heat, robot.joints, links_c, robot.true_base_from_flange
     )
-    warm = replace(cold, robots={"": replace(robot, true_base_from_flange=stands)})
+    warm = replace(cold, robots={"": replace(robot, true_base_from_flange=warm_poses)})
     return replace(
         observed(warm),
         stamps_s=stamps_s,

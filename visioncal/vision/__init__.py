@@ -1,1 +1,1 @@
-"""The camera side: targets, their print, camera models, and the corners found in images."""
+"""Targets, their printing, camera models, and detection of corners in images."""

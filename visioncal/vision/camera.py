@@ -10,19 +10,19 @@ import numpy as np
 
 from visioncal.core.types import Camera, FloatArray
 
-# Newton on a smooth distortion map doubles its digits each step; more steps mean that the
-# point lies outside the region where the model can be inverted.
+# Newton's method converges quadratically; points that need more steps lie where the model has no
+# inverse.
 _INVERSE_ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Projected points and their derivatives.
+    """Projected points and their Jacobians.
 
     Attributes:
         px: (n, 2) pixels.
-        by_point: (n, 2, 3) derivatives by the point in the camera's frame [px/m].
-        by_intrinsics: (n, 2, 4 + k) derivatives by fx, fy, cx, cy and the k coefficients.
+        by_point: (n, 2, 3) Jacobian with respect to the point in the camera's frame [px/m].
+        by_intrinsics: (n, 2, 4 + k) Jacobian with respect to fx, fy, cx, cy and the k coefficients.
     """
 
     px: FloatArray
@@ -31,30 +31,25 @@ class Projection:
 
 
 def intrinsics(camera: Camera) -> FloatArray:
-    """Returns the (4 + k,) vector of fx, fy, cx, cy and the distortion."""
+    """The (4 + k,) vector of fx, fy, cx, cy and the distortion coefficients."""
     return np.concatenate([camera.matrix, camera.distortion])
 
 
 def with_intrinsics(camera: Camera, values: FloatArray) -> Camera:
-    """Returns the camera with other (4 + k,) intrinsics."""
+    """The camera with other (4 + k,) intrinsics."""
     return Camera(camera.model, camera.resolution, values[:4].copy(), values[4:].copy())
 
 
 def matrix_3x3(camera: Camera) -> FloatArray:
-    """Returns the camera matrix in the 3 x 3 form."""
+    """The camera matrix in 3 x 3 form."""
     fx, fy, cx, cy = camera.matrix
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
-    """Projects points.
+    """Projects (n, 3) points in the camera's frame [m] to (n, 2) pixels.
 
-    Args:
-        camera: The intrinsics.
-        points_cam: (n, 3) points in the camera's frame [m].
-
-    Returns:
-        (n, 2) pixels; NaN for points that are not in front of the camera.
+    Points that are not in front of the camera give NaN.
     """
     return project_with_jacobian(camera, points_cam).px
 
@@ -62,12 +57,12 @@ def project(camera: Camera, points_cam: FloatArray) -> FloatArray:
 def project_with_jacobian(
     camera: Camera, points_cam: FloatArray, *, lens: bool = True
 ) -> Projection:
-    """Projects points, with the derivatives by the points and by the intrinsics.
+    """Projects points, with Jacobians with respect to points and intrinsics.
 
     Args:
-        camera: The intrinsics.
+        camera: Intrinsics.
         points_cam: (n, 3) points in the camera's frame [m].
-        lens: Whether the intrinsics' derivatives are wanted; they take a third of the time.
+        lens: Whether to compute the intrinsics' Jacobian; it takes a third of the time.
 
     Returns:
         The projection; NaN for points that are not in front of the camera.
@@ -91,10 +86,10 @@ def project_with_jacobian(
 
 
 def normalise(camera: Camera, px: FloatArray) -> FloatArray:
-    """Inverts the camera: pixels to points on the plane at unit depth.
+    """Inverse projection: pixels to points on the plane at unit depth.
 
     Args:
-        camera: The intrinsics.
+        camera: Intrinsics.
         px: (n, 2) pixels.
 
     Returns:
@@ -107,40 +102,40 @@ def normalise(camera: Camera, px: FloatArray) -> FloatArray:
         error = goal - distorted
         if np.all(np.abs(error) < 1e-13):
             break
-        # A singular map marks a pixel beyond the fold of the distortion: it stays unsettled.
+        # The map is singular beyond the fold of the distortion; those pixels do not converge.
         singular = np.abs(np.linalg.det(by_plane)) < 1e-6
         safe = np.where(singular[:, None, None], np.eye(2), by_plane)
         plane = plane + np.linalg.solve(safe, error[:, :, None])[:, :, 0]
     distorted, by_plane = _distort(camera, plane)
-    # Beyond the fold the map has other branches: turned over, or mirrored through the centre.
-    own_branch = (np.linalg.det(by_plane) > 0) & (np.sum(plane * goal, axis=1) >= 0)
-    settled = own_branch & np.all(np.abs(goal - distorted) < 1e-9, axis=1)
-    return np.where(settled[:, None], plane, np.nan)
+    # Beyond the fold the map has other branches: flipped, or mirrored through the centre.
+    valid_branch = (np.linalg.det(by_plane) > 0) & (np.sum(plane * goal, axis=1) >= 0)
+    converged = valid_branch & np.all(np.abs(goal - distorted) < 1e-9, axis=1)
+    return np.where(converged[:, None], plane, np.nan)
 
 
 def _undistorted_fisheye(goal: FloatArray, camera: Camera) -> FloatArray:
-    """Newton on the angle alone, which is monotonic; gives the start for the plane's Newton."""
+    """Start for the Newton iteration in the plane: Newton's method on the angle alone."""
     radius = np.linalg.norm(goal, axis=1)
     theta = np.minimum(radius, 1.5)
     k = camera.distortion
     for _ in range(_INVERSE_ITERATIONS):
         t2 = theta**2
         value = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-        slope = 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
-        theta = np.clip(theta - (value - radius) / slope, 0.0, 1.57)
+        derivative = 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
+        theta = np.clip(theta - (value - radius) / derivative, 0.0, 1.57)
     scale = np.where(radius > 1e-12, np.tan(theta) / np.maximum(radius, 1e-12), 1.0)
     return goal * scale[:, None]
 
 
 def _distort(camera: Camera, plane: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distorts (n, 2) plane points; returns points, and (n, 2, 2) derivatives."""
+    """Distorts (n, 2) plane points; returns points and (n, 2, 2) Jacobian."""
     if camera.model == "fisheye":
         return _distort_fisheye(plane, camera.distortion)
     return _distort_brown(plane, camera.distortion)
 
 
 def _by_coefficients(camera: Camera, plane: FloatArray) -> FloatArray:
-    """Derivatives (n, 2, k) of the distorted plane points by the coefficients."""
+    """Jacobian (n, 2, k) of the distorted plane points with respect to the coefficients."""
     if camera.model == "fisheye":
         return _fisheye_by_coefficients(plane)
     return _brown_by_coefficients(plane, camera.distortion)
@@ -151,23 +146,25 @@ def _distort_brown(plane: FloatArray, coefficients: FloatArray) -> tuple[FloatAr
     x, y = plane[:, 0], plane[:, 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    radial_derivative = k1 + r2 * (2 * k2 + r2 * 3 * k3)
     if len(coefficients) == 8:
         k4, k5, k6 = coefficients[5:]
         denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
         radial = radial / denominator
-        slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
+        radial_derivative = (
+            radial_derivative - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+        ) / denominator
     cross = x * y
-    bend_x, bend_y = r2 + 2 * x * x, r2 + 2 * y * y
+    tangential_x, tangential_y = r2 + 2 * x * x, r2 + 2 * y * y
     distorted = np.empty_like(plane)
-    distorted[:, 0] = x * radial + 2 * p1 * cross + p2 * bend_x
-    distorted[:, 1] = y * radial + p1 * bend_y + 2 * p2 * cross
+    distorted[:, 0] = x * radial + 2 * p1 * cross + p2 * tangential_x
+    distorted[:, 1] = y * radial + p1 * tangential_y + 2 * p2 * cross
 
     by_plane = np.empty((len(x), 2, 2))
-    by_plane[:, 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    by_plane[:, 0, 1] = 2 * cross * slope + 2 * p1 * x + 2 * p2 * y
+    by_plane[:, 0, 0] = radial + 2 * x * x * radial_derivative + 2 * p1 * y + 6 * p2 * x
+    by_plane[:, 0, 1] = 2 * cross * radial_derivative + 2 * p1 * x + 2 * p2 * y
     by_plane[:, 1, 0] = by_plane[:, 0, 1]
-    by_plane[:, 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    by_plane[:, 1, 1] = radial + 2 * y * y * radial_derivative + 6 * p1 * y + 2 * p2 * x
     return distorted, by_plane
 
 
@@ -200,12 +197,12 @@ def _distort_fisheye(plane: FloatArray, coefficients: FloatArray) -> tuple[Float
     r = _radius(plane)
     theta = np.arctan(r)
     t2 = theta * theta
-    bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    scale = bent / r
-    by_theta = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    distorted_angle = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    scale = distorted_angle / r
+    angle_derivative = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
     # d(scale)/dr divided by r, so that it multiplies plane (x) plane below.
-    slope = (by_theta / (1 + r * r) - scale) / (r * r)
-    by_plane = slope[:, None, None] * plane[:, :, None] * plane[:, None, :]
+    scale_derivative = (angle_derivative / (1 + r * r) - scale) / (r * r)
+    by_plane = scale_derivative[:, None, None] * plane[:, :, None] * plane[:, None, :]
     by_plane[:, [0, 1], [0, 1]] += scale[:, None]
     return plane * scale[:, None], by_plane
 

@@ -1,4 +1,4 @@
-"""What is dark on a printed target: grids of cells, and discs."""
+"""Dark areas of a printed target: grids of cells, and discs."""
 
 from dataclasses import dataclass, field
 
@@ -8,7 +8,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.vision.targets import corner_positions, marked_squares, marker_cells, tag_corners
 
-# A tag's measured corners are off those of a square by no more of its side.
+# Largest deviation of a tag's measured corners from a square, as a share of its side.
 _SQUARE = 0.02
 
 
@@ -17,10 +17,10 @@ class Cells:
     """A grid of dark and light cells.
 
     Attributes:
-        corner_m: (2,) the outer corner of the first cell in the target's frame [m].
+        corner_m: (2,) outer corner of the first cell in the target's frame [m].
         cell_m: Side of a cell [m].
-        dark: (rows, columns) which cells are dark.
-        turn: (2, 2) the directions of its columns and of its rows, as columns of a rotation.
+        dark: (rows, columns) mask of dark cells.
+        turn: (2, 2) rotation, with the directions of the grid's columns and rows as columns.
     """
 
     corner_m: FloatArray
@@ -30,10 +30,10 @@ class Cells:
 
 
 def dark_cells(target: Target) -> tuple[Cells, ...]:
-    """Lists what is dark on a target: no two grids share more than a point of their dark.
+    """Dark areas of a target; dark areas of two grids share at most a point.
 
     Raises:
-        DataError: It is a rig of points other than tags in the plane z = 0.
+        DataError: The target is a rig other than tags in the plane z = 0.
     """
     side = target.square_m
     match target.kind:
@@ -55,34 +55,38 @@ def dark_cells(target: Target) -> tuple[Cells, ...]:
 
 
 def _tags(target: Target) -> tuple[Cells, ...]:
-    """The tags of a rig, as they lie by their corners."""
-    known, places = tag_corners(target), corner_positions(target)
-    if not known or np.ptp(places[:, 2]) > 0.0 or min(array.min() for array in known.values()) < 0:
+    """Tags of a rig, at the poses given by their corners."""
+    ids_of_corners, places = tag_corners(target), corner_positions(target)
+    if (
+        not ids_of_corners
+        or np.ptp(places[:, 2]) > 0.0
+        or min(array.min() for array in ids_of_corners.values()) < 0
+    ):
         raise DataError(
             f"target {target.name} is a rig of points; a board can be printed, or a rig in one "
             "plane z = 0 whose points are all four corners of tags.",
             culprits=[target.name],
         )
     grids = []
-    for number, corners in known.items():
+    for number, corners in ids_of_corners.items():
         quad = places[corners, :2]
         cells = marker_cells(target.dictionary, number)
-        across, down = quad[1] - quad[0], quad[3] - quad[0]
-        side_m = float(np.linalg.norm(across))
-        square = np.array([[-across[1], across[0]], quad[2] - quad[0] - across])
-        if np.abs(square - down).max() > _SQUARE * side_m:
+        x_side, y_side = quad[1] - quad[0], quad[3] - quad[0]
+        side_m = float(np.linalg.norm(x_side))
+        square = np.array([[-x_side[1], x_side[0]], quad[2] - quad[0] - x_side])
+        if np.abs(square - y_side).max() > _SQUARE * side_m:
             raise DataError(
                 f"target {target.name}: the corners of tag {number} are no square, clockwise from "
                 "its upper left.",
                 culprits=[f"tag {number}"],
             )
-        turn = np.stack([across, down], axis=1) / side_m
+        turn = np.stack([x_side, y_side], axis=1) / side_m
         grids.append(Cells(quad[0], side_m / len(cells), cells, turn))
     return tuple(grids)
 
 
 def dark_discs(target: Target) -> FloatArray:
-    """The (n, 2) middles of the dark discs on a target [m], of its diameter."""
+    """(n, 2) centres of the dark discs on a target [m], of its diameter."""
     return corner_positions(target)[:, :2] if target.kind == "circles" else np.zeros((0, 2))
 
 
@@ -100,7 +104,7 @@ def _charuco(target: Target) -> tuple[Cells, ...]:
 
 
 def _aprilgrid(target: Target) -> tuple[Cells, ...]:
-    """The tags, turned by half a turn as on Kalibr's pages, and a square off each corner of one."""
+    """Tags, rotated by a half turn as on Kalibr's pages, and a square at each corner of a tag."""
     side, gap = target.square_m, target.square_m * target.spacing
     corners = corner_positions(target)[::4, :2]
     grids = []

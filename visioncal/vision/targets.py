@@ -1,9 +1,9 @@
-"""Targets, printed ones and rigs of known points: their files, corners and symmetries.
+"""Targets, printed ones and rigs of known points: files, corners and symmetries.
 
 The target's frame: for a ChArUco board the origin is the outer corner of square 0, for a
 checkerboard inner corner 0, for circles the first one's centre, for an AprilGrid the outer corner
-of the tag at the upper left, for a single marker its centre; x runs along columns, y along rows
-(down the printed page), and z into the board. A rig of points has the frame that its table is in.
+of the tag at the upper left, for a single marker its centre. x runs along columns, y along rows
+(down the printed page), and z into the board. A rig of points has the frame of its table.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,52 +24,52 @@ from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import apply
 from visioncal.core.types import FloatArray, IntArray, Mask, Target, TargetKind
 
-# An undeclared square is known as well as office printers keep their scale: to 0.1 %.
+# Relative sigma of a square by default: the scale error of office printers.
 DEFAULT_RELATIVE_SIGMA = 1e-3
 
-# No square is known better, not even one etched in glass.
+# Smallest sigma, even for squares etched in glass.
 LEAST_SIGMA_M = 1e-8
 
-# No printed square is larger; a larger number is in millimetres, one up to this in centimetres or
-# inches: no square of so few millimetres is printed.
+# Largest printed square [m]. Larger numbers are in millimetres, those up to the second limit in
+# centimetres or inches, as no square of so few millimetres is printed.
 LARGEST_M, _LARGEST_IN_CM = 1.0, 4.0
 
-# Sides of markers by those of squares, and a share at which none can be read; the least squares
-# that such markers are on [m]; units that are written in the place of metres [m].
+# Usual range of marker side over square side; ratio at which markers cannot be read; smallest
+# square with such markers [m]; other units [m].
 _MARKERS, _UNREADABLE, _SMALLEST_SQUARE_M = (0.4, 0.95), 0.1, 5e-3
 _UNITS = {"mm": 1e-3, "inches": 0.0254, "cm": 1e-2}
 
-# What descriptions of targets say, of one kind or another.
+# Keys of target descriptions.
 _SIZES = {"square_m", "square_sigma_m", "marker_m", "size_m", "diameter_m", "spacing", "border"}
 KEYS = _SIZES | {"kind", "columns", "rows", "dictionary", "legacy", "id", "asymmetric", "points"}
 
-# The columns of a rig's table; sigma_m may be absent, and tag and corner, together.
+# Columns of a rig's table; sigma_m is optional, and so are tag and corner together.
 RIG_COLUMNS = ("point", "x_m", "y_m", "z_m", "sigma_m", "tag", "corner")
 _WHOLE_NUMBERS = ("point", "tag", "corner")
-# No rig of one cell is larger [m]: a larger number is in millimetres. A pose takes four points.
+# Largest rig [m], beyond which numbers are in millimetres; minimum points for a pose.
 _LARGEST_RIG_M, _FEWEST_POINTS = 20.0, 4
-# Points whose second extent is a smaller share of the first lie on one line.
+# Ratio of the second to the first singular value below which points are collinear.
 _ON_ONE_LINE = 1e-6
 
-# Fewer do not determine a pose robustly; more do not fit a printable board.
+# Fewer squares do not determine a pose robustly; more do not fit a printable board.
 _MIN_SQUARES, _MAX_SQUARES = 3, 100
 
-# A tag has four corners, which do; Kalibr's page has tags of this family with borders of two
-# modules, and white of no more than a tag between them.
+# One tag's four corners suffice. Kalibr's pages have tags of this family with borders of two
+# modules, and gaps of at most a tag's side.
 _MIN_TAGS, _MOST_SPACING, _MOST_BORDER = 1, 1.0, 2
 APRILGRID_DICTIONARY = "DICT_APRILTAG_36h11"
-# A marker's corners, clockwise from its upper left, in its sides.
+# A marker's corners, clockwise from its upper left, in units of its side.
 _CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-# Circles leave so much white between them that their edges stay separate.
+# Largest diameter over spacing of circles, so that their edges remain separate.
 _WIDEST = 0.85
-# Kinds that are found where the image shows a part of them; so are rigs of tags.
+# Kinds that can be detected in part; so can rigs of tags.
 FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
 
 
 def _shipped() -> dict[str, Path]:
-    """The boards that come with visioncal, by name."""
+    """Boards that come with visioncal, by name."""
     package = Path(__file__).resolve().parent
-    # A wheel carries the boards inside the package; a source tree keeps them beside it.
+    # A wheel has the boards inside the package; a source tree has them beside it.
     for folder in (package / "boards", package.parents[1] / "targets"):
         if folder.is_dir():
             return {path.stem: path for path in folder.glob("*.toml")}
@@ -77,7 +77,7 @@ def _shipped() -> dict[str, Path]:
 
 
 def target_names() -> tuple[str, ...]:
-    """Lists the names of the boards that come with visioncal."""
+    """Names of the boards that come with visioncal."""
     return tuple(sorted(_shipped()))
 
 
@@ -86,8 +86,8 @@ def load_target(name_or_path: str | Path, folder: str | Path | None = None) -> T
     """Loads a target.
 
     Args:
-        name_or_path: A name among `target_names()`, or the path of a `.toml`.
-        folder: Relative paths start here; the working directory where None.
+        name_or_path: A name from `target_names()`, or the path of a `.toml`.
+        folder: Base of relative paths; None for the working directory.
 
     Raises:
         DataError: There is no such target, or its description is wrong.
@@ -115,7 +115,7 @@ def read_target(name_or_path: str, folder: Path | None) -> tuple[Target, dict[st
 
 
 def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
-    """Reads the table of a rig's points, column by column; it lies beside the rig's description."""
+    """Reads the table of a rig's points by columns, from the folder of the rig's description."""
     path = folder / name
     if not is_inside(path, folder):
         raise DataError(
@@ -135,30 +135,31 @@ def _read_rig(folder: Path, name: str) -> dict[str, list[Any]]:
     return {name: _column(table, at) for at, name in enumerate(table.columns)}
 
 
-def _column(table: TextTable, at: int) -> list[Any]:
-    read = int if table.columns[at] in _WHOLE_NUMBERS else float
+def _column(table: TextTable, index: int) -> list[Any]:
+    read = int if table.columns[index] in _WHOLE_NUMBERS else float
     values = []
     for row, cells in enumerate(table.rows):
         try:
-            values.append(read(cells[at]))
+            values.append(read(cells[index]))
         except ValueError:
-            what = "whole number" if read is int else "number"
+            kind = "whole number" if read is int else "number"
+            place = table.place(row)
             raise DataError(
-                f"{table.place(row)}, column {table.columns[at]}: {cells[at]!r} is no {what}.",
-                culprits=[table.place(row)],
+                f"{place}, column {table.columns[index]}: {cells[index]!r} is no {kind}.",
+                culprits=[place],
             ) from None
     return values
 
 
 def rig_csv(points: Mapping[str, Sequence[float]]) -> str:
-    """Writes a rig's points, column by column, as the text of its table."""
+    """Text of a rig's table, from its columns."""
     columns = [column for column in RIG_COLUMNS if column in points]
     rows = zip(*(points[column] for column in columns), strict=True)
     return "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows), ""])
 
 
 def misspelt_keys(document: Mapping[str, Any]) -> Iterator[str]:
-    """Words a hint for every key of a target's description that looks like a known one misspelt."""
+    """Hints for unknown keys of a target's description that resemble known ones."""
     for key in sorted(document.keys() - KEYS):
         if hint := did_you_mean(key, KEYS):
             yield f"{key} is no known name and was not read. {hint}"
@@ -167,16 +168,15 @@ def misspelt_keys(document: Mapping[str, Any]) -> Iterator[str]:
 def target_from_document(document: Mapping[str, Any], name: str) -> Target:
     """Builds a target from the content of its `.toml`.
 
-    `square_sigma_m` left out becomes 0.1 % of the side, which is how well office printers keep
-    their scale.
+    The default of `square_sigma_m` is 0.1 % of the side, the scale error of office printers.
 
     Args:
-        document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for
-            a single marker kind, id, size_m, dictionary; for an AprilGrid kind, columns, rows,
-            size_m, spacing and, where they are not Kalibr's, id, dictionary, border; for circles
-            kind, columns, rows, square_m, diameter_m, asymmetric; for a rig kind and points, the
-            columns of its table as lists.
-        name: The name that the target gets.
+        document: kind, columns, rows, square_m, square_sigma_m, marker_m, dictionary, legacy; for a
+            single marker kind, id, size_m, dictionary; for an AprilGrid kind, columns, rows,
+            size_m, spacing and, unless Kalibr's, id, dictionary, border; for circles kind, columns,
+            rows, square_m, diameter_m, asymmetric; for a rig kind and points, the columns of its
+            table as lists.
+        name: Name of the target.
 
     Raises:
         DataError: A field is missing, of another type, or out of range.
@@ -207,7 +207,7 @@ def _described(table: DocumentTable, name: str) -> Target:
     if kind == "checkerboard":
         return Target(name, "checkerboard", columns, rows, square_m, sigma_m)
     marker_m = table.number("marker_m", positive=True)
-    # OpenCV compares the sides in single precision, which does not hold all numbers.
+    # OpenCV compares the sides in single precision.
     if marker_m >= square_m or not 0.0 < np.float32(marker_m) < np.float32(square_m):
         raise table.refuse("marker_m", marker_m, f"less than square_m = {square_m!r}")
     dictionary = table.text("dictionary")
@@ -235,24 +235,24 @@ def _size(table: DocumentTable, key: str) -> float:
 
 
 def _check_one_unit(table: DocumentTable) -> None:
-    """Refuses sides of squares and markers of which one is in another unit, as their ratio says."""
+    """Raises an error if squares and markers have different units, judged by their ratio."""
     square, marker = (table.number(name, positive=True) for name in ("square_m", "marker_m"))
     if _UNREADABLE * square < marker < square:
         return
     low, high = _MARKERS
     for unit, size_m in _UNITS.items():
-        for key, inside, outside in (
+        for key, marker_m, square_m in (
             ("square_m", marker, square * size_m),
             ("marker_m", marker * size_m, square),
         ):
-            right = outside if key == "square_m" else inside
-            if low * outside < inside < high * outside and outside > _SMALLEST_SQUARE_M:
+            corrected = square_m if key == "square_m" else marker_m
+            if low * square_m < marker_m < high * square_m and square_m > _SMALLEST_SQUARE_M:
                 raise DataError(
                     f"{table.label}: square_m is {square:g} and marker_m is {marker:g}; one is in "
                     f"another unit: with {key} in {unit}, and not in metres, a marker is "
-                    f"{inside / outside:.2f} of a square, as usual.",
+                    f"{marker_m / square_m:.2f} of a square, as usual.",
                     culprits=[f"{table.label}: {key}"],
-                    next_step=f"In the target's .toml, write {key} = {right:.6g}.",
+                    next_step=f"In the target's .toml, write {key} = {corrected:.6g}.",
                 )
 
 
@@ -310,10 +310,10 @@ def _circles(table: DocumentTable, name: str) -> Target:
     square_m = _size(table, "square_m")
     asymmetric = table.flag("asymmetric", default=False)
     diameter_m = table.number("diameter_m", positive=True)
-    # Nearer circles would touch.
-    apart_m = square_m * np.sqrt(2.0) if asymmetric else square_m
-    if diameter_m >= _WIDEST * apart_m:
-        needed = f"less than {_WIDEST:g} of the distance of neighbours, {apart_m:g} m,"
+    # Distance of the nearest circles.
+    spacing_m = square_m * np.sqrt(2.0) if asymmetric else square_m
+    if diameter_m >= _WIDEST * spacing_m:
+        needed = f"less than {_WIDEST:g} of the distance of neighbours, {spacing_m:g} m,"
         raise table.refuse("diameter_m", diameter_m, needed)
     return Target(
         name,
@@ -358,18 +358,18 @@ def _rig(table: DocumentTable, name: str) -> Target:
 
 
 def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[str, str]]:
-    """What is wrong with a table of points, and what to do.
+    """Problems of a table of points, each with an instruction.
 
     Args:
-        names: Its columns, point, x_m, y_m and z_m first.
-        values: (columns, n) its cells; of another shape where the rows are uneven.
+        names: Columns of the table, point, x_m, y_m and z_m first.
+        values: (columns, n) cells; of another shape if the rows are uneven.
     """
     if values.ndim != 2:
         yield "has rows of several lengths, or cells that are no numbers", "Fill in all cells."
         return
-    for at, row in np.argwhere(~np.isfinite(values)).tolist():
+    for column, row in np.argwhere(~np.isfinite(values)).tolist():
         yield (
-            f"has {values[at, row]:g} as {names[at]} of row {row + 1}",
+            f"has {values[column, row]:g} as {names[column]} of row {row + 1}",
             "Write a finite number there, or delete the row.",
         )
     numbers, places_m = values[0].tolist(), values[1:4].T
@@ -384,8 +384,11 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
             )
     spread_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
     if spread_m[1] <= _ON_ONE_LINE * spread_m[0]:
-        where = "on one line" if spread_m[0] > 0.0 else "in one place"
-        yield f"has all points {where}", "Give points beside these: no camera tells how they turn."
+        location = "on one line" if spread_m[0] > 0.0 else "in one place"
+        yield (
+            f"has all points {location}",
+            "Give points beside these: no camera tells how they turn.",
+        )
     extent_m = float(np.ptp(places_m, axis=0).max())
     if extent_m > _LARGEST_RIG_M:
         yield (
@@ -401,7 +404,7 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
 
 
 def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, Any]:
-    """Which corners of which tags a rig's points are, and the tags' dictionary."""
+    """Tag corners of a rig's points, and the tags' dictionary."""
     given = [name for name in ("tag", "corner") if name in columns]
     if not given:
         return {}
@@ -426,29 +429,29 @@ def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, 
 
 
 def _dictionary_size(table: DocumentTable, name: str) -> int:
-    """Counts the markers of one of OpenCV's dictionaries."""
-    known = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
-    if name not in known:
+    """Number of markers of one of OpenCV's dictionaries."""
+    names = [entry for entry in dir(cv2.aruco) if entry.startswith("DICT_")]
+    if name not in names:
         raise DataError(
             f"{table.label}: dictionary is {name!r}, which OpenCV does not have.",
             culprits=[f"{table.label}: dictionary"],
-            next_step=did_you_mean(name.upper(), known)
+            next_step=did_you_mean(name.upper(), names)
             or "The names look like DICT_5X5_100 or DICT_APRILTAG_36h11.",
         )
     return len(aruco_dictionary(name).bytesList)
 
 
 def aruco_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """Gives one of OpenCV's dictionaries, by a name that a target has."""
+    """One of OpenCV's dictionaries by name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 def metres(millimetres: float) -> float:
-    """Turns millimetres into metres without rounding twice: 23.6 becomes 0.0236."""
+    """Converts millimetres to metres without rounding twice: 23.6 becomes 0.0236."""
     return float(Decimal(str(millimetres)) / 1000)
 
 
-# What a description says of each kind beside that, and where a target calls it otherwise.
+# Keys of each kind's description, and fields of targets with other names.
 _OF_SQUARES = "columns rows square_m square_sigma_m"
 _FORMS: Mapping[TargetKind, str] = {
     "checkerboard": _OF_SQUARES,
@@ -461,7 +464,7 @@ _NAMES = {"id": "marker_id", "size_m": "square_m"}
 
 
 def target_document(target: Target) -> dict[str, Any]:
-    """Writes a target as the content of a `.toml`, which `target_from_document` reads back."""
+    """A target as the content of a `.toml`, which `target_from_document` can read."""
     if target.kind == "points":
         x_m, y_m, z_m = corner_positions(target).T.tolist()
         tags = np.reshape(target.point_tags, (-1, 2)).T.astype(int).tolist()
@@ -477,12 +480,7 @@ def target_document(target: Target) -> dict[str, Any]:
 
 
 def board_words(target: Target, least: str = "") -> str:
-    """Names a target in a few words, but for its size.
-
-    Args:
-        target: It.
-        least: What stands before its columns and rows, where it may have more.
-    """
+    """A target in a few words, without its size; `least` precedes columns and rows."""
     size = f"{least}{target.columns} x {target.rows}"
     match target.kind:
         case "checkerboard":
@@ -501,13 +499,12 @@ def board_words(target: Target, least: str = "") -> str:
 
 
 def corner_positions(target: Target) -> FloatArray:
-    """Computes where the target's corners are.
+    """Positions of the target's corners.
 
     Returns:
-        (n, 3) positions in the target's frame [m], in the order of the corners' numbers. A
-        marker's four corners come in OpenCV's order, clockwise from its top left; those of an
-        AprilGrid likewise on the page, tag by tag in the order of their ids; the points of a rig in
-        that of its table.
+        (n, 3) positions in the target's frame [m], by corner id. A marker's four corners are in
+        OpenCV's order, clockwise from its top left; those of an AprilGrid likewise on the page, tag
+        by tag in the order of their ids; the points of a rig are in the order of its table.
     """
     side = target.square_m
     if target.kind == "points":
@@ -527,38 +524,38 @@ def corner_positions(target: Target) -> FloatArray:
 
 
 def _tag_places(target: Target) -> IntArray:
-    """The (t, 2) columns and rows of an AprilGrid's tags, in the order of their ids."""
-    # As on Kalibr's pages the first tag is at the lower left, and ids run along the rows.
+    """(t, 2) columns and rows of an AprilGrid's tags, by id."""
+    # As on Kalibr's pages, the first tag is at the lower left and ids run along the rows.
     rows, columns = np.divmod(np.arange(target.columns * target.rows), target.columns)
     return np.stack([columns, target.rows - 1 - rows], axis=1)
 
 
 def circle_places(columns: int, rows: int, *, asymmetric: bool) -> IntArray:
-    """The (n, 2) columns and rows of circles, row by row; of an asymmetric grid in half columns."""
+    """(n, 2) columns and rows of circles, row by row; for an asymmetric grid in half columns."""
     row, column = np.divmod(np.arange(columns * rows), columns)
     return np.stack([2 * column + row % 2 if asymmetric else column, row], axis=1)
 
 
 def point_numbers(target: Target) -> tuple[int, ...]:
-    """The numbers that people give a target's corners, in the order of `corner_positions`."""
+    """Users' numbers of a target's corners, in the order of `corner_positions`."""
     return target.point_numbers or tuple(range(len(corner_positions(target))))
 
 
 def numbered_positions(targets: Sequence[Target]) -> FloatArray:
-    """The (c, 3) corners of several targets, numbered through, each in its own target's frame."""
+    """(c, 3) corners of several targets, concatenated, each in its own target's frame."""
     return np.concatenate([np.zeros((0, 3)), *map(corner_positions, targets)])
 
 
 def tag_corners(target: Target) -> dict[int, IntArray]:
-    """The places (4,) of a rig's tags' corners among its points, by their ids; -1 without one."""
-    found: dict[int, IntArray] = {}
-    for at, (tag, corner) in enumerate(target.point_tags):
-        found.setdefault(tag, np.full(4, -1))[corner] = at
-    return found
+    """Point indices (4,) of a rig's tags' corners, by tag id; -1 for corners that are no points."""
+    corners_of_tag: dict[int, IntArray] = {}
+    for index, (tag, corner) in enumerate(target.point_tags):
+        corners_of_tag.setdefault(tag, np.full(4, -1))[corner] = index
+    return corners_of_tag
 
 
 def first_corners(targets: Sequence[Target]) -> IntArray:
-    """Numbers (b,) that the first corners of several targets get where all are numbered through."""
+    """Indices (b,) of the targets' first corners in the concatenation of all corners."""
     counts = [len(corner_positions(target)) for target in targets]
     return np.cumsum([0, *counts], dtype=np.int64)[:-1]
 
@@ -572,7 +569,7 @@ def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
     if target.kind == "marker":
         return np.full(2, -0.5 * side), np.full(2, 0.5 * side)
     if target.kind == "aprilgrid":
-        # Small squares stand around the outermost tags too.
+        # There are small squares around the outermost tags too.
         count = np.array([target.columns, target.rows])
         high = side * (count * (1.0 + target.spacing))
         return np.full(2, -side * target.spacing), high
@@ -585,7 +582,7 @@ def extent_m(target: Target) -> tuple[FloatArray, FloatArray]:
 
 
 def marker_cells(dictionary_name: str, marker_id: int, border: int = 1) -> Mask:
-    """The (n, n) dark cells of a marker, its border of so many cells included."""
+    """(n, n) mask of a marker's dark cells, including a border of `border` cells."""
     dictionary = aruco_dictionary(dictionary_name)
     size = dictionary.markerSize
     code = dictionary.bytesList[marker_id : marker_id + 1]
@@ -594,20 +591,20 @@ def marker_cells(dictionary_name: str, marker_id: int, border: int = 1) -> Mask:
 
 
 def marked_squares(target: Target) -> IntArray:
-    """The (m, 2) light squares of a ChArUco board, as column and row, in the order of their ids.
+    """(m, 2) light squares of a ChArUco board as column and row, by marker id.
 
     Raises:
         DataError: The target is of another kind.
     """
-    # OpenCV says where the markers lie; the squares between them are dark.
+    # Markers are on the light squares.
     places = np.asarray(charuco_board(target).getObjPoints(), dtype=float)[..., :2]
     return np.asarray(np.floor(places.mean(axis=1) / target.square_m), dtype=np.int64)
 
 
-# Kept, because OpenCV warns of a narrow rim around the markers as often as it builds the board.
+# Cached, as OpenCV warns of a narrow rim around the markers whenever it builds the board.
 @lru_cache(maxsize=64)
 def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
-    """Builds OpenCV's board for a ChArUco target.
+    """OpenCV's board for a ChArUco target.
 
     Raises:
         DataError: The target is of another kind.
@@ -625,17 +622,16 @@ def charuco_board(target: Target) -> cv2.aruco.CharucoBoard:
 
 
 def rotation_transforms(target: Target) -> FloatArray:
-    """Lists the rotations in the plane that leave the printed pattern as it is.
+    """Rotations in the plane that map the printed pattern to itself.
 
     Markers break every symmetry. The squares of a checkerboard of c x r inner corners have the
-    colour of (column + row) mod 2 over c + 1 columns and r + 1 rows. A half turn takes square
-    (i, j) to (c - i, r - j) and keeps the colours where c + r is even; a quarter turn takes it to
-    (c - j, i) and needs c = r, even. Circles have no colours: a symmetric grid looks the same after
-    a half turn, and an asymmetric one of an even number of rows.
+    colour of (column + row) mod 2 over c + 1 columns and r + 1 rows. A half turn maps square (i, j)
+    to (c - i, r - j) and keeps the colours if c + r is even; a quarter turn maps it to (c - j, i)
+    and requires c = r, even. Circles have no colours: a symmetric grid is invariant under a half
+    turn, and so is an asymmetric one with an even number of rows.
 
     Returns:
-        (k, 4, 4) `target_from_turned`, the identity first: the pattern, carried along by any of
-        them, covers itself.
+        (k, 4, 4) `target_from_turned`, the identity first.
     """
     identity = np.eye(4)
     if target.kind == "circles":
@@ -647,13 +643,13 @@ def rotation_transforms(target: Target) -> FloatArray:
     half = transforms.compose(np.diag([-1.0, -1.0, 1.0]), np.array([width_m, height_m, 0.0]))
     if target.columns != target.rows or target.columns % 2:
         return np.stack([identity, half])
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    quarter = transforms.compose(turn, np.array([width_m, 0.0, 0.0]))
+    rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    quarter = transforms.compose(rotation, np.array([width_m, 0.0, 0.0]))
     return np.stack([identity, quarter, half, transforms.invert(quarter)])
 
 
 def _turns_of_circles(target: Target) -> FloatArray:
-    """The turns about a grid's middle, by quarters, that carry every circle to one."""
+    """Rotations by quarter turns about a grid's centre that map circles to circles."""
     places = corner_positions(target)
     low, high = places.min(axis=0), places.max(axis=0)
     turns = []
@@ -662,18 +658,18 @@ def _turns_of_circles(target: Target) -> FloatArray:
         turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         turned = places @ turn.T
         shift = (low + high - turned.min(axis=0) - turned.max(axis=0)) / 2
-        away = np.linalg.norm(turned[:, None] + shift - places, axis=2).min(axis=1)
-        if away.max() < 0.1 * target.square_m:
+        distances = np.linalg.norm(turned[:, None] + shift - places, axis=2).min(axis=1)
+        if distances.max() < 0.1 * target.square_m:
             turns.append(transforms.compose(turn, shift))
     return np.stack(turns)
 
 
 def rotations(target: Target) -> tuple[IntArray, ...]:
-    """Lists the corner numberings that the printed pattern itself does not distinguish.
+    """Corner permutations under the symmetries of the printed pattern.
 
     Returns:
-        Permutations p, the identity first, one for each of `rotation_transforms`: turned by that
-        transform, corner i lies where corner p[i] was.
+        Permutations p, the identity first, one for each of `rotation_transforms`: after that
+        transform, corner i is where corner p[i] was.
     """
     positions = corner_positions(target)
     permutations = []

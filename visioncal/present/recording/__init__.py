@@ -1,7 +1,7 @@
-"""Recordings: a session and its results in one `.rrd`, which the rerun viewer opens.
+"""Recordings: a session and its results in one `.rrd` file, which the rerun viewer opens.
 
-The facts of the session lie in it without loss, beside what is drawn of them; see `codec`. What was
-changed or cut off after it was written is noticed; see `frames`.
+The session's data is stored without loss beside its drawing; see `codec`. Changes and truncation
+after writing are detected; see `frames`.
 """
 
 from visioncal.present.recording.reader import read_session

@@ -1,4 +1,4 @@
-"""The robot as it is drawn: a capsule a link and a ball a joint, and what is in its way."""
+"""Drawing of a robot arm, a capsule per link and a ball per joint, and of obstacles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,24 +10,19 @@ from visioncal.core.types import FloatArray
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 
-# Thickness from the base to the flange, as shares of the arm's length; about that of a UR.
+# Radii of links at the base and at the flange, as shares of the arm's length; about a UR's.
 _BASE_RADIUS, _FLANGE_RADIUS = 0.03, 0.02
-# The balls stand out between the links that they join.
+# Radius of joints, as a share of their link's.
 _JOINT_RADIUS = 1.2
 
-# A piece of floor is drawn, so many times as wide as the cell.
+# Half width of the floor that is drawn, as a share of the cell's size.
 _FLOOR = 1.3
-# And a little lower, so that a board on it is seen [m].
+# The floor is drawn a little lower, so that a board on it is visible [m].
 _BELOW_M = 0.004
 
 
 def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
-    """Draws an arm at the stream's current time.
-
-    Args:
-        stream: Where to.
-        link_frames: (n, 4, 4) the frames of its joints and its flange in the base [m].
-    """
+    """Draws an arm at the stream's current time, by its (n, 4, 4) link frames in the base [m]."""
     shapes = _Shapes.of(link_frames[None])
     capsules = rr.Capsules3D(
         lengths=shapes.lengths_m,
@@ -48,7 +43,7 @@ def log_arm(stream: rr.RecordingStream, link_frames: FloatArray) -> None:
 
 
 def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:
-    """Hangs a frame on another by a pose (4, 4) `parent_from_child`."""
+    """Transform of a child frame on its parent, from a (4, 4) pose `parent_from_child`."""
     return rr.Transform3D(
         translation=pose[:3, 3], mat3x3=pose[:3, :3], parent_frame=parent, child_frame=child
     )
@@ -57,18 +52,16 @@ def placed(pose: FloatArray, parent: str, child: str) -> rr.Transform3D:
 def log_frames(
     stream: rr.RecordingStream, axis_m: float, more: Sequence[tuple[str, str, float]] = ()
 ) -> None:
-    """Draws the axes of base and flange, and puts the arm into the base.
+    """Draws the axes of base and flange, and places the arm in the base.
 
-    Args:
-        stream: Where to.
-        axis_m: Length of the flange's axes [m]; the base's are twice as long.
-        more: Other entities with axes, their frames, and lengths as shares of the flange's.
+    The flange's axes have the length `axis_m`, the base's are twice as long; `more` are other
+    entities with their frames and their lengths relative to the flange's.
     """
     base = rr.Transform3D(parent_frame="cell", child_frame=paths.BASE_FRAME)
     stream.log(paths.BASE, base, static=True)
-    own = ((paths.BASE, paths.BASE_FRAME, 2.0), (paths.FLANGE, paths.FLANGE_FRAME, 1.0))
-    for entity, frame, times in (*own, *more):
-        axes = rr.TransformAxes3D(times * axis_m, show_frame=True)
+    standard = ((paths.BASE, paths.BASE_FRAME, 2.0), (paths.FLANGE, paths.FLANGE_FRAME, 1.0))
+    for entity, frame, scale in (*standard, *more):
+        axes = rr.TransformAxes3D(scale * axis_m, show_frame=True)
         stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
     for part in ("links", "joints"):
         frame_of_arm = rr.CoordinateFrame(paths.BASE_FRAME)
@@ -78,16 +71,9 @@ def log_frames(
 def log_arms(
     stream: rr.RecordingStream, views: Sequence[FloatArray | None], entity: str = paths.ROBOT
 ) -> None:
-    """Draws an arm in all views of a session.
-
-    Args:
-        stream: Where to.
-        views: (n, 4, 4) of each as of `log_arm`; None where the arm is not known, which takes
-            that of the view before off the screen.
-        entity: Under which entity.
-    """
-    known = [view for view in views if view is not None]
-    link_frames, rows = np.array(known or [np.zeros((0, 4, 4))]), range(len(views))
+    """Draws an arm in every view by (n, 4, 4) link frames; None clears the previous view's arm."""
+    known_views = [view for view in views if view is not None]
+    link_frames, rows = np.array(known_views or [np.zeros((0, 4, 4))]), range(len(views))
     drawn = [view is not None for view in views]
     shapes, links, joints = _Shapes.of(link_frames), f"{entity}/links", f"{entity}/joints"
     capsules = rr.Capsules3D.from_fields(colors=colours.LINK, fill_mode="solid")
@@ -108,15 +94,15 @@ def log_arms(
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Capsules and balls of m arms with n links each, one arm behind the other.
+    """Capsules and balls of m arms with n links each, arm after arm.
 
     Attributes:
-        lengths_m: (m n,) of the capsules [m].
-        radii_m: (m n,) of the capsules [m].
-        begins_m: (m n, 3) where they begin [m].
-        quaternions: (m n, 4) x, y, z, w that turn them from the z axis.
+        lengths_m: (m n,) lengths of the capsules [m].
+        radii_m: (m n,) radii of the capsules [m].
+        begins_m: (m n, 3) start points of the capsules [m].
+        quaternions: (m n, 4) rotations x, y, z, w of the capsules from the z axis.
         joints_m: (m (n - 1), 3) centres of the balls [m]; neither base nor flange is a joint.
-        half_sizes_m: (m (n - 1), 3) of the balls [m].
+        half_sizes_m: (m (n - 1), 3) radii of the balls [m].
     """
 
     lengths_m: FloatArray
@@ -128,7 +114,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, link_frames: FloatArray) -> "_Shapes":
-        """Draws (m, n, 4, 4) frames of joints and flanges."""
+        """Shapes of (m, n, 4, 4) frames of joints and flanges."""
         origins = np.insert(link_frames[:, :, :3, 3], 0, 0.0, axis=1)
         links = np.diff(origins, axis=1)
         lengths_m = np.linalg.norm(links, axis=2)
@@ -145,17 +131,17 @@ class _Shapes:
 
 
 def _from_z_to(directions: FloatArray) -> FloatArray:
-    """(n, 4) quaternions x, y, z, w that turn the z axis into (n, 3) directions of any length."""
+    """(n, 4) quaternions x, y, z, w that rotate the z axis onto (n, 3) directions."""
     x, y, z = directions.T
     quaternions = np.stack([-y, x, np.zeros(len(x)), np.linalg.norm(directions, axis=1) + z], 1)
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    # Straight down every horizontal axis serves; links without length have no direction.
+    # For -z any horizontal axis will do; links without length have no direction.
     return np.where(norms > 1e-9, quaternions / np.maximum(norms, 1e-9), [1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """Something in the way: its centre's frame in the base (4, 4) and its lengths (3,) [m]."""
+    """A box: pose of its centre in the base (4, 4) and its side lengths (3,) [m]."""
 
     name: str
     base_from_box: FloatArray
@@ -165,14 +151,7 @@ class Obstacle:
 def log_obstacles(
     stream: rr.RecordingStream, obstacles: Sequence[Obstacle], floor_m: float | None, size_m: float
 ) -> None:
-    """Draws the floor around the cell's centre, and the declared boxes.
-
-    Args:
-        stream: Where to.
-        obstacles: The boxes.
-        floor_m: Height of the floor in the base [m]; None for none.
-        size_m: Of the cell [m].
-    """
+    """Draws the boxes, and the floor of a cell of `size_m` at a height in the base, if any [m]."""
     frame = rr.CoordinateFrame(paths.BASE_FRAME)
     if floor_m is not None:
         half = _FLOOR * size_m
@@ -182,15 +161,15 @@ def log_obstacles(
             colors=colours.GRID,
         )
         stream.log(f"{paths.OBSTACLES}/floor", frame, floor, static=True)
-    for at, box in enumerate(obstacles):
-        drawn = rr.Boxes3D(
+    for index, box in enumerate(obstacles):
+        shape = rr.Boxes3D(
             centers=[np.zeros(3)],
             half_sizes=[0.5 * np.asarray(box.size_m)],
             colors=[(*colours.REJECTED, 90)],
             labels=[box.name],
             fill_mode="solid",
         )
-        name = f"box_{at + 1}"
+        name = f"box_{index + 1}"
         pose = placed(box.base_from_box, paths.BASE_FRAME, name)
         entity = f"{paths.OBSTACLES}/{name}"
-        stream.log(entity, pose, rr.CoordinateFrame(name), drawn, static=True)
+        stream.log(entity, pose, rr.CoordinateFrame(name), shape, static=True)

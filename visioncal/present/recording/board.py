@@ -1,4 +1,4 @@
-"""The target as it is drawn: its pattern on a sheet or its points, and its outline."""
+"""Drawing of a target: its pattern on a sheet or its points, and its outline."""
 
 import cv2
 import numpy as np
@@ -9,9 +9,9 @@ from visioncal.present.recording import colours
 from visioncal.vision.prints import dark_cells, dark_discs
 from visioncal.vision.targets import corner_positions, extent_m
 
-# Enough to show the bits of the markers; the pattern of a large board still stays small.
+# Resolution that shows the markers' bits, and the limit for a large board's pattern.
 _SQUARE_PX, _LARGEST_PX = 48, 2000
-# A rig's points are drawn so large, as a share of its extent; and the edges of a unit box, in one.
+# Radius of a rig's points as a share of its extent; edges of a unit box as one line strip.
 _DOT = 0.02
 _BOX = np.array(
     [
@@ -24,31 +24,31 @@ _BOX = np.array(
 def outline(target: Target) -> FloatArray:
     """(4, 3) corners of the printed pattern in the target's frame [m], clockwise on the page.
 
-    Those of a rig are of the middle of the box around its points.
+    For a rig: the cross-section in the middle of its bounding box.
     """
     low, high = extent_m(target)
-    middle = float(np.mean([end[:, 2] for end in _ends(target)]))
+    middle_z = float(np.mean([end[:, 2] for end in _bounds(target)]))
     corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
-    return np.pad(corners, ((0, 0), (0, 1)), constant_values=middle)
+    return np.pad(corners, ((0, 0), (0, 1)), constant_values=middle_z)
 
 
-def _ends(target: Target) -> tuple[FloatArray, FloatArray]:
-    """The low and high ends (1, 3) of the box around a target's corners [m]."""
-    places = corner_positions(target)
-    return places.min(axis=0, keepdims=True), places.max(axis=0, keepdims=True)
+def _bounds(target: Target) -> tuple[FloatArray, FloatArray]:
+    """Low and high corners (1, 3) of the bounding box of a target's corners [m]."""
+    corners_m = corner_positions(target)
+    return corners_m.min(axis=0, keepdims=True), corners_m.max(axis=0, keepdims=True)
 
 
 def closed_outline(target: Target) -> FloatArray:
-    """(k, 3) the outline as a line strip [m]; of a rig, the edges of the box around it."""
+    """(k, 3) outline as a line strip [m]; for a rig, the edges of its bounding box."""
     if target.kind == "points":
-        low, high = _ends(target)
+        low, high = _bounds(target)
         return np.asarray(low + _BOX * (high - low))
     corners = outline(target)
     return np.vstack([corners, corners[:1]])
 
 
 def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
-    """The pattern as a textured sheet in the target's frame; of a rig, its points."""
+    """The pattern as a textured sheet in the target's frame; for a rig, its points."""
     if target.kind == "points":
         return rr.Points3D(
             corner_positions(target),
@@ -67,7 +67,7 @@ def sheet(target: Target) -> rr.Mesh3D | rr.Points3D:
 
 
 def picture(target: Target) -> Image:
-    """The printed pattern inside its outline, as a grey image with x to the right and y down."""
+    """The printed pattern as a grey image, x to the right and y down."""
     low, high = extent_m(target)
     side_px = _LARGEST_PX * target.square_m / float(np.max(high - low))
     side_px = max(int(min(4 * _SQUARE_PX if target.kind == "marker" else _SQUARE_PX, side_px)), 1)
@@ -77,14 +77,14 @@ def picture(target: Target) -> Image:
     for grid in dark_cells(target):
         left, top = np.rint(scale * (grid.corner_m - low)).astype(int).tolist()
         rows, columns = (max(round(scale * grid.cell_m * value), 1) for value in grid.dark.shape)
-        # Where there are more cells than pixels, they mix to grey.
-        how = cv2.INTER_NEAREST if rows >= len(grid.dark) else cv2.INTER_AREA
-        light = np.where(grid.dark, 0, 255).astype(np.uint8)
-        there = page[top : top + rows, left : left + columns]
-        drawn = cv2.resize(light, (columns, rows), interpolation=how)
-        np.minimum(there, drawn[: there.shape[0], : there.shape[1]], out=there)
-    for middle in scale * (dark_discs(target) - low) - 0.5:
-        x, y = np.rint(16.0 * middle).astype(int).tolist()
+        # More cells than pixels are averaged to grey.
+        interpolation = cv2.INTER_NEAREST if rows >= len(grid.dark) else cv2.INTER_AREA
+        brightness = np.where(grid.dark, 0, 255).astype(np.uint8)
+        region = page[top : top + rows, left : left + columns]
+        resized = cv2.resize(brightness, (columns, rows), interpolation=interpolation)
+        np.minimum(region, resized[: region.shape[0], : region.shape[1]], out=region)
+    for centre in scale * (dark_discs(target) - low) - 0.5:
+        x, y = np.rint(16.0 * centre).astype(int).tolist()
         radius = round(8.0 * scale * target.diameter_m)
         cv2.circle(page, (x, y), radius, 0.0, -1, cv2.LINE_AA, shift=4)
     return page

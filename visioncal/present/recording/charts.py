@@ -1,4 +1,4 @@
-"""Charts over all views, which mark the view that is looked at: coverage, and joints."""
+"""Charts over all views, with a mark for the current view: coverage, and joints."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,23 +16,23 @@ from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 
-# Widths in the viewer's own points, whatever the scale of the chart.
+# Widths in the viewer's UI points, independent of the chart's scale.
 _POINT, _LINE = rr.Radius.ui_points(2.5), rr.Radius.ui_points(0.6)
 _MARK = rr.Radius.ui_points(4.5)
-# Rerun draws points at 30 where nothing else is said.
+# Rerun's default draw order of points is 30.
 _ABOVE = 40.0
-# A bar's share of the range of its chart.
+# Width of a bar as a share of the chart's range.
 _BAR = 0.012
 
 
 @dataclass(frozen=True, eq=False)
 class JointChart:
-    """Residuals over the angle of one joint.
+    """Residuals against the angle of one joint.
 
     Attributes:
-        joint: Which one, counted from 0.
+        joint: Its index, from 0.
         angle_deg: By view [deg].
-        residual_mm: Of the same views [mm].
+        residual_mm: By view [mm].
     """
 
     joint: int
@@ -50,12 +50,7 @@ class JointChart:
         stream.log(f"{paths.over_joint(self.joint)}/{paths.USED}", bars, static=True)
 
     def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Marks the bar of each view when that is looked at: all views as one message.
-
-        Args:
-            stream: Where to.
-            rows: The views' places in the session.
-        """
+        """Marks the current view's bar, for all views, by row in the session, in one message."""
         heights = _single_tensors([self.residual_mm.get(view) for view in rows])
         angles_deg = _single_tensors([self.angle_deg.get(view) for view in rows])
         colour = rr.components.ColorBatch([colours.THIS_VIEW] * len(rows))
@@ -71,14 +66,14 @@ class JointChart:
             f"{paths.over_joint(self.joint)}/{paths.THIS_VIEW}",
             rows.values(),
             [
-                rr.ComponentColumn(key, rr.AnyBatchValue(key, found))
-                for key, found in columns.items()
+                rr.ComponentColumn(key, rr.AnyBatchValue(key, array))
+                for key, array in columns.items()
             ],
         )
 
     @property
     def _width_deg(self) -> float:
-        """A joint that stood still still needs bars that can be seen."""
+        """Width of a bar; visible also for a joint that did not move."""
         return _BAR * max(float(np.ptp(list(self.angle_deg.values()))), 1.0)
 
 
@@ -87,9 +82,9 @@ class Charts:
     """All charts of a result.
 
     Attributes:
-        points: Coverage of the image, of directions and of rotations; only what there is.
-        joints: One chart a joint, where the session has joint angles.
-        used: The views that the fit used.
+        points: Coverage of the image, of directions and of rotation axes, where known.
+        joints: One chart per joint, if the session has joint angles.
+        used: The views in the fit.
     """
 
     points: tuple[PointChart, ...]
@@ -100,21 +95,21 @@ class Charts:
     def of(
         cls, session: Session, calibration: Calibration, evidence: Mapping[int, ViewEvidence]
     ) -> "Charts":
-        """Collects what there is to draw of one camera and one robot."""
+        """Charts of one camera and one robot; none for a cell."""
         used = frozenset(view.view for view in calibration.views if view.used)
         if calibration.cell is not None:
-            # One chart has no room for several cameras, boards or robots.
+            # A chart has no room for several cameras, boards or robots.
             return cls((), (), used)
-        found = (
+        charts = (
             coverage.image_chart(calibration, evidence),
             None if calibration.mount == "instrument" else coverage.directions_chart(evidence),
             coverage.rotation_axes_chart([view for view in evidence.values() if view.view in used]),
         )
-        points = tuple(chart for chart in found if chart is not None)
+        points = tuple(chart for chart in charts if chart is not None)
         return cls(points, _joint_charts(session, calibration), used)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
-        """Draws all views."""
+        """Draws what is the same in all views."""
         for chart in self.points:
             lines = rr.LineStrips2D(chart.lines, colors=colours.GRID, radii=_LINE)
             stream.log(f"{paths.COVERAGE}/{chart.name}/grid", lines, static=True)
@@ -124,15 +119,15 @@ class Charts:
                 places, labels=labels, show_labels=True, colors=colours.WORDS, radii=0.0
             )
             stream.log(f"{paths.COVERAGE}/{chart.name}/words", words, static=True)
-            for name, colour, wanted in (
+            for name, colour, is_used in (
                 (paths.USED, colours.USED, True),
                 (paths.REJECTED, colours.REJECTED, False),
             ):
-                some = [
-                    point for view, point in chart.points.items() if (view in self.used) is wanted
+                shown = [
+                    point for view, point in chart.points.items() if (view in self.used) is is_used
                 ]
-                if some:
-                    points = rr.Points2D(np.vstack(some), colors=colour, radii=_POINT)
+                if shown:
+                    points = rr.Points2D(np.vstack(shown), colors=colour, radii=_POINT)
                     stream.log(f"{paths.COVERAGE}/{chart.name}/{name}", points, static=True)
             style = rr.Points2D.from_fields(
                 colors=colours.THIS_VIEW, radii=_MARK, draw_order=_ABOVE
@@ -142,12 +137,7 @@ class Charts:
             joint.log(stream)
 
     def log_marks(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Marks each view when that is looked at: all views of a chart as one message.
-
-        Args:
-            stream: Where to.
-            rows: The views' places in the session.
-        """
+        """Marks the current view, for all views, by row in the session, in one message a chart."""
         for chart in self.points:
             marked = [chart.points.get(view, np.zeros((0, 2))) for view in rows]
             points = rr.Points2D.columns(positions=np.vstack(marked))
@@ -166,26 +156,28 @@ class Charts:
 
 
 def _single_tensors(values: Sequence[float | None]) -> pa.Array:
-    """Tensors of one number each, or of none; rerun itself makes no batches of them."""
-    kind = rr.components.TensorDataBatch(np.zeros(1)).as_arrow_array().type
-    union, count = kind.field("buffer").type, len(values)
+    """Tensors of one number each, or of none; rerun itself cannot batch them."""
+    tensor_type = rr.components.TensorDataBatch(np.zeros(1)).as_arrow_array().type
+    union, count = tensor_type.field("buffer").type, len(values)
     sizes = np.array([value is not None for value in values], dtype=np.int64)
     numbers = pa.array([value for value in values if value is not None], pa.float64())
     children = [pa.nulls(0, field.type) for field in union]
-    place = [field.name for field in union].index("F64")
-    # By their buffers: what arrow makes itself may hold nulls, which is another type.
-    children[place] = _from_buffers(union[place].type, count, [_ends(sizes)], [numbers])
-    of_type, at = np.full(count, place, dtype=np.int8), np.arange(count, dtype=np.int32)
-    buffer = _from_buffers(union, count, [pa.py_buffer(of_type), pa.py_buffer(at)], children)
-    ones = pa.array(sizes, pa.uint64())
-    shape = _from_buffers(
-        kind.field("shape").type, count, [_ends(np.ones(count, dtype=np.int64))], [ones]
+    type_code = [field.name for field in union].index("F64")
+    # Built from buffers: arrays that arrow builds may hold nulls, which changes their type.
+    children[type_code] = _from_buffers(union[type_code].type, count, [_offsets(sizes)], [numbers])
+    type_codes, indices = np.full(count, type_code, dtype=np.int8), np.arange(count, dtype=np.int32)
+    buffer = _from_buffers(
+        union, count, [pa.py_buffer(type_codes), pa.py_buffer(indices)], children
     )
-    names = pa.nulls(count, kind.field("names").type)
-    return pa.StructArray.from_arrays([shape, names, buffer], fields=list(kind))
+    shapes = pa.array(sizes, pa.uint64())
+    shape = _from_buffers(
+        tensor_type.field("shape").type, count, [_offsets(np.ones(count, dtype=np.int64))], [shapes]
+    )
+    names = pa.nulls(count, tensor_type.field("names").type)
+    return pa.StructArray.from_arrays([shape, names, buffer], fields=list(tensor_type))
 
 
-def _ends(sizes: IntArray) -> pa.Buffer:
+def _offsets(sizes: IntArray) -> pa.Buffer:
     return pa.py_buffer(np.append(0, np.cumsum(sizes)).astype(np.int32))
 
 
@@ -196,7 +188,6 @@ def _from_buffers(
 
 
 def _joint_charts(session: Session, calibration: Calibration) -> tuple[JointChart, ...]:
-    """Charts of the used views that have joint angles."""
     residual_mm = {
         view.view: view.residual_mm
         for view in calibration.views

@@ -1,8 +1,8 @@
-"""How the facts of a session are kept in a recording, without loss.
+"""Lossless storage of a session's data in a recording.
 
-One static entity holds session.toml, the target and the robot; one row an observation holds its
-cells, the numbers as float64. The images are the bytes of their files, at the entity that shows
-them. Rerun itself detects no damage, so each record carries a SHA-256 seal of its content.
+One static entity holds session.toml, the target and the robot. Each view is one row, with its
+numbers as float64. Images are stored as the bytes of their files, at the entity that shows them.
+Rerun itself detects no damage, so each record carries a SHA-256 seal of its content.
 """
 
 import json
@@ -26,10 +26,10 @@ from visioncal.session import Session, Stream, View
 from visioncal.session.columns import is_number
 from visioncal.session.corners import CornerTable
 
-# 2: the writer's version, a mark behind the last view, and seals on the results; 3: streams;
-# 4: corners that another detector found; 5: images that are elsewhere.
+# 2: writer's version, end mark, seals on results; 3: streams; 4: corners of an external detector;
+# 5: images that are stored elsewhere.
 FORMAT = 5
-# In place of the number of views where that was not known from the start.
+# Stands for a number of views that was not known at the start.
 UNKNOWN = -1
 
 _BLOB = "EncodedImage:blob"
@@ -46,19 +46,20 @@ _MEDIA_TYPES = {
 
 @dataclass(frozen=True)
 class Header:
-    """What holds for all rows; an empty text stands for a document that the session lacks.
+    """Data that holds for all rows; an empty text stands for a document that the session lacks.
 
     Attributes:
-        rows: How many were announced; UNKNOWN where that was open.
-        columns: The columns of views.csv.
-        number_columns: Those of them that are kept as numbers.
-        session_toml: The content of session.toml.
-        target_json: The content of the target's file.
+        rows: Announced number of rows; UNKNOWN if it was not known.
+        columns: Columns of views.csv.
+        number_columns: Those of them that are stored as numbers.
+        session_toml: Content of session.toml.
+        target_json: Content of the target's file.
         robot_json: The robot's model.
-        streams: The names of the streams, and as many seals of them behind.
-        corners: The seal of the corners that another detector found; empty where there are none.
-        images: What there is of the images: empty for all, `thumbnail`, or `none`; their digests
+        streams: Names of the streams, followed by their seals.
+        corners: Seal of the external detector's corners; empty if there are none.
+        images: What is stored of the images: empty for all, `thumbnail`, or `none`; their digests
             are in the rows in any case.
+        are in the rows in any case.
     """
 
     rows: int
@@ -73,7 +74,7 @@ class Header:
 
     @classmethod
     def of(cls, session: Session, announced: int, images: str = "") -> "Header":
-        """Collects what holds for all rows of a session."""
+        """The header of a session."""
         return cls(
             announced,
             session.columns,
@@ -89,20 +90,19 @@ class Header:
     def seal(self) -> str:
         """SHA-256 of the content."""
         content = list(vars(self).values())
-        # Before the third format there were no streams, before the fourth no corners, and before
-        # the fifth all images.
+        # Seals of formats 2 to 4 do not cover the fields that later formats added.
         while not content[-1] and len(content) > len(vars(self)) - 3:
             content.pop()
         return sha256(json.dumps(content).encode())
 
     @property
     def stream_seals(self) -> dict[str, str]:
-        """The seals of the streams by their names."""
+        """Seals of the streams by name."""
         count = len(self.streams) // 2
         return dict(zip(self.streams[:count], self.streams[count:], strict=True))
 
     def cells(self, row: "StoredRow") -> list[str]:
-        """Writes a row as texts in the order of the columns, as `View.cell` does."""
+        """A row as texts in the order of the columns, as by `View.cell`."""
         numbers, texts = iter(row.numbers), iter(row.texts)
         cells = []
         for name in self.columns:
@@ -116,12 +116,12 @@ class Header:
 
 @dataclass(frozen=True)
 class StoredRow:
-    """One row as it is kept: NaN and empty text stand for cells that are not filled.
+    """A row as stored: NaN and empty text stand for empty cells.
 
     Attributes:
-        numbers: The cells of the number columns.
-        texts: The cells of the other columns.
-        image_sha256: Of the image's bytes; empty where there was no image.
+        numbers: Cells of the number columns.
+        texts: Cells of the other columns.
+        image_sha256: Digest of the image's bytes; empty without an image.
     """
 
     numbers: tuple[float, ...]
@@ -130,7 +130,7 @@ class StoredRow:
 
     @classmethod
     def of(cls, columns: tuple[str, ...], view: View, image_sha256: str) -> "StoredRow":
-        """Collects the cells of a view."""
+        """The stored row of a view."""
         return cls(
             tuple(view.numbers.get(name, math.nan) for name in columns if is_number(name)),
             tuple(view.cell(name) for name in columns if not is_number(name)),
@@ -144,7 +144,7 @@ class StoredRow:
 
 
 def log_header(stream: rr.RecordingStream, header: Header) -> None:
-    """Logs what holds for all views: session.toml, the columns, the target and the robot."""
+    """Logs session.toml, the columns, the target and the robot."""
     components = {
         "format": pa.array([FORMAT], pa.int64()),
         "visioncal": pa.array([__version__], pa.string()),
@@ -176,7 +176,7 @@ def log_row(stream: rr.RecordingStream, row: StoredRow) -> None:
 def log_image(stream: rr.RecordingStream, name: str, image: bytes | None) -> None:
     """Logs the bytes of an image's file at the stream's current time."""
     if image is None:
-        # Without this, the viewer would go on to show the image of the view before.
+        # Otherwise the viewer would keep showing the previous view's image.
         stream.log(paths.IMAGE, rr.Clear(recursive=False))
     else:
         media_type = _MEDIA_TYPES.get(PurePosixPath(name).suffix.lower())
@@ -184,7 +184,7 @@ def log_image(stream: rr.RecordingStream, name: str, image: bytes | None) -> Non
 
 
 def fact_seal(table: Stream | CornerTable) -> str:
-    """SHA-256 of what counts of a table."""
+    """SHA-256 of a table's content."""
     return sha256(json.dumps(table.fact()).encode())
 
 
@@ -199,7 +199,7 @@ def log_samples(recording: rr.RecordingStream, name: str, samples: Stream) -> No
 
 
 def log_corners(recording: rr.RecordingStream, corners: CornerTable) -> None:
-    """Logs the corners that another detector found, of all views."""
+    """Logs the corners of all views that an external detector found."""
     sigmas = np.zeros(0) if corners.sigmas_px is None else corners.sigmas_px
     components = {
         "views": pa.array(corners.views, pa.int64()),
@@ -212,34 +212,34 @@ def log_corners(recording: rr.RecordingStream, corners: CornerTable) -> None:
 
 
 def log_end(stream: rr.RecordingStream, rows: int) -> None:
-    """Logs that no row will follow."""
+    """Logs the end mark: no further row will follow."""
     components = {"rows": pa.array([rows], pa.int64())}
     stream.log(paths.END, rr.DynamicArchetype(_END, components=components), static=True)
 
 
-def values_of(batch: pa.RecordBatch, archetype: str, place: int = 0) -> dict[str, Any]:
-    """The components of an archetype that one row of a chunk has."""
+def values_of(batch: pa.RecordBatch, archetype: str, position: int = 0) -> dict[str, Any]:
+    """Components of an archetype in one row of a chunk."""
     columns = [name for name in batch.schema.names if name.startswith(f"{archetype}:")]
-    values = {name.removeprefix(f"{archetype}:"): batch.column(name)[place] for name in columns}
+    values = {name.removeprefix(f"{archetype}:"): batch.column(name)[position] for name in columns}
     return {name: value.as_py() for name, value in values.items() if value.is_valid}
 
 
 def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
-    """Reads the format and what holds for all rows; `path` names the recording in messages.
+    """Reads the format and the header; `path` names the recording in messages.
 
     Raises:
-        DataError: The format is newer than this version.
-        ValueError: It was changed after it was written.
+        DataError: The format is newer than this version supports.
+        ValueError: The header was changed after it was written.
     """
     values = values_of(batch, _HEADER)
-    (found,) = values["format"]
-    if found > FORMAT:
-        writer = values["visioncal"][0]
+    (version,) = values["format"]
+    if version > FORMAT:
+        writer_version = values["visioncal"][0]
         raise DataError(
-            f"{path} is a recording of format {found}, written by visioncal {writer}; this version "
-            f"({__version__}) reads formats up to {FORMAT}.",
+            f"{path} is a recording of format {version}, written by visioncal {writer_version}; "
+            f"this version ({__version__}) reads formats up to {FORMAT}.",
             culprits=[str(path)],
-            next_step=f"Install visioncal {writer} or newer.",
+            next_step=f"Install visioncal {writer_version} or newer.",
         )
     header = Header(
         int(values["rows"][0]),
@@ -254,14 +254,14 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
     )
     if header.seal() != values["seal"][0]:
         raise ValueError("the session's declaration was changed or damaged after it was written")
-    return found, header
+    return version, header
 
 
 def read_rows(batch: pa.RecordBatch) -> dict[int, StoredRow]:
-    """Reads those rows whose seal holds, by their place in the session."""
+    """Reads the rows whose seal is intact, by row number."""
     rows = {}
-    for place, index in enumerate(places(batch)):
-        stored = values_of(batch, _ROW, place)
+    for position, index in enumerate(places(batch)):
+        stored = values_of(batch, _ROW, position)
         row = StoredRow(
             tuple(stored.get("numbers") or ()), tuple(stored["texts"]), stored["image_sha256"][0]
         )
@@ -271,13 +271,13 @@ def read_rows(batch: pa.RecordBatch) -> dict[int, StoredRow]:
 
 
 def read_samples(batch: pa.RecordBatch) -> dict[str, Stream]:
-    """Reads streams by their names."""
+    """Reads streams by name."""
     streams = {}
-    for place in range(batch.num_rows):
+    for position in range(batch.num_rows):
         name, columns = (
-            batch.column(f"{_STREAM}:{name}")[place].as_py() for name in ("name", "columns")
+            batch.column(f"{_STREAM}:{name}")[position].as_py() for name in ("name", "columns")
         )
-        cells = batch.column(f"{_STREAM}:values")[place].values.to_numpy(zero_copy_only=False)
+        cells = batch.column(f"{_STREAM}:values")[position].values.to_numpy(zero_copy_only=False)
         values = np.array(cells, dtype=float).reshape(-1, len(columns))
         values.setflags(write=False)
         streams[name[0]] = Stream(tuple(columns), values)
@@ -285,10 +285,10 @@ def read_samples(batch: pa.RecordBatch) -> dict[str, Stream]:
 
 
 def read_corners(batch: pa.RecordBatch) -> CornerTable:
-    """Reads the corners that another detector found."""
-    found = values_of(batch, _CORNERS)
+    """Reads the corners that an external detector found."""
+    components = values_of(batch, _CORNERS)
     names = ("views", "points", "px", "targets", "sigmas_px")
-    views, points, px, targets, sigmas_px = (found.get(name) or () for name in names)
+    views, points, px, targets, sigmas_px = (components.get(name) or () for name in names)
     return CornerTable(
         np.array(views, dtype=np.int64),
         np.array(points, dtype=np.int64),
@@ -299,31 +299,31 @@ def read_corners(batch: pa.RecordBatch) -> CornerTable:
 
 
 def image_places(batch: pa.RecordBatch) -> dict[int, int]:
-    """Finds the rows of a chunk that hold images, by the place of their view in the session."""
+    """Positions of images in a chunk, by row number."""
     if _BLOB not in batch.schema.names:
         return {}
     blobs = batch.column(_BLOB)
-    return {row: place for place, row in enumerate(places(batch)) if blobs[place].is_valid}
+    return {row: position for position, row in enumerate(places(batch)) if blobs[position].is_valid}
 
 
-def image_at(batch: pa.RecordBatch, place: int) -> bytes:
-    """Reads the bytes of the image in one row of a chunk."""
-    blob = batch.column(_BLOB)[place].values[0]
+def image_at(batch: pa.RecordBatch, position: int) -> bytes:
+    """Reads the bytes of the image at one position of a chunk."""
+    blob = batch.column(_BLOB)[position].values[0]
     return bytes(blob.values.to_numpy().tobytes())
 
 
 def read_end(batch: pa.RecordBatch) -> int:
-    """Reads how many rows there are in all."""
+    """Reads the total number of rows."""
     return int(batch.column(f"{_END}:rows")[0].as_py()[0])
 
 
 def places(batch: pa.RecordBatch) -> list[int]:
-    """The places in the session of the views that a chunk's rows belong to."""
+    """Row numbers, in the session, of a chunk's rows."""
     return list(batch.column(paths.TIMELINE).to_pylist())
 
 
 def from_json(text: str) -> dict[str, Any] | None:
-    """Reads a document that the session may lack."""
+    """Reads a document; None for empty text."""
     return dict(json.loads(text)) if text else None
 
 

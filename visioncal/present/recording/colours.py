@@ -1,10 +1,10 @@
-"""The colours of a recording, the same in the cell, the images and the charts."""
+"""Colours of a recording, the same in the cell, the images and the charts."""
 
 USED = (70, 150, 250)
 REJECTED = (230, 70, 60)
-# Stands out from the others on dark and on light ground.
+# Contrasts with the others on dark and on light backgrounds.
 THIS_VIEW = (250, 165, 30)
-# By a verdict's status, as in the report.
+# By the verdict's status, as in the report.
 VERDICT = {"good": (26, 122, 56), "check": (226, 173, 69), "bad": (194, 43, 38)}
 
 LINK = (186, 193, 204)
@@ -14,9 +14,9 @@ PREDICTED = (80, 160, 255)
 RESIDUAL = (255, 70, 60)
 UNCERTAINTY = (190, 120, 255)
 
-# The arm as it was before it was calibrated.
+# The nominal arm, before its calibration.
 STATED = (190, 140, 60)
-# From the least to the largest sigma, evenly spaced, all of them bright on dark ground.
+# From the smallest to the largest sigma, evenly spaced, all bright on a dark background.
 SCALE = (
     (105, 65, 255),
     (150, 75, 240),
@@ -27,6 +27,6 @@ SCALE = (
     (245, 245, 80),
 )
 
-# Lines and words of the charts that viewers should not look at first.
+# Background lines and labels of charts.
 GRID = (128, 134, 146)
 WORDS = (140, 146, 158)

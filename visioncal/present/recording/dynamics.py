@@ -1,4 +1,4 @@
-"""The recording of a dynamic identification: the arm as it moved, and its torques."""
+"""Recording of a dynamic identification: the arm's motion and its torques over time."""
 
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -18,9 +18,9 @@ from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.writer import RecordingWriter
 from visioncal.present.torques import base_parameter_table, torque_note, torque_table
 
-# The flange's axes are so long [m].
+# Length of the flange's axes [m].
 _AXIS_M = 0.08
-# One motion follows the other after so long [s]; the arm is drawn so often [Hz].
+# Pause between motions [s], and the rate at which the arm is drawn [Hz].
 _PAUSE_S, _DRAWN_HZ = 1.0, 20.0
 _LINES = (
     (paths.MEASURED_TORQUE, colours.GRID, 2.5),
@@ -30,15 +30,15 @@ _LINES = (
 
 
 def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | None = None) -> None:
-    """Writes a session with what its torques determined: measured and predicted over time.
+    """Writes a session with its measured and predicted torques over time.
 
-    One motion follows the other on the timeline.
+    Motions follow one another on the timeline.
 
     Args:
         path: The `.rrd` to write; it appears whole or not at all. `read_session` gives the session
             back.
-        run: What was fitted and predicted.
-        blueprint: The layout to open it in.
+        run: Identified model and its predictions.
+        blueprint: Viewer layout of the recording.
 
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.
@@ -51,30 +51,29 @@ def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | No
         ) as writer,
     ):
         writer.add_session(session)
-        writer.draw(partial(_log, run))
+        writer.draw(partial(_log_run, run))
 
 
-def _log(run: Run, recorder: Recorder) -> None:
-    """Draws all motions."""
+def _log_run(run: Run, recorder: Recorder) -> None:
     recorder.stream.reset_time()
     _log_static(recorder.stream, run.identified, run.predictions)
-    begin_s = 0.0
+    start_s = 0.0
     for prediction in run.predictions:
-        times_s = begin_s + prediction.times_s - prediction.times_s[0]
+        times_s = start_s + prediction.times_s - prediction.times_s[0]
         _log_series(recorder.stream, prediction, times_s)
         _log_motion(recorder, run.identified, prediction, times_s)
-        begin_s = float(times_s[-1]) + _PAUSE_S
+        start_s = float(times_s[-1]) + _PAUSE_S
 
 
 def _log_static(
-    stream: rr.RecordingStream, identified: Identified, found: Sequence[Prediction]
+    stream: rr.RecordingStream, identified: Identified, predictions: Sequence[Prediction]
 ) -> None:
     log_frames(stream, _AXIS_M)
-    with_known = any(prediction.known_nm is not None for prediction in found)
+    has_known = any(prediction.known_nm is not None for prediction in predictions)
     for joint in range(identified.robot.joint_count):
         torque = paths.of_joint(paths.TORQUES, joint)
         for name, colour, width in _LINES:
-            if name != paths.KNOWN_TORQUE or with_known:
+            if name != paths.KNOWN_TORQUE or has_known:
                 line = rr.SeriesLines(colors=[colour], widths=[width], names=[name])
                 stream.log(f"{torque}/{name}", line, static=True)
         for group in (paths.TORQUE_ERRORS, paths.SPEEDS):
@@ -87,15 +86,15 @@ def _log_static(
         stream.log(entity, markdown(text), static=True)
 
 
-def _log_series(stream: rr.RecordingStream, found: Prediction, times_s: FloatArray) -> None:
-    # What is no number ends the line, so that the next motion begins another.
+def _log_series(stream: rr.RecordingStream, prediction: Prediction, times_s: FloatArray) -> None:
+    # NaN ends the line, so that the next motion starts a new one.
     index = rr.TimeColumn(paths.MOTION_TIMELINE, duration=[*times_s, times_s[-1] + 0.5 * _PAUSE_S])
     lines = {
-        paths.MEASURED_TORQUE: found.measured_nm,
-        paths.PREDICTED_TORQUE: found.predicted_nm,
-        paths.KNOWN_TORQUE: found.known_nm,
+        paths.MEASURED_TORQUE: prediction.measured_nm,
+        paths.PREDICTED_TORQUE: prediction.predicted_nm,
+        paths.KNOWN_TORQUE: prediction.known_nm,
     }
-    for joint in range(found.q.shape[1]):
+    for joint in range(prediction.q.shape[1]):
         torque = paths.of_joint(paths.TORQUES, joint)
         columns = {
             f"{torque}/{name}": values[:, joint]
@@ -103,24 +102,23 @@ def _log_series(stream: rr.RecordingStream, found: Prediction, times_s: FloatArr
             if values is not None
         }
         columns[paths.of_joint(paths.TORQUE_ERRORS, joint)] = (
-            found.measured_nm - found.predicted_nm
+            prediction.measured_nm - prediction.predicted_nm
         )[:, joint]
-        columns[paths.of_joint(paths.SPEEDS, joint)] = found.dq[:, joint]
+        columns[paths.of_joint(paths.SPEEDS, joint)] = prediction.dq[:, joint]
         for entity, values in columns.items():
             scalars = rr.Scalars.columns(scalars=[*values, np.nan])
             stream.send_columns(entity, [index], scalars)
 
 
 def _log_motion(
-    recorder: Recorder, identified: Identified, found: Prediction, times_s: FloatArray
+    recorder: Recorder, identified: Identified, prediction: Prediction, times_s: FloatArray
 ) -> None:
-    """Draws the arm, not more often than eyes can follow."""
     steps = np.floor((times_s - times_s[0]) * _DRAWN_HZ)
     rows = np.flatnonzero(np.diff(steps, prepend=-1.0) > 0.0)
     recorder.stream.reset_time()
     for row in rows:
         recorder.stream.set_time(paths.MOTION_TIMELINE, duration=float(times_s[row]))
-        log_arm(recorder.stream, identified.robot.link_frames(found.q[row]))
+        log_arm(recorder.stream, identified.robot.link_frames(prediction.q[row]))
     recorder.stream.reset_time()
     recorder.keep()
 

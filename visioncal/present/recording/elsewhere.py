@@ -1,4 +1,4 @@
-"""Images that a recording has no more than the digests of, or faint copies to look at."""
+"""Images of a recording that stores only their digests, or low-quality copies for display."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.session.images import ImageStore
 from visioncal.vision.finders.imaging import decode_image
 
-# Of the full size, so that corners lie over it where they were found: a twentieth of the bytes.
+# At full size, so that overlaid corners fit: a twentieth of the bytes.
 _FAINT_QUALITY = 15
 
 
@@ -21,9 +21,9 @@ class ImagesElsewhere(ImageStore):
 
     Attributes:
         path: The recording.
-        kept: What it has of them: `thumbnail` or `none`.
-        digests: SHA-256 of the images' bytes by name.
-        pictures: Reads the faint copies, by the names of their images.
+        kept: What the recording stores of them: `thumbnail` or `none`.
+        digests: SHA-256 of the images' bytes, by name.
+        pictures: Readers of the low-quality copies, by image name.
     """
 
     path: Path
@@ -32,7 +32,7 @@ class ImagesElsewhere(ImageStore):
     pictures: Mapping[str, Callable[[], bytes]]
 
     def read(self, path: str) -> bytes:
-        """Refuses: the image is not here.
+        """Raises an error: the image is not in the recording.
 
         Raises:
             DataError: Always.
@@ -44,22 +44,22 @@ class ImagesElsewhere(ImageStore):
         )
 
     def sha256(self, path: str) -> str:
-        """Digest of the bytes of an image; empty where there was none."""
+        """Digest of an image's bytes; empty without an image."""
         return self.digests.get(path, "")
 
     def shown(self, path: str) -> bytes | None:
-        """The faint copy of an image; None where there is none."""
+        """Low-quality copy of an image; None if there is none."""
         return self.pictures[path]() if path in self.pictures else None
 
     def absence(self, path: str) -> str:
-        """Says why there is no such image to read."""
+        """Why the image cannot be read, in words."""
         if path not in self.digests:
             return "is missing"
         return f"is not in {self.path.name}, which was written with --images {self.kept}"
 
 
 def faint_picture(image: bytes) -> bytes | None:
-    """A JPEG to look at, of the size of an image; None where its bytes are none."""
+    """Low-quality JPEG at an image's size; None if the bytes are no image."""
     pixels = decode_image(image, colour=True)
     if isinstance(pixels, str):
         return None

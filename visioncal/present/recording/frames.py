@@ -1,12 +1,12 @@
-"""The messages of an `.rrd` file, found without reading what is in them, and chunks unpacked.
+"""Locates the messages of an `.rrd` file without reading their content, and unpacks chunks.
 
-An `.rrd` is a header of 12 bytes and then messages: kind and length, 8 bytes each with the lowest
-first, and a payload. A finished file ends with a message of kind LAST, which shows rerun where its
-chunks are, and 32 bytes that say where that message is. A writer that was killed leaves none of
-these; a file that was cut ends within a message.
+An `.rrd` is a header of 12 bytes followed by messages: kind and length, 8 bytes each in
+little-endian order, and a payload. A finished file ends with a message of kind LAST, which tells
+rerun where its chunks are, and 32 bytes that give the position of that message. A writer that was
+killed leaves none of these; a truncated file ends within a message.
 
-Chunks are read here rather than by rerun, whose reader takes whole files and ends the process on
-some damaged ones. The payload of a chunk is the message `ArrowMsg` of rerun's Protocol Buffers.
+Chunks are not read with rerun's reader, which takes whole files and ends the process on some
+damaged ones. The payload of a chunk is the message `ArrowMsg` of rerun's Protocol Buffers.
 """
 
 import struct
@@ -27,17 +27,17 @@ _START_BYTES, _CLOSING_BYTES = 12, 12
 _HEAD = struct.Struct("<QQ")
 _COMPRESSION, _UNPACKED_SIZE, _BODY = 2, 3, 5
 _LZ4 = 2
-# No block of LZ4 unpacks to more than this many times its size.
+# LZ4 expands a block to at most this many times its size.
 _LZ4_RATIO = 255
 
 
 @dataclass(frozen=True)
 class MessageFrame:
-    """One message.
+    """Position of one message in the file.
 
     Attributes:
         kind: LAST, STORE_INFO, CHUNK or ACTIVATION (of a layout).
-        offset: Where its payload begins in the file.
+        offset: Offset of its payload in the file.
         size: Length of the payload [bytes].
     """
 
@@ -47,21 +47,20 @@ class MessageFrame:
 
     @property
     def end(self) -> int:
-        """Where the next message begins."""
+        """Offset of the next message."""
         return self.offset + self.size
 
 
 @dataclass(frozen=True)
 class Scan:
-    """The whole messages of a file.
+    """The complete messages of a file.
 
     Attributes:
         path: The file.
-        frames: Its messages in its order, up to the first that is cut, without the one of kind
-            LAST.
-        end: Where the last of them ends.
-        finished: Whether the file has its end, as rerun writes it.
-        cut: Whether it goes on behind `end` without being finished.
+        frames: Messages in file order up to the first truncated one, without the one of kind LAST.
+        end: Offset behind the last of them.
+        finished: Whether the file has rerun's closing bytes.
+        cut: Whether data follows `end` although the file is not finished.
     """
 
     path: Path
@@ -72,16 +71,16 @@ class Scan:
 
 
 def scan(path: Path) -> Scan:
-    """Finds the messages of a file.
+    """Locates the messages of a file.
 
     Raises:
-        DataError: The file is missing or no `.rrd`; or it is finished and yet the head of a message
-            does not lead to the next one.
+        DataError: The file is missing or no `.rrd`, or it is finished but a message's length is
+            wrong.
     """
-    why_not = absence(path)
-    if why_not:
+    missing = absence(path)
+    if missing:
         raise DataError(
-            f"{path} {why_not}.", culprits=[str(path)], next_step="Check the path and its spelling."
+            f"{path} {missing}.", culprits=[str(path)], next_step="Check the path and its spelling."
         )
     try:
         size = path.stat().st_size
@@ -97,11 +96,11 @@ def scan(path: Path) -> Scan:
             closed = file.read().startswith(_CLOSING_MAGIC)
     except OSError as error:
         raise _unreadable(path, error) from error
-    led_to_last = bool(frames) and frames[-1].kind == LAST
-    if led_to_last:
+    reached_last = bool(frames) and frames[-1].kind == LAST
+    if reached_last:
         frames.pop()
     end = frames[-1].end if frames else _START_BYTES
-    if closed and not led_to_last:
+    if closed and not reached_last:
         raise DataError(
             f"{path} is damaged: the length of the message at byte {end} was changed after it was "
             "written.",
@@ -112,24 +111,20 @@ def scan(path: Path) -> Scan:
 
 
 def _walk(file: BinaryIO, size: int) -> Iterator[MessageFrame]:
-    """Finds whole messages; stops behind the first of kind LAST."""
-    at = _START_BYTES
-    while at + _HEAD.size <= size:
-        file.seek(at)
-        frame = _frame(file.read(_HEAD.size), at)
-        # A loss of power can leave zeros, which look like an empty message of kind LAST.
+    """Yields complete messages, up to the first of kind LAST."""
+    offset = _START_BYTES
+    while offset + _HEAD.size <= size:
+        file.seek(offset)
+        kind, length = _HEAD.unpack(file.read(_HEAD.size))
+        frame = MessageFrame(kind, offset + _HEAD.size, length)
+        # Zeros, as after a power loss, would read as an empty message of kind LAST.
         empty_last = frame.kind == LAST and not frame.size
         if frame.kind > ACTIVATION or frame.end > size or empty_last:
             return
         yield frame
         if frame.kind == LAST:
             return
-        at = frame.end
-
-
-def _frame(head: bytes, at: int) -> MessageFrame:
-    kind, length = _HEAD.unpack(head)
-    return MessageFrame(kind, at + _HEAD.size, length)
+        offset = frame.end
 
 
 def read_payload(path: Path, frame: MessageFrame) -> bytes:
@@ -155,22 +150,22 @@ def read_payload(path: Path, frame: MessageFrame) -> bytes:
 
 def _unreadable(path: Path, error: OSError) -> DataError:
     missing = isinstance(error, FileNotFoundError)
-    what = "does not exist" if missing else f"cannot be read: {error.strerror or error}"
+    problem = "does not exist" if missing else f"cannot be read: {error.strerror or error}"
     return DataError(
-        f"{path} {what}.",
+        f"{path} {problem}.",
         culprits=[str(path)],
         next_step="Check the path and its spelling." if missing else "",
     )
 
 
 def record_batch(payload: bytes, entities: Container[str]) -> tuple[str, pa.RecordBatch] | None:
-    """Unpacks a chunk, if it is of one of the entities that are asked for.
+    """Unpacks a chunk if it belongs to one of the given entities.
 
     Returns:
-        The path of its entity, and its rows; None where it is of another entity.
+        Path of its entity, and its rows; None for another entity.
 
     Raises:
-        ValueError: It is damaged.
+        ValueError: The chunk is damaged.
     """
     try:
         numbers, fields = _fields(payload)
@@ -192,36 +187,36 @@ def record_batch(payload: bytes, entities: Container[str]) -> tuple[str, pa.Reco
 
 
 def _fields(message: bytes) -> tuple[dict[int, int], dict[int, bytes]]:
-    """Splits a message of Protocol Buffers into its integers and its other fields, by number."""
+    """Splits a Protocol Buffers message into integers and other fields, by field number."""
     numbers: dict[int, int] = {}
     fields: dict[int, bytes] = {}
-    at = 0
-    while at < len(message):
-        key, at = _varint(message, at)
+    position = 0
+    while position < len(message):
+        key, position = _varint(message, position)
         number, wire_type = key >> 3, key & 7
         if wire_type == 0:
-            numbers[number], at = _varint(message, at)
+            numbers[number], position = _varint(message, position)
             continue
         if wire_type == 2:
-            size, at = _varint(message, at)
+            size, position = _varint(message, position)
         elif wire_type in (1, 5):
             size = 8 if wire_type == 1 else 4
         else:
             raise ValueError(f"a message has a field of wire type {wire_type}")
-        if at + size > len(message):
+        if position + size > len(message):
             raise ValueError("a message ends within a field")
-        fields[number] = message[at : at + size]
-        at += size
+        fields[number] = message[position : position + size]
+        position += size
     return numbers, fields
 
 
-def _varint(message: bytes, at: int) -> tuple[int, int]:
+def _varint(message: bytes, position: int) -> tuple[int, int]:
     value = 0
     for shift in range(0, 64, 7):
-        if at >= len(message):
+        if position >= len(message):
             raise ValueError("a message ends within a number")
-        value |= (message[at] & 0x7F) << shift
-        at += 1
-        if message[at - 1] < 0x80:
-            return value, at
+        value |= (message[position] & 0x7F) << shift
+        position += 1
+        if message[position - 1] < 0x80:
+            return value, position
     raise ValueError("a number has more than 64 bits")

@@ -1,4 +1,4 @@
-"""A recording at work, drawn view by view."""
+"""Live drawing of a session while it is recorded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,25 +16,25 @@ from visioncal.present.recording.markdown import markdown
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
 from visioncal.robot import Robot
 
-# Sizes of what is drawn [m].
+# Sizes of axes, lines and points [m].
 _AXIS_M, _LINE_M, _POINT_M = 0.08, 0.001, 0.003
-# Pictures go through a socket while the arm waits; nobody measures in them.
+# JPEG quality: pictures are for display only, and the arm waits for their transfer.
 _JPEG = 80
 
 
 @dataclass(frozen=True, eq=False)
 class LiveCell:
-    """What is drawn of a cell besides its views.
+    """Content of a live drawing that is the same for all views.
 
     Attributes:
         mount: Where the camera is.
         target: The board.
         resolution: (width, height) of the images [px].
-        robot: The arm; None where its model is not known.
-        camera: The lens; None where it is not known.
-        x: (4, 4) where the camera is guessed to be, on the flange or in the base [m]; None where
-            that is not known, and neither camera nor board are drawn.
-        z: (4, 4) where the board is guessed to be, in the base or on the flange [m].
+        robot: Model of the arm; None where unknown.
+        camera: Intrinsics; None where unknown.
+        x: (4, 4) estimated pose of the camera, on the flange or in the base [m]; None where
+            unknown, and neither camera nor board are drawn.
+        z: (4, 4) estimated pose of the board, in the base or on the flange [m].
     """
 
     mount: Mount
@@ -48,16 +48,16 @@ class LiveCell:
 
 @dataclass(frozen=True, eq=False)
 class LiveView:
-    """What is drawn of a view.
+    """Content of a live drawing for one view.
 
     Attributes:
         view: Its number.
         image: (h, w) or (h, w, 3) blue, green, red.
-        px: (n, 2) the corners in it [px].
+        px: (n, 2) detected corners [px].
         base_from_flange: (4, 4) [m].
-        q: (n,) joint angles [rad]; None where they are not known.
-        sigma_mm: What is predicted so far; None where nothing is [mm].
-        note: In Markdown.
+        q: (n,) joint angles [rad]; None where unknown.
+        sigma_mm: Sigma predicted from the views so far [mm]; None where undetermined.
+        note: Text in Markdown.
     """
 
     view: int
@@ -71,15 +71,15 @@ class LiveView:
 
 @dataclass(eq=False)
 class LiveDrawing:
-    """Draws a recording into a stream of rerun."""
+    """Draws a session into a rerun stream while it is recorded."""
 
     stream: rr.RecordingStream
     cell: LiveCell
     _px: dict[int, FloatArray] = field(default_factory=dict)
-    _places: list[FloatArray] = field(default_factory=list)
+    _flange_poses: list[FloatArray] = field(default_factory=list)
 
     def begin(self) -> None:
-        """Draws what stands still."""
+        """Draws the static part."""
         stream, cell = self.stream, self.cell
         more: list[tuple[str, str, float]] = []
         if cell.x is not None:
@@ -91,7 +91,7 @@ class LiveDrawing:
             log_image_plane(stream, cell.camera, 1.0)
 
     def draw(self, view: LiveView) -> None:
-        """Draws a view, and all so far with it."""
+        """Draws a view, and the charts of all views so far."""
         stream = self.stream
         stream.set_time(paths.TIMELINE, sequence=view.view)
         self._draw_image(view)
@@ -110,7 +110,7 @@ class LiveDrawing:
         model = rr.ColorModel.L if view.image.ndim == 2 else rr.ColorModel.BGR
         picture = rr.Image(view.image, color_model=model).compress(jpeg_quality=_JPEG)
         self.stream.log(paths.IMAGE, in_image, picture)
-        # Rerun counts from the image's corner, not from the first pixel's centre.
+        # Rerun's origin is the image's corner, not the first pixel's centre.
         points = rr.Points2D(view.px + 0.5, colors=colours.DETECTED, radii=rr.Radius.ui_points(2.5))
         self.stream.log(paths.DETECTED, in_image, points)
 
@@ -119,25 +119,25 @@ class LiveDrawing:
         log_pose(stream, paths.FLANGE, paths.FLANGE_FRAME, flange)
         if cell.robot is not None and view.q is not None:
             log_arm(stream, cell.robot.link_frames(view.q))
-        self._places.append(flange)
+        self._flange_poses.append(flange)
         in_base = rr.CoordinateFrame(paths.BASE_FRAME)
         points = rr.Points3D(
-            [place[:3, 3] for place in self._places], colors=colours.USED, radii=_POINT_M
+            [pose[:3, 3] for pose in self._flange_poses], colors=colours.USED, radii=_POINT_M
         )
         stream.log(f"{paths.STOPS}/{paths.USED}", in_base, points)
         if cell.x is None or cell.z is None:
             return
         in_hand = cell.mount == "eye-in-hand"
-        placed = (flange @ cell.x, cell.z) if in_hand else (cell.x, flange @ cell.z)
-        log_pose(stream, paths.CAMERA, paths.CAM_FRAME, placed[0])
-        log_pose(stream, paths.TARGET, paths.TARGET_FRAME, placed[1])
-        strips = [array for pose in self._places for array in self._carried(pose)]
+        poses = (flange @ cell.x, cell.z) if in_hand else (cell.x, flange @ cell.z)
+        log_pose(stream, paths.CAMERA, paths.CAM_FRAME, poses[0])
+        log_pose(stream, paths.TARGET, paths.TARGET_FRAME, poses[1])
+        strips = [line for pose in self._flange_poses for line in self._carried(pose)]
         if strips:
             lines = rr.LineStrips3D(strips, colors=colours.USED, radii=_LINE_M)
             stream.log(f"{paths.STOPS}/{paths.USED}/carried", in_base, lines)
 
     def _carried(self, flange: FloatArray) -> Sequence[FloatArray]:
-        """The camera's frustum or the board's rim at a place of the flange, (k, 3) lines."""
+        """(k, 3) lines of the camera's frustum or the board's rim, at a flange pose."""
         cell = self.cell
         if cell.mount == "eye-in-hand":
             shapes = [] if cell.camera is None else frustum(cell.camera, SMALL_FRUSTUM)

@@ -1,4 +1,4 @@
-"""Markdown as the viewer shows it: text, facts and tables."""
+"""Text, facts and tables as Markdown for the viewer."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -7,17 +7,17 @@ import rerun as rr
 
 from visioncal.present.tables import Fact, Table
 
-# Rows that are marked so stand out.
+# Marks of rows that are set in bold.
 _BOLD = ("taken", "sure")
 
 
 def plain(text: str) -> str:
-    """Escapes text from outside: the viewer would load pictures and follow links in Markdown."""
+    """Escapes text from outside: in Markdown, the viewer would load pictures and follow links."""
     return re.sub(r"([\\`*_{}\[\]()#+\-.!|<>~&])", r"\\\1", " ".join(text.split()))
 
 
 def markdown(text: str) -> rr.TextDocument:
-    """A text that viewers render as Markdown."""
+    """A text document that viewers render as Markdown."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 
@@ -29,12 +29,12 @@ def fact_lines(facts: Iterable[Fact]) -> Iterator[str]:
 
 
 def table_lines(table: Table | None) -> Iterator[str]:
-    """A table, behind an empty line; nothing of none."""
+    """A table, after an empty line; nothing for None."""
     if table is None:
         return
     yield ""
     yield _line(map(plain, table.titles))
-    yield _line("---" if at in table.words else "---:" for at in range(len(table.titles)))
+    yield _line("---" if column in table.words else "---:" for column in range(len(table.titles)))
     for row in table.rows:
         first, *rest = map(plain, row.cells)
         is_bold = row.mark in _BOLD or not rest

@@ -1,4 +1,4 @@
-"""Text and plots of a result: the verdict, its figures, and the residuals of every view."""
+"""Texts and plots of a result: verdict, figures, and residuals of every view."""
 
 import math
 from collections import defaultdict
@@ -36,14 +36,14 @@ _MARKS = (
         6.0,
     ),
 )
-# The scale of a plot ends here, in largest residuals of the used views.
+# End of a plot's scale, as a multiple of the used views' largest residual.
 _ROOM = 1.25
 
 
 def log_static(
     stream: rr.RecordingStream, calibration: Calibration, targets: Mapping[str, Target]
 ) -> None:
-    """Logs the verdict, what else is to be said, and how the residuals' plots look."""
+    """Logs the verdict, further texts, and the style of the residual plots."""
     log_verdict(stream, calibration.verdict, verdict_markdown(calibration))
     for entity, text in (
         (paths.FIGURES, figures_markdown(calibration, targets)),
@@ -63,7 +63,7 @@ def log_static(
 
 
 def log_verdict(stream: rr.RecordingStream, verdict: Verdict, text: str) -> None:
-    """Logs a verdict's text, and a point in its colour: a view of nothing says that it is empty."""
+    """Logs a verdict's text, and a point in its colour, as an empty view would say it is empty."""
     stream.log(paths.VERDICT, markdown(text), static=True)
     point = rr.Points2D([[0.0, 0.0]], colors=colours.VERDICT[verdict.status])
     stream.log(paths.VERDICT_STRIP, point, static=True)
@@ -75,20 +75,13 @@ def log_views(
     rows: Mapping[int, View],
     unposed: Mapping[int, Sequence[str]] = MappingProxyType({}),
 ) -> None:
-    """Logs the views' residuals and what became of them.
-
-    Args:
-        stream: Where to.
-        sights: What became of each view, by its place in the session.
-        rows: All views, by their places.
-        unposed: The robots whose pose is not known at a view, by its place.
-    """
+    """Logs residuals and status of the views, by row; `unposed` are robots without a pose."""
     by_seer: dict[str, dict[int, ViewResult]] = defaultdict(dict)
     for row, sight in sights.items():
         by_seer[sight.seer][row] = sight
-    for seer, mine in by_seer.items():
+    for seer, seer_sights in by_seer.items():
         for plot, attribute in _PLOTS.items():
-            _log_residuals(stream, paths.part_of(plot, seer), mine, attribute)
+            _log_residuals(stream, paths.part_of(plot, seer), seer_sights, attribute)
     texts = [
         view_markdown(sights[row], () if view.is_of_lens else unposed.get(row, ()))
         if row in sights
@@ -102,16 +95,16 @@ def log_views(
 def _log_residuals(
     stream: rr.RecordingStream, plot: str, sights: Mapping[int, ViewResult], attribute: str
 ) -> None:
-    """Logs a residual of the views, by their places in the session."""
+    """Logs one kind of residual of the views, by row."""
     values = {row: getattr(sight, attribute) for row, sight in sights.items()}
     used = [value for row, value in values.items() if value is not None and sights[row].used]
-    # Views that were not used must not flatten the others.
+    # Views that were not used must not compress the scale.
     end, marks = _ROOM * max(used, default=math.inf), defaultdict[str, dict[int, float]](dict)
     for row, value in values.items():
         if sights[row].used:
             if value is not None:
                 marks[paths.USED][row] = float(value)
-        # Marked on the axis where it is unknown: a gap would look as if there were no such view.
+        # Marked on the axis if unknown: a gap would suggest that there is no such view.
         elif (value or 0.0) > end:
             marks[paths.BEYOND][row] = end
         else:
@@ -121,23 +114,25 @@ def _log_residuals(
 
 
 def log_scalars(stream: rr.RecordingStream, entity: str, values: Mapping[int, float]) -> None:
-    """Logs a number of each of some views, by their places in the session."""
+    """Logs one number per view, by row."""
     if values:
         send_rows(stream, entity, values, rr.Scalars.columns(scalars=list(values.values())))
 
 
 def verdict_markdown(calibration: Calibration) -> str:
-    """The verdict with its reasons, the transforms, and the views that were left out."""
+    """Verdict with its reasons, the transforms, and the views left out."""
     return "\n".join(_verdict_lines(calibration))
 
 
 def _verdict_lines(calibration: Calibration) -> Iterator[str]:
-    verdict, cell, known = calibration.verdict, calibration.cell, calibration.budget
+    verdict, cell, budget = calibration.verdict, calibration.cell, calibration.budget
     yield from (f"# {verdict.headline}", "", *_list(verdict.top))
     if calibration.next_steps:
         yield from ("", "## What to do next", "")
-    for at, step in enumerate(calibration.next_steps, 1):
-        yield f"{at}. {plain(step.words)}" + (f"  \n   `{step.command}`" if step.command else "")
+    for number, step in enumerate(calibration.next_steps, 1):
+        yield f"{number}. {plain(step.words)}" + (
+            f"  \n   `{step.command}`" if step.command else ""
+        )
     for name, frame in calibration.frames.items():
         if frame.verdict.status != "good":
             yield f"- {plain(name)}: {frame.verdict.headline}, see Tools and fixtures."
@@ -148,8 +143,8 @@ def _verdict_lines(calibration: Calibration) -> Iterator[str]:
         yield from _list(": ".join(row.cells) for row in facts.moved_table(cell).rows)
         yield f"The frame of the cell is that of {plain(cell.reference)}."
     yield from table_lines(facts.edge_table(calibration.placed))
-    if known is not None:
-        yield from ("", plain(" ".join(facts.summary(calibration, known))))
+    if budget is not None:
+        yield from ("", plain(" ".join(facts.summary(calibration, budget))))
     used = sum(view.used for view in calibration.views)
     yield from ("", f"{used} of {len(calibration.views)} views used.")
     yield from _list(suspects.words for suspects in advice.left_out(calibration.views))
@@ -162,29 +157,24 @@ def _list(sentences: Iterable[str]) -> Iterator[str]:
 def figures_markdown(
     calibration: Calibration, targets: Mapping[str, Target] = MappingProxyType({})
 ) -> str:
-    """The residuals of the fit and of what it had not seen, the noise, and what else was found.
-
-    Args:
-        calibration: The result.
-        targets: The boards by name, as far as they are known.
-    """
+    """Residuals of fit and validation, noise, uncertainty budget, boards and arms."""
     return "\n".join(_figure_lines(calibration, targets))
 
 
-def _figure_lines(found: Calibration, targets: Mapping[str, Target]) -> Iterator[str]:
-    yield from ("# Residuals, rms", *table_lines(facts.residual_table(found)))
-    yield from table_lines(facts.pair_table(found))
-    yield from ("", "# Noise, per axis", "", *fact_lines(facts.noise_facts(found)))
-    sources, known = facts.source_table(found), found.budget
+def _figure_lines(calibration: Calibration, targets: Mapping[str, Target]) -> Iterator[str]:
+    yield from ("# Residuals, rms", *table_lines(facts.residual_table(calibration)))
+    yield from table_lines(facts.pair_table(calibration))
+    yield from ("", "# Noise, per axis", "", *fact_lines(facts.noise_facts(calibration)))
+    sources, budget = facts.source_table(calibration), calibration.budget
     if sources is not None:
         yield from ("", "# Where the uncertainty comes from", "")
-        if known is not None:
-            yield plain(" ".join(facts.summary(found, known)))
+        if budget is not None:
+            yield plain(" ".join(facts.summary(calibration, budget)))
         yield from table_lines(sources)
-    for name, board in found.named_boards.items():
-        if said := facts.board_facts(found, board, targets.get(name)):
-            yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(said))
-    for name, arm in found.by_name.robots.items():
+    for name, board in calibration.named_boards.items():
+        if board_lines := facts.board_facts(calibration, board, targets.get(name)):
+            yield from ("", f"# Board {plain(name)}".strip(), "", *fact_lines(board_lines))
+    for name, arm in calibration.by_name.robots.items():
         of = plain(facts.of(name))
         if arm.arm_errors is not None:
             yield from ("", f"# Arm{of}", "", *fact_lines(arms.error_facts(arm.arm_errors)))
@@ -193,18 +183,13 @@ def _figure_lines(found: Calibration, targets: Mapping[str, Target]) -> Iterator
 
 
 def solvers_markdown(calibration: Calibration) -> str:
-    """A table of the solvers: their residuals, and how far their edges are from the result's."""
+    """Comparison of the solvers: residuals, and distances from the result."""
     table = facts.solver_table(calibration)
     return "" if table is None else "\n".join(["# Solvers compared", *table_lines(table)])
 
 
 def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
-    """What became of one view.
-
-    Args:
-        sight: That.
-        unposed: The robots without a pose at its stop.
-    """
+    """Status and residuals of one view; `unposed` are the robots without a pose at its stop."""
     state = "used" if sight.used else "not used"
     lines = [f"# View {sight.view}: {state} ([report](report.html#view-{sight.view}))", ""]
     if sight.reason:
@@ -214,14 +199,14 @@ def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
         ("position residual", sight.residual_mm, "mm"),
         ("orientation residual", sight.residual_deg, "deg"),
     )
-    known = [] if sight.corners is None else [f"corners {sight.corners}"]
-    known += [
+    parts = [] if sight.corners is None else [f"corners {sight.corners}"]
+    parts += [
         f"{label} {significant(value, 3)} {unit}"
         for label, value, unit in figures
         if value is not None
     ]
-    of = f"Stop {sight.stop}, {plain(sight.seer)} of {plain(sight.seen)}: " if sight.seer else ""
-    lines.append(of + ", ".join(known))
+    pair = f"Stop {sight.stop}, {plain(sight.seer)} of {plain(sight.seen)}: " if sight.seer else ""
+    lines.append(pair + ", ".join(parts))
     if unposed:
         names = ", ".join(map(plain, unposed))
         lines += ["", f"The pose of {names} is not known at this stop: drawn as it was last."]
@@ -229,13 +214,13 @@ def view_markdown(sight: ViewResult, unposed: Sequence[str] = ()) -> str:
 
 
 def _unseen_markdown(view: View) -> str:
-    """A view in which nothing of the cell was observed."""
-    what = "for the lens alone" if view.is_of_lens else "it has a robot's pose alone"
-    return f"# View {view.number}\n\n{what}"
+    """Text of a view without any observation of the cell."""
+    reason = "for the lens alone" if view.is_of_lens else "it has a robot's pose alone"
+    return f"# View {view.number}\n\n{reason}"
 
 
 def tools_markdown(calibration: Calibration) -> str:
-    """All tools and fixtures, each with its verdict, its pose, its observations and its figures."""
+    """All tools and fixtures: verdict, pose, observations and figures."""
     return "\n".join(chain.from_iterable(_tool(*frame) for frame in calibration.frames.items()))
 
 
@@ -253,7 +238,7 @@ def _tool(name: str, frame: Frame) -> Iterator[str]:
 
 
 def arms_markdown(calibration: Calibration) -> str:
-    """What is known of each arm of which levels were tried, and of its drift."""
+    """Model level and drift of each arm."""
     return "\n".join(
         chain.from_iterable(
             _arm(facts.of(name), arm) for name, arm in calibration.by_name.robots.items()
@@ -261,24 +246,24 @@ def arms_markdown(calibration: Calibration) -> str:
     )
 
 
-def _arm(of: str, found: ArmSections) -> Iterator[str]:
-    if found.arm is not None:
-        yield from (f"# The arm{plain(of)}", "", *_levels(found.arm))
-    if found.arm is not None and found.elastic is not None:
-        yield from ("", "## Joints that bend", *table_lines(arms.spring_table(found.elastic)))
-        yield from ("", *fact_lines(arms.spring_facts(found.elastic)))
-    if found.thermal is not None:
+def _arm(of: str, sections: ArmSections) -> Iterator[str]:
+    if sections.arm is not None:
+        yield from (f"# The arm{plain(of)}", "", *_levels(sections.arm))
+    if sections.arm is not None and sections.elastic is not None:
+        yield from ("", "## Joints that bend", *table_lines(arms.spring_table(sections.elastic)))
+        yield from ("", *fact_lines(arms.spring_facts(sections.elastic)))
+    if sections.thermal is not None:
         yield from ("", f"# Drift with temperature{plain(of)}", "")
-        yield plain(arms.drift_sentence(found.thermal))
-        yield from table_lines(arms.drift_table(found.thermal))
+        yield plain(arms.drift_sentence(sections.thermal))
+        yield from table_lines(arms.drift_table(sections.thermal))
 
 
-def _levels(found: ArmResult) -> Iterator[str]:
-    """Which level was taken and why, and what is known of the arm then."""
-    yield from (f"{plain(sentence)}\n" for sentence in arms.arm_sentences(found))
-    yield from table_lines(arms.level_table(found))
+def _levels(arm: ArmResult) -> Iterator[str]:
+    """Model level with its reason, parameters, and observability of an arm."""
+    yield from (f"{plain(sentence)}\n" for sentence in arms.arm_sentences(arm))
+    yield from table_lines(arms.level_table(arm))
     yield from ("", "Ratio: twice the gain in log-likelihood over the arm as stated.")
-    if found.left_out:
+    if arm.left_out:
         yield ""
         yield (
             "The plots show the views that were left out in turn, and as diamonds those that the "
@@ -286,15 +271,15 @@ def _levels(found: ArmResult) -> Iterator[str]:
             "The orange line in the cell is the arm as stated, its departure magnified as its "
             "entity says."
         )
-    if found.parameters:
-        yield from ("", "## Parameters", "", plain(arms.parameter_note(found)))
-        for table in arms.parameter_tables(found):
+    if arm.parameters:
+        yield from ("", "## Parameters", "", plain(arms.parameter_note(arm)))
+        for table in arms.parameter_tables(arm):
             yield from table_lines(table)
-    if found.observability is not None:
+    if arm.observability is not None:
         yield from ("", "## What the stops determine", "")
-        yield from fact_lines(arms.identifiability_facts(found))
-    yield from _list(found.not_determined or ())
-    if found.stops:
+        yield from fact_lines(arms.identifiability_facts(arm))
+    yield from _list(arm.not_determined or ())
+    if arm.stops:
         yield from ("", "## Influence of each stop", "")
         yield "By how much the mean variance over the workspace would grow without it:"
-        yield from table_lines(arms.stop_table(found))
+        yield from table_lines(arms.stop_table(arm))

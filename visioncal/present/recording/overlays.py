@@ -1,4 +1,4 @@
-"""What was detected and predicted, drawn over the images."""
+"""Detected and predicted corners drawn over the images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,23 +14,23 @@ from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
 
-# Rerun puts the image's corner, not the first pixel's centre, at the origin.
+# Rerun's origin is the image's corner, not the first pixel's centre.
 _CENTRE = 0.5
-# Radii are shares of the image's width, so that they look alike in small and large images.
+# Radii as shares of the image's width.
 _DOT, _LINE = 1 / 280, 1 / 800
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """How residuals and corners are drawn, the same in all views.
+    """Style of corners and residuals, the same in all views.
 
     Attributes:
-        factor: How many times longer residuals of used views are drawn than they are. Those of
-            other views, which may be anything, are drawn to scale.
-        used: The views that the fit used.
+        factor: Magnification of the used views' residuals. Those of other views are drawn to scale,
+            as they may be arbitrarily large.
+        used: The views in the fit.
         width: Width of the images [px].
-        frames: Of the images, by the places of their views.
-        active: Whether there is anything to draw in any view.
+        frames: Frame of each image, by row.
+        active: Whether any view has corners.
     """
 
     factor: int
@@ -41,18 +41,15 @@ class Overlay:
 
     @classmethod
     def of(
-        cls,
-        session: Session,
-        calibration: Calibration | None,
-        evidence: Mapping[int, ViewEvidence],
+        cls, session: Session, calibration: Calibration | None, evidence: Mapping[int, ViewEvidence]
     ) -> "Overlay":
-        """Chooses the factor by the used views."""
+        """Chooses the magnification by the used views' residuals."""
         views = () if calibration is None else calibration.views
         width = None if calibration is None else parts.image_width(calibration)
         if width is None:
             width = 1280 if session.resolution is None else session.resolution[0]
         used = frozenset(view.view for view in views if view.used)
-        shown = [other for view, other in evidence.items() if view in used]
+        shown = [seen_view for view, seen_view in evidence.items() if view in used]
         active = any(view.corners is not None for view in evidence.values())
         return cls(
             magnification(shown, width),
@@ -66,29 +63,30 @@ class Overlay:
         """Logs corners and residuals of all views, in the order of the session."""
         if not self.active:
             return
-        nothing = np.zeros((0, 2))
-        px = [nothing if view.corners is None else view.corners.px for view in seen]
-        predicted_px = [
-            nothing if view.predicted_px is None else view.predicted_px for view in seen
-        ]
+        empty = np.zeros((0, 2))
+        px = [empty if view.corners is None else view.corners.px for view in seen]
+        predicted_px = [empty if view.predicted_px is None else view.predicted_px for view in seen]
         for entity, points_px, colour, size in (
             (paths.DETECTED, px, colours.DETECTED, _DOT),
             (paths.PREDICTED, predicted_px, colours.PREDICTED, 0.5 * _DOT),
         ):
-            look = rr.Points2D.from_fields(colors=colour, radii=size * self.width)
+            dots = rr.Points2D.from_fields(colors=colour, radii=size * self.width)
             positions = rr.Points2D.columns(positions=np.vstack(points_px) + _CENTRE)
-            self._send(stream, entity, look, positions, points_px)
-        for entity, factor, wanted in (
+            self._send(stream, entity, dots, positions, points_px)
+        for entity, factor, is_used in (
             (paths.magnified_residuals(self.factor), self.factor, True),
             (paths.RESIDUALS_TO_SCALE, 1, False),
         ):
             paired = [
-                len(ends) == len(begins) and (view.view in self.used) is wanted
+                len(ends) == len(begins) and (view.view in self.used) is is_used
                 for view, begins, ends in zip(seen, px, predicted_px, strict=True)
             ]
-            begins_px = [array if own else nothing for array, own in zip(px, paired, strict=True)]
+            begins_px = [
+                array if is_paired else empty for array, is_paired in zip(px, paired, strict=True)
+            ]
             ends_px = [
-                array if own else nothing for array, own in zip(predicted_px, paired, strict=True)
+                array if is_paired else empty
+                for array, is_paired in zip(predicted_px, paired, strict=True)
             ]
             origins = np.vstack(begins_px)
             vectors = factor * (np.vstack(ends_px) - origins)
@@ -100,12 +98,12 @@ class Overlay:
         self,
         stream: rr.RecordingStream,
         entity: str,
-        look: rr.Points2D | rr.Arrows2D,
+        style: rr.Points2D | rr.Arrows2D,
         columns: rr.ComponentColumnList,
         parts: Sequence[FloatArray],
     ) -> None:
-        """Sends what is drawn in the image; empty parts take back what the view before has left."""
-        stream.log(entity, look, static=True)
+        """Sends what is drawn in the image; an empty part clears that of the previous view."""
+        stream.log(entity, style, static=True)
         log_image_frames(stream, entity, self.frames)
         send_rows(
             stream, entity, range(len(parts)), columns.partition([len(part) for part in parts])
@@ -113,7 +111,7 @@ class Overlay:
 
 
 def image_frames(session: Session, calibration: Calibration | None) -> dict[int, str]:
-    """The frames of the images, by the places of their views; of an only camera, its one."""
+    """Image frame of each view, by row."""
     cell = None if calibration is None else calibration.cell
     if cell is None:
         return dict.fromkeys(range(len(session.views)), paths.IMAGE_FRAME)
@@ -123,7 +121,7 @@ def image_frames(session: Session, calibration: Calibration | None) -> dict[int,
 
 
 def log_image_frames(stream: rr.RecordingStream, entity: str, frames: Mapping[int, str]) -> None:
-    """Says in which image's frame an entity is, by the places of views."""
+    """Logs the image frame of an entity, by row."""
     names = set(frames.values())
     if len(names) == 1:
         stream.log(entity, rr.CoordinateFrame(*names), static=True)

@@ -1,7 +1,7 @@
-"""Where things are in a recording: the names of its entities, its frames and its timeline.
+"""Names of a recording's entities, frames and timelines.
 
-The frames of the cell are rerun's named frames, each placed on what it hangs on. Of several robots,
-cameras or targets, the entities have their names: /cameras/top in the place of /camera.
+The frames of the cell are rerun's named frames, each placed on its parent. With several robots,
+cameras or targets, entities carry names: /cameras/top instead of /camera.
 """
 
 import rerun as rr
@@ -9,7 +9,7 @@ import rerun as rr
 TIMELINE = "view"
 APPLICATION = "visioncal"
 
-# The facts of the session, to be read back.
+# The session's data, to be read back.
 SESSION = "/session"
 ROWS = "/session/rows"
 STREAMS = "/session/streams"
@@ -21,7 +21,7 @@ IMAGE = "/camera/image"
 BASE_FRAME, FLANGE_FRAME, CAM_FRAME, TARGET_FRAME = "base", "flange", "cam", "target"
 IMAGE_FRAME = "image"
 
-# Results, exact; the calibration's text is written last and makes them count.
+# Exact results; the calibration's text is written last and validates the others.
 CALIBRATION = "/results/calibration"
 EVIDENCE = "/results/evidence"
 
@@ -46,7 +46,7 @@ DETECTED = f"{IMAGE}/detected"
 PREDICTED = f"{IMAGE}/predicted"
 RESIDUALS_TO_SCALE = f"{IMAGE}/residuals_of_views_not_used_to_scale"
 
-# What is explained of it.
+# Rendered images and their residuals.
 DRAWN = "/explained/board_as_it_should_look"
 REST = "/explained/not_explained"
 BLUR_NOTE = "/notes/blur"
@@ -62,15 +62,15 @@ ARM_NOTE = "/notes/arm"
 DRIFT_MM = "/arm/warming/drift_mm"
 RISE_K = "/arm/warming/rise_k"
 
-# A whole cell of several robots: its frame, and who saw whom.
+# A cell of several robots: its frame, and who saw whom.
 CELL_FRAME = "cell"
 CELL = "/cell"
 SIGHT_LINE = "/sight"
 NETWORK = "/network"
-# Where earlier versions kept the text of its result.
+# Earlier versions stored the text of a cell's result here.
 ALIGNMENT = "/results/alignment"
 
-# A plan: what is in the way, and how far the joints go.
+# A plan: obstacles, and the path of the arm.
 OBSTACLES = "/obstacles"
 WAY = "/way"
 WAY_TIMELINE = "way"
@@ -78,7 +78,7 @@ PREDICTED_SIGMA = "/plan/sigma_after_so_many_stops_mm"
 PLAN_NOTE = "/notes/plan"
 STOP_NOTE = "/notes/stop"
 
-# A motion, second by second.
+# A motion over time.
 MOTION_TIMELINE = "motion"
 MOTION = "/motion"
 MOTION_KINDS = ("position_deg", "speed_deg_s", "acceleration_deg_s2", "torque_nm")
@@ -91,7 +91,7 @@ DYNAMICS_NOTE = "/notes/dynamics"
 PARAMETERS_NOTE = "/notes/parameters"
 MEASURED_TORQUE, PREDICTED_TORQUE, KNOWN_TORQUE = "measured", "predicted", "known_before"
 
-# A recording at work.
+# A live recording.
 LIVE_SIGMA = "/live/predicted_sigma_mm"
 LIVE_NOTE = "/notes/recording"
 
@@ -101,14 +101,14 @@ POSITION_MM = f"{RESIDUALS}/position_mm"
 ORIENTATION_DEG = f"{RESIDUALS}/orientation_deg"
 REPROJECTION_PX = f"{RESIDUALS}/reprojection_px"
 VERDICT = "/notes/verdict"
-# A strip in the verdict's colour: texts have none.
+# A strip in the verdict's colour, as texts have no background colour.
 VERDICT_STRIP = "/verdict_strip"
 FIGURES = "/notes/figures"
 SOLVERS = "/notes/solvers"
 TOOLS = "/notes/tools_and_fixtures"
 VIEW_NOTE = "/notes/view"
 USED, REJECTED, THIS_VIEW = "used", "rejected", "this_view"
-# Drawn where the scale ends, because it lies farther out.
+# Beyond the scale, and drawn at its end.
 BEYOND = "rejected_beyond_the_scale"
 
 
@@ -116,7 +116,7 @@ _ENTITIES = {BASE_FRAME: BASE, FLANGE_FRAME: FLANGE, CAM_FRAME: CAMERA, TARGET_F
 
 
 def entity_of(frame: str) -> str:
-    """The entity of a frame: a robot's base or flange, a camera's, a target's, a tool's."""
+    """Entity of a frame: a robot's base or flange, a camera, a target, a tool."""
     kind, _, name = frame.partition("_")
     if kind in _ENTITIES:
         return named(_ENTITIES[kind], name)
@@ -124,35 +124,35 @@ def entity_of(frame: str) -> str:
 
 
 def named(entity: str, name: str) -> str:
-    """The entity of one of several things by its name: /robots/a of /robot; of an only one, it."""
+    """Entity of one of several things by name: /robots/a for /robot; unchanged without a name."""
     return f"{entity}s/{rr.escape_entity_path_part(name)}" if name else entity
 
 
 def image_frame(camera: str) -> str:
-    """The frame of the images of a camera, by its frame."""
+    """Image frame of a camera, by the camera's frame."""
     return IMAGE_FRAME if camera == CAM_FRAME else f"{IMAGE_FRAME}_of_{camera}"
 
 
 def part_of(plot: str, name: str) -> str:
-    """The part of a plot that is of one camera or robot by its name; of an only one, the plot."""
+    """Part of a plot for one camera or robot by name; the plot itself for an empty name."""
     return f"{plot}/{rr.escape_entity_path_part(name)}" if name else plot
 
 
 def magnified_residuals(factor: int) -> str:
-    """The entity of residuals that are drawn `factor` times longer than they are."""
+    """Entity of residuals drawn `factor` times longer."""
     return f"{IMAGE}/residuals_magnified_{factor}x"
 
 
 def magnified_arm(factor: int) -> str:
-    """The entity of the arm as stated, drawn `factor` times farther off than it is."""
+    """Entity of the nominal arm, its deviation drawn `factor` times larger."""
     return f"{NOMINAL_ARM}/off_magnified_{factor}x"
 
 
 def over_joint(joint: int) -> str:
-    """The entity of the residuals over the angle of a joint, which is counted from 0."""
+    """Entity of the residuals against the angle of a joint (index from 0)."""
     return f"{RESIDUALS}/over_joints/q{joint + 1}"
 
 
 def of_joint(group: str, joint: int) -> str:
-    """The entity of a joint, which is counted from 0, within a group over time."""
+    """Entity of a joint (index from 0) within a group over time."""
     return f"{group}/joint_{joint + 1}"

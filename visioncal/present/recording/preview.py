@@ -1,4 +1,4 @@
-"""The previews of plans: stops and motions that nobody has driven yet."""
+"""Previews of plans: stops and motions before they are driven."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -27,17 +27,17 @@ from visioncal.robot import Robot
 from visioncal.vision.camera import project
 from visioncal.vision.targets import corner_positions
 
-# Sizes of what is drawn, as shares of the cell's size.
+# Sizes as shares of the cell's size.
 _AXIS, _LINE, _POINT = 0.12, 0.002, 0.004
-# The way is drawn in steps of so much of a joint's turn [rad].
+# Largest joint rotation between drawn postures of the path [rad].
 _STEP_RAD = 0.05
-# A lens bends the board's sides: they are drawn with so many points.
+# Points per side of the board, which the lens bends.
 _SIDE_POINTS = 9
 
 
 @dataclass(frozen=True, eq=False)
 class PreviewStop:
-    """A stop: its view's number, joint angles (n,), and those (j, n) on the way to it [rad]."""
+    """A stop: view number, joint angles (n,), and those of via points before it (j, n) [rad]."""
 
     view: int
     q: FloatArray
@@ -47,23 +47,23 @@ class PreviewStop:
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """What is drawn of a plan.
+    """Content of a plan's preview.
 
     Attributes:
-        name: What to call the recording.
+        name: Name of the recording.
         mount: Where the camera is.
         robot: The arm.
-        camera: The lens.
+        camera: The camera's intrinsics.
         target: The board.
-        x: (4, 4) where the camera is guessed to be, on the flange or in the base [m].
-        z: (4, 4) where the board is guessed to be, in the base or on the flange [m].
-        stops: In the order in which the robot drives to them.
-        sigmas_mm: Predicted after so many stops; NaN where something is undetermined [mm].
-        obstacles: What is in the way.
-        floor_m: Height of the floor in the base [m]; None for none.
-        places_m: (w, 3) places of the workspace [m], may be empty.
-        places_sigma_mm: (w,) predicted there [mm].
-        note: The plan in Markdown.
+        x: (4, 4) estimated pose of the camera, on the flange or in the base [m].
+        z: (4, 4) estimated pose of the board, in the base or on the flange [m].
+        stops: Stops in driving order.
+        sigmas_mm: Predicted sigma by number of stops; NaN where something is undetermined [mm].
+        obstacles: Obstacles in the cell.
+        floor_m: Height of the floor in the base [m]; None without a floor.
+        places_m: (w, 3) points of the workspace [m]; may be empty.
+        places_sigma_mm: (w,) predicted sigma there [mm].
+        note: Text of the plan in Markdown.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Preview:
 
     @property
     def base_from_flange(self) -> FloatArray:
-        """(k, 4, 4) the flange at the stops [m]."""
+        """(k, 4, 4) flange poses at the stops [m]."""
         return self.robot.base_from_flange(np.array([stop.q for stop in self.stops]))
 
     @property
@@ -92,7 +92,7 @@ class Preview:
         return float(np.median(np.linalg.norm(self.base_from_flange[:, :3, 3], axis=1)))
 
     def placed(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where camera and board are in the base, (4, 4) each, with the flange at a place [m]."""
+        """Poses of camera and board in the base, (4, 4) each, for a flange pose [m]."""
         if self.mount == "eye-in-hand":
             return base_from_flange @ self.x, self.z
         return self.x, base_from_flange @ self.z
@@ -101,12 +101,12 @@ class Preview:
 def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None) -> None:
     """Writes the preview of a plan as a recording.
 
-    It has two timelines: one step a stop, and the way of the arm in small steps.
+    It has two timelines: one step per stop, and the arm's path in small steps.
 
     Args:
         path: The `.rrd` to write; it appears whole or not at all.
-        preview: What is drawn.
-        blueprint: The layout to open it in.
+        preview: The plan.
+        blueprint: Viewer layout of the recording.
 
     Raises:
         DataError: The file cannot be written.
@@ -129,16 +129,12 @@ def _charts(preview: Preview) -> Charts:
             stop.view, base_from_flange=flange, cam_from_target=cam_from_target
         )
         px[stop.view] = _corners_px(preview, cam_from_target)
-    found = (
+    charts = (
         corners_chart(preview.camera.resolution, px),
         directions_chart(evidence),
         rotation_axes_chart(list(evidence.values())),
     )
-    return Charts(
-        tuple(point_chart for point_chart in found if point_chart is not None),
-        (),
-        frozenset(evidence),
-    )
+    return Charts(tuple(chart for chart in charts if chart is not None), (), frozenset(evidence))
 
 
 def _corners_px(preview: Preview, cam_from_target: FloatArray) -> FloatArray:
@@ -165,18 +161,18 @@ def _log_static(stream: rr.RecordingStream, preview: Preview, charts: Charts) ->
     charts.log_static(stream)
     note = markdown(preview.note)
     stream.log(paths.PLAN_NOTE, note, static=True)
-    known = np.isfinite(preview.sigmas_mm)
-    if known.any():
+    finite = np.isfinite(preview.sigmas_mm)
+    if finite.any():
         bars = rr.BarChart(
-            preview.sigmas_mm[known],
-            abscissa=np.flatnonzero(known).astype(float),
+            preview.sigmas_mm[finite],
+            abscissa=np.flatnonzero(finite).astype(float),
             color=colours.USED,
         )
         stream.log(paths.PREDICTED_SIGMA, bars, static=True)
 
 
 def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) -> None:
-    """Draws what the flange carries at all stops, and its way between them."""
+    """Draws what the flange carries at all stops, and its path between them."""
     frame = rr.CoordinateFrame(paths.BASE_FRAME)
     flange = preview.base_from_flange
     strips, centres = [], []
@@ -200,35 +196,35 @@ def _log_carried(stream: rr.RecordingStream, preview: Preview, size_m: float) ->
         show_labels=True,
     )
     stream.log(f"{paths.STOPS}/{paths.USED}", frame, points, static=True)
-    way = np.array([q for _, steps in _way(preview) for q in steps])
-    held = preview.x if preview.mount == "eye-in-hand" else preview.z
-    places = (preview.robot.base_from_flange(way) @ held)[:, :3, 3]
-    drawn = rr.LineStrips3D([places], colors=colours.THIS_VIEW, radii=0.7 * _LINE * size_m)
-    stream.log(paths.WAY, frame, drawn, static=True)
+    path = np.array([q for _, steps in _path(preview) for q in steps])
+    flange_from_carried = preview.x if preview.mount == "eye-in-hand" else preview.z
+    positions = (preview.robot.base_from_flange(path) @ flange_from_carried)[:, :3, 3]
+    line = rr.LineStrips3D([positions], colors=colours.THIS_VIEW, radii=0.7 * _LINE * size_m)
+    stream.log(paths.WAY, frame, line, static=True)
 
 
-def _way(preview: Preview) -> Iterator[tuple[PreviewStop, list[FloatArray]]]:
-    """Each stop with the postures (n,) on the way to it, the last of which is its own."""
-    last: FloatArray | None = None
+def _path(preview: Preview) -> Iterator[tuple[PreviewStop, list[FloatArray]]]:
+    """Each stop with the postures (n,) on the path to it, its own last."""
+    previous: FloatArray | None = None
     for stop in preview.stops:
-        corners = [*([] if last is None else [last]), *stop.via, stop.q]
-        steps = [] if last is not None else [corners[0]]
-        for begin, end in pairwise(corners):
+        waypoints = [*([] if previous is None else [previous]), *stop.via, stop.q]
+        steps = [] if previous is not None else [waypoints[0]]
+        for begin, end in pairwise(waypoints):
             count = max(int(np.ceil(np.abs(end - begin).max() / _STEP_RAD)), 1)
             steps += [begin + share * (end - begin) for share in np.arange(1, count + 1) / count]
-        last = stop.q
+        previous = stop.q
         yield stop, steps
 
 
 def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
     stream, step = recorder.stream, 0
-    for row, (stop, steps) in enumerate(_way(preview)):
+    for index, (stop, steps) in enumerate(_path(preview)):
         for q in steps[:-1]:
             stream.reset_time()
             stream.set_time(paths.WAY_TIMELINE, sequence=step)
             _log_cell(stream, preview, q)
             step += 1
-        recorder.at(row)
+        recorder.at(index)
         stream.set_time(paths.WAY_TIMELINE, sequence=step)
         step += 1
         cam_from_target = _log_cell(stream, preview, stop.q)
@@ -239,13 +235,12 @@ def _log_stops(recorder: Recorder, preview: Preview, charts: Charts) -> None:
 
 
 def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: FloatArray) -> None:
-    """Draws the board as the camera will see it."""
     frame = rr.CoordinateFrame(paths.IMAGE_FRAME)
     outline = board.closed_outline(preview.target)
     shares = np.linspace(0.0, 1.0, _SIDE_POINTS)[:, None]
     sides = np.concatenate([begin + shares * (end - begin) for begin, end in pairwise(outline)])
     seen = apply(cam_from_target, sides)
-    # Rerun counts from the image's corner, not from the first pixel's centre.
+    # Rerun's origin is the image's corner, not the first pixel's centre.
     rim = rr.LineStrips2D([project(preview.camera, seen) + 0.5], colors=colours.DETECTED)
     stream.log(f"{paths.IMAGE}/board", frame, rim)
     px = _corners_px(preview, cam_from_target) + 0.5
@@ -254,7 +249,7 @@ def _log_image(stream: rr.RecordingStream, preview: Preview, cam_from_target: Fl
 
 
 def _log_cell(stream: rr.RecordingStream, preview: Preview, q: FloatArray) -> FloatArray:
-    """Draws the arm and what it carries; gives `cam_from_target` (4, 4)."""
+    """Draws the arm and what it carries; returns `cam_from_target` (4, 4)."""
     links = preview.robot.link_frames(q)
     base_from_cam, base_from_target = preview.placed(links[-1])
     log_arm(stream, links)
@@ -266,12 +261,12 @@ def _log_cell(stream: rr.RecordingStream, preview: Preview, q: FloatArray) -> Fl
 
 @dataclass(frozen=True, eq=False)
 class MotionPart:
-    """One motion.
+    """One motion of a plan.
 
     Attributes:
-        name: What it is.
-        motion: From zero on.
-        torques_nm: (m, n) that the nominal arm needs [N m]; None where that is not known.
+        name: Its name.
+        motion: Joint motion, from time zero.
+        torques_nm: (m, n) torques of the nominal arm [N m]; None where unknown.
     """
 
     name: str
@@ -281,15 +276,15 @@ class MotionPart:
 
 @dataclass(frozen=True, eq=False)
 class MotionPreview:
-    """What is drawn of planned motions.
+    """Content of a preview of planned motions.
 
     Attributes:
-        name: What to call the recording.
+        name: Name of the recording.
         robot: The arm.
-        parts: In their order, one after the other on the timeline.
-        obstacles: What is in the way.
-        floor_m: Height of the floor in the base [m]; None for none.
-        note: The plan in Markdown.
+        parts: Motions in their order, one after the other on the timeline.
+        obstacles: Obstacles in the cell.
+        floor_m: Height of the floor in the base [m]; None without a floor.
+        note: Text of the plan in Markdown.
     """
 
     name: str
@@ -301,9 +296,9 @@ class MotionPreview:
 
     @property
     def places_m(self) -> FloatArray:
-        """(k, 3) where the flange comes by, and the base [m]."""
-        ways = [self.robot.base_from_flange(part.motion.q)[:, :3, 3] for part in self.parts]
-        return np.vstack([np.zeros(3), *ways])
+        """(k, 3) positions of the base and of the flange along all motions [m]."""
+        paths = [self.robot.base_from_flange(part.motion.q)[:, :3, 3] for part in self.parts]
+        return np.vstack([np.zeros(3), *paths])
 
 
 def write_motion_preview(
@@ -313,8 +308,8 @@ def write_motion_preview(
 
     Args:
         path: The `.rrd` to write; it appears whole or not at all.
-        preview: What is drawn.
-        blueprint: The layout to open it in.
+        preview: The motions.
+        blueprint: Viewer layout of the recording.
 
     Raises:
         DataError: The file cannot be written.
@@ -323,11 +318,11 @@ def write_motion_preview(
         recorder.stream.send_recording_name(preview.name)
         recorder.lay_out(blueprint)
         _log_motions(recorder.stream, preview)
-        begin_s = 0.0
+        start_s = 0.0
         for part in preview.parts:
-            _log_curves(recorder.stream, part, begin_s)
-            _log_way(recorder.stream, preview, part, begin_s)
-            begin_s += float(part.motion.times_s[-1])
+            _log_curves(recorder.stream, part, start_s)
+            _log_arm_motion(recorder.stream, preview, part, start_s)
+            start_s += float(part.motion.times_s[-1])
             recorder.keep()
 
 
@@ -337,40 +332,38 @@ def _log_motions(stream: rr.RecordingStream, preview: MotionPreview) -> None:
     log_frames(stream, _AXIS * size_m)
     in_base = rr.CoordinateFrame(paths.BASE_FRAME)
     log_obstacles(stream, preview.obstacles, preview.floor_m, size_m)
-    rest = 1
-    for at, part in enumerate(preview.parts):
-        way = places[rest : rest + len(part.motion)]
-        rest += len(part.motion)
-        colour = colours.THIS_VIEW if at == 0 else colours.USED
-        drawn = rr.LineStrips3D([way], colors=colour, radii=_LINE * size_m)
-        stream.log(f"{paths.WAY}/{part.name}", in_base, drawn, static=True)
+    start = 1
+    for index, part in enumerate(preview.parts):
+        path = places[start : start + len(part.motion)]
+        start += len(part.motion)
+        colour = colours.THIS_VIEW if index == 0 else colours.USED
+        line = rr.LineStrips3D([path], colors=colour, radii=_LINE * size_m)
+        stream.log(f"{paths.WAY}/{part.name}", in_base, line, static=True)
     names = list(preview.robot.joint_names)
     # A joint has the same colour in all curves.
-    tints = [colours.SCALE[place % len(colours.SCALE)] for place in range(len(names))]
+    tints = [colours.SCALE[joint % len(colours.SCALE)] for joint in range(len(names))]
     for kind in paths.MOTION_KINDS:
         lines = rr.SeriesLines(names=names, colors=tints)
         stream.log(f"{paths.MOTION}/{kind}", lines, static=True)
     stream.log(paths.PLAN_NOTE, markdown(preview.note), static=True)
 
 
-def _log_curves(stream: rr.RecordingStream, part: MotionPart, begin_s: float) -> None:
-    """Draws the joints' curves."""
+def _log_curves(stream: rr.RecordingStream, part: MotionPart, start_s: float) -> None:
     motion = part.motion
     curves = [np.rad2deg(array) for array in (motion.q, motion.dq, motion.ddq)]
     if part.torques_nm is not None:
         curves.append(part.torques_nm)
-    times = rr.TimeColumn(paths.MOTION_TIMELINE, duration=_durations(begin_s + motion.times_s))
+    times = rr.TimeColumn(paths.MOTION_TIMELINE, duration=_durations(start_s + motion.times_s))
     for kind, values in zip(paths.MOTION_KINDS, curves, strict=False):
         columns = rr.Scalars.columns(scalars=values)
         stream.send_columns(f"{paths.MOTION}/{kind}", indexes=[times], columns=columns)
 
 
-def _log_way(
-    stream: rr.RecordingStream, preview: MotionPreview, part: MotionPart, begin_s: float
+def _log_arm_motion(
+    stream: rr.RecordingStream, preview: MotionPreview, part: MotionPart, start_s: float
 ) -> None:
-    """Moves the arm."""
     motion = part.motion
-    for duration, q in zip(_durations(begin_s + motion.times_s), motion.q, strict=True):
+    for duration, q in zip(_durations(start_s + motion.times_s), motion.q, strict=True):
         stream.set_time(paths.MOTION_TIMELINE, duration=duration)
         links = preview.robot.link_frames(q)
         log_arm(stream, links)
@@ -379,5 +372,5 @@ def _log_way(
 
 
 def _durations(times_s: FloatArray) -> npt.NDArray[np.timedelta64]:
-    """Times as the recording counts them, so that curves and arm have the same to the last bit."""
+    """Times in the recording's resolution, so that curves and arm agree to the last bit."""
     return np.round(1e9 * times_s).astype("timedelta64[ns]")

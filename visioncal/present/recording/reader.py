@@ -1,4 +1,4 @@
-"""Reads the session that a recording holds, also where the recording was cut off."""
+"""Reads the session of a recording, also of a truncated one."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,22 +28,22 @@ from visioncal.session.images import ImageStore
 _AGAIN = "Take the recording again from its origin, or calibrate the session's folder."
 _SHOWN_ROWS = 10
 _ELSEWHERE: Mapping[str, ImagesKept] = {"thumbnail": "thumbnail", "none": "none"}
-# What a chunk can raise whose names or shapes were damaged in a way that Arrow cannot notice.
+# Errors of chunks whose names or shapes were damaged in ways that Arrow cannot detect.
 _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError)
 
 
 def read_session(path: Path) -> Session:
-    """Reads the session that a recording holds.
+    """Reads the session of a recording.
 
     Returns:
-        The session, with the same facts and the same digest as the one that was written. Its
-        images are read when they are asked for. Where the recording was cut off, the session has
-        the views that are complete, and a warning that says what was lost.
+        The session, with the same data and the same digest as the one that was written. Its images
+        are read on demand. If the recording was cut off, the session has its complete views, and a
+        warning about what was lost.
 
     Raises:
         DataError: The file is missing, is no recording of a session, was cut off before its first
-            view, is of a newer format, or is damaged where the session's facts are; the message
-            names the row or the image.
+            view, is of a newer format, or has damaged session data; the message names the row or
+            the image.
     """
     scanned = scan(path)
     records = _read_records(scanned)
@@ -63,7 +63,7 @@ def read_session(path: Path) -> Session:
 
 
 def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> ImageStore:
-    """The images of these rows, or what there is of those that are elsewhere."""
+    """Images of complete rows, or the substitute for images that are stored elsewhere."""
     images = RecordedImages(path, records.images_by_name(complete))
     kept = _ELSEWHERE.get(records.header.images)
     if kept is None:
@@ -77,20 +77,20 @@ def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> Imag
 
 @dataclass(frozen=True)
 class _Image:
-    """Where an image is: a row of a chunk. And the SHA-256 of its bytes."""
+    """Position of an image, as a row of a chunk, and the SHA-256 of its bytes."""
 
     frame: MessageFrame
-    place: int
+    position: int
     digest: str
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedImages(ImageStore):
-    """Images that stay in a recording until they are asked for.
+    """Images that are read from a recording on demand.
 
     Attributes:
         path: The recording.
-        places: Where in it they are, by name.
+        places: Position of each image in it, by name.
     """
 
     path: Path
@@ -100,24 +100,24 @@ class RecordedImages(ImageStore):
         """Reads the bytes of one image file.
 
         Raises:
-            DataError: There is no such image, or the recording is not what it was any more.
+            DataError: There is no such image, or the recording has changed since it was loaded.
         """
         if path not in self.places:
             raise DataError(f"The session has no image {path}.", culprits=[path])
         image = self.places[path]
-        moved = DataError(
+        changed = DataError(
             f"{self.path}: the image {path} is not there any more: the recording was changed or "
             "replaced since it was loaded.",
             culprits=[path],
             next_step="Load it again.",
         )
         try:
-            found = record_batch(read_payload(self.path, image.frame), (paths.IMAGE,))
-            data = b"" if found is None else codec.image_at(found[1], image.place)
+            chunk = record_batch(read_payload(self.path, image.frame), (paths.IMAGE,))
+            data = b"" if chunk is None else codec.image_at(chunk[1], image.position)
         except _DAMAGE as error:
-            raise moved from error
+            raise changed from error
         if sha256(data) != image.digest:
-            raise moved
+            raise changed
         return data
 
     def sha256(self, path: str) -> str:
@@ -125,22 +125,22 @@ class RecordedImages(ImageStore):
         return self.places[path].digest if path in self.places else ""
 
     def absence(self, path: str) -> str:
-        """Says why there is no such image; empty where there is one."""
+        """Why there is no such image, in words; empty if there is one."""
         return "" if path in self.places else "is missing"
 
 
 @dataclass(frozen=True, eq=False)
 class _Records:
-    """What was found of a session.
+    """The records of a session's data.
 
     Attributes:
-        header: What holds for all rows.
-        rows: The rows, by their places in the session.
-        images: The images, by the places of their rows.
-        streams: What was read many times a second, by name.
-        corners: The corners that another detector found; None where they were not found.
-        closed: How many rows there are by the mark behind the last one; None without the mark.
-        damaged: How many chunks could not be read.
+        header: Data that holds for all rows.
+        rows: Rows by number.
+        images: Images by row number.
+        streams: Streams by name.
+        corners: Corners of an external detector; None if there are none.
+        closed: Number of rows by the end mark; None without the mark.
+        damaged: Number of chunks that could not be read.
     """
 
     header: codec.Header
@@ -152,114 +152,97 @@ class _Records:
     damaged: int
 
     @property
-    def begun(self) -> bool:
-        """Whether the last view lacks its row or its image."""
+    def is_incomplete(self) -> bool:
+        """Whether a view lacks its row or its image."""
         if self.header.images:
             return False
         with_image = {key for key, row in self.rows.items() if row.image_sha256}
         return with_image != set(self.images)
 
     def image_name(self, row: int) -> str:
-        """The name of the image of a row."""
         cells = self.header.cells(self.rows[row])
         return dict(zip(self.header.columns, cells, strict=True))["image"]
 
     def images_by_name(self, rows: Sequence[int]) -> dict[str, _Image]:
-        """The images of these rows."""
         return {self.image_name(row): self.images[row] for row in rows if row in self.images}
 
 
 def chunks(
     scanned: Scan, entities: Container[str], damaged: list[MessageFrame]
 ) -> Iterator[tuple[MessageFrame, str, pa.RecordBatch]]:
-    """Unpacks the chunks of some entities, in the order of the file.
+    """Unpacks the chunks of some entities in file order: message, entity path and rows of each.
 
-    Args:
-        scanned: The recording.
-        entities: The paths of the entities.
-        damaged: Receives the messages that cannot be unpacked, whatever they held.
-
-    Returns:
-        Message, path of the entity, and rows of each chunk.
+    Messages that cannot be unpacked are appended to `damaged`.
     """
     for frame in scanned.frames:
         if frame.kind == CHUNK:
             try:
-                found = record_batch(read_payload(scanned.path, frame), entities)
+                chunk = record_batch(read_payload(scanned.path, frame), entities)
             except ValueError:
                 damaged.append(frame)
                 continue
-            if found is not None:
-                yield frame, *found
+            if chunk is not None:
+                yield frame, *chunk
 
 
 def _read_records(scanned: Scan) -> _Records:
-    found: tuple[int, codec.Header] | None = None
+    version_and_header: tuple[int, codec.Header] | None = None
     rows: dict[int, codec.StoredRow] = {}
     images: dict[int, _Image] = {}
     streams: dict[str, Stream] = {}
     corners: CornerTable | None = None
     damaged: list[MessageFrame] = []
     closed: int | None = None
-    entities = (
-        paths.SESSION,
-        paths.STREAMS,
-        paths.CORNERS,
-        paths.ROWS,
-        paths.IMAGE,
-        paths.END,
-    )
+    entities = (paths.SESSION, paths.STREAMS, paths.CORNERS, paths.ROWS, paths.IMAGE, paths.END)
     for frame, entity, batch in chunks(scanned, entities, damaged):
         try:
             if entity == paths.SESSION:
-                found = codec.read_header(batch, scanned.path)
+                version_and_header = codec.read_header(batch, scanned.path)
             elif entity == paths.STREAMS:
                 streams |= codec.read_samples(batch)
             elif entity == paths.CORNERS:
                 corners = codec.read_corners(batch)
             elif entity == paths.ROWS:
-                # Of two rows at one place, the later one was damaged into being there.
+                # Of two rows with one number, the later one has a damaged number.
                 rows = codec.read_rows(batch) | rows
             elif entity == paths.IMAGE:
-                images |= _images(frame, batch)
+                images |= {
+                    row: _Image(frame, position, sha256(codec.image_at(batch, position)))
+                    for row, position in codec.image_places(batch).items()
+                }
             else:
                 closed = codec.read_end(batch)
         except _DAMAGE:
             damaged.append(frame)
-    if found is None:
+    if version_and_header is None:
         raise _no_header(scanned, damaged)
-    version, header = found
+    version, header = version_and_header
     if version == 1 and scanned.finished:
-        # The first format had no mark of its own.
+        # The first format had no end mark.
         closed = header.rows
     return _Records(header, rows, images, streams, corners, closed, len(damaged))
-
-
-def _images(frame: MessageFrame, batch: pa.RecordBatch) -> dict[int, _Image]:
-    return {
-        row: _Image(frame, place, sha256(codec.image_at(batch, place)))
-        for row, place in codec.image_places(batch).items()
-    }
 
 
 def _no_header(scanned: Scan, damaged: Sequence[MessageFrame]) -> DataError:
     next_step = _AGAIN
     if damaged:
-        what = "is damaged: the session's declaration cannot be read"
+        problem = "is damaged: the session's declaration cannot be read"
     elif scanned.finished:
-        what, next_step = "holds no session of visioncal", "Give the .rrd that visioncal wrote."
+        problem, next_step = "holds no session of visioncal", "Give the .rrd that visioncal wrote."
     else:
-        what = "was cut off before the session's declaration was complete: no view is in it"
-    return DataError(f"{scanned.path} {what}.", culprits=[str(scanned.path)], next_step=next_step)
+        problem = "was cut off before the session's declaration was complete: no view is in it"
+    return DataError(
+        f"{scanned.path} {problem}.", culprits=[str(scanned.path)], next_step=next_step
+    )
 
 
 def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
-    """The streams that were written, in the order of the header."""
-    found, seals = records.streams, records.header.stream_seals
+    """Streams in the order of the header, after a check of their seals."""
+    streams, seals = records.streams, records.header.stream_seals
     damaged = [
         name
         for name, seal in seals.items()
-        if name not in found or codec.fact_seal(found[name]) != seal
+        if name not in streams or codec.fact_seal(streams[name]) != seal
     ]
     if damaged:
         raise DataError(
@@ -268,38 +251,38 @@ def _whole_streams(path: Path, records: _Records) -> dict[str, Stream]:
             culprits=damaged,
             next_step=_AGAIN,
         )
-    return {name: found[name] for name in seals}
+    return {name: streams[name] for name in seals}
 
 
 def _corners_of(
     path: Path, records: _Records, cells: Sequence[Sequence[str]]
 ) -> CornerTable | None:
-    """The corners of the views that are complete; None where the session has none."""
-    seal, found = records.header.corners, records.corners
+    """Corners of the complete views; None if the session has none."""
+    seal, corners = records.header.corners, records.corners
     if not seal:
         return None
-    if found is None or codec.fact_seal(found) != seal:
+    if corners is None or codec.fact_seal(corners) != seal:
         raise DataError(
             f"{path} is damaged: the corners of its views cannot be read or were changed after it "
             "was written.",
             culprits=["corners"],
             next_step=_AGAIN,
         )
-    at = records.header.columns.index("view")
-    return found.of_views([int(row[at]) for row in cells])
+    view_column = records.header.columns.index("view")
+    return corners.of_views([int(row[view_column]) for row in cells])
 
 
 def _complete_rows(path: Path, records: _Records) -> list[int]:
-    """The places of the rows that are there with their images."""
-    # Views are written one after the other, so what is missing before the last trace of a view, or
-    # from a recording that was closed, was damaged rather than cut off.
+    """Numbers of the rows that are complete with their images."""
+    # Views are written one after another: what is missing before the last trace of a view, or from
+    # a closed recording, was damaged, not cut off.
     rows, images, closed = records.rows, records.images, records.closed
     # The last view of a recording that was cut off may lack its row or its image.
-    sure = max([*rows, *images], default=0) if closed is None else closed
-    # A damaged place can be a very large number.
+    written = max([*rows, *images], default=0) if closed is None else closed
+    # A damaged row number can be very large.
     missing = [
         f"row {row + 1}"
-        for row in islice((row for row in range(sure) if row not in rows), _SHOWN_ROWS)
+        for row in islice((row for row in range(written) if row not in rows), _SHOWN_ROWS)
     ]
     if missing:
         raise DataError(
@@ -314,7 +297,7 @@ def _complete_rows(path: Path, records: _Records) -> list[int]:
     changed = [
         row for row in rows if row in images and images[row].digest != rows[row].image_sha256
     ]
-    changed += [row for row in absent if row < sure]
+    changed += [row for row in absent if row < written]
     if changed:
         raise _changed_images(path, [records.image_name(row) for row in sorted(changed)])
     return sorted(set(rows) - set(absent))
@@ -330,7 +313,7 @@ def _changed_images(path: Path, names: Sequence[str]) -> DataError:
 
 
 def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:
-    """Words what is not in the recording any more."""
+    """Sentences about what was lost from the recording."""
     name, announced = scanned.path.name, records.header.rows
     if records.header.images:
         yield f"{name}: the images are elsewhere, and only their digests are kept."
@@ -341,10 +324,12 @@ def _losses(scanned: Scan, records: _Records, complete: int) -> Iterator[str]:
                 "results that were added last may not be."
             )
     elif announced == codec.UNKNOWN:
-        begun = " A view that had been begun is lost." if scanned.cut or records.begun else ""
+        lost = (
+            " A view that had been begun is lost." if scanned.cut or records.is_incomplete else ""
+        )
         yield (
             f"{name}: the recording was not closed: its writer was stopped, or the file was cut "
-            f"off. {complete} views are complete.{begun}"
+            f"off. {complete} views are complete.{lost}"
         )
     elif complete < announced:
         yield (

@@ -1,4 +1,4 @@
-"""Opens a stream of rerun that writes to a file, and finds out whether it could."""
+"""Rerun streams that write to a file, with a check that the data was written."""
 
 import os
 import shutil
@@ -13,25 +13,25 @@ from rerun.blueprint import BlueprintLike
 from visioncal.present.recording import paths
 from visioncal.present.recording.frames import scan
 
-# Room for one more view, however large its image, and for the end of the file.
+# Free space that one more view and the end of the file need at most.
 _ROOM_BYTES = 100_000_000
-# So long rerun may take to write what was logged last [s]. Where its writer has ended, as on a full
-# disk, it would be waited for without end.
+# Timeout of a flush [s]. Without it, a flush never returns once rerun's writer has ended, as on a
+# full disk.
 _WRITTEN_S = 30.0
 
 
 class Recorder:
-    """A stream of rerun that writes to a file.
+    """A rerun stream that writes to a file.
 
     Attributes:
-        stream: Where to log.
+        stream: Stream to log to.
     """
 
     def __init__(self, path: Path) -> None:
-        """Begins the file.
+        """Starts the file.
 
         Args:
-            path: The `.rrd`; one that is there is replaced.
+            path: The `.rrd`; an existing file is replaced.
 
         Raises:
             OSError: The file cannot be created.
@@ -46,18 +46,19 @@ class Recorder:
             raise OSError(str(error)) from error
 
     def lay_out(self, blueprint: BlueprintLike | None) -> None:
-        """Adds the layout to open the recording in, if there is one.
+        """Adds the viewer layout of the recording, if there is one.
 
-        It is a hundred kilobytes, and comes after the facts: a cut within it loses none of them.
-        It is made active because a browser has begun to draw by the time it arrives.
+        It has a hundred kilobytes and follows the session's data, so that a cut within it loses
+        none of that. It is made active because a browser has started to draw by the time it
+        arrives.
         """
         if blueprint is not None:
             self.stream.send_blueprint(blueprint, make_active=True, make_default=True)
-            # Not between the parts of what comes next.
+            # Flushed, so that it does not end up between later parts.
             self.keep()
 
     def at(self, row: int) -> None:
-        """Says which view is logged next, by its place in the session.
+        """Sets the row (the view's index in the session) of what is logged next.
 
         Raises:
             OSError: There is too little room for another view.
@@ -66,10 +67,10 @@ class Recorder:
         self.stream.set_time(paths.TIMELINE, sequence=row)
 
     def keep(self) -> None:
-        """Hands what was logged to the operating system: it survives the death of the process.
+        """Flushes to the operating system: what was logged survives the death of the process.
 
         Raises:
-            OSError: It could not be written.
+            OSError: The data could not be written.
         """
         try:
             self.stream.flush(timeout_sec=_WRITTEN_S)
@@ -90,11 +91,11 @@ class Recorder:
         ending.start()
         ending.join(0.0 if self._is_lost else _WRITTEN_S)
         if ending.is_alive():
-            # It would be waited for when Python ends, too.
+            # Python's exit would wait for it as well.
             rr.unregister_shutdown()
         if kind is not None:
             return
-        # Rerun only prints that it could not write.
+        # Rerun does not raise when it could not write.
         if not scan(self._path).finished:
             raise OSError("its end is missing; the disk may be full")
         with self._path.open("r+b") as file:
@@ -107,22 +108,16 @@ def send_rows(
     rows: Iterable[int],
     columns: Iterable[rr.ComponentColumn],
 ) -> None:
-    """Logs what an entity shows in many views as one message, whatever the stream's time is.
+    """Logs an entity for many views, by row, in one message, whatever the stream's time.
 
-    A tenth of the time that as many messages take.
-
-    Args:
-        stream: Where to.
-        entity: What is shown.
-        rows: The places of the views in the session.
-        columns: Of each component, a part a view.
+    This takes a tenth of the time of single messages. Each component has one partition per view.
     """
     time = rr.TimeColumn(paths.TIMELINE, sequence=rows)
     rr.send_columns(entity, [time], columns, recording=stream)
 
 
 def _check_room(folder: Path) -> None:
-    """Stops in time: on a full disk, rerun's own thread dies and whoever waits for it hangs."""
+    """Raises early: on a full disk, rerun's thread dies and waiting for it hangs."""
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < _ROOM_BYTES:
         raise OSError(f"{free_bytes / 1e6:.0f} MB are free, {_ROOM_BYTES / 1e6:.0f} are needed")

@@ -1,7 +1,7 @@
-"""What was computed from a session, kept in its recording: drawn, and exact.
+"""A session's results in its recording: as drawing, and exact.
 
-A result counts when its last message, the calibration's text, is there; of several, the last one
-counts.
+A result is valid once its last message, the calibration's text, is there; the last of several
+results holds.
 """
 
 import json
@@ -38,11 +38,11 @@ def log_results(
     calibration: Calibration | None,
     evidence: Sequence[ViewEvidence],
 ) -> None:
-    """Logs what was computed: first what is drawn of it, then what makes it count.
+    """Logs results: their drawing, their exact values, then the message that validates them.
 
     Raises:
-        DataError: The evidence names a view that the session does not have, or what was found
-            beside the edges cannot be read.
+        DataError: The evidence names a view that the session does not have, or a section of the
+            result cannot be read.
         OSError: The file cannot be written.
     """
     seen_of = {view.view: view for view in evidence}
@@ -56,20 +56,20 @@ def log_results(
         )
     _draw(recorder, session, calibration, seen_of)
     result = uuid4().hex
-    for place, seen in enumerate(evidence):
+    for index, seen in enumerate(evidence):
         recorder.at(rows[seen.view])
-        _log_evidence(recorder.stream, seen, result, place)
-    # Rerun orders what it holds as it likes: what makes the result count must come after the rest.
+        _log_evidence(recorder.stream, seen, result, index)
+    # Rerun may reorder what it buffers, and the message that validates the result must be last.
     recorder.keep()
     _log_result(recorder.stream, calibration, result, len(evidence))
     recorder.keep()
 
 
 def read_calibration(path: Path) -> Calibration | None:
-    """Reads the result that a recording holds.
+    """Reads the result of a recording.
 
     Returns:
-        The one that was added last; None where there is none.
+        The result added last; None if there is none.
 
     Raises:
         DataError: The file cannot be read, or the result is damaged.
@@ -81,11 +81,10 @@ def read_calibration(path: Path) -> Calibration | None:
 
 
 def read_evidence(path: Path) -> tuple[ViewEvidence, ...]:
-    """Reads what was seen and computed of the views, exactly as it was written.
+    """Reads the evidence of the views, exactly as it was written.
 
     Returns:
-        What belongs to the result that was added last, in the order in which it was given; empty
-        where there is none.
+        Evidence of the result added last, in its original order; empty if there is none.
 
     Raises:
         DataError: The file cannot be read, or the evidence is damaged.
@@ -123,7 +122,7 @@ def _draw(
 def _log_views(
     stream: rr.RecordingStream, session: Session, calibration: Calibration, scene: SceneDrawing
 ) -> None:
-    """Logs what became of each view, and how the arms had drifted."""
+    """Logs each view's status, and the drift of the arms."""
     views = dict(enumerate(session.views))
     rows = {view.number: row for row, view in views.items()}
     sights = {rows[view.view]: view for view in calibration.views if view.view in rows}
@@ -137,11 +136,11 @@ def _log_views(
             notes.log_scalars(stream, paths.part_of(plot, name), values)
 
 
-def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence, result: str, place: int) -> None:
-    """Keeps what was computed of a view; what is drawn has single precision."""
+def _log_evidence(stream: rr.RecordingStream, seen: ViewEvidence, result: str, index: int) -> None:
+    """Logs a view's exact evidence; its drawing has single precision."""
     components = {
         "result": pa.array([result], pa.string()),
-        "place": pa.array([place], pa.int64()),
+        "place": pa.array([index], pa.int64()),
         "view": pa.array([seen.view], pa.int64()),
     }
     if seen.corners is not None:
@@ -184,7 +183,7 @@ def _seal(values: Mapping[str, list[Any]]) -> str:
 
 @dataclass(frozen=True)
 class _Result:
-    """A result as it is kept; its text is empty where there was no calibration."""
+    """A stored result; its text is empty without a calibration."""
 
     text: str = ""
     evidence_count: int = 0
@@ -192,40 +191,40 @@ class _Result:
 
 
 def _read_result(path: Path) -> _Result:
-    """Reads the last result, with what is intact of its evidence."""
-    last: dict[str, Any] = {}
+    """Reads the last result, with the intact part of its evidence."""
+    latest: dict[str, Any] = {}
     evidence: dict[str, dict[int, ViewEvidence]] = {}
     damaged: list[MessageFrame] = []
     entities = (paths.CALIBRATION, paths.EVIDENCE, paths.ALIGNMENT)
     try:
         for _, entity, batch in chunks(scan(path), entities, damaged):
-            for place in range(batch.num_rows):
+            for position in range(batch.num_rows):
                 if entity == paths.EVIDENCE:
-                    values = codec.values_of(batch, _EVIDENCE, place)
+                    values = codec.values_of(batch, _EVIDENCE, position)
                     seen = _evidence(values)
                     evidence.setdefault(values["result"][0], {})[values["place"][0]] = seen
                 else:
-                    # Of a whole cell, earlier versions kept no evidence.
-                    none = {"result": [""], "evidence_count": [0]}
-                    last = none | codec.values_of(batch, _ALIGNMENT, place)
-                    last |= codec.values_of(batch, _RESULT, place) | codec.values_of(
-                        batch, "TextDocument", place
+                    # Earlier versions stored no evidence for cells.
+                    no_evidence = {"result": [""], "evidence_count": [0]}
+                    latest = no_evidence | codec.values_of(batch, _ALIGNMENT, position)
+                    latest |= codec.values_of(batch, _RESULT, position) | codec.values_of(
+                        batch, "TextDocument", position
                     )
-                    # What was damaged before this one is no newer result.
+                    # Chunks damaged before this one hold no newer result.
                     damaged.clear()
-        if damaged or (last and sha256(last["text"][0].encode()) != last["seal"][0]):
+        if damaged or (latest and sha256(latest["text"][0].encode()) != latest["seal"][0]):
             raise _damaged(path)
-        if not last:
+        if not latest:
             return _Result()
-        (result,), (count,), (text,) = last["result"], last["evidence_count"], last["text"]
+        (result,), (count,), (text,) = latest["result"], latest["evidence_count"], latest["text"]
     except (KeyError, ValueError, TypeError) as error:
         raise _damaged(path) from error
-    found = evidence.get(result, {})
-    return _Result(text, count, tuple(found[place] for place in sorted(found)))
+    own_evidence = evidence.get(result, {})
+    return _Result(text, count, tuple(own_evidence[position] for position in sorted(own_evidence)))
 
 
 def _evidence(values: Mapping[str, Any]) -> ViewEvidence:
-    """Reads what belongs to one view, after a check of its seal."""
+    """Reads one view's evidence, after a check of its seal."""
     sealed = {name: entry for name, entry in values.items() if name != "seal"}
     if values["seal"] != [_seal(sealed)]:
         raise ValueError("the evidence was changed after it was written")
@@ -256,15 +255,15 @@ def _damaged(path: Path) -> DataError:
 
 
 def _log_explained(stream: rr.RecordingStream, seen: ViewEvidence) -> None:
-    """Logs one view's images at the stream's current time, or takes back the view before."""
-    found = seen.explained
+    """Logs a view's rendered images at the stream's current time, or clears the previous ones."""
+    explained = seen.explained
     for entity, image in (
-        (paths.DRAWN, None if found is None else found.drawn),
-        (paths.REST, None if found is None else found.rest),
+        (paths.DRAWN, None if explained is None else explained.drawn),
+        (paths.REST, None if explained is None else explained.rest),
     ):
         if image is None:
             stream.log(entity, rr.Clear(recursive=False))
         else:
             stream.log(entity, rr.EncodedImage(contents=image, media_type="image/jpeg"))
-    words = "This image was not looked at." if found is None else found.words
+    words = "This image was not looked at." if explained is None else explained.words
     stream.log(paths.BLUR_NOTE, rr.TextDocument(words, media_type="text/markdown"))

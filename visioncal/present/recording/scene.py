@@ -1,4 +1,4 @@
-"""The cell in 3D: robots, cameras and targets, as the calibration puts them, view by view."""
+"""The cell in 3D by the calibration, view by view: robots, cameras and targets."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,26 +27,26 @@ from visioncal.session.observations import standing
 from visioncal.session.table import reported_matrices
 from visioncal.vision.camera import matrix_3x3
 
-# Sizes of what is drawn, as shares of the cell's size: how far flanges are from their bases.
+# Sizes as shares of the cell's size, which is the distance of flanges from their bases.
 _AXIS, _FRUSTUM, _LINE, _POINT = 0.12, 0.18, 0.002, 0.004
-# Axes of what is neither a base, a flange nor a tool are so large beside the flange's.
+# Lengths of axes relative to the flange's: of other frames, and of tools.
 _AXES = {paths.BASE_FRAME: 2.0, paths.FLANGE_FRAME: 1.0}
 _OTHER_AXES, _TOOL_AXES = 0.7, 0.5
-# The views that are not the current one, drawn as small frusta or boards.
+# Size of the small frusta that mark all views.
 SMALL_FRUSTUM = 0.05
 
-# The height of the bodies' names, and the drawing's units [px].
+# Height of the bodies' names, and the drawing's units [px].
 _BODY_HEIGHT, _ACROSS_PX, _DOWN_PX = 3.6, 110.0, 120.0
 
 
 @dataclass(frozen=True, eq=False)
 class RobotState:
-    """How a robot stands in a view.
+    """Pose and posture of a robot in a view.
 
     Attributes:
         pose: (4, 4) `base_from_flange`.
-        q: (n,) its joint angles [rad]; None where they are not known.
-        is_past: Whether that is how it stood in another view: in this one it is not known.
+        q: (n,) joint angles [rad]; None where unknown.
+        is_past: Whether the state is that of another view, as it is unknown in this one.
     """
 
     pose: FloatArray
@@ -54,7 +54,7 @@ class RobotState:
     is_past: bool = False
 
     def link_frames(self, robot: Robot | None) -> FloatArray | None:
-        """(n, 4, 4) of the robot in its base; None where it or its joints' angles are not known."""
+        """(n, 4, 4) link frames in the base; None if the model or the joint angles are unknown."""
         if robot is None or self.q is None or len(self.q) != robot.joint_count:
             return None
         return robot.link_frames(self.q)
@@ -63,10 +63,10 @@ class RobotState:
 def robot_states(
     session: Session, calibration: Calibration | None, evidence: Mapping[int, ViewEvidence]
 ) -> Mapping[str, Mapping[int, RobotState]]:
-    """By flange and by the view's number, how its robot stands, where that is known."""
+    """State of each robot, where known, by flange and view number."""
     if calibration is not None and calibration.cell is not None:
-        return _of_cell(session, calibration)
-    # Of several robots, each pose is in a base of its own, which nothing places.
+        return _cell_states(session, calibration)
+    # Without a result, the bases of several robots have no known poses.
     views = () if session.is_network else session.views
     poses = reported_matrices(views)
     seen = {view.view: view.base_from_flange for view in evidence.values()}
@@ -82,29 +82,31 @@ def robot_states(
     return {flange: {view: state for view, state in states.items() if state is not None}}
 
 
-def _of_cell(session: Session, calibration: Calibration) -> Mapping[str, Mapping[int, RobotState]]:
-    """Of a whole cell: as of the view's stop, or else as at the last one with a pose.
+def _cell_states(
+    session: Session, calibration: Calibration
+) -> Mapping[str, Mapping[int, RobotState]]:
+    """States in a cell: at the view's stop, or else at the last stop with a pose.
 
-    A robot without a pose yet stands as at its first one.
+    A robot without a pose so far has its first one.
     """
     rows = standing(session.declaration, session.views)
     models = parts.calibrated_robots(calibration)
-    found: dict[str, Mapping[int, RobotState]] = {}
+    states: dict[str, Mapping[int, RobotState]] = {}
     for flange, name in parts.frames(calibration).robots.items():
-        by_view = {view: mine[name] for view, mine in rows.items() if name in mine}
-        own = {view: _state(row, models.get(name)) for view, row in by_view.items()}
-        last = next((robot_state for robot_state in own.values() if robot_state is not None), None)
-        shown: dict[int, RobotState] = {}
+        by_view = {view: by_robot[name] for view, by_robot in rows.items() if name in by_robot}
+        known = {view: _state(row, models.get(name)) for view, row in by_view.items()}
+        current = next((state for state in known.values() if state is not None), None)
+        filled: dict[int, RobotState] = {}
         for view in session.views:
-            last = own.get(view.number) or (last and replace(last, is_past=True))
-            if last is not None:
-                shown[view.number] = last
-        found[flange] = shown
-    return found
+            current = known.get(view.number) or (current and replace(current, is_past=True))
+            if current is not None:
+                filled[view.number] = current
+        states[flange] = filled
+    return states
 
 
 def _state(row: View, robot: Robot | None) -> RobotState | None:
-    """How a robot stands by the row with its pose, or with its joint angles."""
+    """State by the row's pose, or by its joint angles; None without both."""
     pose, q = row.base_from_flange(), row.joints_rad
     if pose is not None:
         return RobotState(np.asarray(pose.as_matrix()), q)
@@ -115,17 +117,17 @@ def _state(row: View, robot: Robot | None) -> RobotState | None:
 
 @dataclass(frozen=True, eq=False)
 class SceneDrawing:
-    """What is drawn of the cell. Frames are placed on what they hang on.
+    """Drawing of the cell, with each frame placed on its parent.
 
     Attributes:
         session: The session.
-        calibration: Its result, if there is one; without it only the flange is drawn.
-        frames: What hangs on what.
-        states: By flange and by the view's number, how its robot stands, where that is known.
-        size_m: By which sizes are chosen [m].
-        uncertainty: What is drawn of the result's uncertainty.
-        charts: The charts over all views.
-        arm: What is drawn of a calibrated arm.
+        calibration: Result of the session; without it only the flange is drawn.
+        frames: Tree of frames.
+        states: State of each robot, where known, by flange and view number.
+        size_m: Size of the cell, which drawn sizes refer to [m].
+        uncertainty: Drawing of the result's uncertainty.
+        charts: Charts over all views.
+        arm: Drawing of a calibrated arm.
     """
 
     session: Session
@@ -139,12 +141,9 @@ class SceneDrawing:
 
     @classmethod
     def of(
-        cls,
-        session: Session,
-        calibration: Calibration | None,
-        evidence: Mapping[int, ViewEvidence],
+        cls, session: Session, calibration: Calibration | None, evidence: Mapping[int, ViewEvidence]
     ) -> "SceneDrawing":
-        """Collects the poses of the flanges, from the evidence or else as they were recorded."""
+        """Collects flange poses from the evidence, or else as recorded."""
         frames = parts.frames(calibration)
         states = robot_states(session, calibration, evidence)
         size_m = _size_m(frames, states)
@@ -162,7 +161,7 @@ class SceneDrawing:
         )
 
     def log_static(self, stream: rr.RecordingStream) -> None:
-        """Logs what does not change from view to view."""
+        """Logs what is the same in all views."""
         for frame, parent in self.frames.parents.items():
             entity = paths.entity_of(frame)
             if frame in self.frames.matrices:
@@ -182,7 +181,7 @@ class SceneDrawing:
                 drawn.log_static(stream)
 
     def _log_things(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
-        """Draws the images' planes, the boards, and the network of a whole cell."""
+        """Draws image planes, boards, and the network of a cell."""
         for frame, camera in parts.cameras(calibration).items():
             log_image_plane(stream, camera.camera, self.size_m, frame or paths.CAM_FRAME)
         for frame, target in self._boards.items():
@@ -196,12 +195,7 @@ class SceneDrawing:
             log_network(stream, calibration)
 
     def log_views(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
-        """Logs where everything is in each view.
-
-        Args:
-            stream: Where to.
-            seen: What was seen in each, in the order of the session.
-        """
+        """Logs the poses in each view, in the order of the session."""
         for flange in self.frames.robots:
             states = [self.states[flange].get(view.view) for view in seen]
             poses = [None if state is None else state.pose for state in states]
@@ -220,7 +214,7 @@ class SceneDrawing:
             self.arm.log_views(stream, rows)
 
     def in_cell(self, frame: str, view: int) -> FloatArray | None:
-        """(4, 4) where a frame is in the cell in a view; None where that is unknown."""
+        """(4, 4) pose of a frame in the cell in a view; None where unknown."""
         matrix = np.eye(4)
         while frame != paths.CELL_FRAME:
             if frame in self.frames.robots:
@@ -234,21 +228,17 @@ class SceneDrawing:
         return matrix
 
     def unposed(self, view: int) -> list[str]:
-        """The robots of a whole cell without a pose at the stop of a view."""
+        """Robots of a cell without a pose at the stop of a view."""
         if self.calibration is None or self.calibration.cell is None:
             return []
-        found = {robot: self.states[name].get(view) for name, robot in self.frames.robots.items()}
-        return [
-            robot
-            for robot, robot_state in found.items()
-            if robot_state is None or robot_state.is_past
-        ]
+        states = {robot: self.states[name].get(view) for name, robot in self.frames.robots.items()}
+        return [robot for robot, state in states.items() if state is None or state.is_past]
 
     @cached_property
     def _boards(self) -> Mapping[str, Target]:
-        """The targets by their frames, as far as the calibration places them."""
-        boards = parts.stated_boards(self.session).items()
-        frames = {frame_name("target", name): target for name, target in boards}
+        """Targets by frame, where the calibration places them."""
+        named = parts.stated_boards(self.session).items()
+        frames = {frame_name("target", name): target for name, target in named}
         return {frame: target for frame, target in frames.items() if frame in self.frames.parents}
 
     @cached_property
@@ -260,7 +250,6 @@ class SceneDrawing:
         return share * self.size_m
 
     def _log_axes(self, stream: rr.RecordingStream, entity: str, frame: str) -> None:
-        """Draws a frame's axes with its name."""
         tools = () if self.calibration is None else self.calibration.frames
         is_tool = any(tool.endswith(f"_from_{frame}") for tool in tools)
         share = _TOOL_AXES if is_tool else _AXES.get(frame.partition("_")[0], _OTHER_AXES)
@@ -268,10 +257,10 @@ class SceneDrawing:
         stream.log(entity, rr.CoordinateFrame(frame), axes, static=True)
 
     def _carried_by(self, flange: str) -> list[str]:
-        return [name for name, on in self.frames.parents.items() if on == flange]
+        return [name for name, parent in self.frames.parents.items() if parent == flange]
 
     def _log_mount(self, stream: rr.RecordingStream, flange: str) -> None:
-        """Draws the edges that hang on a flange, as lines."""
+        """Draws lines from a flange to what it carries."""
         for child in self._carried_by(flange):
             line = rr.LineStrips3D(
                 [[np.zeros(3), self.frames.matrices[child][:3, 3]]],
@@ -282,14 +271,18 @@ class SceneDrawing:
             stream.log(entity, rr.CoordinateFrame(flange), line, static=True)
 
     def _log_stops(self, stream: rr.RecordingStream, flange: str) -> None:
-        """All places of a flange; those of views that were not used in another colour."""
+        """All positions of a flange; those of unused views in another colour."""
         stops = paths.part_of(paths.STOPS, self.frames.robots[flange])
         frame = rr.CoordinateFrame(self.frames.parents[flange])
-        own = {view: state.pose for view, state in self.states[flange].items() if not state.is_past}
+        poses_by_view = {
+            view: state.pose for view, state in self.states[flange].items() if not state.is_past
+        }
         for name, colour in ((paths.USED, colours.USED), (paths.REJECTED, colours.REJECTED)):
             is_rejected = name == paths.REJECTED
             poses = [
-                array for view, array in own.items() if (view in self._rejected) is is_rejected
+                array
+                for view, array in poses_by_view.items()
+                if (view in self._rejected) is is_rejected
             ]
             if not poses:
                 continue
@@ -304,8 +297,8 @@ class SceneDrawing:
                 stream.log(f"{stops}/{name}/carried", frame, lines, static=True)
 
     def _shapes_on(self, flange: str) -> list[FloatArray]:
-        """What the flange of an only robot carries, as (k, 3) lines in its frame."""
-        # Those of several would hide each other.
+        """What a single robot's flange carries, as (k, 3) lines in its frame."""
+        # The shapes of several robots would hide each other.
         if self.calibration is None or self.calibration.cell is not None:
             return []
         cameras = parts.cameras(self.calibration)
@@ -324,10 +317,10 @@ class SceneDrawing:
     def _log_arm(
         self, stream: rr.RecordingStream, flange: str, states: Sequence[RobotState | None]
     ) -> None:
-        """Draws a robot, or only a line to its flange where its joints are not known."""
+        """Draws a robot, or a line to its flange if its posture is unknown."""
         name = self.frames.robots[flange]
-        known = {} if self.calibration is None else parts.calibrated_robots(self.calibration)
-        robot, entity = known.get(name), paths.named(paths.ROBOT, name)
+        models = {} if self.calibration is None else parts.calibrated_robots(self.calibration)
+        robot, entity = models.get(name), paths.named(paths.ROBOT, name)
         arms: list[FloatArray | None] = []
         strips: list[list[FloatArray]] = []
         for state in states:
@@ -340,8 +333,8 @@ class SceneDrawing:
         _send_strips(stream, f"{entity}/reach", dict(enumerate(strips)))
 
     def _log_seen_targets(self, stream: rr.RecordingStream, seen: Sequence[ViewEvidence]) -> None:
-        """Draws the target's outline where each view alone sees it."""
-        # A part without strips takes those of the view before off the screen.
+        """Draws the target's outline as each view alone places it."""
+        # A part without strips clears those of the previous view.
         strips: dict[int, list[FloatArray]] = {}
         boards = (
             self.session.boards if any(view.cam_from_target is not None for view in seen) else {}
@@ -350,21 +343,21 @@ class SceneDrawing:
         views = () if self.calibration is None else self.calibration.views
         seers = {view.view: view.seer or paths.CAM_FRAME for view in views}
         cameras = frames_of_kind(seers.values(), "camera")
-        for row, (view, other) in enumerate(zip(self.session.views, seen, strict=True)):
+        for row, (view, view_seen) in enumerate(zip(self.session.views, seen, strict=True)):
             if (name := self.session.board_of(view)) not in boards:
                 continue
             strips[row] = []
-            if other.cam_from_target is None or seers.get(other.view) not in cameras:
+            if view_seen.cam_from_target is None or seers.get(view_seen.view) not in cameras:
                 continue
-            cell_from_cam = self.in_cell(seers[other.view], other.view)
+            cell_from_cam = self.in_cell(seers[view_seen.view], view_seen.view)
             if cell_from_cam is not None:
-                pose = cell_from_cam @ other.cam_from_target
+                pose = cell_from_cam @ view_seen.cam_from_target
                 strips[row] = [outlines[name] @ pose[:3, :3].T + pose[:3, 3]]
         rejected = {row: seen[row].view in self._rejected for row in strips}
         self._send_lines(stream, paths.SEEN_TARGET, strips, rejected, _LINE)
 
     def _log_sights(self, stream: rr.RecordingStream) -> None:
-        """Draws who saw whom in each view of a whole cell, as a line from one to the other."""
+        """Draws a line from seer to seen in each view of a cell."""
         if self.calibration is None or self.calibration.cell is None:
             return
         sights = {view.view: view for view in self.calibration.views}
@@ -382,7 +375,7 @@ class SceneDrawing:
         log_image_frames(stream, paths.IMAGE, image_frames(self.session, self.calibration))
 
     def _middle(self, frame: str, cell_from_frame: FloatArray) -> FloatArray:
-        """The middle of what was seen, in the cell."""
+        """Centre of what was seen, in the cell."""
         target = self._boards.get(frame)
         middle = np.zeros(3) if target is None else board.outline(target).mean(axis=0)
         return np.asarray(cell_from_frame[:3, :3] @ middle + cell_from_frame[:3, 3])
@@ -395,7 +388,7 @@ class SceneDrawing:
         rejected: Mapping[int, bool],
         width: float,
     ) -> None:
-        """Draws lines in the cell by the places of views, by whether these were not used."""
+        """Draws lines in the cell by row, coloured by whether the view was used."""
         if not strips:
             return
         frame = rr.CoordinateFrame(paths.CELL_FRAME)
@@ -406,12 +399,14 @@ class SceneDrawing:
 
 
 def _size_m(frames: parts.FrameHierarchy, states: Mapping[str, Mapping[int, RobotState]]) -> float:
-    """How far flanges are from their bases, or half of how far apart things stand in the cell."""
-    poses = [robot_state.pose for mine in states.values() for robot_state in mine.values()]
+    """Distance of flanges from their bases, or half the cell's extent if that is larger."""
+    poses = [state.pose for by_view in states.values() for state in by_view.values()]
     distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]
-    fixed = (paths.CELL_FRAME, paths.BASE_FRAME)
+    parents = (paths.CELL_FRAME, paths.BASE_FRAME)
     places = [
-        matrix[:3, 3] for frame, matrix in frames.matrices.items() if frames.parents[frame] in fixed
+        matrix[:3, 3]
+        for frame, matrix in frames.matrices.items()
+        if frames.parents[frame] in parents
     ]
     extent_m = float(np.linalg.norm(np.ptp([np.zeros(3), *places], axis=0)))
     return max(float(np.median(distances)) if distances else 1.0, 0.5 * extent_m)
@@ -420,10 +415,10 @@ def _size_m(frames: parts.FrameHierarchy, states: Mapping[str, Mapping[int, Robo
 def log_image_plane(
     stream: rr.RecordingStream, camera: Camera, size_m: float, frame: str = paths.CAM_FRAME
 ) -> None:
-    """Hangs the image into a camera's frame, as large as a cell of some size [m] asks for."""
+    """Places the image in a camera's frame, scaled to a cell's size [m]."""
     image = paths.image_frame(frame)
     matrix = matrix_3x3(camera)
-    # Rerun puts the image's corner, not the first pixel's centre, at the origin.
+    # Rerun's origin is the image's corner, not the first pixel's centre.
     matrix[:2, 2] += 0.5
     plane = rr.Pinhole(
         image_from_camera=matrix,
@@ -438,7 +433,7 @@ def log_image_plane(
 
 
 def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
-    """The edges of a camera's field of view down to a depth [m], as lines in its frame."""
+    """Edges of a camera's field of view to a depth [m], as lines in its frame."""
     width, height = camera.resolution
     fx, fy, cx, cy = camera.matrix
     corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
@@ -450,7 +445,7 @@ def frustum(camera: Camera, depth_m: float) -> list[FloatArray]:
 def log_pose(
     stream: rr.RecordingStream, entity: str, frame: str, base_from_frame: FloatArray | None
 ) -> None:
-    """Places a frame; an unknown one must not keep the place of the view before."""
+    """Places a frame; an unknown pose clears that of the previous view."""
     if base_from_frame is None:
         stream.log(entity, rr.Clear(recursive=False))
         return
@@ -460,7 +455,7 @@ def log_pose(
 def _log_poses(
     stream: rr.RecordingStream, parent: str, frame: str, poses: Sequence[FloatArray | None]
 ) -> None:
-    """Places a frame on its parent in each view of a session, as `log_pose` in one."""
+    """Places a frame on its parent in each view; see `log_pose`."""
     entity = paths.entity_of(frame)
     known = {row: pose for row, pose in enumerate(poses) if pose is not None}
     for row in (index for index in range(len(poses)) if index not in known):
@@ -483,8 +478,10 @@ def _send_strips(
     strips: Mapping[int, Sequence[FloatArray]],
     more: Iterable[rr.ComponentColumn] = (),
 ) -> None:
-    """Draws lines in views, by their places; no line takes those of the view before off."""
-    lines = rr.LineStrips3D.columns(strips=[array for some in strips.values() for array in some])
+    """Draws lines by row; an empty list clears those of the previous view."""
+    lines = rr.LineStrips3D.columns(
+        strips=[array for lines_of_view in strips.values() for array in lines_of_view]
+    )
     parts = lines.partition([len(strip) for strip in strips.values()])
     send_rows(stream, entity, strips, [*parts, *more])
 
@@ -496,9 +493,9 @@ def log_network(stream: rr.RecordingStream, calibration: Calibration) -> None:
     for body, (left, right) in spans(tree).items():
         nodes[body] = (0.5 * (left + right), _BODY_HEIGHT)
     nodes |= places(tree)
-    words = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
-    words[paths.CELL_FRAME] = f"the frame of {tree.reference}"
-    labels = [f"{node}\n{words.get(node) or sigma_words(tree, node)}" for node in nodes]
+    captions = {flange: f"robot {robot}" for flange, robot in tree.flanges.items()}
+    captions[paths.CELL_FRAME] = f"the frame of {tree.reference}"
+    labels = [f"{node}\n{captions.get(node) or sigma_words(tree, node)}" for node in nodes]
     bodies = {paths.CELL_FRAME, *tree.flanges}
     seen = [(pair.seer, pair.seen) for pair in pairs(calibration.views) if pair.used]
     hangs = [(tree.parents[node], node) for node in nodes if node != paths.CELL_FRAME]

@@ -1,7 +1,7 @@
-"""How well the cell is known: the calibrated arm over the workspace, and the edges' ellipsoids.
+"""Accuracy in 3D: the calibrated arm over the workspace, and ellipsoids of the edges.
 
-Ellipsoids, and where each view puts the target, are far too small to be seen at their true size, so
-both are drawn larger by one factor, which their names say.
+Ellipsoids and single views' target positions are too small to be seen at true size; both are
+magnified by one factor, which their names state.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,38 +24,38 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
 from visioncal.session import Session, View
 
-# Sizes of what is drawn, as shares of the cell's size.
+# Sizes as shares of the cell's size.
 _PLACE, _LEGEND, _LINE = 0.025, 0.035, 0.008
-# How far off the arm as stated is drawn where it is farthest.
+# Drawn size of the nominal arm's largest deviation, as a share of the cell's size.
 _SHARE = 0.4
-# Colours end here, that a few places at the rim do not take all of them.
+# Percentiles at the ends of the colour scale, as few places at the rim would dominate it.
 _LOW_PERCENT, _HIGH_PERCENT = 1.0, 98.0
 _LEGEND_STEPS = 6
-# The plots' series: arm as stated and calibrated, of views left out in turn and held back.
+# Plot series: nominal and calibrated arm; markers of cross-validation and hold-out views.
 _STATED, _CALIBRATED = "as_stated", "calibrated"
 _CIRCLE, _DIAMOND = rr.components.MarkerShape.Circle, rr.components.MarkerShape.Diamond
 
-# Half axes of the ellipsoid that holds a point in 95 % of cases, in standard deviations: the root
-# of the chi-square distribution's quantile for three degrees of freedom.
+# Half axes of the 95 % ellipsoid in standard deviations: root of the chi-square quantile for three
+# degrees of freedom.
 SIGMAS_95 = 2.795
-# How large the largest of them is drawn, as a share of the cell's size.
+# Drawn size of the largest ellipsoid, as a share of the cell's size.
 _LARGEST = 0.07
-# Placements beyond this are drawn here, as shares of the same: wrong views lie anywhere.
+# Placements beyond this share of the cell's size are drawn there: wrong views lie anywhere.
 _REACH = 0.2
 _POINT, _FINE_LINE = 0.005, 0.0015
 
 
 @dataclass(frozen=True, eq=False)
 class ArmPicture:
-    """What is drawn of a calibrated arm.
+    """Drawing of a calibrated arm.
 
     Attributes:
-        found: What is known of it.
-        robot: The arm as calibrated.
+        found: Result of its calibration.
+        robot: Calibrated model.
         off_m: By view, (k, 3) origins of the calibrated arm's joints and flange in the base, and
-            how far off these are in the arm as stated [m].
-        factor: How many times farther off the arm as stated is drawn.
-        size_m: The cell's size [m].
+            the deviations of the nominal arm's origins [m].
+        factor: Magnification of the nominal arm's deviations.
+        size_m: Size of the cell [m].
     """
 
     found: ArmResult
@@ -68,25 +68,25 @@ class ArmPicture:
     def of(
         cls, session: Session, calibration: Calibration | None, size_m: float
     ) -> "ArmPicture | None":
-        """Collects what there is to draw; None where the arm stays as stated."""
+        """Collects what to draw; None if the arm was not calibrated."""
         if calibration is None:
             return None
-        found, nominal = calibration.arm, calibration.robot
-        robot = None if found is None else found.robot
-        if found is None or robot is None:
+        result, nominal = calibration.arm, calibration.robot
+        robot = None if result is None else result.robot
+        if result is None or robot is None:
             return None
         off_m = {
-            view.number: _off(view, view.joints_rad, robot, nominal)
+            view.number: _deviations(view, view.joints_rad, robot, nominal)
             for view in session.views
             if nominal is not None
             and view.joints_rad is not None
             and len(view.joints_rad) == robot.joint_count == nominal.joint_count
         }
         farthest_m = max((float(np.abs(pair[1]).max()) for pair in off_m.values()), default=0.0)
-        return cls(found, robot, off_m, round_factor(_SHARE * size_m, farthest_m), size_m)
+        return cls(result, robot, off_m, round_factor(_SHARE * size_m, farthest_m), size_m)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
-        """Draws the map with its legend, and how the plots look."""
+        """Draws the map with its legend, and the style of the plots."""
         frame = rr.CoordinateFrame(paths.BASE_FRAME)
         stream.log(paths.magnified_arm(self.factor), frame, static=True)
         if self.found.workspace_map:
@@ -103,17 +103,15 @@ class ArmPicture:
                         marker_sizes=5.0 if held else 3.5,
                         names=f"{label}, held back" if held else label,
                     )
-                    stream.log(_series(plot, name, held=held), points, static=True)
+                    stream.log(_series(plot, name, is_holdout=held), points, static=True)
 
     def log_views(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
-        """Draws the arm as stated in each view, and marks what both make of it.
-
-        Args:
-            stream: Where to.
-            rows: The views' places in the session.
-        """
+        """Draws the nominal arm in each view, by row, and plots the residuals of both arms."""
         drawn = [self.off_m[view] for view in rows if view in self.off_m]
-        strips = [np.vstack([np.zeros(3), at + self.factor * off]) for at, off in drawn]
+        strips = [
+            np.vstack([np.zeros(3), origins + self.factor * deviations])
+            for origins, deviations in drawn
+        ]
         entity = paths.magnified_arm(self.factor)
         style = rr.LineStrips3D.from_fields(colors=colours.STATED, radii=_LINE * self.size_m)
         stream.log(entity, style, static=True)
@@ -123,14 +121,16 @@ class ArmPicture:
         )
         for held, views in ((False, self.found.left_out), (True, self.found.holdout)):
             _log_unseen(
-                stream, {rows[view.view]: view for view in views if view.view in rows}, held=held
+                stream,
+                {rows[view.view]: view for view in views if view.view in rows},
+                is_holdout=held,
             )
 
 
 def log_map(
     stream: rr.RecordingStream, places_m: FloatArray, sigma_mm: FloatArray, size_m: float
 ) -> None:
-    """Draws standard deviations (w,) [mm] at (w, 3) places of a cell of some size [m]."""
+    """Draws standard deviations (w,) [mm] at (w, 3) points, sized for a cell of `size_m` [m]."""
     low, high = np.percentile(sigma_mm, [_LOW_PERCENT, _HIGH_PERCENT])
     frame = rr.CoordinateFrame(paths.BASE_FRAME)
     places = rr.Points3D(
@@ -142,70 +142,78 @@ def log_map(
     )
     stream.log(f"{paths.WORKSPACE}/sigma_of_a_tool_s_place", frame, places, static=True)
     steps_mm = np.linspace(low, high, _LEGEND_STEPS)
-    # A column beside the map, as high as it.
+    # A column beside the map, of the same height.
     bottom, top = places_m[:, 2].min(), places_m[:, 2].max()
     column = np.zeros((_LEGEND_STEPS, 3))
     column[:, :2] = places_m[:, :2].min(axis=0)
     column[:, 2] = np.linspace(bottom, top, _LEGEND_STEPS)
-    words = [f"{significant(step)} mm" for step in steps_mm]
-    words[-1] += " sigma of a tool's place"
+    labels = [f"{significant(step)} mm" for step in steps_mm]
+    labels[-1] += " sigma of a tool's place"
     legend = rr.Points3D(
         column,
         colors=_colours(steps_mm, low, high),
         radii=_LEGEND * size_m,
-        labels=words,
+        labels=labels,
         show_labels=True,
     )
     stream.log(f"{paths.WORKSPACE}/legend", frame, legend, static=True)
 
 
-def _log_unseen(stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, held: bool) -> None:
+def _log_unseen(
+    stream: rr.RecordingStream, seen: Mapping[int, UnseenView], *, is_holdout: bool
+) -> None:
     for plot, before, after in (
         (paths.UNSEEN_MM, "nominal_mm", "mm"),
         (paths.UNSEEN_DEG, "nominal_deg", "deg"),
     ):
         pairs = {row: (getattr(view, before), getattr(view, after)) for row, view in seen.items()}
         known = {row: pair for row, pair in pairs.items() if None not in pair}
-        for at, name in enumerate((_STATED, _CALIBRATED)):
-            entity = _series(plot, name, held=held)
-            log_scalars(stream, entity, {row: pair[at] for row, pair in known.items()})
+        for index, name in enumerate((_STATED, _CALIBRATED)):
+            entity = _series(plot, name, is_holdout=is_holdout)
+            log_scalars(stream, entity, {row: pair[index] for row, pair in known.items()})
 
 
-def _series(plot: str, name: str, *, held: bool) -> str:
-    return f"{plot}/{name}_held_back" if held else f"{plot}/{name}"
+def _series(plot: str, name: str, *, is_holdout: bool) -> str:
+    return f"{plot}/{name}_held_back" if is_holdout else f"{plot}/{name}"
 
 
-def _off(view: View, q: FloatArray, robot: Robot, nominal: Robot) -> tuple[FloatArray, FloatArray]:
-    """Origins of an arm's joints and flange in one view, and how far off the nominal one's are."""
-    origins, stated = robot.link_frames(q)[:, :3, 3], nominal.link_frames(q)[:, :3, 3].copy()
-    # The calibrated arm ends at the frame of the reported poses, which may be a tool's.
+def _deviations(
+    view: View, q: FloatArray, robot: Robot, nominal: Robot
+) -> tuple[FloatArray, FloatArray]:
+    """Origins of an arm's joints and flange in one view, and the nominal arm's deviations."""
+    origins, nominal_origins = (
+        robot.link_frames(q)[:, :3, 3],
+        nominal.link_frames(q)[:, :3, 3].copy(),
+    )
+    # The calibrated arm ends at the frame of the reported poses, possibly a tool's.
     reported = view.base_from_flange()
     if reported is None:
-        return origins[:-1], stated[:-1] - origins[:-1]
-    stated[-1] = reported.translation
-    return origins, stated - origins
+        return origins[:-1], nominal_origins[:-1] - origins[:-1]
+    nominal_origins[-1] = reported.translation
+    return origins, nominal_origins - origins
 
 
 def _colours(values: FloatArray, low: float, high: float) -> FloatArray:
-    """(k, 3) colours of values between two ends, 0 to 255."""
+    """(k, 3) colours of values on the scale between two ends, 0 to 255."""
     scale = np.array(colours.SCALE, dtype=float)
     share = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0) * (len(scale) - 1)
-    at = np.arange(len(scale))
-    columns = [np.interp(share, at, scale[:, channel]) for channel in range(3)]
+    stops = np.arange(len(scale))
+    columns = [np.interp(share, stops, scale[:, channel]) for channel in range(3)]
     return np.asarray(np.stack(columns, axis=1).round(), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What is drawn of the uncertainty.
+    """Drawing of the result's uncertainty.
 
     Attributes:
-        edges: The edges that have a covariance, by name; tools and fixtures among them.
-        scatter_m: By view, how far from the result it puts its target: (3,) in the target's frame.
-        frames: By view, the frame of its target.
-        used: The views that the fit used.
-        factor: How many times larger than it is everything is drawn.
-        size_m: The cell's size [m].
+        edges: Edges with a covariance, by name, including tools and fixtures.
+        scatter_m: By view, deviation of its target position from the result: (3,) in the target's
+            frame.
+        frames: By view, frame of its target.
+        used: The views in the fit.
+        factor: Magnification of everything.
+        size_m: Size of the cell [m].
     """
 
     edges: Mapping[str, Edge]
@@ -223,45 +231,40 @@ class Uncertainty:
         size_m: float,
         frames: Mapping[int, str] | None = None,
     ) -> "Uncertainty":
-        """Collects the placements and chooses the factor by the used views.
+        """Collects the placements, and chooses the magnification by the used views.
 
-        Args:
-            calibration: The result.
-            evidence: What each view shows.
-            size_m: The cell's size [m].
-            frames: By view, the frame of its target; the only one's where None.
+        `frames` is the frame of each view's target; None for a single target.
         """
         used = frozenset(view.view for view in calibration.views if view.used)
         if frames is None:
             frames = dict.fromkeys(evidence, list(calibration.edges)[1].rpartition("_from_")[2])
         scatter_m = {
             view: placed[:3, 3]
-            for view, other in evidence.items()
-            if view in frames
-            and (placed := placement(calibration, other, frames[view])) is not None
+            for view, seen in evidence.items()
+            if view in frames and (placed := placement(calibration, seen, frames[view])) is not None
         }
-        last = parts.frames(calibration).matrices
+        final_frames = parts.frames(calibration).matrices
         edges = {
             name: edge
             for name, edge in calibration.placed.items()
-            if edge.covariance.any() and name.rpartition("_from_")[2] in last
+            if edge.covariance.any() and name.rpartition("_from_")[2] in final_frames
         }
-        sizes_m = [SIGMAS_95 * _axes(edge)[0].max() for edge in edges.values()]
+        sizes_m = [SIGMAS_95 * _principal_sigmas(edge)[0].max() for edge in edges.values()]
         sizes_m += [float(np.linalg.norm(scatter_m[view])) for view in scatter_m.keys() & used]
         factor = round_factor(_LARGEST * size_m, max(sizes_m, default=0.0))
         return cls(edges, scatter_m, frames, used, factor, size_m)
 
     def log_static(self, stream: rr.RecordingStream) -> None:
-        """Draws the ellipsoids, and all views' placements of the target."""
+        """Draws the ellipsoids, and the target positions by all views."""
         for name, edge in self.edges.items():
             self._log_ellipsoid(stream, name, edge)
-        for name, colour, wanted in (
+        for name, colour, is_used in (
             (paths.USED, colours.USED, True),
             (paths.REJECTED, colours.REJECTED, False),
         ):
-            some = [view for view in self.scatter_m if (view in self.used) is wanted]
-            for frame in self._frames_of(some):
-                positions_m = self._positions_m(some, frame)
+            views = [view for view in self.scatter_m if (view in self.used) is is_used]
+            for frame in self._frames_of(views):
+                positions_m = self._positions_m(views, frame)
                 points = rr.Points3D(positions_m, colors=colour, radii=_POINT * self.size_m)
                 entity = f"{self._placements(frame)}/{name}"
                 stream.log(entity, rr.CoordinateFrame(frame), points, static=True)
@@ -275,7 +278,7 @@ class Uncertainty:
         child = name.rpartition("_from_")[2]
         entity = f"{paths.entity_of(child)}/{name}_95_percent_magnified_{self.factor}x"
         frame = rr.CoordinateFrame(child)
-        sigmas_m, axes = _axes(edge)
+        sigmas_m, axes = _principal_sigmas(edge)
         ellipsoid = rr.Ellipsoids3D(
             half_sizes=[SIGMAS_95 * self.factor * sigmas_m],
             quaternions=[Rotation.from_matrix(axes).as_quat()],
@@ -284,9 +287,9 @@ class Uncertainty:
         )
         stream.log(entity, frame, ellipsoid, static=True)
         if child not in (paths.TARGET_FRAME, *self.frames.values()):
-            # All are drawn alike, and tools are close to the camera: more labels would hide them.
+            # Only targets are labelled: tools are close to the camera, and labels would hide them.
             return
-        # Beside the board, clear of the name of the frame.
+        # Beside the board, clear of the frame's name.
         label = rr.Points3D(
             [[0.0, -2.0 * _LARGEST * self.size_m, 0.0]],
             radii=0.0,
@@ -297,14 +300,9 @@ class Uncertainty:
         stream.log(f"{entity}/label", frame, label, static=True)
 
     def log_views(self, stream: rr.RecordingStream, views: Sequence[int]) -> None:
-        """Marks each view's placement of the target when it is looked at.
-
-        Args:
-            stream: Where to.
-            views: All, in the order of the session.
-        """
+        """Marks the current view's target position, for all views of the session in order."""
         for frame in self._frames_of(self.scatter_m):
-            # Of the other targets, nothing takes the mark of the view before off the screen.
+            # For other targets, an empty part clears the mark of the previous view.
             marked = [self._positions_m([view] * (view in self.scatter_m), frame) for view in views]
             entity = f"{self._placements(frame)}/{paths.THIS_VIEW}"
             radius = 1.5 * _POINT * self.size_m
@@ -315,23 +313,25 @@ class Uncertainty:
             send_rows(stream, entity, range(len(views)), parts)
 
     def _positions_m(self, views: Iterable[int], frame: str) -> FloatArray:
-        """(k, 3) where the placements of a target by some views are drawn, in its frame."""
+        """(k, 3) drawn positions of a target by some views, in its frame."""
         shown = [view for view in views if self.frames[view] == frame]
-        places_m = [self._within_reach(self.factor * self.scatter_m[index]) for index in shown]
+        places_m = [self._within_reach(self.factor * self.scatter_m[view]) for view in shown]
         return np.reshape(places_m, (-1, 3))
 
     def _placements(self, frame: str) -> str:
         return f"{paths.entity_of(frame)}/placements_magnified_{self.factor}x"
 
     def _log_beyond(self, stream: rr.RecordingStream, frame: str) -> None:
-        """Arrows towards the placements that lie too far out to be drawn."""
-        mine = [array for view, array in self.scatter_m.items() if self.frames[view] == frame]
-        drawn_m = [self.factor * array for array in mine]
-        far = [array for array in drawn_m if np.linalg.norm(array) > _REACH * self.size_m]
-        if far:
+        """Arrows towards positions that lie too far out to be drawn."""
+        deviations = [
+            vector for view, vector in self.scatter_m.items() if self.frames[view] == frame
+        ]
+        drawn_m = [self.factor * vector for vector in deviations]
+        beyond = [vector for vector in drawn_m if np.linalg.norm(vector) > _REACH * self.size_m]
+        if beyond:
             arrows = rr.Arrows3D(
-                vectors=[self._within_reach(array) for array in far],
-                origins=np.zeros((len(far), 3)),
+                vectors=[self._within_reach(vector) for vector in beyond],
+                origins=np.zeros((len(beyond), 3)),
                 colors=colours.REJECTED,
                 radii=_FINE_LINE * self.size_m,
             )
@@ -343,14 +343,14 @@ class Uncertainty:
         return drawn_m * min(1.0, reach_m / max(float(np.linalg.norm(drawn_m)), 1e-12))
 
 
-def _axes(edge: Edge) -> tuple[FloatArray, FloatArray]:
+def _principal_sigmas(edge: Edge) -> tuple[FloatArray, FloatArray]:
     """Standard deviations (3,) [m] along the columns of a (3, 3) rotation, in the child's frame."""
     variances_m2, axes = np.linalg.eigh(edge.covariance[3:, 3:])
     return np.sqrt(np.clip(variances_m2, 0.0, None)), axes * np.sign(np.linalg.det(axes))
 
 
 def round_factor(wanted_m: float, size_m: float) -> int:
-    """The largest of 1, 2, 5, 10, 20 ... by which a size stays under the wanted one."""
+    """Largest of 1, 2, 5, 10, 20 ... that keeps a size within the wanted one."""
     if not size_m > 0.0:
         return 1
     ratio = max(wanted_m / size_m, 1.0)

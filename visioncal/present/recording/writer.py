@@ -1,4 +1,4 @@
-"""Writes a session to a recording: view by view as it is captured, or as a whole."""
+"""Writes recordings of sessions: view by view during capture, or as a whole."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,8 +23,8 @@ from visioncal.session.table import TextRow, View, read_views
 class RecordingWriter:
     """Writes a recording while its session is captured.
 
-    A view survives the death of the process as soon as `add_view` returns. A recording that is left
-    by an exception opens as one that was cut off.
+    A view survives the death of the process once `add_view` returns. A recording that an exception
+    interrupts opens as one that was cut off.
 
         with RecordingWriter(path, session, announced=20) as writer:
             writer.add_view(["1", "images/001.png", "0.4", ...], png)
@@ -40,16 +40,16 @@ class RecordingWriter:
         label: Path | None = None,
         images: ImagesKept = "full",
     ) -> None:
-        """Begins the file.
+        """Starts the file.
 
         Args:
-            path: The `.rrd`. It must not exist, unless it is written aside for another.
-            session: What holds for all views; those that it has are not written.
-            announced: How many views are to come, so that a reader can say how many were lost.
-            blueprint: The layout to open the recording in.
-            label: The path that it is written aside for, which messages name; None for none.
-            images: What is kept of the images beside their digests. Of a session whose images are
-                elsewhere it is what there is.
+            path: The `.rrd`. It must not exist, unless `label` is given.
+            session: Data that holds for all views; its own views are not written.
+            announced: Number of views to come, by which readers can state how many were lost.
+            blueprint: Viewer layout of the recording.
+            label: Final path that messages name, where `path` is a temporary one.
+            images: What is stored of the images beside their digests; ignored for a session whose
+                images are stored elsewhere.
 
         Raises:
             DataError: The file exists or cannot be written.
@@ -58,8 +58,8 @@ class RecordingWriter:
         self._session = session
         self._numbers: set[int] = set()
         self._images: dict[str, str] = {}
-        elsewhere = session.images
-        self._kept = elsewhere.kept if isinstance(elsewhere, ImagesElsewhere) else images
+        store = session.images
+        self._kept = store.kept if isinstance(store, ImagesElsewhere) else images
         with named_errors(self._label):
             if label is None:
                 path.open("xb").close()
@@ -68,8 +68,8 @@ class RecordingWriter:
             rows = codec.UNKNOWN if announced is None else announced
             header = codec.Header.of(session, rows, "" if self._kept == "full" else self._kept)
             codec.log_header(self._recorder.stream, header)
-            for place, (name, samples) in enumerate(session.streams.items()):
-                self._recorder.at(place)
+            for index, (name, samples) in enumerate(session.streams.items()):
+                self._recorder.at(index)
                 codec.log_samples(self._recorder.stream, name, samples)
             if session.corner_table is not None:
                 codec.log_corners(self._recorder.stream, session.corner_table)
@@ -80,14 +80,13 @@ class RecordingWriter:
         """Adds one view.
 
         Args:
-            cells: One text for each of the session's columns, as views.csv has them.
-            image: The bytes of the file that the column `image` names; None where it names none,
-                or one that is missing.
+            cells: One text per column of the session, as in views.csv.
+            image: Bytes of the file that the column `image` names; None without a name or a file.
 
         Raises:
-            DataError: A cell is wrong, the view's number is already there, its image is another
-                than an earlier view has by the same name, or the file cannot be written. The views
-                before stay as they are.
+            DataError: A cell is wrong, the view's number is already there, its image differs from
+                an earlier view's of the same name, or the file cannot be written. Earlier views
+                remain.
         """
         view = self._checked(cells)
         digest = "" if image is None else self._digest_of(view, image)
@@ -111,12 +110,12 @@ class RecordingWriter:
     def add_results(
         self, session: Session, calibration: Calibration | None, evidence: Sequence[ViewEvidence]
     ) -> None:
-        """Adds what was computed.
+        """Adds results.
 
         Args:
             session: The session with all of its views.
-            calibration: Its result; None draws the cell as it was recorded.
-            evidence: What was seen and computed of the views, in any order.
+            calibration: Result of the session; None draws the cell as recorded.
+            evidence: Evidence of the views, in any order.
 
         Raises:
             DataError: The file cannot be written.
@@ -137,11 +136,11 @@ class RecordingWriter:
                 checked = self._checked(cells)
                 self._log(checked, images.sha256(view.image), images.shown(view.image))
             else:
-                known = bool(view.image) and images.exists(view.image)
-                self.add_view(cells, images.read(view.image) if known else None)
+                has_image = bool(view.image) and images.exists(view.image)
+                self.add_view(cells, images.read(view.image) if has_image else None)
 
     def draw(self, log: Callable[[Recorder], None]) -> None:
-        """Adds what is drawn and belongs to no view.
+        """Adds a drawing that belongs to no view.
 
         Raises:
             DataError: The file cannot be written.
@@ -152,11 +151,11 @@ class RecordingWriter:
 
     @property
     def _where(self) -> str:
-        """What messages call the row that is added."""
+        """Name of the row that is added, for messages."""
         return f"row {len(self._numbers) + 1}"
 
     def _checked(self, cells: Sequence[str]) -> View:
-        """Refuses a row that could be written but not be read again."""
+        """Checks a row: it must be readable again."""
         where, corners = self._where, self._session.corner_table is not None
         rows = [TextRow(where, tuple(cells))]
         (view,) = read_views(self._session.columns, rows, "views.csv", with_corners=corners)
@@ -169,7 +168,7 @@ class RecordingWriter:
         return view
 
     def _digest_of(self, view: View, image: bytes) -> str:
-        """SHA-256 of a view's image; refuses one without a name, or with another's."""
+        """SHA-256 of a view's image, which must have a name of its own."""
         where = self._where
         if not view.image:
             raise DataError(f"{where}: it has an image but does not name it.", culprits=[where])
@@ -185,7 +184,7 @@ class RecordingWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Closes the recording, with a mark that all views are there unless an error left it.
+        """Closes the recording, with the end mark unless an error occurred.
 
         Raises:
             DataError: The file cannot be written.
@@ -208,12 +207,11 @@ def write_recording(
 
     Args:
         path: The `.rrd` to write; it appears whole or not at all.
-        session: What was recorded; `read_session` gives it back.
-        calibration: Its result, if there is one.
-        evidence: What was seen and computed of the views, in any order.
-        blueprint: The layout to open it in, as `viewer.blueprint` makes it; the viewer
-            makes its own where None.
-        images: What is kept of the images beside their digests.
+        session: The session; `read_session` returns it.
+        calibration: Result of the session, if there is one.
+        evidence: Evidence of the views, in any order.
+        blueprint: Viewer layout, as by `viewer.blueprint`; None for the viewer's own.
+        images: What is stored of the images beside their digests.
 
     Raises:
         DataError: The file cannot be written, or an image of the session cannot be read.

@@ -1,4 +1,4 @@
-"""The report: one HTML file that says whether to trust a calibration, and why."""
+"""The report: one HTML file with the verdict on a calibration and its reasons."""
 
 from visioncal.present.report.page import write_report
 

@@ -1,4 +1,4 @@
-"""An arm's plots: before and after it was calibrated, its uncertainty, its springs and drift."""
+"""Plots of an arm: residuals before and after calibration, uncertainty, springs and drift."""
 
 from collections.abc import Callable
 
@@ -14,22 +14,22 @@ from visioncal.present.report.svg import Figure
 from visioncal.results.arm import ArmResult, ElasticResult, ThermalResult, UnseenView
 
 _WIDE_IN, _MAP_IN = 9.2, 5.0
-# Places left free between the views that were left out in turn and those that are held back.
+# Gap between cross-validation views and hold-out views, in views.
 _GAP = 1.5
-# Many views have room for so many labels.
+# Largest number of labelled views.
 _MOST_LABELS = 25
-# Colours end here, that a few places at the rim do not take all of them.
+# Percentiles at the ends of the colour scale, as few places at the rim would dominate it.
 _LOW_PERCENT, _HIGH_PERCENT = 1.0, 98.0
-# A scale of decades has no room for zero [mm, deg].
+# Smallest value on a logarithmic scale [mm, deg].
 _LEAST = 1e-6
-# A map is no taller than this many times its width; its steps of colour.
+# Largest height over width of a map, and its number of colours.
 _TALLEST, _SHADES = 1.0, 32
-# Above and below marks on a scale of decades, as a factor.
+# Room above and below marks on a logarithmic scale, as a factor.
 _SPARE = 1.25
 
-# Height of the drift's figure, and how wide its band is: it holds 95 % of cases.
+# Height of the drift plot, and half width of its 95 % band in sigmas.
 _DRIFT_IN, _BAND = 2.6, 1.96
-# Panels side by side, their height, and room between them for their labels.
+# Panels side by side, their height, and the gaps between them.
 _PANELS, _PANEL_IN, _ACROSS_IN, _DOWN_IN = 3, 2.3, 0.75, 0.75
 
 _BEFORE, _AFTER = svg.CHECK, svg.ACCENT
@@ -37,39 +37,39 @@ _BEFORE, _AFTER = svg.CHECK, svg.ACCENT
 _Pair = Callable[[UnseenView], tuple[float | None, float | None]]
 
 
-def before_and_after(found: ArmResult) -> Markup:
-    """Residuals of views that the fit had not seen, by the arm as stated and as calibrated.
+def before_and_after(arm: ArmResult) -> Markup:
+    """Residuals of views that the fit did not use, by the nominal and the calibrated arm.
 
     Returns:
-        The figure; empty where these residuals are not known.
+        The figure; empty if these residuals are unknown.
     """
-    if not found.left_out:
+    if not arm.left_out:
         return Markup("")
-    views = [*found.left_out, *found.holdout]
-    places = np.arange(float(len(views)))
-    places[len(found.left_out) :] += _GAP
+    views = [*arm.left_out, *arm.holdout]
+    positions = np.arange(float(len(views)))
+    positions[len(arm.left_out) :] += _GAP
     panels: list[tuple[str, _Pair]] = [("position [mm]", lambda view: (view.nominal_mm, view.mm))]
     if all(view.deg is not None for view in views):
         panels.append(("orientation [deg]", lambda view: (view.nominal_deg, view.deg)))
     step = max(1, -(-len(views) // _MOST_LABELS))
-    ticks = [(float(place), str(view.view)) for place, view in zip(places, views, strict=True)][
-        ::step
-    ]
+    ticks = [
+        (float(position), str(view.view)) for position, view in zip(positions, views, strict=True)
+    ][::step]
     figure = Figure(_WIDE_IN, 1.7 * len(panels) + 0.2)
     rows = boxes(figure, len(panels), 1, Margins(0.75, 0.75, top=0.45), (0.0, 0.2))
     for (box,), (label, pair) in zip(rows, panels, strict=True):
-        last = box is rows[-1][0]
+        is_last = box is rows[-1][0]
         pairs = np.maximum(np.array([pair(view) for view in views], dtype=float), _LEAST)
         heights = Scale(float(pairs.min()) / _SPARE, float(pairs.max()) * _SPARE, decades=True)
-        panel = Panel(figure, box, Scale(places[0] - 0.8, places[-1] + 0.8), heights)
-        panel.x_axis("view" if last else "", ticks, grid=False, words=last)
+        panel = Panel(figure, box, Scale(positions[0] - 0.8, positions[-1] + 0.8), heights)
+        panel.x_axis("view" if is_last else "", ticks, grid=False, words=is_last)
         panel.y_axis(label)
-        _dumbbells(panel, places, pairs)
-        _mark_rms(panel, pairs[: len(found.left_out)])
-        if found.holdout:
-            panel.post(len(found.left_out) - 0.5 + 0.5 * _GAP, svg.MUTED)
+        _dumbbells(panel, positions, pairs)
+        _mark_rms(panel, pairs[: len(arm.left_out)])
+        if arm.holdout:
+            panel.post(len(arm.left_out) - 0.5 + 0.5 * _GAP, svg.MUTED)
             if box is rows[0][0]:
-                _name_sets(panel, places[len(found.left_out)])
+                _name_sets(panel, positions[len(arm.left_out)])
     entries = [
         ("\N{WHITE CIRCLE}", _BEFORE, "arm as stated"),
         ("\N{BLACK CIRCLE}", _AFTER, "calibrated arm"),
@@ -81,10 +81,10 @@ def before_and_after(found: ArmResult) -> Markup:
 
 
 def _dumbbells(panel: Panel, places: FloatArray, values: FloatArray) -> None:
-    """Draws (m, 2) residuals, before and after, one above the other."""
-    gap = np.full(len(places), np.nan)
-    stems = np.stack([places, places, gap], axis=1).ravel()
-    heights = np.stack([values[:, 0], values[:, 1], gap], axis=1).ravel()
+    """Draws (m, 2) residuals, before and after, joined by a line."""
+    breaks = np.full(len(places), np.nan)
+    stems = np.stack([places, places, breaks], axis=1).ravel()
+    heights = np.stack([values[:, 0], values[:, 1], breaks], axis=1).ravel()
     panel.line(stems, heights, svg.LINE)
     panel.marks(places, values[:, 0], "ring", _BEFORE)
     panel.marks(places, values[:, 1], "dot", _AFTER)
@@ -92,7 +92,7 @@ def _dumbbells(panel: Panel, places: FloatArray, values: FloatArray) -> None:
 
 def _mark_rms(panel: Panel, values: FloatArray) -> None:
     """Writes the root mean squares of (m, 2) residuals beside the panel."""
-    # Apart from each other where both are alike.
+    # Above and below, so that similar values do not overlap.
     marks = ((_BEFORE, "bottom"), (_AFTER, "top"))
     for rms, (colour, side) in zip(np.sqrt(np.mean(values**2, axis=0)), marks, strict=True):
         x, y = panel.box.right + 6.0, float(panel.y_at(float(rms)))
@@ -101,33 +101,25 @@ def _mark_rms(panel: Panel, values: FloatArray) -> None:
 
 
 def _name_sets(panel: Panel, first_held: float) -> None:
-    """Says above the panels which views are which."""
-    for words, place in (("left out in turn", -0.4), ("held back by the session", first_held)):
-        x, y = float(panel.x_at(place)), panel.box.top - 4.0
+    for words, position in (("left out in turn", -0.4), ("held back by the session", first_held)):
+        x, y = float(panel.x_at(position)), panel.box.top - 4.0
         panel.figure.text(x, y, words, size=svg.SMALL, colour=svg.MUTED)
 
 
-def side_map(found: ArmResult, stops_m: FloatArray) -> Markup:
-    """The map seen from the side: height over the distance from the base's axis.
-
-    Args:
-        found: The arm, with a map of its workspace.
-        stops_m: (m, 3) where the flange was when the arm was measured; may be empty [m].
-    """
+def side_map(arm: ArmResult, stops_m: FloatArray) -> Markup:
+    """Map of the workspace from the side, with the stops' (m, 3) flange positions [m]."""
     return _map(
-        found,
-        _from_the_side(found.map_places_m),
+        arm,
+        _from_the_side(arm.map_places_m),
         _from_the_side(stops_m),
         ("distance from the base's axis [m]", "base z [m]"),
         "side",
     )
 
 
-def top_map(found: ArmResult, stops_m: FloatArray) -> Markup:
-    """The map seen from above; see `side_map`."""
-    return _map(
-        found, found.map_places_m[:, :2], stops_m[:, :2], ("base x [m]", "base y [m]"), "top"
-    )
+def top_map(arm: ArmResult, stops_m: FloatArray) -> Markup:
+    """Map of the workspace from above; see `side_map`."""
+    return _map(arm, arm.map_places_m[:, :2], stops_m[:, :2], ("base x [m]", "base y [m]"), "top")
 
 
 def _from_the_side(places_m: FloatArray) -> FloatArray:
@@ -135,31 +127,27 @@ def _from_the_side(places_m: FloatArray) -> FloatArray:
 
 
 def _map(
-    found: ArmResult,
-    places_m: FloatArray,
-    stops_m: FloatArray,
-    labels: tuple[str, str],
-    name: str,
+    arm: ArmResult, places_m: FloatArray, stops_m: FloatArray, labels: tuple[str, str], name: str
 ) -> Markup:
-    """Draws (k, 2) places, the worst ones on top, and the stops as crosses."""
-    order = np.argsort(found.map_sigmas_mm)
-    low, high = np.percentile(found.map_sigmas_mm, [_LOW_PERCENT, _HIGH_PERCENT])
+    """Draws (k, 2) places with the largest sigmas on top, and the stops as crosses."""
+    order = np.argsort(arm.map_sigmas_mm)
+    low, high = np.percentile(arm.map_sigmas_mm, [_LOW_PERCENT, _HIGH_PERCENT])
     ends = np.vstack([places_m, stops_m, np.zeros((1, 2))])
     start, end = ends.min(axis=0), ends.max(axis=0)
     spare = 0.05 * np.maximum(end - start, 1e-3)
     start, end = start - spare, end + spare
     share = min(float((end - start)[1] / (end - start)[0]), _TALLEST)
-    # A map that is too tall for the room is as high as that, and less wide.
+    # A map that is too tall is drawn at the height limit, and narrower.
     figure = Figure(_MAP_IN, 0.6 + (_MAP_IN - 1.5) * share)
     ((box,),) = boxes(figure, 1, 1, Margins(right=0.9))
     box = box.shaped(float((end - start)[1] / (end - start)[0]))
     panel = Panel(figure, box, Scale(start[0], end[0]), Scale(start[1], end[1]))
     panel.x_axis(labels[0], 6)
     panel.y_axis(labels[1], 6)
-    steps, colours = svg.shades(found.map_sigmas_mm[order], low, high, svg.PLASMA, _SHADES)
+    steps, colours = svg.shades(arm.map_sigmas_mm[order], low, high, svg.PLASMA, _SHADES)
     for step, colour in enumerate(colours):
-        some = places_m[order][steps == step]
-        panel.marks(some[:, 0], some[:, 1], "dot", colour, 5.1)
+        places = places_m[order][steps == step]
+        panel.marks(places[:, 0], places[:, 1], "dot", colour, 5.1)
     panel.marks(stops_m[:, 0], stops_m[:, 1], "x", svg.INK, 4.5)
     panel.marks([0.0], [0.0], "square", svg.INK, 6.0)
     panel.colour_bar(Scale(low, high), svg.PLASMA, "sigma [mm]")
@@ -167,15 +155,15 @@ def _map(
     return figure.inline(f"The workspace from the {name}, sigma {sigmas}")
 
 
-def course(found: ThermalResult) -> Markup:
-    """The drift over time, with the band in which it is predicted to lie."""
-    times_h = [hours(found, point.stamp_s) for point in found.course]
-    drift_mm = np.array([point.drift_mm for point in found.course])
-    band_mm = _BAND * np.array([point.sigma_mm for point in found.course])
+def course(thermal: ThermalResult) -> Markup:
+    """Drift over time, with its 95 % band."""
+    times_h = [hours(thermal, point.stamp_s) for point in thermal.course]
+    drift_mm = np.array([point.drift_mm for point in thermal.course])
+    band_mm = _BAND * np.array([point.sigma_mm for point in thermal.course])
     low, high = drift_mm - band_mm, drift_mm + band_mm
     seen = [
-        (hours(found, observed_drift.stamp_s), observed_drift.drift_mm)
-        for observed_drift in found.seen or ()
+        (hours(thermal, observation.stamp_s), observation.drift_mm)
+        for observation in thermal.seen or ()
     ]
     values_mm = np.concatenate([low, high, [mm for _, mm in seen]])
     least, most = 1.1 * min(0.0, float(values_mm.min())), float(values_mm.max())
@@ -188,7 +176,7 @@ def course(found: ThermalResult) -> Markup:
     panel.band(np.array(times_h), low, high, svg.ACCENT)
     panel.line(times_h, drift_mm, svg.ACCENT)
     if seen:
-        panel.marks([at for at, _ in seen], [mm for _, mm in seen], "dot", svg.INK)
+        panel.marks([time_h for time_h, _ in seen], [mm for _, mm in seen], "dot", svg.INK)
         line, dot = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}", "\N{BLACK CIRCLE}"
         entries = [(line, svg.ACCENT, "the model"), (dot, svg.INK, "seen by the stops")]
         figure.legend(box.right - 6.0, box.bottom - 6.0, entries)
@@ -196,15 +184,15 @@ def course(found: ThermalResult) -> Markup:
 
 
 def deflection_against_load(elastic: ElasticResult) -> Markup:
-    """How far each stop sees each determined joint bend, over the torque on it.
+    """Deflection of each determined joint at each stop, against the torque on it.
 
     Returns:
-        The figure; empty where no joint is determined.
+        The figure; empty if no joint is determined.
     """
     bending = {
-        spring: np.array(seen)
-        for at, spring in enumerate(elastic.joints)
-        if spring.stiffness_nm_per_rad is not None and (seen := elastic.bends(at))
+        spring: np.array(deflections)
+        for index, spring in enumerate(elastic.joints)
+        if spring.stiffness_nm_per_rad is not None and (deflections := elastic.bends(index))
     }
     if not bending:
         return Markup("")

@@ -1,4 +1,4 @@
-"""The certificate: one page to print and to sign."""
+"""The certificate: one page to print and sign."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -14,18 +14,18 @@ from visioncal.present.report.templates import template
 from visioncal.results import Calibration
 from visioncal.session import Session
 
-# More do not fit a page; the report has them all.
+# Largest number of transforms that fit the page; the report has all.
 _MOST_EDGES = 4
 _Facts = list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Signed:
-    """What a person says of a calibration.
+    """What a person adds to a certificate.
 
     Attributes:
-        operator: Who made it; empty where that is left to be signed.
-        serials: Serial numbers by what they are of.
+        operator: Who made the calibration; empty to be filled in by hand.
+        serials: Serial numbers by device.
     """
 
     operator: str = ""
@@ -35,13 +35,13 @@ class Signed:
 def write_certificate(
     path: Path, calibration: Calibration, session: Session | None, signed: Signed
 ) -> None:
-    """Writes the certificate as one HTML page that prints on one sheet of A4.
+    """Writes the certificate as one HTML page that fits one sheet of A4.
 
     Args:
         path: The file; it appears whole or not at all.
-        calibration: What is certified.
-        session: What it was made of; None where that is not at hand.
-        signed: What a person says of it.
+        calibration: Calibration to certify.
+        session: Session of the calibration; None if it is not at hand.
+        signed: What a person adds to it.
 
     Raises:
         DataError: The file cannot be written.
@@ -93,19 +93,19 @@ def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
     for fact in need_facts(calibration.need, calibration.verdict):
         yield fact.label[0].upper() + fact.label[1:], f"{fact.value} {fact.note}".strip()
     for name, edge in [*calibration.placed.items()][:_MOST_EDGES]:
-        turn = ", ".join(
+        rotation = ", ".join(
             f"{value:.4f}" for value in edge.transform.rotation.as_rotvec(degrees=True)
         )
-        yield name, f"{edge.place_words(3)}; rotation vector ({turn}) deg; {edge.sigma_words}"
+        yield name, f"{edge.place_words(3)}; rotation vector ({rotation}) deg; {edge.sigma_words}"
     if (test := calibration.touch_test) is not None:
         largest = max(point.gap_mm for point in test.points)
         words = "passed" if test.passed else "not passed"
         yield "Touch test", f"{words}, largest gap {figure(largest)} mm, with {test.tool}"
     left_out = calibration.validation.held_out
-    turned = "" if left_out.deg is None else f" and {figure(left_out.deg)} deg"
+    rotation_words = "" if left_out.deg is None else f" and {figure(left_out.deg)} deg"
     used = sum(view.used for view in calibration.views)
     yield "Views used", f"{used} of {len(calibration.views)}"
-    yield "Left out, views are predicted to", f"{figure(left_out.mm)} mm{turned} (rms)"
+    yield "Left out, views are predicted to", f"{figure(left_out.mm)} mm{rotation_words} (rms)"
 
 
 def _limits(calibration: Calibration) -> Iterator[tuple[str, str]]:

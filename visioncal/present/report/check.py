@@ -1,4 +1,4 @@
-"""The page of a check: one HTML file that says whether a calibration still holds."""
+"""The page of a check: one HTML file on whether a calibration still holds."""
 
 from collections.abc import Iterable, Sequence
 
@@ -19,7 +19,7 @@ from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
 
 _WIDE_IN, _HIGH_IN = 9.2, 3.6
-# Bars of a stop, side by side, and how many labels have room below them.
+# Width of a stop's bars, and the largest number of labels below them.
 _BAR, _MOST_LABELS = 0.38, 20
 
 
@@ -49,12 +49,12 @@ def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) ->
 
 
 def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray | None) -> Table:
-    """Residuals stop by stop, and of all of them; see `_residuals`."""
+    """Residuals by stop, and their rms; see `_residuals`."""
     sides = {"as calibrated": before} | ({} if after is None else {"undone": after})
     # Positions first, then rotations.
     columns = {
-        f"{name} [{unit}]": values[:, at]
-        for at, unit in enumerate(("mm", "deg"))
+        f"{name} [{unit}]": values[:, column_index]
+        for column_index, unit in enumerate(("mm", "deg"))
         for name, values in sides.items()
     }
     rms = [np.sqrt(np.mean(np.square(column))) for column in columns.values()]
@@ -65,7 +65,7 @@ def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray 
 
 
 def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | None) -> Markup:
-    """Residuals stop by stop: as the calibration has the cell, and with the change undone."""
+    """Residuals by stop: as calibrated, and with the change undone."""
     count, sides = len(stops), [("as calibrated", svg.ACCENT, before)]
     if after is not None:
         sides = [("as calibrated", svg.BAD, before),
@@ -77,10 +77,10 @@ def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | Non
     # Side by side where there are two.
     width, shifts = (1.5 * _BAR, (0.0,)) if after is None else (_BAR, (-0.5 * _BAR, 0.5 * _BAR))
     for column, label in enumerate(("position [mm]", "rotation [deg]")):
-        ((box,), last) = (rows[column], column == 1)
+        ((box,), is_last) = (rows[column], column == 1)
         top = 1.05 * max(float(values[:, column].max()) for *_, values in sides) or 1.0
         panel = Panel(figure, box, Scale(-0.7, count - 0.3), Scale(0.0, top))
-        panel.x_axis("stop, by its views" if last else "", ticks, grid=False, words=last)
+        panel.x_axis("stop, by its views" if is_last else "", ticks, grid=False, words=is_last)
         panel.y_axis(label)
         for shift, (_, colour, values) in zip(shifts, sides, strict=True):
             panel.bars([index + shift for index in range(count)], values[:, column], width, colour)
@@ -91,27 +91,27 @@ def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | Non
 
 
 def _undone(check: Check) -> str:
-    """The change without which stops are shown, in words; a scatter cannot be undone."""
-    found = check.named[0] if check.named else None
-    return "" if found is None or found.name == NOISE else thing(check, found)
+    """Words for the change that can be undone; empty if there is none, as for mere noise."""
+    change = check.named[0] if check.named else None
+    return "" if change is None or change.name == NOISE else thing(check, change)
 
 
 def _change_table(check: Check) -> Table:
-    """The changes that were compared, with their shares, and which the check takes for true."""
+    """Changes that were compared: their probability, and whether the check found them."""
     rows = []
     for suspect in [] if check.passed else listed_suspects(check):
-        share, named = 100.0 * suspect.probability, suspect in check.named
+        share, is_found = 100.0 * suspect.probability, suspect in check.named
         cells = (
             f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
-            "found" if named else "ruled out",
+            "found" if is_found else "ruled out",
             thing(check, suspect),
         )
-        rows.append(TableRow(cells, "left-out" if named else "rejected"))
+        rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
     return _reasons(rows, ("share", "", "change"))
 
 
 def _trigger_table(triggers: Sequence[Outcome]) -> Table:
-    """When to calibrate again: what says so first."""
+    """Triggers for a new calibration, those that fired first."""
     words = {"fired": "now", "unknown": "not known", "quiet": "not yet"}
     states = [*words]
     return _reasons(
@@ -128,6 +128,6 @@ def _reasons(rows: Iterable[TableRow], titles: tuple[str, str, str] = ("", "", "
 
 
 def _lengths(twists: FloatArray) -> FloatArray:
-    """(m, 2) lengths of (m, 6) twists [mm, deg]."""
-    turn, shift = np.linalg.norm(twists.reshape(-1, 2, 3), axis=2).T
-    return np.stack([1e3 * shift, np.rad2deg(turn)], axis=1)
+    """(m, 2) norms of (m, 6) twists [mm, deg]."""
+    rotation, translation = np.linalg.norm(twists.reshape(-1, 2, 3), axis=2).T
+    return np.stack([1e3 * translation, np.rad2deg(rotation)], axis=1)

@@ -1,4 +1,4 @@
-"""What the report says: rows of ready text, made from a calibration, for the templates."""
+"""Texts of the report, made from a calibration for the templates."""
 
 from collections.abc import Collection, Iterator, Sequence
 
@@ -26,13 +26,13 @@ _MOUNTS = {
 
 
 def edge_meaning(name: str) -> str:
-    """What a transform of some name, such as `flange_from_cam`, is."""
+    """Meaning of a transform's name, such as `flange_from_cam`."""
     parent, _, child = name.partition("_from_")
     return f"The pose of {frame_words(child)} in the frame of {frame_words(parent)}."
 
 
 def edge_facts(name: str, edge: Edge) -> list[Fact]:
-    """A transform's components with their deviations and units."""
+    """Components of a transform with standard deviations and units."""
     rotation = edge.matrix[:3, :3]
     # The perturbation is in the child's frame; the components are along the parent's axes.
     covariance_m2 = rotation @ edge.covariance[3:, 3:] @ rotation.T
@@ -47,8 +47,8 @@ def edge_facts(name: str, edge: Edge) -> list[Fact]:
     else:
         parent = frame_words(name.partition("_from_")[0])
         rows.append(Fact("rotation", "not measured", f"taken as that of {parent}"))
-    turned = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
-    return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{turned}")]
+    rotation_sigma = f", {significant(edge.sigma_deg)} deg" if edge.oriented else ""
+    return [*rows, Fact("sigma", f"{significant(edge.sigma_mm)} mm{rotation_sigma}")]
 
 
 def _rotation_facts(edge: Edge) -> list[Fact]:
@@ -66,13 +66,13 @@ def _rotation_facts(edge: Edge) -> list[Fact]:
 
 
 def matrix_text(matrix: FloatArray) -> str:
-    """A (4, 4) transform, to be copied."""
+    """A (4, 4) transform as text to copy."""
     rows = [", ".join(f"{value: .9f}" for value in row) for row in matrix]
     return "[[" + "],\n [".join(rows) + "]]"
 
 
 def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
-    """The handful of figures that most readers come for."""
+    """The few figures that most readers look for."""
     validation = calibration.validation
     facts = [*need_facts(calibration.need, calibration.verdict)]
     sigmas = _camera_sigmas if calibration.cell is None else _cell_sigmas
@@ -82,8 +82,8 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
             sigma = f"{significant(arm.arm.workspace_sigma_mm.median)} mm"
             facts.append(Fact(f"all over the workspace{of(name)}, sigma", sigma))
     if validation.is_of_unseen:
-        turned = validation.held_out.deg
-        note = "" if turned is None else f"{significant(turned)}{DEGREE}"
+        rotation_deg = validation.held_out.deg
+        note = "" if rotation_deg is None else f"{significant(rotation_deg)}{DEGREE}"
         facts.append(Fact("held-out residual", f"{significant(validation.held_out.mm)} mm", note))
     if calibration.rms.px is not None:
         facts.append(Fact("reprojection, rms", f"{significant(calibration.rms.px)} px"))
@@ -91,7 +91,7 @@ def key_figures(calibration: Calibration) -> tuple[Fact, ...]:
 
 
 def views_used(calibration: Calibration) -> Fact:
-    """How many views the fit used."""
+    """Number of views in the fit."""
     used = sum(view.used for view in calibration.views)
     return Fact("views used", f"{used} of {len(calibration.views)}")
 
@@ -106,14 +106,17 @@ def _camera_sigmas(calibration: Calibration) -> list[Fact]:
 
 
 def _cell_sigmas(calibration: Calibration) -> list[Fact]:
-    """How well the robots' bases are known in the first one's, and what is known worst."""
+    """Sigmas of the robots' bases relative to the first one, and the least known frame."""
     tree = calibration.tree
     bases = [name for name in frames_of_kind(tree.parents, "base") if tree.parents[name] == CELL]
     facts = []
     for base in bases[1:]:
         edge = tree.between(bases[0], base)
-        sigma, turned = f"{significant(edge.sigma_mm)} mm", f"{significant(edge.sigma_deg)}{DEGREE}"
-        facts.append(Fact(f"{base} in {bases[0]}, sigma", sigma, turned))
+        sigma, sigma_deg = (
+            f"{significant(edge.sigma_mm)} mm",
+            f"{significant(edge.sigma_deg)}{DEGREE}",
+        )
+        facts.append(Fact(f"{base} in {bases[0]}, sigma", sigma, sigma_deg))
     worst = weakest_frame(tree)
     if worst:
         facts.append(Fact("least known", worst, f"{significant(tree.edge_of(worst).sigma_mm)} mm"))
@@ -121,19 +124,19 @@ def _cell_sigmas(calibration: Calibration) -> list[Fact]:
 
 
 def stops_m(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> FloatArray:
-    """(m, 3) where the flange was in the used views [m]."""
+    """(m, 3) flange positions of the used views [m]."""
     used = {view.view for view in calibration.views if view.used}
     poses = [view.base_from_flange for view in evidence if view.view in used]
     return np.reshape([pose[:3, 3] for pose in poses if pose is not None], (-1, 3))
 
 
-def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
-    """What the task needs and how likely that is met, and what the result is good for."""
+def need_facts(need: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
+    """Probability that the task's need is met, and the tolerance the result suits."""
     facts = []
-    if met is not None:
-        both = ((met.need.mm, " mm"), (met.need.deg, DEGREE))
-        asked = " and ".join(f"{value:g}{unit}" for value, unit in both if value is not None)
-        facts.append(Fact(f"picks within {asked}", percent(met.probability)))
+    if need is not None:
+        tolerances = ((need.need.mm, " mm"), (need.need.deg, DEGREE))
+        words = " and ".join(f"{value:g}{unit}" for value, unit in tolerances if value is not None)
+        facts.append(Fact(f"picks within {words}", percent(need.probability)))
     if verdict.good_for_mm is not None:
         facts.append(
             Fact("good for tasks of", f"{significant(verdict.good_for_mm)} mm", "and more")
@@ -142,18 +145,18 @@ def need_facts(met: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
 
 
 def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
-    """How the result was obtained."""
+    """Method: views, solver, models and clocks."""
     facts = [views_used(calibration)]
     if calibration.cell is None:
         facts.insert(0, Fact("mount", calibration.mount, _MOUNTS[calibration.mount]))
-    answer = answering_solver(calibration)
-    if answer is not None:
+    solver = answering_solver(calibration)
+    if solver is not None:
         note = (
             "fit of both transforms, weighted by the noise"
-            if answer == "joint"
+            if solver == "joint"
             else "a closed form"
         )
-        facts.append(Fact("solver", answer, note))
+        facts.append(Fact("solver", solver, note))
     for name, robot in parts.robots(calibration).items():
         model = str(robot.document.get("name", "given"))
         facts.append(Fact(f"robot model{of(name)}", model))
@@ -171,7 +174,7 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
 
 
 def touch_table(test: TouchTest) -> Table:
-    """The gaps at the points of a touch test, and those that were predicted."""
+    """Measured and predicted gaps of a touch test."""
     rows = [
         TableRow(
             (point.name, significant(point.gap_mm), significant(point.radius95_mm)),
@@ -183,7 +186,7 @@ def touch_table(test: TouchTest) -> Table:
 
 
 def _clock_facts(clock: ClockResult, label: str) -> Iterator[Fact]:
-    """How far a camera's clock is ahead of its robot's, and when an image's rows are taken."""
+    """Offset of a camera's clock from its robot's, and the shutter's readout time."""
     ahead_ms = 1e3 * clock.camera_minus_robot_s
     if clock.sigma_s is None:
         yield Fact(label, f"{ahead_ms:+.4g} ms", "taken so: views at rest")
@@ -194,39 +197,41 @@ def _clock_facts(clock: ClockResult, label: str) -> Iterator[Fact]:
     shutter = clock.shutter
     if shutter is not None:
         sigma_ms = 1e3 * shutter.readout_sigma_s
-        late = f"{matched(1e3 * shutter.readout_s, sigma_ms)} ms"
+        readout = f"{matched(1e3 * shutter.readout_s, sigma_ms)} ms"
         note = f"{PLUS_MINUS} {significant(sigma_ms)}, from an image's first row to its last"
-        yield Fact(f"{shutter.kind} shutter", late, note)
+        yield Fact(f"{shutter.kind} shutter", readout, note)
 
 
 def _point_fact(point: PointResult) -> Fact:
     axis_mm = point.sigma_mm / np.sqrt(3.0)
-    place = ", ".join(matched(1e3 * value, axis_mm) for value in (point.x_m, point.y_m, point.z_m))
+    position = ", ".join(
+        matched(1e3 * value, axis_mm) for value in (point.x_m, point.y_m, point.z_m)
+    )
     note = f"{PLUS_MINUS} {significant(point.sigma_mm)}, on the flange"
-    return Fact(f"point {point.point}", f"[{place}] mm", note)
+    return Fact(f"point {point.point}", f"[{position}] mm", note)
 
 
 def lens_facts(result: CameraResult) -> tuple[Fact, ...]:
-    """The intrinsics, each with its standard deviation where it was estimated."""
+    """Intrinsics, with standard deviations where estimated."""
     values, count = intrinsics(result.camera), len(result.camera.matrix)
     sigmas = np.zeros(len(values))
     if result.covariance is not None and len(result.covariance) == len(values):
         sigmas = np.sqrt(np.clip(np.diag(result.covariance), 0.0, None))
     facts = []
-    for at, (name, value, sigma) in enumerate(
+    for index, (name, value, sigma) in enumerate(
         zip(intrinsics_names(result.camera), values, sigmas, strict=True)
     ):
-        unit = "px" if at < count else ""
-        stated = f"{value:.2f}" if at < count else f"{value:.5g}"
-        known = f"{PLUS_MINUS} {matched(sigma, sigma)} {unit}".strip()
+        unit = "px" if index < count else ""
+        stated = f"{value:.2f}" if index < count else f"{value:.5g}"
+        tolerance = f"{PLUS_MINUS} {matched(sigma, sigma)} {unit}".strip()
         facts.append(
-            Fact(name, matched(value, sigma), known) if sigma else Fact(name, stated, unit)
+            Fact(name, matched(value, sigma), tolerance) if sigma else Fact(name, stated, unit)
         )
     return tuple(facts)
 
 
 def view_table(calibration: Calibration, outlying: Collection[int]) -> Table:
-    """What became of each view; rows have the names to which the recording's notes lead."""
+    """Status and residuals of each view; the recording's notes link to the rows."""
     rows, words = [], {"used": "yes", "look": "look", "left-out": "left out", "rejected": "no"}
     for view in calibration.views:
         figures = (view.rms_px, view.residual_mm, view.residual_deg)

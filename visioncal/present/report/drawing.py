@@ -1,4 +1,4 @@
-"""Figures of the report on their own, for notebooks."""
+"""Single figures of the report, for notebooks."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from visioncal.present.report import plots, sources
 from visioncal.results import Calibration
 
 FIGURES = ("residuals", "budget", "directions")
-# The page of a report states its colours; on its own a figure brings them.
+# Colours that the report's page defines, for a figure on its own.
 _COLOURS = (
     "--ink:#1c2733;--muted:#5c6b7a;--line:#cfd6dd;--accent:#1f6fb2;--good:#2e7d32;--bad:#c62828;"
     "--check:#b26a00;--card:#ffffff;background:#fff"
@@ -20,11 +20,11 @@ _SPACE = 'xmlns="http://www.w3.org/2000/svg"'
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure.
+    """A figure of the report.
 
     Attributes:
         name: What it shows.
-        markup: It, as markup that pages embed.
+        markup: Markup to embed in pages.
     """
 
     name: str
@@ -38,21 +38,21 @@ class Drawing:
 
     @typed
     def save(self, path: Path | str) -> None:
-        """Writes it as an .svg, whole or not at all."""
-        begin = self.markup.index("<svg")
-        text = self.markup[begin : self.markup.rindex("</svg>") + len("</svg>")]
-        begun = f'<svg {_SPACE} style="{_COLOURS};font-family:sans-serif"'
-        write_atomically(Path(path), text.replace("<svg", begun, 1))
+        """Writes the figure as an .svg file, whole or not at all."""
+        start = self.markup.index("<svg")
+        text = self.markup[start : self.markup.rindex("</svg>") + len("</svg>")]
+        opening = f'<svg {_SPACE} style="{_COLOURS};font-family:sans-serif"'
+        write_atomically(Path(path), text.replace("<svg", opening, 1))
 
 
 def draw(calibration: Calibration, what: str) -> Drawing:
-    """Draws a figure of a calibration's report; see `Calibration.plot`."""
-    known = calibration.budget
+    """Draws one figure of a calibration's report; see `Calibration.plot`."""
+    budget = calibration.budget
     markup = ""
     if what == "residuals":
         markup = str(plots.residuals(calibration))
-    elif what in FIGURES and known is not None:
-        markup = str((sources.budget if what == "budget" else sources.directions)(known))
+    elif what in FIGURES and budget is not None:
+        markup = str((sources.budget if what == "budget" else sources.directions)(budget))
     if not markup:
         raise DataError(
             f"There is no figure {what!r} of this calibration.",

@@ -1,4 +1,4 @@
-"""The report of a dynamic identification: one HTML file, as that of a calibration."""
+"""The report of a dynamic identification, as one HTML file."""
 
 from collections.abc import Iterator, Sequence
 
@@ -24,16 +24,16 @@ from visioncal.present.report.svg import Figure
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Fact
 
-# So many of the fitted motions are shown: more look alike.
+# Number of fitted motions shown: more look alike.
 _MOST_FITTED = 2
 _WIDE_IN, _PANEL_IN, _SQUARE_IN = 9.2, 1.15, 3.0
-# Widths of torques and of errors beside them.
+# Relative widths of torque and error panels.
 _SHARES = (2.2, 1.0)
-# More points than these a line hide each other.
+# Largest number of points per line, and of marks.
 _MOST_POINTS, _MOST_MARKS = 1500, 600
 _COLUMNS = 3
 _CURVE_POINTS, _TICKS = 401, 5
-# Between columns and between rows.
+# Gaps between columns and between rows.
 _FRICTION_GAPS_IN = (0.55, 0.5)
 
 
@@ -58,26 +58,20 @@ def render_dynamics(run: Run) -> str:
         identified=identified,
         counts=_counts(identified),
         humps=tuple(_hump_facts(identified)),
-        plots=tuple(_plots(shown)),
+        plots=tuple((f"{each.label}, {use}", torques(each)) for each, use in shown),
         friction_plot=friction(identified, run.predictions),
     )
 
 
-def _plots(shown: Sequence[tuple[Prediction, str]]) -> Iterator[tuple[str, Markup]]:
-    """Torques over time, with a title each."""
-    for prediction, how in shown:
-        yield f"{prediction.label}, {how}", torques(prediction)
-
-
 def _key_figures(identified: Identified) -> Iterator[Fact]:
-    base, found = identified.base, identified.validation
+    base, validation = identified.base, identified.validation
     yield Fact("base parameters", str(base.rank), f"of {len(base.model.names)}")
     shares = identified.determined
     yield Fact("known to 2 %", str(shares.count("2 %")), f"to 10 %: {shares.count('10 %')} more")
-    if found is not None:
-        worst = int(np.argmax(found.shares))
-        median = significant(100.0 * float(np.median(found.shares)))
-        high = significant(100.0 * float(found.shares[worst]))
+    if validation is not None:
+        worst = int(np.argmax(validation.shares))
+        median = significant(100.0 * float(np.median(validation.shares)))
+        high = significant(100.0 * float(validation.shares[worst]))
         yield Fact("error on unseen motion", f"{median} %", f"up to {high} % (joint {worst + 1})")
     samples = sum(stream.samples for stream in identified.streams)
     yield Fact("samples", str(samples), f"{identified.robot.joint_count} torques each")
@@ -101,37 +95,37 @@ def _hump_facts(identified: Identified) -> Iterator[Fact]:
         )
 
 
-def torques(found: Prediction) -> Markup:
-    """Measured and predicted torques of each joint over time, and what the prediction is off."""
-    some = slice(None, None, max(len(found.times_s) // _MOST_POINTS, 1))
-    times = (found.times_s - found.times_s[0])[some]
-    measured, predicted = found.measured_nm[some], found.predicted_nm[some]
-    off = np.where(found.used[some], measured - predicted, np.nan)
+def torques(prediction: Prediction) -> Markup:
+    """Measured and predicted torques of each joint over time, and their difference."""
+    subset = slice(None, None, max(len(prediction.times_s) // _MOST_POINTS, 1))
+    times = (prediction.times_s - prediction.times_s[0])[subset]
+    measured, predicted = prediction.measured_nm[subset], prediction.predicted_nm[subset]
+    errors = np.where(prediction.used[subset], measured - predicted, np.nan)
     joints = measured.shape[1]
     figure = Figure(_WIDE_IN, _PANEL_IN * joints + 0.4)
     margins, gaps_in = Margins(left=0.85, top=0.3), (0.75, 0.15)
     span = Scale(float(times[0]), float(times[-1]))
     for joint, pair in enumerate(boxes(figure, joints, 2, margins, gaps_in, _SHARES)):
-        last = joint == joints - 1
+        is_last = joint == joints - 1
         heights = spanning(np.concatenate([measured[:, joint], predicted[:, joint]]))
         panel = Panel(figure, pair[0], span, heights)
-        beside = Panel(figure, pair[1], span, spanning(off[:, joint]))
-        for item, title in ((panel, f"joint {joint + 1}\n[N m]"), (beside, "")):
-            item.x_axis("time [s]" if last else "", _TICKS, words=last)
-            item.y_axis(title, 3)
+        error_panel = Panel(figure, pair[1], span, spanning(errors[:, joint]))
+        for part, title in ((panel, f"joint {joint + 1}\n[N m]"), (error_panel, "")):
+            part.x_axis("time [s]" if is_last else "", _TICKS, words=is_last)
+            part.y_axis(title, 3)
         panel.line(times, measured[:, joint], svg.MUTED, 2.0)
         panel.line(times, predicted[:, joint], svg.ACCENT, 0.9)
-        beside.line(times, off[:, joint], svg.BAD, 0.7)
+        error_panel.line(times, errors[:, joint], svg.BAD, 0.7)
         if joint == 0:
             line, above = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}", pair[0].top - 6.0
             entries = [(line, svg.MUTED, "measured"), (line, svg.ACCENT, "predicted")]
             figure.legend(pair[0].left, above, entries, anchor="start")
             figure.legend(pair[1].left, above, [(line, svg.BAD, "error")], anchor="start")
-    return figure.inline(f"Torques over time: {found.label}")
+    return figure.inline(f"Torques over time: {prediction.label}")
 
 
-def friction(identified: Identified, found: Sequence[Prediction]) -> Markup:
-    """Each joint's friction over its speed: what the torques leave for it, and the fit."""
+def friction(identified: Identified, predictions: Sequence[Prediction]) -> Markup:
+    """Friction of each joint against its speed: by the torques, and by the model."""
     if not identified.base.model.terms.symbols:
         return Markup("")
     joints = identified.robot.joint_count
@@ -142,7 +136,7 @@ def friction(identified: Identified, found: Sequence[Prediction]) -> Markup:
     for joint, box in enumerate(panels[:joints]):
         speed = "speed [rad/s]" if joint >= joints - _COLUMNS else ""
         torque = "" if joint % _COLUMNS else "friction [N m]"
-        panel = _friction_panel(figure, box, (speed, torque), identified, found, joint)
+        panel = _friction_panel(figure, box, (speed, torque), identified, predictions, joint)
         panel.title(identified.robot.joint_names[joint])
     return figure.inline("Friction of each joint over its speed")
 
@@ -152,26 +146,32 @@ def _friction_panel(
     box: Box,
     titles: tuple[str, str],
     identified: Identified,
-    found: Sequence[Prediction],
+    predictions: Sequence[Prediction],
     joint: int,
 ) -> Panel:
-    samples = np.concatenate([_samples(identified, prediction, joint) for prediction in found])
-    speeds, left = samples[:: max(len(samples) // _MOST_MARKS, 1)].T
-    reach = max(float(np.abs(speeds).max(initial=0.0)), 1e-3)
-    # Close to rest, where dry friction turns over, in small steps.
-    around = np.linspace(-1.0, 1.0, _CURVE_POINTS)
+    samples = np.concatenate(
+        [_samples(identified, prediction, joint) for prediction in predictions]
+    )
+    speeds, measured = samples[:: max(len(samples) // _MOST_MARKS, 1)].T
+    max_speed = max(float(np.abs(speeds).max(initial=0.0)), 1e-3)
+    # Small steps near standstill, where dry friction changes sign.
+    steps = np.linspace(-1.0, 1.0, _CURVE_POINTS)
     curve = np.zeros((_CURVE_POINTS, identified.robot.joint_count))
-    curve[:, joint] = reach * np.sign(around) * np.abs(around) ** 3
-    taken = friction_at(identified, curve)[:, joint]
-    panel = Panel(figure, box, spanning(curve[:, joint]), spanning(np.concatenate([left, taken])))
+    curve[:, joint] = max_speed * np.sign(steps) * np.abs(steps) ** 3
+    modelled = friction_at(identified, curve)[:, joint]
+    panel = Panel(
+        figure, box, spanning(curve[:, joint]), spanning(np.concatenate([measured, modelled]))
+    )
     panel.x_axis(titles[0], 5)
     panel.y_axis(titles[1], 5)
-    panel.marks(speeds, left, "dot", svg.MUTED, 3.0, 0.5)
-    panel.line(curve[:, joint], taken, svg.ACCENT)
+    panel.marks(speeds, measured, "dot", svg.MUTED, 3.0, 0.5)
+    panel.line(curve[:, joint], modelled, svg.ACCENT)
     return panel
 
 
-def _samples(identified: Identified, found: Prediction, joint: int) -> FloatArray:
-    """(k, 2) speeds and what is left for friction, of samples that count."""
-    left = left_for_friction(identified, found)
-    return np.column_stack([found.dq[:, joint], left[:, joint]])[found.used[:, joint]]
+def _samples(identified: Identified, prediction: Prediction, joint: int) -> FloatArray:
+    """(k, 2) speed and friction torque of the samples in the fit."""
+    friction_nm = left_for_friction(identified, prediction)
+    return np.column_stack([prediction.dq[:, joint], friction_nm[:, joint]])[
+        prediction.used[:, joint]
+    ]

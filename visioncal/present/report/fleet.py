@@ -1,4 +1,4 @@
-"""The page of a batch: what stands out among many sessions, and the results of all."""
+"""The page of a batch: outstanding sessions, and the results of all."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,13 +16,13 @@ _ERRORS = {
     "ConvergenceError": "not settled",
 }
 _ICONS = {"good": "good", "check": "check"}
-# So many of the sessions of one robot are named by what stands out of them.
+# Largest number of outstanding sessions listed per group.
 _MOST_NAMED = 6
 
 
 @dataclass(frozen=True)
 class _Odd:
-    """What stands out of the sessions in one folder, as those of one robot are: of the worst."""
+    """Outstanding sessions of one group, such as one robot, with the reasons of the worst."""
 
     title: str
     count: str
@@ -32,12 +32,7 @@ class _Odd:
 
 
 def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> str:
-    """Renders the page as HTML text, whose links are relative to its folder.
-
-    Args:
-        rows: Those first that stand out the most.
-        cells: What simulated ones came to, by what they have in common.
-    """
+    """Renders the page as HTML text, with links relative to its folder; worst sessions first."""
     states = Counter(row.verdict or row.state for row in rows)
     return template("fleet.html.j2").render(
         kind="Batch",
@@ -66,7 +61,7 @@ def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> s
 
 
 def _cell_table(cells: Sequence[CellFigures]) -> Table:
-    """What simulated sessions came to, by what they have in common."""
+    """Summaries of simulated sessions by cell."""
     titles = (
         "cell",
         "results",
@@ -84,7 +79,7 @@ def _cell_table(cells: Sequence[CellFigures]) -> Table:
 
 
 def _reasons(rows: Iterable[tuple[str, str, str, str]]) -> Table:
-    """Sessions by name, with what is said of them and how that is marked."""
+    """Sessions by name, with the kind, the text and the mark of each."""
     marked = (TableRow((name, kind, words.strip()), mark) for name, kind, words, mark in rows)
     return Table(("", "", ""), tuple(marked), (0, 1, 2))
 
@@ -94,14 +89,14 @@ def _figure(value: float | None) -> str:
 
 
 def _odd(rows: Sequence[FleetRow]) -> Iterator[_Odd]:
-    """By folder, in the order of the worst that stands out in each."""
-    standing = [row for row in rows if row.score > 0.0]
-    order = list(dict.fromkeys(row.group or row.name for row in standing))
+    """Groups of outstanding sessions, in the order of the worst of each."""
+    outstanding = [row for row in rows if row.score > 0.0]
+    order = list(dict.fromkeys(row.group or row.name for row in outstanding))
     sizes = Counter(row.group or row.name for row in rows)
-    by_place = sorted(standing, key=lambda value: order.index(value.group or value.name))
-    for name, members in groupby(by_place, key=lambda value: value.group or value.name):
-        mine = tuple(members)
-        reasons = tuple(mine[0].stands_out.split("; "))
-        count = f"{len(mine)} of {sizes[name]} sessions" if sizes[name] > 1 else ""
-        named = mine[:_MOST_NAMED]
-        yield _Odd(name, count, reasons, named, len(mine) - len(named))
+    grouped = sorted(outstanding, key=lambda value: order.index(value.group or value.name))
+    for name, members in groupby(grouped, key=lambda value: value.group or value.name):
+        worst_first = tuple(members)
+        reasons = tuple(worst_first[0].stands_out.split("; "))
+        count = f"{len(worst_first)} of {sizes[name]} sessions" if sizes[name] > 1 else ""
+        listed = worst_first[:_MOST_NAMED]
+        yield _Odd(name, count, reasons, listed, len(worst_first) - len(listed))

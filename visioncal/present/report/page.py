@@ -1,4 +1,4 @@
-"""Puts the report together and writes it."""
+"""Composes and writes the report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from visioncal.results.evidence import ViewEvidence, magnification
 from visioncal.session import Session
 
 _MAX_REJECTED_PICTURES = 4
-# The grey of a picture whose image nobody has.
+# Grey level in place of a missing image.
 _PAPER = 235
 
 
@@ -34,19 +34,19 @@ def write_report(
     note: str = "",
     review: str = "",
 ) -> None:
-    """Writes the report as one HTML file that needs no network and no script.
+    """Writes the report as one HTML file that needs neither network nor scripts.
 
     Args:
         path: The file to write; it appears whole or not at all.
-        calibration: What to report.
-        session: Where its images and joint angles are; without it the report shows none.
-        evidence: What was seen and computed of each view, in any order.
-        note: What the reader should know of this report itself.
-        review: The command that opens the recording, to which the number of a view is added; empty
-            where there is none.
+        calibration: Calibration to report.
+        session: Session with images and joint angles; without it the report shows none.
+        evidence: Evidence of the views, in any order.
+        note: What the reader should know about this report itself.
+        review: Command that opens the recording, to which a view's number is added; empty if there
+            is none.
 
     Raises:
-        DataError: The file cannot be written, or what was found beside the edges cannot be read.
+        DataError: The file cannot be written, or a section of the result cannot be read.
     """
     write_atomically(path, render(calibration, session, evidence, note, review))
 
@@ -60,11 +60,11 @@ def render(
 ) -> str:
     """Renders the report as HTML text; see `write_report`."""
     cell, suspects = calibration.cell, advice.suspects(calibration)
-    about = calibration.mount if cell is None else network.kinds(calibration.tree)
+    subject = calibration.mount if cell is None else network.kinds(calibration.tree)
     return template("report.html.j2").render(
         kind="Calibration report" if cell is None else "Alignment report",
         name=calibration.session_name,
-        subtitle=f"{about} \N{MIDDLE DOT} {facts.readable_time(calibration.created)}",
+        subtitle=f"{subject} \N{MIDDLE DOT} {facts.readable_time(calibration.created)}",
         notes=[note] if note else [],
         judged=calibration.verdict,
         steps=calibration.next_steps,
@@ -77,7 +77,7 @@ def render(
         calibration=calibration,
         cell=cell,
         session=session,
-        # Coverage and joints are those of one camera, one board and one robot.
+        # Coverage and joint plots are for one camera, one board and one robot.
         evidence=evidence if cell is None else (),
         review=f"{review} --view" if review else "",
         suspects=suspects,
@@ -93,7 +93,7 @@ def _pictures(
     seen = {view.view: view for view in evidence}
     views = calibration.views
     extremes = _extremes(views, seen)
-    # One factor for all pictures, so that they can be compared.
+    # One magnification for all pictures, so that they can be compared.
     shown = [seen[view.view] for _, view in extremes]
     magnify = magnification(shown, parts.image_width(calibration) or 0)
     pictures = None if session is None else _Pictures(session, seen)
@@ -107,8 +107,8 @@ def _pictures(
 def _extremes(
     views: Sequence[ViewResult], seen: Mapping[int, ViewEvidence]
 ) -> list[tuple[str, ViewResult]]:
-    """The used views with the smallest and the largest reprojection error, and words for them."""
-    drawn = [
+    """Captioned used views with the smallest and the largest reprojection error."""
+    candidates = [
         (view.rms_px, view)
         for view in views
         if view.used
@@ -116,32 +116,32 @@ def _extremes(
         and view.view in seen
         and seen[view.view].corners is not None
     ]
-    ranked = sorted(drawn, key=lambda pair: pair[0])
-    picked = [ranked[0], ranked[-1]] if len(ranked) > 1 else ranked
+    ranked = sorted(candidates, key=lambda pair: pair[0])
+    extremes = [ranked[0], ranked[-1]] if len(ranked) > 1 else ranked
     return [
         (f"{which} used view: {named(view)}, {significant(rms_px)} px rms", view)
-        for which, (rms_px, view) in zip(("Best", "Worst"), picked, strict=False)
+        for which, (rms_px, view) in zip(("Best", "Worst"), extremes, strict=False)
     ]
 
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Takes pictures of views out of the session's images."""
+    """Pictures of views from the session's images."""
 
     session: Session
     seen: Mapping[int, ViewEvidence]
 
     def of_used(self, captioned: Sequence[tuple[str, ViewResult]], magnify: int) -> list[Thumbnail]:
-        """Pictures with what was detected and predicted over them."""
-        found = [
+        """Pictures with detected and predicted corners."""
+        pictures = [
             self._of(view, caption, self.seen.get(view.view), magnify)
             for caption, view in captioned
         ]
-        return [item for item in found if item is not None]
+        return [picture for picture in pictures if picture is not None]
 
     def of_rejected(self, views: Sequence[ViewResult]) -> list[Thumbnail]:
-        """The first few of the views that were not used, with their reasons."""
-        found = (
+        """The first few views that were not used, with their reasons."""
+        pictures = (
             self._of(
                 view,
                 f"View {named(view)}: {view.reason}",
@@ -151,22 +151,24 @@ class _Pictures:
             for view in views
             if not view.used
         )
-        return list(islice((item for item in found if item is not None), _MAX_REJECTED_PICTURES))
+        return list(
+            islice((picture for picture in pictures if picture is not None), _MAX_REJECTED_PICTURES)
+        )
 
     def _of(
         self, view: ViewResult, caption: str, evidence: ViewEvidence | None, magnify: int
     ) -> Thumbnail | None:
-        """A view's picture; None where it has no image, which the table of views says anyway."""
-        # Corners that another detector found are drawn on nothing where there is no image of them.
-        shown = next((other for other in self.session.views if other.number == view.view), None)
+        """Picture of a view; None if it has no image, as the table of views states."""
+        # Corners of an external detector are drawn on a blank image if theirs is missing.
+        shown = next((row for row in self.session.views if row.number == view.view), None)
         if shown is None:
             return None
         if not shown.image or not self.session.images.exists(shown.image):
             resolution = self.session.resolution
             if not shown.has_corners or resolution is None:
                 return None
-            nothing = np.full((resolution[1], resolution[0], 3), _PAPER, dtype=np.uint8)
-            return drawn(nothing, evidence, caption, view.view, magnify)
+            blank = np.full((resolution[1], resolution[0], 3), _PAPER, dtype=np.uint8)
+            return drawn(blank, evidence, caption, view.view, magnify)
         try:
             data = self.session.images.read(shown.image)
         except DataError:

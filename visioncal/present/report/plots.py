@@ -1,4 +1,4 @@
-"""The report's plots: residuals by view and by joint angle, coverage; frames."""
+"""Plots of the report: residuals by view and joint angle, coverage, tools and fixtures."""
 
 import base64
 from collections.abc import Callable, Collection, Sequence
@@ -24,21 +24,21 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.results.views import rms_of
 from visioncal.session import Session
 
-# Beyond this many marks a bitmap is smaller than the vectors.
+# Above this number of marks a bitmap is smaller than vectors.
 _MANY_MARKS = 2500
-# Widths of figures, such that their text is as large as the page's.
+# Widths of figures at which their text matches the page's.
 _WIDE_IN, _SMALL_IN = 9.2, 3.7
-# Colours that errors have, and how large dots are: in points, and of a bitmap in its pixels.
+# Number of colours for errors; size of dots [points]; pixels per point and dot radius in bitmaps.
 _SHADES, _DOT_PT, _DOTS_A_POINT, _DOT_REACH = 24, 2.2, 2.0, 2
 _AXES = (("x", svg.ACCENT), ("y", svg.CHECK), ("z", svg.GOOD))
 _WIDTH_IN, _ROW_IN = 9.2, 1.25
-# Few points beyond the scale do not flatten the cloud of the others.
+# Scales ignore the few largest points, which would compress the others.
 _ROOM, _KEPT_PERCENT = 1.3, 95.0
-# How wide a point is.
+# Width of a mark.
 _DASH_PT = 2.4
 
 _FRAME_WIDTH_IN, _FRAME_HEIGHT_IN = 5.0, 1.7
-# More characters than this below the bars run into each other, so their labels stand upright.
+# Labels with more characters in total are vertical; longest label.
 _MOST_CHARACTERS, _LONGEST = 36, 12
 _MOST_LABELS = 24
 # Mean width of a letter.
@@ -49,13 +49,13 @@ _HEADROOM, _WIDTH = 1.25, 0.7
 
 @dataclass(frozen=True)
 class Bar:
-    """One of them.
+    """One bar of a bar chart.
 
     Attributes:
-        label: What it is, for the axis.
-        value: Its height; None where that is unknown.
-        used: Whether it was used; the scale is that of the used ones.
-        colour: Of the bar and its mark.
+        label: Axis label.
+        value: Height; None where unknown.
+        used: Whether it was used; used bars define the scale.
+        colour: Colour of the bar and its mark.
     """
 
     label: str
@@ -76,42 +76,45 @@ def draw_bars(
     labelled: bool = True,
     turned: bool = False,
 ) -> None:
-    """Draws bars side by side; what exceeds the used ones' scale is clipped.
+    """Draws a bar chart, clipped to the scale of the used bars.
 
     Args:
-        figure: Where to.
-        box: Where in it.
-        bars: From left to right.
-        rms: Root mean square over the used ones, drawn as a line; None draws none.
-        most_labels: How many labels have room below them.
-        limit: Where doubt begins; a line where the scale holds it, else words. None for nothing.
-        titles: Of the axis below and of that at the left.
+        figure: Figure to draw in.
+        box: Box of the chart.
+        bars: Bars from left to right.
+        rms: Root mean square of the used bars, drawn as a line; None for no line.
+        most_labels: Largest number of labels below the bars.
+        limit: Value where doubt begins: a line if the scale contains it, else a text. None for
+            neither.
+        titles: Titles of the horizontal and the vertical axis.
         labelled: Whether bars have labels.
-        turned: Whether these stand upright.
+        turned: Whether labels are vertical.
     """
-    known = [(place, bar, bar.value) for place, bar in enumerate(bars) if bar.value is not None]
-    used = [value for _, bar, value in known if bar.used]
-    top = _HEADROOM * max(used or [value for _, _, value in known], default=1.0) or 1.0
+    valued = [
+        (position, bar, bar.value) for position, bar in enumerate(bars) if bar.value is not None
+    ]
+    used = [value for _, bar, value in valued if bar.used]
+    top = _HEADROOM * max(used or [value for _, _, value in valued], default=1.0) or 1.0
     panel = Panel(figure, box, Scale(-0.7, len(bars) - 0.3), Scale(0.0, 1.2 * top))
     step = max(1, -(-len(bars) // most_labels))
-    ticks = [(float(place), bars[place].label) for place in range(0, len(bars), step)]
+    ticks = [(float(position), bars[position].label) for position in range(0, len(bars), step)]
     panel.x_axis(titles[0], ticks, grid=False, words=labelled, turned=turned)
     panel.y_axis(titles[1])
-    for colour in dict.fromkeys(bar.colour for _, bar, _ in known):
-        shown = [(place, value) for place, bar, value in known if bar.colour == colour]
+    for colour in dict.fromkeys(bar.colour for _, bar, _ in valued):
+        shown = [(position, value) for position, bar, value in valued if bar.colour == colour]
         panel.bars(
             [index for index, _ in shown], [min(value, top) for _, value in shown], _WIDTH, colour
         )
-    for place, bar, value in known:
+    for position, bar, value in valued:
         if not bar.used:
-            _mark(panel, place, bar, value, top)
-    for place, bar in enumerate(bars):
+            _mark_unused(panel, position, bar, value, top)
+    for position, bar in enumerate(bars):
         if bar.value is None and not bar.used:
-            panel.marks([place], [0.05 * top], "x", bar.colour, 5.0)
+            panel.marks([position], [0.05 * top], "x", bar.colour, 5.0)
     if rms is not None:
         panel.level(rms, svg.INK, dash=svg.DASHED)
-        words, at = f"rms {significant(rms)}", float(panel.y_at(rms))
-        figure.text(box.right + 4.0, at, words, size=svg.SMALL, rise="middle")
+        label, height = f"rms {significant(rms)}", float(panel.y_at(rms))
+        figure.text(box.right + 4.0, height, label, size=svg.SMALL, rise="middle")
     if limit is not None:
         _draw_limit(panel, limit, top)
 
@@ -129,19 +132,19 @@ def _draw_limit(panel: Panel, limit: float, top: float) -> None:
     )  # fmt: skip
 
 
-def _mark(panel: Panel, place: int, bar: Bar, value: float, top: float) -> None:
-    """Marks one that was not used, with its value where that lies beyond the scale."""
+def _mark_unused(panel: Panel, position: int, bar: Bar, value: float, top: float) -> None:
+    """Marks an unused bar, with its value if it exceeds the scale."""
     clipped = value > top
-    panel.marks([place], [min(value, top)], "^" if clipped else "x", bar.colour, 5.0)
+    panel.marks([position], [min(value, top)], "^" if clipped else "x", bar.colour, 5.0)
     if clipped:
-        x, y = float(panel.x_at(place)), float(panel.y_at(top)) - 5.0
+        x, y = float(panel.x_at(position)), float(panel.y_at(top)) - 5.0
         panel.figure.text(x, y, significant(value), size=svg.SMALL, colour=bar.colour,
                           anchor="middle")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Measure:
-    """A kind of residual: its label, its value of a view and of many, and where doubt begins."""
+    """A kind of residual: its label, its value for a view and for many, and where doubt begins."""
 
     label: str
     value_of: Callable[[ViewResult], float | None]
@@ -167,14 +170,14 @@ _MEASURES = (
 
 
 def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Markup:
-    """Residuals of every view: of one camera all, of a whole cell its positions by camera.
+    """Residuals of all views: every kind for one camera, positions by camera for a cell.
 
     Args:
         calibration: The result.
-        outlying: Numbers of used views that are marked, beside those that were not used.
+        outlying: Numbers of used views to highlight, beside the unused ones.
 
     Returns:
-        The figure; empty where there are no residuals.
+        The figure; empty without residuals.
     """
     measures: tuple[_Measure, ...] = _MEASURES
     if calibration.cell is not None:
@@ -183,24 +186,26 @@ def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Marku
     for view in calibration.views:
         by_seer.setdefault(view.seer, []).append(view)
     shown = [
-        (seer, mine, measure)
-        for seer, mine in by_seer.items()
+        (seer, seer_views, measure)
+        for seer, seer_views in by_seer.items()
         for measure in measures
-        if any(measure.value_of(view) is not None for view in mine)
+        if any(measure.value_of(view) is not None for view in seer_views)
     ]
     if not shown:
         return Markup("")
-    named = 0.3 if calibration.cell is not None else 0.0
-    figure = Figure(_WIDE_IN, (1.3 + named) * len(shown) + 0.25)
-    rows = boxes(figure, len(shown), 1, Margins(0.75, 0.75, top=0.1 + named), (0.0, 0.15 + named))
-    for (box,), (seer, mine, measure) in zip(rows, shown, strict=True):
-        last = box is rows[-1][0]
-        marked = [Bar(str(view.view), measure.value_of(view), view.used, _colour(view, outlying))
-                  for view in mine]  # fmt: skip
-        # Views of several cameras are other ones in each panel.
-        labelled = last or calibration.cell is not None
-        draw_bars(figure, box, marked, measure.rms_of(rms_of(mine)), limit=measure.limit,
-                  labelled=labelled, titles=("view" if last else "", measure.label))  # fmt: skip
+    header_in = 0.3 if calibration.cell is not None else 0.0
+    figure = Figure(_WIDE_IN, (1.3 + header_in) * len(shown) + 0.25)
+    rows = boxes(
+        figure, len(shown), 1, Margins(0.75, 0.75, top=0.1 + header_in), (0.0, 0.15 + header_in)
+    )
+    for (box,), (seer, seer_views, measure) in zip(rows, shown, strict=True):
+        is_last = box is rows[-1][0]
+        bars = [Bar(str(view.view), measure.value_of(view), view.used, _colour(view, outlying))
+                  for view in seer_views]  # fmt: skip
+        # With several cameras, each panel has other views.
+        labelled = is_last or calibration.cell is not None
+        draw_bars(figure, box, bars, measure.rms_of(rms_of(seer_views)), limit=measure.limit,
+                  labelled=labelled, titles=("view" if is_last else "", measure.label))  # fmt: skip
         figure.text(box.left, box.top - 5.0, seer)
     return figure.inline("Bars: residuals of each view")
 
@@ -212,50 +217,49 @@ def _colour(view: ViewResult, outlying: Collection[int]) -> str:
 
 
 def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
-    """All corners of the used views over the image frame, coloured by reprojection error."""
+    """Corners of the used views over the image, coloured by reprojection error."""
     used = {view.view for view in calibration.views if view.used}
     seen = [view for view in evidence if view.corners is not None and view.view in used]
     if not seen or calibration.camera is None:
         return Markup("")
     px = np.concatenate([view.corners.px for view in seen if view.corners is not None])
     errors = np.concatenate([_corner_errors(view) for view in seen])
-    known = np.isfinite(errors)
+    with_error = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
-    errors_known = bool(known.any())
+    errors_known = bool(with_error.any())
     margins = Margins(right=0.85 if errors_known else 0.15)
-    wide = _SMALL_IN - margins.left - margins.right
-    figure = Figure(_SMALL_IN, margins.top + wide * height / width + margins.bottom)
+    width_in = _SMALL_IN - margins.left - margins.right
+    figure = Figure(_SMALL_IN, margins.top + width_in * height / width + margins.bottom)
     ((box,),) = boxes(figure, 1, 1, margins)
-    across, down = Scale(-0.5, width - 0.5), Scale(height - 0.5, -0.5)
-    panel = Panel(figure, box.shaped(height / width), across, down)
+    scale_x, scale_y = Scale(-0.5, width - 0.5), Scale(height - 0.5, -0.5)
+    panel = Panel(figure, box.shaped(height / width), scale_x, scale_y)
     panel.x_axis("image x [px]", 4)
     panel.y_axis("image y [px]", 5)
     panel.frame()
-    top = float(np.percentile(errors[known], 98)) if errors_known else 1.0
-    steps, colours = svg.shades(errors[known], 0.0, top, svg.PLASMA, _SHADES)
-    layers = [(px[~known], svg.ACCENT), *((px[known][steps == index], colours[index])
+    top = float(np.percentile(errors[with_error], 98)) if errors_known else 1.0
+    steps, colours = svg.shades(errors[with_error], 0.0, top, svg.PLASMA, _SHADES)
+    layers = [(px[~with_error], svg.ACCENT), *((px[with_error][steps == index], colours[index])
                                           for index in range(_SHADES))]  # fmt: skip
     if len(px) > _MANY_MARKS and errors_known:
-        _draw_bitmap(panel, px[known], steps, colours)
+        _draw_bitmap(panel, px[with_error], steps, colours)
     else:
-        for places, colour in layers:
-            panel.marks(places[:, 0], places[:, 1], "dot", colour, _DOT_PT)
+        for positions, colour in layers:
+            panel.marks(positions[:, 0], positions[:, 1], "dot", colour, _DOT_PT)
     if errors_known:
         panel.colour_bar(Scale(0.0, top), svg.PLASMA, "reprojection error [px]")
     return figure.inline("Corners of all used views over the image")
 
 
 def _draw_bitmap(panel: Panel, px: FloatArray, steps: IntArray, colours: Sequence[str]) -> None:
-    """Draws coloured dots as pixels."""
     box: Box = panel.box
     size = np.array([box.right - box.left, box.bottom - box.top]) * _DOTS_A_POINT
     image = np.zeros((int(size[1]) + 1, int(size[0]) + 1, 4), np.uint8)
     shades = np.array([[int(colour[k : k + 2], 16) for k in (5, 3, 1)] for colour in colours])
     shares = np.stack([panel.x.shares(px[:, 0]), 1.0 - panel.y.shares(px[:, 1])], axis=1)
-    middle = np.round(shares * size - 0.5).astype(int)
+    centres = np.round(shares * size - 0.5).astype(int)
     reach = range(-_DOT_REACH, _DOT_REACH + 1)
     for shift in ((i, j) for i in reach for j in reach if abs(i) + abs(j) < 2 * _DOT_REACH):
-        x, y = np.clip(middle + shift, 0, size.astype(int)).T
+        x, y = np.clip(centres + shift, 0, size.astype(int)).T
         image[y, x, :3], image[y, x, 3] = shades[steps], 255
     encoded = cv2.imencode(".png", image)[1].tobytes()
     uri = "data:image/png;base64," + base64.b64encode(encoded).decode("ascii")
@@ -263,7 +267,7 @@ def _draw_bitmap(panel: Panel, px: FloatArray, steps: IntArray, colours: Sequenc
 
 
 def _corner_errors(evidence: ViewEvidence) -> FloatArray:
-    """Distances [px] of a view's corners from their predictions; NaN where there is none."""
+    """Reprojection errors of a view's corners [px]; NaN without predictions."""
     if evidence.corners is None:
         return np.zeros(0)
     if evidence.predicted_px is None:
@@ -272,37 +276,41 @@ def _corner_errors(evidence: ViewEvidence) -> FloatArray:
 
 
 def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
-    """Where the camera looked at the target from: tilt against its normal, and azimuth."""
+    """Viewing directions towards the target: tilt against its normal, and azimuth."""
     chart = directions_chart({view.view: view for view in evidence})
     if chart is None or calibration.mount == "instrument":
         return Markup("")
     used = {view.view for view in calibration.views if view.used}
     seen = [
-        (mark, colour, words, np.vstack(some))
-        for is_used, mark, colour, words in (
+        (mark, colour, label, np.vstack(shown))
+        for is_used, mark, colour, label in (
             (True, "dot", svg.ACCENT, "used"),
             (False, "x", svg.BAD, "not used"),
         )
-        if (some := [places for view, places in chart.points.items() if (view in used) is is_used])
+        if (
+            shown := [
+                positions for view, positions in chart.points.items() if (view in used) is is_used
+            ]
+        )
     ]
-    farthest_deg = max(float(np.linalg.norm(places, axis=1).max()) for *_, places in seen)
+    farthest_deg = max(float(np.linalg.norm(positions, axis=1).max()) for *_, positions in seen)
     top = max(45.0, 5.0 + farthest_deg)
     figure = Figure(_SMALL_IN, 3.0)
-    middle, radius = 0.5 * figure.width, 0.5 * figure.height - 24.0
-    box = Box(middle - radius, 24.0, middle + radius, 24.0 + 2.0 * radius)
+    centre_x, radius = 0.5 * figure.width, 0.5 * figure.height - 24.0
+    box = Box(centre_x - radius, 24.0, centre_x + radius, 24.0 + 2.0 * radius)
     panel = Panel(figure, box, Scale(-top, top), Scale(top, -top))
     _draw_rings(panel, [tick for tick in Scale(0.0, top).ticks(4, whole=True) if tick > 0.0], top)
-    for mark, colour, _, places in seen:
-        panel.marks(places[:, 0], places[:, 1], mark, colour)
+    for mark, colour, _, positions in seen:
+        panel.marks(positions[:, 0], positions[:, 1], mark, colour)
     if len(seen) > 1:
         signs = {"dot": "\N{BLACK CIRCLE}", "x": "\N{MULTIPLICATION SIGN}"}
-        entries = [(signs[mark], colour, words) for mark, colour, words, *_ in seen]
+        entries = [(signs[mark], colour, label) for mark, colour, label, *_ in seen]
         figure.legend(4.0, figure.height - 4.0, entries, anchor="start")
     return figure.inline("Where the camera looked from")
 
 
 def _draw_rings(panel: Panel, rings_deg: Sequence[float], top_deg: float) -> None:
-    """Draws the lines of equal tilt with their degrees, and the target's axes."""
+    """Draws circles of equal tilt with labels, and the target's axes."""
     figure, box = panel.figure, panel.box
     x, y = 0.5 * (box.left + box.right), 0.5 * (box.top + box.bottom)
     radius = 0.5 * (box.right - box.left)
@@ -313,21 +321,21 @@ def _draw_rings(panel: Panel, rings_deg: Sequence[float], top_deg: float) -> Non
     cross = f"M{box.left:.1f} {y:.1f}H{box.right:.1f}M{x:.1f} {box.top:.1f}V{box.bottom:.1f}"
     figure.path(cross, stroke=svg.LINE, width=0.6)
     for tilt_deg in rings_deg:
-        # Along a line between two axes.
-        at = radius * tilt_deg / top_deg
-        words = f"{tilt_deg:.0f}\N{DEGREE SIGN}"
-        figure.text(x + 0.92 * at, y - 0.38 * at, words, colour=svg.MUTED)
-    for words, across, down, anchor in (
+        # Labels lie along a line between two axes.
+        r_label = radius * tilt_deg / top_deg
+        label = f"{tilt_deg:.0f}\N{DEGREE SIGN}"
+        figure.text(x + 0.92 * r_label, y - 0.38 * r_label, label, colour=svg.MUTED)
+    for label, dx, dy, anchor in (
         ("x", radius + 6.0, 0.0, "start"),
         ("y", 0.0, radius + 9.0, "middle"),
         ("-x", -radius - 6.0, 0.0, "end"),
         ("-y", 0.0, -radius - 9.0, "middle"),
     ):
-        figure.text(x + across, y + down, words, colour=svg.MUTED, anchor=anchor, rise="middle")
+        figure.text(x + dx, y + dy, label, colour=svg.MUTED, anchor=anchor, rise="middle")
 
 
 def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
-    """How far the flange turned from its mean orientation, about each of its own axes."""
+    """Rotation of the flange from its mean orientation, about each of its axes."""
     used = {view.view for view in calibration.views if view.used}
     poses = [
         view.base_from_flange
@@ -338,15 +346,15 @@ def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence])
         return Markup("")
     rotations = np.stack(poses)[:, :3, :3]
     base_from_mean = nearest_rotation(rotations.mean(axis=0))
-    turns_deg = np.rad2deg(Rotation.from_matrix(base_from_mean.T @ rotations).as_rotvec())
-    reach = max(10.0, 1.1 * float(np.abs(turns_deg).max()))
+    rotvecs_deg = np.rad2deg(Rotation.from_matrix(base_from_mean.T @ rotations).as_rotvec())
+    reach = max(10.0, 1.1 * float(np.abs(rotvecs_deg).max()))
     figure = Figure(_SMALL_IN, 2.0)
     ((box,),) = boxes(figure, 1, 1, Margins(left=0.5))
     panel = Panel(figure, box, Scale(-reach, reach), Scale(2.6, -0.6))
     panel.x_axis("rotation from the mean orientation [deg]")
     panel.y_axis("flange axis", [(0.0, "x"), (1.0, "y"), (2.0, "z")])
     for row in range(3):
-        panel.marks(turns_deg[:, row], np.full(len(turns_deg), row), "|", svg.ACCENT, 17.0)
+        panel.marks(rotvecs_deg[:, row], np.full(len(rotvecs_deg), row), "|", svg.ACCENT, 17.0)
     return figure.inline("Rotations of the flange in the used views")
 
 
@@ -356,16 +364,16 @@ def residuals_over_joints(
     evidence: Sequence[ViewEvidence],
     outlying: Collection[int] = (),
 ) -> Markup:
-    """Residuals of the used views along the target's axes, one column a joint.
+    """Residuals of the used views along the target's axes, one column per joint.
 
     Args:
         calibration: The result.
-        session: Where the joint angles are.
-        evidence: The views' poses.
-        outlying: Numbers of used views to leave out, which would hide the others.
+        session: Session with the joint angles.
+        evidence: Poses of the views.
+        outlying: Numbers of used views to leave out, as they would compress the scale.
 
     Returns:
-        The figure; empty where there are no joint angles.
+        The figure; empty without joint angles.
     """
     if session is None or not evidence:
         return Markup("")
@@ -383,17 +391,19 @@ def residuals_over_joints(
         return Markup("")
     joints_deg = np.rad2deg([joints for joints, _ in pairs])
     twists = np.array([residual for _, residual in pairs])
-    return _figure(joints_deg, 1e3 * twists[:, 3:], np.rad2deg(twists[:, :3]))
+    return _joint_figure(joints_deg, 1e3 * twists[:, 3:], np.rad2deg(twists[:, :3]))
 
 
-def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -> Markup:
-    """Draws (m, n) joint angles against (m, 3) residuals of position and of orientation."""
+def _joint_figure(
+    joints_deg: FloatArray, residuals_mm: FloatArray, residuals_deg: FloatArray
+) -> Markup:
+    """Plots (m, 3) position and orientation residuals against (m, n) joint angles."""
     count = joints_deg.shape[1]
     figure = Figure(_WIDTH_IN, 2 * _ROW_IN + 0.5)
     upper, lower = boxes(figure, 2, count, Margins(0.85, top=0.3))
     for row, values, label in (
-        (upper, away_mm, "position [mm]"),
-        (lower, away_deg, "rotation [deg]"),
+        (upper, residuals_mm, "position [mm]"),
+        (lower, residuals_deg, "rotation [deg]"),
     ):
         reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
         shown, is_lower = np.clip(values, -reach, reach), row is lower
@@ -413,28 +423,28 @@ def _figure(joints_deg: FloatArray, away_mm: FloatArray, away_deg: FloatArray) -
 
 
 def frame_plot(name: str, frame: Frame) -> Markup:
-    """Bars of what each observation is off; the wrong ones in red."""
+    """Residual of each observation of a tool or a fixture; outliers in red."""
     if all(observation.residual_mm is None for observation in frame.observations):
         return Markup("")
-    labels = [_short(observation.name) for observation in frame.observations]
-    upright = sum(map(len, labels)) > _MOST_CHARACTERS
+    names = [observation.name for observation in frame.observations]
+    labels = [
+        name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"
+        for name in names
+    ]
+    vertical = sum(map(len, labels)) > _MOST_CHARACTERS
     shown = [
-        Bar(label, observation.residual_mm, observation.used, _colour_of_thing(observation))
+        Bar(label, observation.residual_mm, observation.used, _observation_colour(observation))
         for label, observation in zip(labels, frame.observations, strict=True)
     ]
-    below_in = 0.25 + _LETTER_IN * max(map(len, labels)) if upright else 0.3
-    figure = Figure(_FRAME_WIDTH_IN, _FRAME_HEIGHT_IN + (0.4 if upright else 0.0))
-    ((box,),) = boxes(figure, 1, 1, Margins(0.65, 0.65, below_in))
+    bottom_in = 0.25 + _LETTER_IN * max(map(len, labels)) if vertical else 0.3
+    figure = Figure(_FRAME_WIDTH_IN, _FRAME_HEIGHT_IN + (0.4 if vertical else 0.0))
+    ((box,),) = boxes(figure, 1, 1, Margins(0.65, 0.65, bottom_in))
     draw_bars(figure, box, shown, frame.rms_mm, _MOST_LABELS, titles=("", "off by [mm]"),
-              turned=upright)  # fmt: skip
+              turned=vertical)  # fmt: skip
     return figure.inline(f"Bars: what each observation of {name} is off")
 
 
-def _colour_of_thing(observation: Observation) -> str:
+def _observation_colour(observation: Observation) -> str:
     if not observation.used:
         return svg.BAD
     return svg.CHECK if observation.reason else svg.ACCENT
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"

@@ -1,4 +1,4 @@
-"""The templates of pages, and what they call to say and draw a result."""
+"""Page templates, and the functions that they call."""
 
 import platform
 from functools import cache
@@ -12,7 +12,7 @@ from visioncal.present import advice, arms, details, facts, parts, torques
 from visioncal.present.report import armplots, content, network, plots, sources
 
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
-# Whose functions they call.
+# Modules whose functions the templates call.
 _CALLED = (
     *(parts, facts, arms, details, torques, advice),
     *(content, network, plots, armplots, sources),
@@ -21,32 +21,32 @@ _CALLED = (
 
 @cache
 def _software() -> str:
-    """The versions of this program, of Python, and of the libraries that compute the result."""
+    """Versions of this program, of Python, and of the libraries that compute the result."""
     versions = "".join(f", {name} {metadata.version(name)}" for name in _DEPENDENCIES)
     return f"visioncal {__version__}, Python {platform.python_version()}{versions}"
 
 
 def template(name: str) -> Template:
-    """A template by its name, in which what is not given is an error."""
+    """A template by name, in which undefined variables are errors."""
     return _environment().get_template(name)
 
 
 @cache
 def _environment() -> Environment:
-    # It keeps the templates, which take longer to be compiled than a page to be made.
-    found = Environment(
+    # Cached, as compiling the templates takes longer than rendering a page.
+    environment = Environment(
         loader=PackageLoader("visioncal", "present/report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters["significant"] = significant
-    named = {
+    environment.filters["significant"] = significant
+    functions = {
         name: var
         for module in _CALLED
         for name, var in vars(module).items()
         if getattr(var, "__module__", "") == module.__name__
     }
-    found.globals |= named | {"software": _software, "version": __version__}
-    return found
+    environment.globals |= functions | {"software": _software, "version": __version__}
+    return environment

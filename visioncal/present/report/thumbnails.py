@@ -1,4 +1,4 @@
-"""Small pictures of views with what was detected and predicted drawn over them."""
+"""Small pictures of views with detected and predicted corners."""
 
 import base64
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from visioncal.vision.finders.imaging import decode_image
 
 _WIDTH_PX, _SMALL_PX = 720, 240
 _JPEG_QUALITY = 78
-# A crop is this many times as large as the corners' extent, and a little of the image more.
+# Size of a crop: factor on the corners' extent, plus a share of the image.
 _ROOM, _LEAST_SHARE = 1.25, 0.05
 
 
 @dataclass(frozen=True)
 class Residual:
-    """One corner in image coordinates [px]: where it was seen, and the tip of its arrow."""
+    """Arrow at one corner in image coordinates [px]: detected position, and tip."""
 
     x: float
     y: float
@@ -28,16 +28,16 @@ class Residual:
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A picture and its overlay, both in the full image's pixel coordinates.
+    """A picture with its overlay, in the full image's pixel coordinates.
 
     Attributes:
         view: The view's number.
-        caption: What to say below it.
+        caption: Text below it.
         jpeg_uri: The picture as a data URI.
-        left: Image x of the picture's left edge [px]; pixel centres are at integers.
-        top: Image y of its upper edge [px].
-        width: Its width [px].
-        height: Its height [px].
+        left: Image x of the left edge [px]; pixel centres are at integers.
+        top: Image y of the upper edge [px].
+        width: Width [px].
+        height: Height [px].
         corners: (n, 2) detected corners [px].
         residuals: Arrows from detected corners towards their predictions, magnified.
     """
@@ -64,14 +64,14 @@ def thumbnail(
     """Draws one view, cropped to the target where corners were found.
 
     Args:
-        image_bytes: The encoded image.
-        evidence: What was found in it, if anything.
-        caption: What to say below it.
+        image_bytes: Encoded image.
+        evidence: Evidence of the view, if any.
+        caption: Text below it.
         view: The view's number.
-        magnify: How many times longer residuals are drawn than they are.
+        magnify: Magnification of the residuals.
 
     Returns:
-        The picture, or None where the bytes are no image that can be shown.
+        The picture; None if the bytes cannot be decoded.
     """
     pixels = decode_image(image_bytes, colour=True)
     return None if isinstance(pixels, str) else drawn(pixels, evidence, caption, view, magnify)
@@ -111,7 +111,7 @@ def _residuals(
 
 
 def _around(px: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of a crop around the corners, in the image's proportions [px]."""
+    """Left, top, right, bottom of a crop around the corners, with the image's proportions [px]."""
     low, high = px.min(axis=0), px.max(axis=0)
     share = min(1.0, _ROOM * float(np.max((high - low) / (width, height))) + _LEAST_SHARE)
     size = np.maximum(np.round(share * np.array([width, height])), 1.0)
@@ -126,7 +126,7 @@ def _jpeg_uri(image: Image) -> str:
 
 
 def small_picture(image_bytes: bytes) -> bytes | None:
-    """A JPEG of an image for a listing; None where the bytes are no image that can be shown."""
+    """A small JPEG of an image for a listing; None if the bytes cannot be decoded."""
     pixels = decode_image(image_bytes, colour=True)
     return None if isinstance(pixels, str) else _jpeg(pixels, _SMALL_PX / pixels.shape[1])
 

@@ -1,4 +1,4 @@
-"""The rerun viewer: the layout of a recording, and ways to open it."""
+"""The rerun viewer: layouts of recordings, and ways to open them."""
 
 from visioncal.present.viewer.layout import blueprint
 from visioncal.present.viewer.native import review_native

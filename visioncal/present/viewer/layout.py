@@ -1,4 +1,4 @@
-"""The layout in which the rerun viewer opens a recording."""
+"""Layout of a recording in the rerun viewer."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,28 +17,27 @@ from visioncal.results.arm import ArmResult
 from visioncal.session import Session
 from visioncal.session.table import reported_matrices
 
-# Distance of the eye from the cell's centre, in extents of all that the cell holds.
+# Distance of the eye from the cell's centre, in extents of the cell's content.
 EYE_DISTANCE = 0.8
-# And in extents of the workspace, whose corners are empty.
+# In extents of the workspace, whose corners are empty.
 MAP_DISTANCE = 0.55
 
 
 @dataclass(frozen=True)
 class _Contents:
-    """What a session and its result have to show."""
+    """Which parts a session and its result have."""
 
     images: bool
     joints: int
     unused: bool
     frames: bool
-    turns: bool
-    sight: bool
+    orientations: bool
+    by_camera: bool
     seers: tuple[str, ...]
     cell: CellResult | None
 
     @classmethod
     def of(cls, session: Session, calibration: Calibration | None) -> "_Contents":
-        """Collects it."""
         joints = [len(view.joints_rad) for view in session.views if view.joints_rad is not None]
         cell = None if calibration is None else calibration.cell
         views = () if calibration is None else calibration.views
@@ -55,17 +54,10 @@ class _Contents:
 
 
 def blueprint(session: Session, calibration: Calibration | None = None) -> rrb.Blueprint:
-    """Lays out a recording of a session and its result.
+    """Layout of a recording of a session and its result; parts that they lack get no space.
 
-    The first tab shows the verdict, the cell and the image; others the network of a whole cell, the
-    calibrated arm, the residuals, what the views cover, and the solvers.
-
-    Args:
-        session: The session; what it does not have gets no room.
-        calibration: Its result, by which the eye finds camera and target too.
-
-    Returns:
-        The layout, to be written into the recording.
+    The first tab shows the verdict, the cell and the image. Others show the network of a cell, the
+    calibrated arm, the residuals, the coverage, and the solvers.
     """
     contents, eye = _Contents.of(session, calibration), _eye(session, calibration)
     tabs: list[rrb.Container | rrb.View] = [_overview(contents, eye, calibration)]
@@ -90,7 +82,7 @@ def _figures(calibration: Calibration | None) -> rrb.Container:
 
 
 def with_panels(content: rrb.Container, timeline: str = paths.TIMELINE) -> rrb.Blueprint:
-    """A layout whose panels are folded, paused at the start of a timeline."""
+    """A layout with collapsed panels, paused at the start of a timeline."""
     folded = rrb.PanelState.Collapsed
     return rrb.Blueprint(
         content,
@@ -106,7 +98,7 @@ def space_view(
     eye: rrb.EyeControls3D | None = None,
     frame: str = paths.BASE_FRAME,
 ) -> rrb.Spatial3DView:
-    """Entities in space, with z upwards."""
+    """Entities in 3D, with z upwards."""
     return rrb.Spatial3DView(
         name=name,
         origin="/",
@@ -119,19 +111,16 @@ def space_view(
 def image_view(
     name: str, entity: str, bounds: rrb.VisualBounds2D | None = None
 ) -> rrb.Spatial2DView:
-    """An entity in a plane, with all that is drawn over it."""
+    """An entity in 2D, with its overlays."""
     return rrb.Spatial2DView(
         name=name, origin=entity, contents=["$origin/**"], visual_bounds=bounds
     )
 
 
 def series(name: str, entity: str) -> rrb.TimeSeriesView:
-    """The curves of an entity, without a legend, which would hide some of them."""
+    """Curves of an entity, without a legend, which would cover them."""
     return rrb.TimeSeriesView(
-        name=name,
-        origin=entity,
-        contents=["$origin/**"],
-        plot_legend=rrb.PlotLegend(visible=False),
+        name=name, origin=entity, contents=["$origin/**"], plot_legend=rrb.PlotLegend(visible=False)
     )
 
 
@@ -150,14 +139,14 @@ def _overview(
     if not contents.images:
         right = rrb.Vertical(verdict, note, row_shares=[2, 1])
         return rrb.Horizontal(left, right, name="Overview", column_shares=[1.3, 1])
-    words = "Image: green detected, blue predicted, red residual"
-    image = image_view(words, paths.IMAGE, _bounds(contents))
+    title = "Image: green detected, blue predicted, red residual"
+    image = image_view(title, paths.IMAGE, _bounds(contents))
     right = rrb.Vertical(verdict, image, note, row_shares=[3.7, 4.2, 1.5])
     return rrb.Horizontal(left, right, name="Overview", column_shares=[1.2, 1])
 
 
 def _bounds(contents: _Contents) -> rrb.VisualBounds2D | None:
-    """What holds the largest image of several cameras; None of one, whose image is alone."""
+    """Bounds of the largest image of several cameras; None for one camera."""
     cameras = {} if contents.cell is None else contents.cell.cameras
     sizes = [camera.camera.resolution for camera in cameras.values()]
     if not sizes:
@@ -167,7 +156,7 @@ def _bounds(contents: _Contents) -> rrb.VisualBounds2D | None:
 
 
 def _explained() -> rrb.Container:
-    """The image, the board as it should look in it, and what is left."""
+    """The image, its rendering from the calibration, and their difference."""
     images = rrb.Horizontal(
         *(
             rrb.Spatial2DView(name=name, origin=entity, contents=["$origin"])
@@ -183,22 +172,24 @@ def _explained() -> rrb.Container:
 
 
 def _arms(calibration: Calibration, eye: rrb.EyeControls3D | None) -> list[rrb.Container]:
-    """The calibrated arms: one with its workspace, several in words; and their drift."""
-    arms = calibration.by_name.robots.values()
-    found = [arm.arm for arm in arms if arm.arm is not None and arm.arm.is_calibrated]
+    """Calibrated arms, one with its workspace or several as text; and their drift."""
+    sections = calibration.by_name.robots.values()
+    calibrated = [
+        section.arm for section in sections if section.arm is not None and section.arm.is_calibrated
+    ]
     tabs: list[rrb.Container] = []
-    if found and calibration.cell is None:
-        tabs.append(_arm(found[0], eye))
-    elif found:
+    if calibrated and calibration.cell is None:
+        tabs.append(_arm(calibrated[0], eye))
+    elif calibrated:
         note = rrb.TextDocumentView(name="The arms", origin=paths.ARM_NOTE)
         tabs.append(rrb.Horizontal(note, name="Arm"))
-    if any(arm.thermal is not None for arm in arms):
+    if any(section.thermal is not None for section in sections):
         tabs.append(_warming())
     return tabs
 
 
 def _warming() -> rrb.Container:
-    """How the arm drifted, view by view, and how much warmer its warmest link was."""
+    """Drift of the arm by view, and the temperature rise of the warmest link."""
     return rrb.Vertical(
         rrb.TimeSeriesView(name="Drift of the flange [mm]", origin=paths.DRIFT_MM),
         rrb.TimeSeriesView(name="Rise of the warmest link [K]", origin=paths.RISE_K),
@@ -206,43 +197,45 @@ def _warming() -> rrb.Container:
     )
 
 
-def _arm(found: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
-    """The accuracy of the calibrated arm, how views left out speak for it, and its parameters."""
-    # The places are all around the base, farther out than the views.
-    wider = eye_on(found.map_places_m, MAP_DISTANCE) if found.workspace_map else eye
+def _arm(arm: ArmResult, eye: rrb.EyeControls3D | None) -> rrb.Container:
+    """Accuracy of the calibrated arm, residuals of unseen views, and parameters."""
+    # The workspace surrounds the base and extends beyond the views.
+    workspace_eye = eye_on(arm.map_places_m, MAP_DISTANCE) if arm.workspace_map else eye
     places = (paths.BASE, paths.ROBOT, paths.WORKSPACE, paths.NOMINAL_ARM)
     contents = [*(f"+ {place}/**" for place in places), f"+ {paths.STOPS}/{paths.USED}"]
-    cell = space_view("Sigma of a tool's place over the workspace", contents, wider)
+    cell = space_view("Sigma of a tool's place over the workspace", contents, workspace_eye)
     note = rrb.TextDocumentView(name="The arm", origin=paths.ARM_NOTE)
-    if not found.left_out:
+    if not arm.left_out:
         return rrb.Horizontal(cell, note, name="Arm", column_shares=[1.4, 1])
-    # What else there is to say stands in the note; a title has little room.
-    words = "orange: as stated, blue: calibrated"
-    unseen = [series(f"Left out [mm], {words}", paths.UNSEEN_MM)]
-    if found.nominal.held_out_deg is not None:
-        unseen.append(series(f"Left out [deg], {words}", paths.UNSEEN_DEG))
+    # A title has little room; the note explains the rest.
+    legend = "orange: as stated, blue: calibrated"
+    unseen = [series(f"Left out [mm], {legend}", paths.UNSEEN_MM)]
+    if arm.nominal.held_out_deg is not None:
+        unseen.append(series(f"Left out [deg], {legend}", paths.UNSEEN_DEG))
     left = rrb.Vertical(cell, rrb.Horizontal(*unseen), row_shares=[2.4, 1])
     return rrb.Horizontal(left, note, name="Arm", column_shares=[1.4, 1])
 
 
-def verdict_views(found: Verdict | None) -> rrb.Container | rrb.View:
-    """The verdict's text, below a strip in its colour once there is one."""
+def verdict_views(verdict: Verdict | None) -> rrb.Container | rrb.View:
+    """The verdict's text, below a strip in its colour if there is a verdict."""
     text = rrb.TextDocumentView(name="Verdict", origin=paths.VERDICT)
-    if found is None:
+    if verdict is None:
         return text
     strip = rrb.Spatial2DView(
-        name=found.headline, origin=paths.VERDICT_STRIP, background=[*colours.VERDICT[found.status]]
+        name=verdict.headline,
+        origin=paths.VERDICT_STRIP,
+        background=[*colours.VERDICT[verdict.status]],
     )
     return rrb.Vertical(strip, text, row_shares=[1, 8], name="Verdict")
 
 
-def _verdict(contents: _Contents, found: Verdict | None) -> rrb.Container | rrb.View:
-    """The verdict, and what is said of tools and fixtures behind it."""
-    verdict = verdict_views(found)
+def _verdict(contents: _Contents, verdict: Verdict | None) -> rrb.Container | rrb.View:
+    """The verdict, with tools and fixtures in a second tab."""
+    view = verdict_views(verdict)
     if not contents.frames:
-        return verdict
+        return view
     tools = rrb.TextDocumentView(name="Tools and fixtures", origin=paths.TOOLS)
-    return rrb.Tabs(verdict, tools, active_tab=0)
+    return rrb.Tabs(view, tools, active_tab=0)
 
 
 def _residuals(contents: _Contents) -> rrb.Container:
@@ -265,7 +258,7 @@ def _residuals(contents: _Contents) -> rrb.Container:
 
 def _coverage(contents: _Contents) -> rrb.Container:
     directions, axes = disc_views()
-    if not contents.sight:
+    if not contents.by_camera:
         return rrb.Horizontal(axes, name="Coverage")
     if not contents.images:
         return rrb.Horizontal(directions, axes, name="Coverage")
@@ -276,7 +269,7 @@ def _coverage(contents: _Contents) -> rrb.Container:
 
 
 def disc_views() -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
-    """The charts of where the camera looks from, and of the axes of rotation."""
+    """Charts of viewing directions and rotation axes."""
     directions = _disc(
         "Where the camera looks from, about the target's normal",
         paths.DIRECTIONS,
@@ -291,60 +284,61 @@ def disc_views() -> tuple[rrb.Spatial2DView, rrb.Spatial2DView]:
 
 
 def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DView:
-    """A chart of directions, with room for the words around its rim."""
+    """A chart of directions, with room for labels around its rim."""
     reach_deg = 1.2 * rings_deg[-1]
     bounds = rrb.VisualBounds2D(x_range=(-reach_deg, reach_deg), y_range=(-reach_deg, reach_deg))
     return image_view(f"{name} (rings: {rings_deg[0]}\N{DEGREE SIGN})", entity, bounds)
 
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
-    """Looks at the cell from the side, from where all of it fills the view."""
+    """Views the cell from the side so that it fills the view; None without known positions."""
     frames = parts.frames(calibration)
-    bases = {paths.CELL_FRAME, paths.BASE_FRAME}
+    parents = {paths.CELL_FRAME, paths.BASE_FRAME}
     fixed = [
-        matrix[:3, 3] for frame, matrix in frames.matrices.items() if frames.parents[frame] in bases
+        matrix[:3, 3]
+        for frame, matrix in frames.matrices.items()
+        if frames.parents[frame] in parents
     ]
-    # Of several robots, each pose is in a base of its own.
+    # With several robots, the poses have different bases.
     poses = {} if session.is_network else reported_matrices(session.views)
     places = np.array([np.zeros(3), *(pose[:3, 3] for pose in poses.values()), *fixed])
     return eye_on(places) if len(places) > 2 else None
 
 
 def eye_on(places: FloatArray, distance: float = EYE_DISTANCE) -> rrb.EyeControls3D:
-    """Looks at (k, 3) places from where all of them fill the view [m]."""
+    """Views (k, 3) points [m] from the side so that they fill the view."""
     low, high = places.min(axis=0), places.max(axis=0)
     centre, size_m = 0.5 * (low + high), float(np.linalg.norm(high - low))
     forward = centre[:2] / max(float(np.linalg.norm(centre[:2])), 1e-9)
-    # From the robot's right and its front, above the table.
+    # From the robot's front right, above the table.
     direction = np.array([forward[1] + 0.6 * forward[0], 0.6 * forward[1] - forward[0], 0.6])
     return rrb.EyeControls3D(position=centre + distance * size_m * direction, look_target=centre)
 
 
 def _cell_contents(contents: _Contents) -> list[str]:
-    several = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET)
+    kinds = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET)
     entities = [
-        *(name for entity in several for name in (entity, f"{entity}s")),
+        *(name for entity in kinds for name in (entity, f"{entity}s")),
         paths.STOPS,
         paths.FRAMES,
         paths.SEEN_TARGET,
         paths.CELL,
         paths.SIGHT_LINE,
     ]
-    # The image's overlays would float as a crowd of points in the frustum.
+    # The image's overlays would clutter the frustum.
     hidden = [f"- {paths.IMAGE}/**", f"+ {paths.IMAGE}"] if contents.images else []
     return [*(f"+ {entity}/**" for entity in entities), *hidden]
 
 
 def _plots(contents: _Contents, seer: str) -> list[rrb.TimeSeriesView]:
-    """The residuals of the views of one camera."""
-    wanted = [
+    plots = [
         ("Position residual [mm]", paths.POSITION_MM),
-        *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.turns else []),
+        *([("Orientation residual [deg]", paths.ORIENTATION_DEG)] if contents.orientations else []),
     ]
     if contents.images:
-        wanted.append(("Reprojection error [px]", paths.REPROJECTION_PX))
-    # A legend would hide the marks at the top and at the bottom, of just these views; a longer
-    # title would be cut beside a plot's buttons.
+        plots.append(("Reprojection error [px]", paths.REPROJECTION_PX))
+    # A legend would cover the marks at the top and bottom, which are of these views; a longer title
+    # would be cut off.
     legend = "; red: not used" if contents.unused else ""
     of = f"{seer}: " if seer else ""
-    return [series(f"{of}{name}{legend}", paths.part_of(word, seer)) for name, word in wanted]
+    return [series(f"{of}{name}{legend}", paths.part_of(word, seer)) for name, word in plots]

@@ -1,4 +1,4 @@
-"""A viewer that is fed while a session is recorded."""
+"""A viewer that shows a session while it is recorded."""
 
 import socket
 import time
@@ -14,9 +14,9 @@ from visioncal.present.viewer.layout import image_view, space_view
 from visioncal.present.viewer.process import free_port, viewer_process
 
 _HOST = "127.0.0.1"
-# A viewer that does not listen by then is not coming [s].
+# Time for the viewer to listen, polling interval, and time for its window to open [s].
 _PATIENCE_S, _POLL_S, _WINDOW_S = 10.0, 0.1, 1.0
-# What was drawn last is on its way for so long at most [s].
+# Longest wait for the last data to arrive [s].
 _FLUSH_S = 2.0
 
 
@@ -25,20 +25,20 @@ def live_viewer(name: str) -> Iterator[rr.RecordingStream]:
     """Opens a viewer; leaving the block closes it.
 
     Args:
-        name: What to call the recording.
+        name: Name of the recording.
 
     Yields:
         The stream that it shows.
 
     Raises:
-        DriverError: It cannot be shown here.
+        DriverError: The viewer cannot be shown here.
     """
     port = free_port()
     with viewer_process("--bind", _HOST, "--port", str(port)) as process:
-        until = time.monotonic() + _PATIENCE_S
-        while process.poll() is None and time.monotonic() < until and not _listens(port):
+        deadline = time.monotonic() + _PATIENCE_S
+        while process.poll() is None and time.monotonic() < deadline and not _listens(port):
             time.sleep(_POLL_S)
-        # It listens before it opens its window, and ends where it cannot.
+        # It listens before it opens its window, and exits if it cannot open one.
         time.sleep(_WINDOW_S)
         if process.poll() is not None or not _listens(port):
             raise DriverError(
@@ -58,18 +58,18 @@ def live_viewer(name: str) -> Iterator[rr.RecordingStream]:
 
 
 def live_blueprint() -> rrb.Blueprint:
-    """The layout of a recording at work: image and cell, coverage and predicted sigma."""
+    """Layout of a live recording: image and cell, coverage and predicted sigma."""
     entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.CAMERA, paths.TARGET, paths.STOPS)
     shown = [*(f"+ {entity}/**" for entity in entities), f"- {paths.DETECTED}/**"]
     cell = space_view("Cell: views so far in blue", shown)
     image = image_view("This view", paths.IMAGE)
-    covered = image_view("What corners have reached", paths.IMAGE_COVERAGE)
+    coverage = image_view("What corners have reached", paths.IMAGE_COVERAGE)
     sigma = rrb.TimeSeriesView(name="Predicted sigma [mm]", origin=paths.LIVE_SIGMA)
     note = rrb.TextDocumentView(name="This view", origin=paths.LIVE_NOTE)
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(image, cell, row_shares=[1, 1]),
-            rrb.Vertical(covered, sigma, note, row_shares=[2, 1, 1]),
+            rrb.Vertical(coverage, sigma, note, row_shares=[2, 1, 1]),
             column_shares=[1.6, 1],
         ),
         rrb.SelectionPanel(state=rrb.PanelState.Collapsed),

@@ -1,4 +1,4 @@
-"""A recording in rerun's native viewer."""
+"""Shows a recording in rerun's native viewer."""
 
 import time
 from pathlib import Path
@@ -11,16 +11,16 @@ from visioncal.core.errors import DriverError
 from visioncal.present.recording import paths
 from visioncal.present.viewer.process import free_port, until_interrupted, viewer_process
 
-# How long a recording is waited for, and how often it is asked for.
+# Longest wait for the recording to load, and polling interval [s].
 _PATIENCE_S, _AGAIN_S = 60.0, 0.2
 
 
 def review_native(recording: Path, row: int | None = None) -> None:
-    """Shows a recording in a window, until that is closed or Ctrl-C or SIGTERM comes.
+    """Shows a recording in a window, until it is closed or by Ctrl-C or SIGTERM.
 
     Args:
         recording: The `.rrd`.
-        row: The place of the view to open it at; None for the first.
+        row: Row of the view to open it at; None for the first.
 
     Raises:
         DriverError: The viewer cannot be shown here.
@@ -31,19 +31,19 @@ def review_native(recording: Path, row: int | None = None) -> None:
     with until_interrupted(), viewer_process(*arguments) as process:
         if row is not None:
             Thread(target=_seek, args=(process, port, row), daemon=True).start()
-        said, _ = process.communicate()
+        output, _ = process.communicate()
         if process.returncode != 0:
-            last = said.strip().splitlines()[-1:] or ["it did not say why"]
+            last_line = output.strip().splitlines()[-1:] or ["it did not say why"]
             raise DriverError(
-                f"rerun's viewer ended with status {process.returncode}: {last[0]}.",
+                f"rerun's viewer ended with status {process.returncode}: {last_line[0]}.",
                 next_step="Without a display, show the recording in a browser: --web.",
             )
 
 
 def _seek(process: Popen[str], port: int, row: int) -> None:
-    """Goes to a view once the viewer has the recording; where it never has, it stays as it is."""
-    end = time.monotonic() + _PATIENCE_S
-    while process.poll() is None and time.monotonic() < end:
+    """Goes to a view once the viewer has loaded the recording; gives up after a timeout."""
+    deadline = time.monotonic() + _PATIENCE_S
+    while process.poll() is None and time.monotonic() < deadline:
         try:
             viewer = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
             viewer.set_time(paths.TIMELINE, sequence=row, play_state="paused")

@@ -1,4 +1,4 @@
-"""The layouts in which the rerun viewer opens previews of plans, and identified dynamics."""
+"""Layouts of previews of plans, and of identified dynamics, in the rerun viewer."""
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -27,14 +27,12 @@ _TITLES = {
 
 
 def plan_blueprint(preview: Preview) -> rrb.Blueprint:
-    """Lays out the preview of a plan.
-
-    Returns:
-        The layout, to be written into the recording.
-    """
+    """Layout of the preview of a plan."""
     flange = preview.base_from_flange
-    placed = [pose for value in flange for pose in preview.placed(value)]
-    places = np.array([np.zeros(3), *flange[:, :3, 3], *(array[:3, 3] for array in placed)])
+    poses = [pose for base_from_flange in flange for pose in preview.placed(base_from_flange)]
+    places = np.array(
+        [np.zeros(3), *flange[:, :3, 3], *(pose_in_base[:3, 3] for pose_in_base in poses)]
+    )
     tabs = [_overview(places), _coverage()]
     if len(preview.places_m):
         tabs.insert(1, _workspace(preview))
@@ -53,7 +51,7 @@ def _cell(
         paths.OBSTACLES,
         *more,
     )
-    # The predicted corners would float as a crowd of points in the frustum.
+    # The predicted corners would clutter the frustum.
     contents = [
         *(f"+ {entity}/**" for entity in entities),
         f"- {paths.IMAGE}/**",
@@ -97,11 +95,7 @@ def _coverage() -> rrb.Container:
 
 
 def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
-    """Lays out the preview of motions.
-
-    Returns:
-        The layout, to be written into the recording.
-    """
+    """Layout of the preview of motions."""
     entities = (paths.BASE, paths.ROBOT, paths.FLANGE, paths.OBSTACLES, paths.WAY)
     cell = space_view(
         "The flange's way: exciting motion in orange, sweeps in blue",
@@ -112,7 +106,7 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
     kinds: tuple[str, ...] = paths.MOTION_KINDS
     if any(part.torques_nm is None for part in preview.parts):
         kinds = kinds[:-1]
-    # One legend is enough: a joint has the same colour in all curves.
+    # One legend suffices: a joint has the same colour in all curves.
     curves = [
         rrb.TimeSeriesView(
             name=_TITLES[kind],
@@ -130,11 +124,7 @@ def motion_blueprint(preview: MotionPreview) -> rrb.Blueprint:
 
 
 def dynamics_blueprint(run: Run) -> rrb.Blueprint:
-    """Lays out torques over time beside the moving arm.
-
-    Returns:
-        The layout, to be written into the recording.
-    """
+    """Layout of torques over time beside the moving arm."""
     tabs = rrb.Tabs(_torques(run), _figures(), active_tab=0)
     return with_panels(tabs, paths.MOTION_TIMELINE)
 

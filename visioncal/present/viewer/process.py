@@ -1,4 +1,4 @@
-"""Rerun's viewer as a process of its own, which reaches no other machine and leaves none behind."""
+"""Rerun's viewer as a child process, without network access beyond this machine."""
 
 import os
 import signal
@@ -11,19 +11,19 @@ from contextlib import contextmanager, suppress
 from visioncal.core.interrupts import ended_like_ctrl_c
 
 _PATIENCE_S = 5.0
-# Nothing listens at the port of the discard service, so what goes there ends there.
+# Nothing listens at the port of the discard service.
 _NOWHERE = "http://127.0.0.1:9"
 
 
 @contextmanager
 def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """Runs rerun's viewer; leaving the block ends it with all that it has started.
+    """Runs rerun's viewer; leaving the block ends it with all its child processes.
 
     Args:
-        arguments: Those of the `rerun` command. What it writes can be read from `stdout`.
+        arguments: Arguments of the `rerun` command. Its output can be read from `stdout`.
 
     Yields:
-        The process, which leads a group of its own.
+        The process, which leads its own process group.
     """
     process = subprocess.Popen(
         [sys.executable, "-m", "rerun_cli", *arguments],
@@ -43,7 +43,7 @@ def viewer_process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def free_port() -> int:
-    """A port of this machine at which nothing listens."""
+    """A free port of this machine."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return int(free.getsockname()[1])
@@ -51,23 +51,23 @@ def free_port() -> int:
 
 @contextmanager
 def until_interrupted() -> Iterator[None]:
-    """Runs a block that Ctrl-C or SIGTERM ends as its ordinary end, not as an error."""
+    """Runs a block that Ctrl-C or SIGTERM ends without an error."""
     with suppress(KeyboardInterrupt), ended_like_ctrl_c("SIGINT", "SIGTERM"):
         yield
 
 
 def _quiet(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment in which the viewer sends no statistics and asks for no newer version."""
-    # It sends none where it believes itself under continuous integration, and it asks through the
-    # proxy; both leave the user's own settings of rerun as they are.
+    """Environment in which the viewer sends no statistics and checks for no newer version."""
+    # It sends none under continuous integration, and checks through the proxy; neither changes the
+    # user's settings of rerun.
     quiet = {key: name for key, name in environment.items() if key != "FORCE_RERUN_ANALYTICS"}
     proxies = dict.fromkeys(("HTTPS_PROXY", "https_proxy", "ALL_PROXY", "all_proxy"), _NOWHERE)
     return quiet | proxies | {"CI": "1", "NO_COLOR": "1"}
 
 
 def _end_group(process: subprocess.Popen[str]) -> None:
-    """Ends a process and those that it started; rerun's command starts the viewer as a child."""
-    # Both signals: the command may have ended while its child has not.
+    """Ends a process and its children; rerun's command starts the viewer as a child."""
+    # Both signals, as the command may have ended before its child.
     for number in (signal.SIGTERM, signal.SIGKILL):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)

@@ -1,7 +1,7 @@
-"""A recording in a browser, from a server that only this machine reaches.
+"""Shows a recording in a browser, from a server that only this machine reaches.
 
-Rerun's own server listens to the whole network and its page asks servers outside for fonts and
-news. This one answers for a handful of names with a page that may load nothing from elsewhere.
+Rerun's own server listens to the whole network, and its page requests fonts and news from other
+servers. This one serves a fixed set of names, with a page that loads nothing from elsewhere.
 """
 
 import re
@@ -32,7 +32,7 @@ _HEADERS = {
             "default-src 'none'",
             "script-src 'self' 'wasm-unsafe-eval'",
             f"connect-src 'self' http://{_HOST}:*",
-            # The viewer styles its canvas itself, and shows pictures that it has made.
+            # The viewer styles its canvas itself, and shows generated pictures.
             "style-src 'self' 'unsafe-inline'",
             "img-src 'self' data: blob:",
             "base-uri 'none'",
@@ -45,23 +45,23 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
-    # Another recording may be shown at the same address later.
+    # Another recording may have the same address later.
     "Cache-Control": "no-store",
 }
 SCRIPT, MODULE = "re_viewer.js", "re_viewer_bg.wasm"
 _PATIENCE_S = 30.0
 _SERVING = re.compile(r"Hosting a web-viewer at http://127\.0\.0\.1:(\d+)")
-# A recording by its URL makes rerun serve the files alone; nobody ever asks for it.
+# With the URL of a recording, rerun only serves the viewer's files; nothing fetches it.
 _NO_RECORDING = "http://127.0.0.1/none.rrd"
 
 
 @dataclass(frozen=True)
 class _Route:
-    """What is handed out under one name.
+    """Content of one path.
 
     Attributes:
-        media_type: Its type.
-        source: The bytes, or the file that is read anew for each request.
+        media_type: Media type.
+        source: The bytes, or the file that is read for each request.
     """
 
     media_type: str
@@ -78,35 +78,37 @@ class _Route:
 def review_web(
     recording: Path, port: int, opened: Callable[[str], None], row: int | None = None
 ) -> None:
-    """Serves a recording with the viewer to this machine, until Ctrl-C or SIGTERM comes.
+    """Serves a recording with the viewer to this machine, until Ctrl-C or SIGTERM.
 
     Args:
         recording: The `.rrd`.
-        port: Where to listen; 0 for any free port.
-        opened: Called with the page's URL once it can be visited.
-        row: The place of the view to open it at; None for the first.
+        port: Port to listen on; 0 for any free port.
+        opened: Called with the page's URL once it is available.
+        row: Row of the view to open it at; None for the first.
 
     Raises:
-        DataError: The port cannot be had.
-        DriverError: Rerun's command does not hand out its web viewer.
+        DataError: The port cannot be used.
+        DriverError: Rerun's command does not serve its web viewer.
     """
     with until_interrupted(), _server(_routes(recording), port) as server:
-        at = "" if row is None else f"#when={paths.TIMELINE}@{row}"
-        opened(f"http://{_HOST}:{server.server_port}/{at}")
+        fragment = "" if row is None else f"#when={paths.TIMELINE}@{row}"
+        opened(f"http://{_HOST}:{server.server_port}/{fragment}")
         server.serve_forever()
 
 
 def _routes(recording: Path) -> dict[str, _Route]:
-    """All that can be asked for; no path is ever made of a request."""
-    own = {name: read_bytes(Path(__file__).with_name(name)) for name in (_PAGE, _STYLE, _STARTER)}
+    """All served paths; a request is never turned into a file path."""
+    page_files = {
+        name: read_bytes(Path(__file__).with_name(name)) for name in (_PAGE, _STYLE, _STARTER)
+    }
     assets = _viewer_assets()
     report = recording.with_name(_REPORT)
-    # What the notes of the views lead to.
-    beside = {f"/{_REPORT}": _Route(_HTML, report)} if report.is_file() else {}
-    return beside | {
-        "/": _Route(_HTML, own[_PAGE]),
-        f"/{_STYLE}": _Route("text/css; charset=utf-8", own[_STYLE]),
-        f"/{_STARTER}": _Route(_JAVASCRIPT, own[_STARTER]),
+    # The notes of the views link to it.
+    report_route = {f"/{_REPORT}": _Route(_HTML, report)} if report.is_file() else {}
+    return report_route | {
+        "/": _Route(_HTML, page_files[_PAGE]),
+        f"/{_STYLE}": _Route("text/css; charset=utf-8", page_files[_STYLE]),
+        f"/{_STARTER}": _Route(_JAVASCRIPT, page_files[_STARTER]),
         f"/{SCRIPT}": _Route(_JAVASCRIPT, assets[SCRIPT]),
         f"/{MODULE}": _Route("application/wasm", assets[MODULE]),
         f"/{_RECORDING}": _Route("application/octet-stream", recording),
@@ -115,7 +117,7 @@ def _routes(recording: Path) -> dict[str, _Route]:
 
 def _server(routes: Mapping[str, _Route], port: int) -> ThreadingHTTPServer:
     try:
-        # A browser keeps connections in reserve; a thread for each keeps them apart.
+        # Threads, as browsers keep idle connections open.
         return _Server((_HOST, port), partial(_Handler, routes))
     except OSError as error:
         raise DataError(
@@ -125,16 +127,16 @@ def _server(routes: Mapping[str, _Route], port: int) -> ThreadingHTTPServer:
 
 
 class _Server(ThreadingHTTPServer):
-    """A server that takes it calmly when a page is closed while it is sent."""
+    """A server that ignores connections closed by the browser."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 - its interface
-        """Reports what went wrong with a request; that a connection ended is nothing wrong."""
+        """Reports errors of a request other than a closed connection."""
         if not isinstance(sys.exc_info()[1], ConnectionError):
             super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers one request out of the routes."""
+    """Answers one request from the routes."""
 
     server_version = "visioncal"
     sys_version = ""
@@ -144,7 +146,6 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*arguments)  # type: ignore[arg-type]
 
     def do_GET(self) -> None:
-        """Sends the content of a route."""
         self._answer(with_content=True)
 
     def do_HEAD(self) -> None:
@@ -152,7 +153,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_content=False)
 
     def _answer(self, *, with_content: bool) -> None:
-        if not self._asked_for_here():
+        if not self._is_own_host():
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             return
         route = self._routes.get(self.path)
@@ -172,38 +173,38 @@ class _Handler(BaseHTTPRequestHandler):
             if with_content:
                 shutil.copyfileobj(stream, self.wfile)
 
-    def _asked_for_here(self) -> bool:
-        """Whether the page's own address was asked for."""
-        # Another name that leads here is how a foreign page would read this server through the
-        # browser (DNS rebinding).
+    def _is_own_host(self) -> bool:
+        """Whether the request's host is the page's own address."""
+        # Through another name, a foreign page could read this server in the browser (DNS
+        # rebinding).
         port = self.connection.getsockname()[1]
         return self.headers.get("Host", "") in (f"{_HOST}:{port}", f"localhost:{port}")
 
     def end_headers(self) -> None:
-        """Adds the headers that all answers carry."""
+        """Adds the headers common to all answers."""
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         super().end_headers()
 
     def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002
-        """Keeps the terminal quiet."""
+        """Suppresses log output."""
 
 
 def _viewer_assets() -> Mapping[str, bytes]:
-    """Fetches the script and the module of the web viewer, by name."""
-    # Rerun's command is let serve them on this machine for the quarter of a second that it takes.
+    """Script and module of the web viewer, by name."""
+    # Rerun's command serves them on this machine, for about a quarter of a second.
     arguments = ("--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", "0", _NO_RECORDING)
     with viewer_process(*arguments) as process:
-        said: list[str] = []
+        output: list[str] = []
         for line in process.stdout or ():
-            said.append(line.strip())
+            output.append(line.strip())
             if serving := _SERVING.search(line):
                 return {name: _fetch(int(serving[1]), name) for name in (SCRIPT, MODULE)}
-    raise _unserved(" ".join(said[-1:]) or "it said nothing")
+    raise _unserved(" ".join(output[-1:]) or "it said nothing")
 
 
 def _fetch(port: int, name: str) -> bytes:
-    # Not urllib, which would ask a proxy of the environment for it.
+    # Not urllib, which would use a proxy from the environment.
     connection = HTTPConnection("127.0.0.1", port, timeout=_PATIENCE_S)
     try:
         connection.request("GET", f"/{name}")

@@ -1,1 +1,1 @@
-"""Corners of blurred, moving and badly lit images, by all their pixels: torch and kornia."""
+"""Dense corner fitting in blurred, moving and badly lit images, with torch and kornia."""

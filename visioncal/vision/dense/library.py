@@ -1,4 +1,4 @@
-"""torch and kornia, which come with the extra `dense`, and the device that they work on."""
+"""Access to torch and kornia, which the extra `dense` installs, and to their device."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ def library(name: str) -> Any:  # noqa: ANN401 - a module of a package that need
     """Imports torch or kornia.
 
     Raises:
-        DataError: It is not installed, with the command that installs it.
+        DataError: The library is not installed.
     """
     try:
         return import_module(name)
@@ -28,10 +28,10 @@ def library(name: str) -> Any:  # noqa: ANN401 - a module of a package that need
 
 
 def chosen_device(wanted: str) -> str:
-    """Chooses the device to work on.
+    """Chooses the torch device.
 
     Args:
-        wanted: `auto` for a GPU where there is one, `cpu` or `cuda`.
+        wanted: `auto` for a GPU if there is one, `cpu` or `cuda`.
 
     Raises:
         DataError: There is no such device, or torch is not installed.
@@ -40,14 +40,14 @@ def chosen_device(wanted: str) -> str:
         raise DataError(
             f"device {wanted!r} is not one of {', '.join(DEVICES)}.", culprits=["--device"]
         )
-    there = bool(library("torch").cuda.is_available())
-    if wanted == "cuda" and not there:
+    has_gpu = bool(library("torch").cuda.is_available())
+    if wanted == "cuda" and not has_gpu:
         raise DataError(
             "--device cuda: torch finds no GPU here.",
             culprits=["--device"],
             next_step="Leave it out, or install torch with CUDA and its driver.",
         )
-    return "cuda" if there and wanted != "cpu" else "cpu"
+    return "cuda" if has_gpu and wanted != "cpu" else "cpu"
 
 
 @contextmanager
@@ -61,5 +61,5 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-# Images are worked on side by side; torch's threads inside ours wait for one another.
+# Images are processed in parallel threads, which torch's own threads would slow down.
 ONE_TORCH_THREAD = SharedSetting(_one_thread)

@@ -1,4 +1,4 @@
-"""The board as printed, as calibration, blur and light have it in an image, and what is left."""
+"""Rendering of a board into an image from calibration, blur and light, and the difference."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,15 +18,15 @@ from visioncal.vision.targets import corner_positions, marked_squares, marker_ce
 if TYPE_CHECKING:
     from torch import Tensor
 
-# What is not explained is drawn so many times as strong, about a middle grey.
+# Magnification of the difference image, and its grey level for zero.
 MAGNIFIED, MIDDLE = 4, 128
-# How far around the outermost corners a board is looked at [squares].
+# Rim around the outermost corners [squares].
 _RIM = 1.0
-# Polynomials through so many places a side carry a map over an image.
+# Nodes per side of the polynomial that interpolates a map.
 _NODES = 14
-# Pixels that show the light, at least and at most.
+# Least and approximate largest number of pixels for the fit of light.
 _FEWEST_LIT, _LIT_BY = 100, 50_000
-# Beyond so many pixels, there is one sample in each.
+# Largest number of pixels that are rendered with two samples each.
 _MOST_FINE = 1_500_000
 _FEWEST = 6
 
@@ -36,10 +36,10 @@ class Print:
     """A board as a grid of light and dark cells.
 
     Attributes:
-        x: (c + 1,) lines along x, from the board's origin [squares].
-        y: (r + 1,) lines along y.
-        light: (r + 2, c + 2) which cells are light; around the board all are.
-        inset: How far a light square's marker is from its edges [squares]; infinite without one.
+        x: (c + 1,) grid lines along x, from the board's origin [squares].
+        y: (r + 1,) grid lines along y.
+        light: (r + 2, c + 2) mask of light cells, with light paper around the board.
+        inset: Margin of a light square around its marker [squares]; infinite without markers.
     """
 
     x: FloatArray
@@ -73,28 +73,24 @@ class Print:
         return cls(x, y, _paper(light), inset)
 
     def light_at(self, places: FloatArray) -> Mask:
-        """(n,) which of (n, 2) places [squares] lie on light cells."""
+        """(n,) mask of (n, 2) positions [squares] on light cells."""
         column = np.searchsorted(self.x, places[:, 0])
         row = np.searchsorted(self.y, places[:, 1])
         return np.asarray(self.light[row, column])
 
     def drawn(self, x: "Tensor", y: "Tensor", sigma_x: "Tensor", sigma_y: "Tensor") -> "Tensor":
-        """Draws the print: 1 where it is light, 0 where dark, edges as of a Gaussian.
+        """Renders the print at (...) positions [squares]: 1 for light, 0 for dark.
 
-        Args:
-            x: (...) places on the board [squares].
-            y: Likewise.
-            sigma_x: Widths of edges across the lines of constant x [squares].
-            sigma_y: Likewise.
+        Edges are Gaussian, with widths across the lines of constant x and of constant y [squares].
         """
         torch = library("torch")
         light = torch.as_tensor(self.light, dtype=x.dtype, device=x.device)
-        (at_x, beyond_x), (at_y, beyond_y) = (
+        (column, beyond_x), (row, beyond_y) = (
             _nearest(torch.as_tensor(lines, dtype=x.dtype, device=x.device), at, sigma)
             for lines, at, sigma in ((self.x, x, sigma_x), (self.y, y, sigma_y))
         )
-        upper = torch.lerp(light[at_y, at_x], light[at_y, at_x + 1], beyond_x)
-        lower = torch.lerp(light[at_y + 1, at_x], light[at_y + 1, at_x + 1], beyond_x)
+        upper = torch.lerp(light[row, column], light[row, column + 1], beyond_x)
+        lower = torch.lerp(light[row + 1, column], light[row + 1, column + 1], beyond_x)
         return torch.lerp(upper, lower, beyond_y)
 
 
@@ -102,26 +98,26 @@ def _paper(light: Mask) -> Mask:
     return np.pad(light, 1, constant_values=True)
 
 
-def _nearest(lines: "Tensor", at: "Tensor", sigma: "Tensor") -> "tuple[Tensor, Tensor]":
-    """The line next to each place, and the share of a Gaussian there that lies beyond it."""
+def _nearest(lines: "Tensor", positions: "Tensor", sigma: "Tensor") -> "tuple[Tensor, Tensor]":
+    """Index of the nearest line, and the share of the Gaussian beyond it."""
     torch = library("torch")
-    near = torch.bucketize(at.contiguous(), (lines[1:] + lines[:-1]) / 2)
-    return near, torch.special.ndtr((at - lines[near]) / sigma)
+    index = torch.bucketize(positions.contiguous(), (lines[1:] + lines[:-1]) / 2)
+    return index, torch.special.ndtr((positions - lines[index]) / sigma)
 
 
 def board_places(target: Target, ids: IntArray) -> FloatArray:
-    """(n, 2) corners on the board [squares]."""
+    """(n, 2) corner positions on the board [squares]."""
     return np.asarray(corner_positions(target)[ids, :2] / target.square_m)
 
 
 @dataclass(frozen=True, eq=False)
 class DenseImage:
-    """An image, as far as it is explained.
+    """A rendered image and its difference from the actual one.
 
     Attributes:
-        drawn: (h, w) the board as it should look; around it, the image.
-        rest: (h, w) image less drawn, `MAGNIFIED` times about `MIDDLE`.
-        rest_rms: Rms of what is not explained, on the board [grey levels].
+        drawn: (h, w) the rendered board within the image.
+        rest: (h, w) image less rendering, magnified by `MAGNIFIED` about `MIDDLE`.
+        rest_rms: Rms difference on the board [grey levels].
     """
 
     drawn: Image
@@ -138,82 +134,83 @@ def explain(
     blur: Blur,
     tone: float,
 ) -> DenseImage | None:
-    """Draws the board into an image.
+    """Renders the board into an image.
 
     Args:
         image: (h, w) grey image.
         target: A checkerboard or a ChArUco board.
-        ids: (n,) numbers of corners.
-        px: (n, 2) where a calibration puts them [px].
-        camera: Its camera.
-        blur: The image's point-spread function.
-        tone: q of `dense.fit`.
+        ids: (n,) corner ids.
+        px: (n, 2) corners predicted by a calibration [px].
+        camera: Camera model.
+        blur: Point-spread function of the image.
+        tone: Tone q of `dense.fit`.
 
     Returns:
-        What is explained and what is not; None where the corners do not determine it, or lie
-        outside the image.
+        Rendering and difference; None if the corners do not determine them, or lie outside the
+        image.
     """
     if len(ids) < _FEWEST or not np.isfinite(px).all():
         return None
     torch, printed, board = library("torch"), Print.of(target), board_places(target, ids)
     with ONE_TORCH_THREAD.held(), torch.inference_mode(), suppress(np.linalg.LinAlgError):
         on_board = map_of_all(board, normalise(camera, px))
-        low, high = _part(px, board, image)
+        low, high = _region(px, board, image)
         margin = int(np.ceil(blur.reach_px)) + 1
         fine = 2 if np.prod(high - low) <= _MOST_FINE else 1
         u, v = (
             np.arange(fine * (b - a + 2 * margin)) / fine + a - margin
             for a, b in zip(low.tolist(), high.tolist(), strict=True)
         )
-        x, y = _over(u, v, lambda at: on_board(normalise(camera, at)))
+        x, y = _interpolated_map(u, v, lambda at: on_board(normalise(camera, at)))
         light = _blurred(printed, x, y, blur, fine)
         inner = (slice(margin * fine, -margin * fine, fine),) * 2
         light, x, y = light[inner], x[inner], y[inner]
         part = image[low[1] : high[1], low[0] : high[0]].astype(float)
         toned = light + tone * light * (1.0 - light)
-        on = _is_on(printed, x, y)
-        if on.sum() < _FEWEST_LIT:
+        on_board_mask = _on_print(printed, x, y)
+        if on_board_mask.sum() < _FEWEST_LIT:
             return None
-        model = _lit(part, toned, on)
+        model = _with_light(part, toned, on_board_mask)
         drawn, rest = image.copy(), np.full_like(image, MIDDLE)
-        place = (slice(low[1], high[1]), slice(low[0], high[0]))
-        drawn[place] = np.where(on, np.clip(np.rint(model), 0, 255), part).astype(np.uint8)
-        off = np.where(on, MAGNIFIED * (part - model), 0.0) + MIDDLE
-        rest[place] = np.clip(np.rint(off), 0, 255).astype(np.uint8)
-        return DenseImage(drawn, rest, float(np.sqrt(np.mean((part - model)[on] ** 2))))
+        region = (slice(low[1], high[1]), slice(low[0], high[0]))
+        drawn[region] = np.where(on_board_mask, np.clip(np.rint(model), 0, 255), part).astype(
+            np.uint8
+        )
+        difference = np.where(on_board_mask, MAGNIFIED * (part - model), 0.0) + MIDDLE
+        rest[region] = np.clip(np.rint(difference), 0, 255).astype(np.uint8)
+        return DenseImage(drawn, rest, float(np.sqrt(np.mean((part - model)[on_board_mask] ** 2))))
     return None
 
 
-def _part(px: FloatArray, board: FloatArray, image: Image) -> tuple[IntArray, IntArray]:
-    """Low and high corner of what is looked at [px]."""
+def _region(px: FloatArray, board: FloatArray, image: Image) -> tuple[IntArray, IntArray]:
     extent = np.ptp(px, axis=0) / np.maximum(np.ptp(board, axis=0).min(), 1.0)
-    more = _RIM * float(extent.max()) + 2.0
+    margin = _RIM * float(extent.max()) + 2.0
     size = np.array(image.shape[::-1])
-    low = np.clip(np.floor(px.min(axis=0) - more), 0, size - 1).astype(int)
-    high = np.clip(np.ceil(px.max(axis=0) + more) + 1, low + 1, size).astype(int)
+    low = np.clip(np.floor(px.min(axis=0) - margin), 0, size - 1).astype(int)
+    high = np.clip(np.ceil(px.max(axis=0) + margin) + 1, low + 1, size).astype(int)
     return low, high
 
 
-def _over(
-    u: FloatArray, v: FloatArray, mapped: Callable[[FloatArray], FloatArray]
+def _interpolated_map(
+    u: FloatArray, v: FloatArray, board_map: Callable[[FloatArray], FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """A smooth map (h, w) of all places u, v, by polynomials through some of its values."""
+    """Values (h, w) of a smooth map on the grid u, v, by polynomial interpolation."""
     nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     inverse = np.linalg.inv(chebvander(nodes, _NODES - 1))
-    ends = [(array[0], array[-1]) for array in (u, v)]
-    at_u, at_v = ((a + b + nodes * (b - a)) / 2 for a, b in ends)
-    values = mapped(np.stack(np.meshgrid(at_u, at_v), axis=-1).reshape(-1, 2))
+    bounds = [(array[0], array[-1]) for array in (u, v)]
+    u_nodes, v_nodes = ((a + b + nodes * (b - a)) / 2 for a, b in bounds)
+    values = board_map(np.stack(np.meshgrid(u_nodes, v_nodes), axis=-1).reshape(-1, 2))
     values = values.reshape(_NODES, _NODES, 2)
     along_u, along_v = (
         chebvander((2 * array - a - b) / (b - a), _NODES - 1) @ inverse
-        for array, (a, b) in zip((u, v), ends, strict=True)
+        for array, (a, b) in zip((u, v), bounds, strict=True)
     )
     x, y = (along_v @ values[..., axis] @ along_u.T for axis in (0, 1))
     return x, y
 
 
 def _blurred(printed: Print, x: FloatArray, y: FloatArray, blur: Blur, fine: int) -> FloatArray:
-    """The print at (h, w) places on the board, `fine` samples a pixel, blurred."""
+    """The print at (h, w) positions on the board, `fine` samples per pixel, blurred."""
     torch = library("torch")
     step = 1.0 / fine
 
@@ -228,12 +225,12 @@ def _blurred(printed: Print, x: FloatArray, y: FloatArray, blur: Blur, fine: int
     wu = 2 * np.pi * torch.fft.rfftfreq(width, step, dtype=torch.float64)
     wv = 2 * np.pi * torch.fft.fftfreq(height, step, dtype=torch.float64)
     otf = transfer(blur, wu, wv[:, None])[0].to(torch.float32)
-    found = torch.fft.irfft2(torch.fft.rfft2(drawn) * otf, s=(height, width))
-    return np.asarray(found.numpy(), float)
+    blurred = torch.fft.irfft2(torch.fft.rfft2(drawn) * otf, s=(height, width))
+    return np.asarray(blurred.numpy(), float)
 
 
-def _is_on(printed: Print, x: FloatArray, y: FloatArray) -> Mask:
-    """Which places are on the print, or on a little of the paper around it."""
+def _on_print(printed: Print, x: FloatArray, y: FloatArray) -> Mask:
+    """Mask of positions on the print or on a narrow rim of paper."""
     rim = 0.2
     return np.asarray(
         (x > printed.x[0] - rim)
@@ -243,13 +240,13 @@ def _is_on(printed: Print, x: FloatArray, y: FloatArray) -> Mask:
     )
 
 
-def _lit(part: FloatArray, toned: FloatArray, on: Mask) -> FloatArray:
-    """The model in grey levels: offset and gain are quadratic surfaces over the image."""
+def _with_light(part: FloatArray, toned: FloatArray, mask: Mask) -> FloatArray:
+    """The rendering in grey levels, with offset and gain as quadratic surfaces over the image."""
     height, width = part.shape
     v, u = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
     columns = np.concatenate([terms, terms * toned[..., None]], axis=-1)
-    chosen = np.flatnonzero(on)
+    chosen = np.flatnonzero(mask)
     chosen = chosen[:: 1 + len(chosen) // _LIT_BY]
     rows = columns.reshape(-1, columns.shape[-1])[chosen]
     return np.asarray(columns @ np.linalg.lstsq(rows, part.ravel()[chosen], rcond=None)[0])

@@ -1,4 +1,4 @@
-"""Finding a target's corners in an image: one module a kind of target."""
+"""Detection of a target's corners in an image: one module per kind of target."""
 
 import numpy as np
 
@@ -15,15 +15,10 @@ __all__ = ["DetectedCorners", "NotFound", "blur_of", "find_target", "fitting_lay
 
 
 def find_target(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
-    """Finds a target's corners to sub-pixel accuracy.
+    """Detects a target's corners in a (h, w) grey image, to sub-pixel accuracy.
 
-    Args:
-        image: (h, w) grey image.
-        target: What to look for.
-        quick: Whether nothing more is searched where a first, quick search for a board fails.
-
-    Returns:
-        The corners, or why there are none.
+    Returns the corners, or why there are none. With `quick`, detection of a board stops if a first,
+    quick search fails.
     """
     match target.kind:
         case "charuco" | "checkerboard" | "aprilgrid" | "circles":
@@ -40,17 +35,17 @@ def find_target(image: Image, target: Target, *, quick: bool = False) -> Detecte
 
 
 def blur_of(image: Image, target: Target, ids: IntArray, px: FloatArray) -> float:
-    """Measures how wide edges are at corners that were found, in another image of them or the same.
+    """Edge width at detected corners, in the same image or another one of them.
 
     Args:
         image: (h, w) grey image.
-        target: What was found.
-        ids: (n,) the corners' numbers, n >= 1.
-        px: (n, 2) where they are, to a pixel or so [px].
+        target: Detected target.
+        ids: (n,) corner ids, n >= 1.
+        px: (n, 2) corners, to about a pixel [px].
 
     Returns:
-        The width as a Gaussian's sigma, on a board in the direction in which edges are wider: what
-        moves is smeared in one alone [px].
+        The width as a Gaussian's sigma; on a board, in the direction of the wider edges, as motion
+        smears one direction only [px].
     """
     if target.kind in FINDERS:
         blur_px = float(refine(image, target, ids, px).blur_px.max())

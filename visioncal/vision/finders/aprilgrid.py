@@ -1,4 +1,4 @@
-"""Finding AprilGrids, and checking whether they are as described."""
+"""Detection of AprilGrids, and checks that they are as described."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,49 +12,41 @@ from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.targets import aruco_dictionary
 
 LACKS_SQUARES = "the tags lack the small dark squares at their corners that an AprilGrid has"
-# The squares at a tag's corners touch it, and OpenCV sees a tag only where white surrounds it.
-# Where two dark corners meet, the image is grey: counted as white where dark has to be darker than
-# its surroundings by so many levels, and in twice as many pixels, of which grey gets enough. The
-# last copy serves pictures of little contrast too.
+# OpenCV detects only tags surrounded by white, but squares touch a tag's corners. The image is grey
+# where two dark corners meet: it counts as white if dark has to be darker than its surroundings by
+# this many levels, and if the enlarged image has enough grey pixels. The last copy also suits
+# images of little contrast.
 _DARKER, _LITTLE, _ENLARGED = 25.0, 7.0, 2
-# Where so many of the tags are read, their border is as stated.
+# Share of read tags at which their border is as stated.
 _MANY = 0.5
-# With another border so many times as many are read where that is right.
+# Factor of tags read by which another border is the right one.
 _MORE = 1.25
-# So many tags check a homography's eight unknowns, and make one of their own lines.
+# Minimum number of tags to check a homography.
 _LEAST_TAGS = 2
-# Half-widths of the windows in which corners are refined, as a share of the white between tags, and
-# their bounds [px].
+# Half-widths of the windows of corner refinement, as a share of the gap between tags, and bounds
+# [px].
 _WINDOW, _WINDOWS_PX = 0.35, (2, 6)
 _ENDS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-2)
-# The white between tags that is seen may differ by so much from the stated one [sides]; so many
-# sides in line have to be seen, and half of them within so much.
+# Tolerance of the gap between tags [sides]; minimum number of collinear pairs of sides, and largest
+# interquartile range of their gaps.
 _SPACING, _LEAST_SPACINGS, _SCATTER = 0.02, 4, 0.05
-# Places along a tag's side, and so far inside it, in its dark border [sides].
+# Positions along a tag's side, and distance inside it, in its dark border [sides].
 _ALONG, _INSIDE = (0.06, 0.35, 0.65, 0.94), 0.06
-# An outer line of tags is missing where so many places on its near side are lighter than grey; the
-# tags of so many lines beside it show where it would be.
+# An outer line of tags is missing if this share of positions on its near side is light; number of
+# lines beside it that predict its position.
 _MOST_OF, _NEAR_LINES = 0.8, 2
 
 
 def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Finds the corners of an AprilGrid's tags.
-
-    Args:
-        image: (h, w) grey image.
-        target: An AprilGrid target.
-
-    Returns:
-        The corners, or why there are none.
-    """
-    many = _MANY * target.columns * target.rows
-    ids, px = grid_tags(image, target.dictionary, target.border, many)
+    """Corners of an AprilGrid's tags in a (h, w) grey image, or why there are none."""
+    expected = _MANY * target.columns * target.rows
+    ids, px = grid_tags(image, target.dictionary, target.border, expected)
     border = NotFound(
         f"the tags have a border of {3 - target.border} modules, and the target says border = "
         f"{target.border}",
         misfit=True,
     )
-    if len(ids) < many and _has_other_border(image, target, ids):
+    if len(ids) < expected and _has_other_border(image, target, ids):
         return border
     if not len(ids):
         return NotFound(f"no board: no tag of {target.dictionary} is seen")
@@ -67,7 +59,7 @@ def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
     if misfit > LAYOUT_MISFIT:
         return NotFound("the tags do not lie as the target describes them", misfit=True)
     size = f"the target's {target.columns} x {target.rows}"
-    if not own.all() and layout_misfit(_places(target, numbers), px) <= LAYOUT_MISFIT:
+    if not own.all() and layout_misfit(_tag_corners(target, numbers), px) <= LAYOUT_MISFIT:
         return NotFound(f"the grid has tag {ids[~own][0]} besides {size}", misfit=True)
     numbers, px = numbers[own], px[own]
     if lacks_a_line(image, target, numbers, px):
@@ -88,7 +80,7 @@ def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
 
 
 def free_tags_step(target: Target) -> str:
-    """What to type for a grid of tags without squares: they are free tags."""
+    """Instruction to describe a grid of tags without squares as free tags."""
     side = f"{target.square_m:g}"
     return (
         f'Describe it as free tags: in its .toml, kind = "points", points = "tags.csv", dictionary '
@@ -102,31 +94,29 @@ def free_tags_step(target: Target) -> str:
 def grid_tags(
     image: Image, dictionary: str, border: int, enough: float
 ) -> tuple[IntArray, FloatArray]:
-    """Finds tags whose corners other dark squares touch, those that are seen once.
+    """Tags in a (h, w) grey image whose corners touch dark squares, without ids that appear twice.
 
-    Args:
-        image: (h, w) grey image.
-        dictionary: OpenCV's name of their family.
-        border: Dark modules around the bits.
-        enough: Of so many, no more are looked for in other ways.
+    The search stops at `enough` tags.
 
     Returns:
-        (t,) ids, ascending, and (t, 4, 2) corners in OpenCV's order, to a pixel or two [px].
+        (t,) ids, ascending, and (t, 4, 2) corners in OpenCV's order, to one or two pixels [px].
     """
     corners: dict[int, FloatArray] = {}
-    for work in _copies(image):
+    for copy in _copies(image):
         parameters = cv2.aruco.DetectorParameters()
         parameters.markerBorderBits = border
-        parameters.adaptiveThreshConstant = work.darker
+        parameters.adaptiveThreshConstant = copy.darker
         detector = cv2.aruco.ArucoDetector(aruco_dictionary(dictionary), parameters)
-        px, ids, _ = detector.detectMarkers(work.image)
-        found = [] if ids is None else [int(number) for number in ids.ravel()]
-        # Where a pixel of the copy has its centre in the image.
-        quads = (np.reshape(px, (-1, 4, 2)) + 0.5) / work.scale - 0.5
-        once = {
-            index: quad for index, quad in zip(found, quads, strict=True) if found.count(index) == 1
+        px, ids, _ = detector.detectMarkers(copy.image)
+        found_ids = [] if ids is None else [int(number) for number in ids.ravel()]
+        # From pixel centres of the copy to those of the image.
+        quads = (np.reshape(px, (-1, 4, 2)) + 0.5) / copy.scale - 0.5
+        unique = {
+            index: quad
+            for index, quad in zip(found_ids, quads, strict=True)
+            if found_ids.count(index) == 1
         }
-        corners = once | corners
+        corners = unique | corners
         if len(corners) >= enough:
             break
     numbers = sorted(corners)
@@ -136,7 +126,7 @@ def grid_tags(
 
 @dataclass(frozen=True, eq=False)
 class _Copy:
-    """A copy of an image in which OpenCV may see tags, its scale, and by how much dark is dark."""
+    """A processed copy of an image, its scale, and the threshold below its surroundings."""
 
     image: Image
     scale: float
@@ -144,7 +134,7 @@ class _Copy:
 
 
 def _copies(image: Image) -> Iterator[_Copy]:
-    """The image enlarged; smoothed, for what moved; and with less dark, for ink that spread."""
+    """Copies: enlarged; smoothed, against motion; dilated, against spreading ink."""
     large = cv2.resize(image, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
     yield _Copy(np.asarray(large, np.uint8), _ENLARGED, _DARKER)
     yield _Copy(np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8), 1.0, _DARKER)
@@ -152,35 +142,35 @@ def _copies(image: Image) -> Iterator[_Copy]:
 
 
 def laid(target: Target, numbers: IntArray, px: FloatArray, own: Mask) -> tuple[FloatArray, float]:
-    """Orders the corners of tags as on the page, and says how far the tags are from their places.
+    """Orders the corners of tags as on the page, and measures the layout's misfit.
 
     Args:
-        target: The grid.
-        numbers: (t,) the tags' numbers on it.
-        px: (t, 4, 2) their corners in OpenCV's order [px].
-        own: (t,) mask of those that count.
+        target: Grid.
+        numbers: (t,) tag numbers on the grid.
+        px: (t, 4, 2) corners in OpenCV's order [px].
+        own: (t,) mask of the tags to use.
 
     Returns:
-        (t, 4, 2) the corners, and the misfit of `layout_misfit`; 0 of one tag.
+        (t, 4, 2) ordered corners, and the misfit of `layout_misfit`; 0 for a single tag.
     """
-    # Kalibr's pages have the tags upside down; others are recognised by where the tags lie.
-    turned = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
+    # Kalibr's pages have the tags upside down; other orientations are recognised by the layout.
+    rotated = [np.roll(px, turn, axis=1) for turn in (2, 0, 1, 3)]
     if own.sum() < _LEAST_TAGS:
-        return turned[0], 0.0
-    places = _places(target, numbers[own])
-    misfits = [layout_misfit(places, array[own]) for array in turned]
-    return turned[int(np.argmin(misfits))], min(misfits)
+        return rotated[0], 0.0
+    places = _tag_corners(target, numbers[own])
+    misfits = [layout_misfit(places, array[own]) for array in rotated]
+    return rotated[int(np.argmin(misfits))], min(misfits)
 
 
 def _has_other_border(image: Image, target: Target, ids: IntArray) -> bool:
-    """Whether many more tags are read with the other border: with a wrong one some are."""
-    many = max(_MORE * len(ids), _MANY * target.columns * target.rows)
-    other = grid_tags(image, target.dictionary, 3 - target.border, many)[0]
-    return len(other) >= many
+    """Whether many more tags are read with the other border; a wrong one reads some."""
+    expected = max(_MORE * len(ids), _MANY * target.columns * target.rows)
+    other_ids = grid_tags(image, target.dictionary, 3 - target.border, expected)[0]
+    return len(other_ids) >= expected
 
 
 def _has_squares(image: Image, px: FloatArray, spacing: float) -> bool:
-    """Whether there is dark off the corners of tags (t, 4, 2) [px], and white off their sides."""
+    """Whether it is dark beyond the corners of tags (t, 4, 2) [px], and white beyond the sides."""
     centre = px.mean(axis=1, keepdims=True)
     sides = (px + np.roll(px, -1, axis=1)) / 2
     inside, outside = 0.9, 1.0 + spacing
@@ -188,14 +178,16 @@ def _has_squares(image: Image, px: FloatArray, spacing: float) -> bool:
         centre + inside * (px - centre),
         *(centre + outside * (array - centre) for array in (px, sides)),
     ]
-    top = np.array(image.shape[::-1]) - 1
-    at = (np.clip(np.rint(place), 0, top).astype(int) for place in places)
-    dark, squares, white = (float(np.median(image[value[..., 1], value[..., 0]])) for value in at)
+    last_pixel = np.array(image.shape[::-1]) - 1
+    pixels = (np.clip(np.rint(place), 0, last_pixel).astype(int) for place in places)
+    dark, squares, white = (
+        float(np.median(image[pixel[..., 1], pixel[..., 0]])) for pixel in pixels
+    )
     return squares < (dark + white) / 2
 
 
-def _places(target: Target, numbers: IntArray) -> FloatArray:
-    """(t, 4, 2) the corners of tags [sides]; rows go on where numbers are none of the target's."""
+def _tag_corners(target: Target, numbers: IntArray) -> FloatArray:
+    """(t, 4, 2) corners of tags [sides]; numbers outside the grid continue its rows."""
     rows, columns = np.divmod(numbers, target.columns)
     first = np.stack([columns, target.rows - 1 - rows], axis=1) * (1.0 + target.spacing)
     square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
@@ -203,51 +195,53 @@ def _places(target: Target, numbers: IntArray) -> FloatArray:
 
 
 def refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
-    """Refines the (t, 4, 2) corners of tags [px], each a saddle between two dark squares."""
+    """Refines the (t, 4, 2) corners of tags [px], each a saddle point between two dark squares."""
     sides = np.linalg.norm(px - np.roll(px, 1, axis=1), axis=2)
     window = int(np.clip(_WINDOW * spacing * sides.min(), *_WINDOWS_PX))
     start = px.reshape(-1, 1, 2).astype(np.float32)
-    found = cv2.cornerSubPix(image, start.copy(), (window, window), (-1, -1), _ENDS)
-    # Some find no saddle and go astray.
-    strays = np.linalg.norm(found - start, axis=2, keepdims=True) > 2 * window
-    return np.where(strays, start, found).reshape(px.shape).astype(float)
+    refined = cv2.cornerSubPix(image, start.copy(), (window, window), (-1, -1), _ENDS)
+    # Without a saddle point the refinement diverges.
+    strays = np.linalg.norm(refined - start, axis=2, keepdims=True) > 2 * window
+    return np.where(strays, start, refined).reshape(px.shape).astype(float)
 
 
 def seen_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
-    """The white between tags [sides], as stated where too few of them are side by side.
+    """Measured gap between tags [sides]; the stated one if too few tags are adjacent.
 
-    Four corners of two tags in line lie at 0, 1, 1 + s and 2 + s. No view of the plane changes
-    their cross-ratio (AC BD) / (BC AD) = (1 + s)^2 / (s (2 + s)), and a lens hardly does.
+    Four corners of two collinear tags lie at 0, 1, 1 + s and 2 + s. Their cross-ratio (AC BD) / (BC
+    AD) = (1 + s)^2 / (s (2 + s)) is invariant under projection, and almost under lens distortion.
     """
-    index = {number: at for at, number in enumerate(numbers.tolist())}
+    index = {number: place for place, number in enumerate(numbers.tolist())}
     lines: list[FloatArray] = []
-    for number, at in index.items():
+    for number, place in index.items():
         right = number + 1 if (number + 1) % target.columns else -1
-        for beside, sides in (
+        for neighbour, sides in (
             (right, [[0, 1], [3, 2]]),
             (number + target.columns, [[3, 0], [2, 1]]),
         ):
-            if beside in index:
-                lines += [np.concatenate([px[at][side], px[index[beside]][side]]) for side in sides]
+            if neighbour in index:
+                lines += [
+                    np.concatenate([px[place][side], px[index[neighbour]][side]]) for side in sides
+                ]
     if len(lines) < _LEAST_SPACINGS:
         return target.spacing
     a, b, c, d = np.moveaxis(np.array(lines), 1, 0)
     far, near = (
-        np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
-        for one, other in ((c - a, d - b), (c - b, d - a))
+        np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+        for first, second in ((c - a, d - b), (c - b, d - a))
     )
     quarter, middle, last = np.percentile(np.sqrt(far / np.maximum(far - near, 1e-9)), [25, 50, 75])
-    # Corners that scatter, as in blurred images, show nothing.
+    # Scattered corners, as in blurred images, are inconclusive.
     return target.spacing if last - quarter > _SCATTER else float(middle) - 1.0
 
 
 def lacks_a_line(image: Image, target: Target, numbers: IntArray, px: FloatArray) -> bool:
     """Whether all tags of an outer row or column are missing, and the image shows paper there.
 
-    What is dark in their place may hide them.
+    Dark areas in their place may hide them.
     """
     rows, columns = np.divmod(np.arange(target.columns * target.rows), target.columns)
-    # Rows count from below. Of a missing tag the side is looked at that is nearest to the others.
+    # Rows count from below. A missing tag is checked on the side next to the others.
     near, far = _INSIDE, 1.0 - _INSIDE
     lines = (
         (rows, 0, [(value, near) for value in _ALONG]),
@@ -255,10 +249,10 @@ def lacks_a_line(image: Image, target: Target, numbers: IntArray, px: FloatArray
         (columns, 0, [(far, value) for value in _ALONG]),
         (columns, target.columns - 1, [(near, value) for value in _ALONG]),
     )
-    return any(_lacks(image, target, numbers, px, *line) for line in lines)
+    return any(_lacks_line(image, target, numbers, px, *line) for line in lines)
 
 
-def _lacks(
+def _lacks_line(
     image: Image,
     target: Target,
     numbers: IntArray,
@@ -267,32 +261,34 @@ def _lacks(
     end: int,
     rim: Sequence[tuple[float, float]],
 ) -> bool:
-    """Whether a line is missing: the tags whose number `across` it is `end`."""
+    """Whether a line is missing: the tags whose number `across` the grid is `end`."""
     line = np.flatnonzero(across == end)
-    # The nearest tags show where those would be, whatever the lens.
-    beside = np.abs(across[numbers] - end) <= _NEAR_LINES
-    if np.isin(line, numbers).any() or beside.sum() < _LEAST_TAGS:
+    # The nearest tags predict the positions despite lens distortion.
+    nearby = np.abs(across[numbers] - end) <= _NEAR_LINES
+    if np.isin(line, numbers).any() or nearby.sum() < _LEAST_TAGS:
         return False
-    flat = _places(target, numbers[beside])
-    found = cv2.findHomography(flat.reshape(-1, 2), px[beside].reshape(-1, 2))[0]
-    homography = np.asarray(found, dtype=float)
+    on_board = _tag_corners(target, numbers[nearby])
+    fit = cv2.findHomography(on_board.reshape(-1, 2), px[nearby].reshape(-1, 2))[0]
+    homography = np.asarray(fit, dtype=float)
     if homography.shape != (3, 3):
         return False
     white = 0.5 + (0.5 + target.spacing / 2) * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     dark, light = (
-        float(np.nanmedian(_levels(image, flat[:, 0], array, homography)))
+        float(np.nanmedian(_levels(image, on_board[:, 0], array, homography)))
         for array in (np.array(rim), white)
     )
-    missing = _levels(image, _places(target, line)[:, 0], np.array(rim), homography)
-    # Nothing is said of what is outside the image.
+    missing = _levels(image, _tag_corners(target, line)[:, 0], np.array(rim), homography)
+    # NaN outside the image compares as not missing.
     return float(np.mean(missing > (dark + light) / 2)) > _MOST_OF
 
 
 def _levels(
     image: Image, corners: FloatArray, inside: FloatArray, homography: FloatArray
 ) -> FloatArray:
-    """(t, k) grey levels at k places from the (t, 2) upper left corners of tags [sides]."""
-    # NaN outside the image.
+    """(t, k) grey levels at k offsets from the (t, 2) upper left corners of tags [sides].
+
+    NaN outside the image.
+    """
     places = (corners[:, None] + inside).reshape(1, -1, 2)
     px = np.rint(cv2.perspectiveTransform(places, homography)[0])
     shown = ((px >= 0) & (px < image.shape[::-1])).all(axis=1)

@@ -1,4 +1,4 @@
-"""Finding a board by a quick search where that sees all of it, and its corners in the image."""
+"""Detection of boards, first by quick searches that suffice if they find the whole board."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -19,17 +19,17 @@ from visioncal.vision.targets import corner_positions
 
 _Finder: TypeAlias = Callable[[Image, Target], DetectedCorners | NotFound]
 
-# Images with longer sides are halved first, and at twice as much once more: detectors take as long
-# as there are pixels. Smaller images lose markers and gain nothing; a checkerboard has none.
+# Images with longer sides are searched at half size first, and above twice that at a quarter:
+# detection time is proportional to pixels. A checkerboard has no markers that get lost.
 _LONG_SIDE_PX: Mapping[TargetKind, int] = {
     "charuco": 2000,
     "checkerboard": 1000,
     "aprilgrid": 2000,
     "circles": 2000,
 }
-# Corners that the template does not fit are left out: a detector is off there by up to a pixel. Of
-# views where fewer than these fit, the detector's corners serve, all of them, with a tenth of the
-# weight: so much less exact they are in the median of what was measured.
+# Corners that the template does not fit are dropped, as detectors err there by up to a pixel. If
+# fewer than these fit, all corners of the detector are used, with a tenth of the weight: their
+# accuracy relative to the template's in the median.
 _FEWEST_FITTED, _LEAST_FITTED, DETECTED_WEIGHT = 6, 0.5, 0.1
 
 FINDERS: dict[TargetKind, _Finder] = {
@@ -38,7 +38,7 @@ FINDERS: dict[TargetKind, _Finder] = {
     "aprilgrid": find_aprilgrid,
     "circles": find_circles,
 }
-# Searches that take a third of the time and see less.
+# Searches that take a third of the time and detect less.
 QUICK: dict[TargetKind, _Finder] = {
     "charuco": partial(find_charuco, quick=True),
     "checkerboard": partial(find_checkerboard, quick=True),
@@ -46,25 +46,17 @@ QUICK: dict[TargetKind, _Finder] = {
 
 
 def find_board(image: Image, target: Target, *, quick: bool = False) -> DetectedCorners | NotFound:
-    """Finds the corners of a board whose corners the template fits.
+    """Corners of a board in a (h, w) grey image, or why there are none.
 
-    OpenCV finds them, by a quick search or in a small copy where that sees the whole board; the
-    template of `refine` says where they are.
-
-    Args:
-        image: (h, w) grey image.
-        target: A target of one of the kinds of `FINDERS`.
-        quick: Whether nothing more is searched where the first of these finds nothing.
-
-    Returns:
-        The corners, or why there are none.
+    OpenCV detects them, by a quick search or in a reduced copy if that finds the whole board;
+    `refine` then measures their positions. With `quick`, detection stops if the first search fails.
     """
-    for find, by in _quick_searches(image, target.kind):
-        small = image if by == 1 else _shrunk(image, by)
+    for find, factor in _quick_searches(image, target.kind):
+        small = image if factor == 1 else _shrunk(image, factor)
         seen = find(small, target)
         if isinstance(seen, DetectedCorners) and not len(hidden_corners(seen, small.shape, target)):
-            # Where a pixel of the small image has its centre in the large one.
-            px = by * seen.px + (by - 1) / 2
+            # From pixel centres of the small image to those of the large one.
+            px = factor * seen.px + (factor - 1) / 2
             refined = _refined(image, target, DetectedCorners(seen.ids, px))
             if refined.weights is None:
                 return refined
@@ -75,11 +67,11 @@ def find_board(image: Image, target: Target, *, quick: bool = False) -> Detected
 
 
 def _quick_searches(image: Image, kind: TargetKind) -> Iterator[tuple[_Finder, int]]:
-    """What to search with first, and how many times smaller a copy of the image."""
+    """Quick searches, each with the factor by which the image is reduced."""
     find = QUICK.get(kind, FINDERS[kind])
-    for by in (4, 2):
-        if max(image.shape) > by // 2 * _LONG_SIDE_PX[kind] and min(image.shape) >= by:
-            yield find, by
+    for factor in (4, 2):
+        if max(image.shape) > factor // 2 * _LONG_SIDE_PX[kind] and min(image.shape) >= factor:
+            yield find, factor
     if kind in QUICK:
         yield find, 1
 
@@ -94,9 +86,9 @@ def _refined(image: Image, target: Target, seen: DetectedCorners) -> DetectedCor
     )
 
 
-def _shrunk(image: Image, by: int) -> Image:
-    height, width = (by * (side // by) for side in image.shape)
-    size = (width // by, height // by)
+def _shrunk(image: Image, factor: int) -> Image:
+    height, width = (factor * (side // factor) for side in image.shape)
+    size = (width // factor, height // factor)
     small = cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)
 
@@ -104,15 +96,9 @@ def _shrunk(image: Image, by: int) -> Image:
 def hidden_corners(
     seen: DetectedCorners | Corners, shape: tuple[int, ...], target: Target
 ) -> IntArray:
-    """Finds the corners that an image should show with the squares around them, and does not.
+    """Ids (n,) of undetected corners that the image should contain with the squares around them.
 
-    Args:
-        seen: Those that are found; where too few to say where the board lies, all others are taken.
-        shape: Height and width of the image [px].
-        target: A board of squares.
-
-    Returns:
-        (n,) their numbers, ascending.
+    If the detected corners are too few to locate the board, these are all others.
     """
     places: FloatArray = corner_positions(target)[:, :2] / target.square_m
     missing = np.setdiff1d(np.arange(len(places)), seen.ids)
@@ -121,9 +107,9 @@ def hidden_corners(
     homography = cv2.findHomography(places[seen.ids], seen.px)[0] if len(seen.ids) > 3 else None
     if homography is None:
         return missing
-    # A corner takes both markers beside it.
+    # Detecting a corner requires both markers beside it.
     around = places[missing, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    ahead = around @ homography[2, :2] + homography[2, 2]
-    px = (around @ homography[:2, :2].T + homography[:2, 2]) / ahead[..., None]
-    inside = (ahead > 0) & ((px > 0) & (px < np.array(shape[::-1]) - 1)).all(axis=-1)
+    depth = around @ homography[2, :2] + homography[2, 2]
+    px = (around @ homography[:2, :2].T + homography[:2, 2]) / depth[..., None]
+    inside = (depth > 0) & ((px > 0) & (px < np.array(shape[::-1]) - 1)).all(axis=-1)
     return np.asarray(missing[inside.all(axis=1)])

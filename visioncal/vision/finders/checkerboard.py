@@ -1,4 +1,4 @@
-"""Finding checkerboards."""
+"""Detection of checkerboards."""
 
 import cv2
 import numpy as np
@@ -6,35 +6,28 @@ import numpy as np
 from visioncal.core.types import FloatArray, Image, Target
 from visioncal.vision.finders.result import DetectedCorners, NotFound
 
-# OpenCV's search takes 170 bytes and a microsecond a pixel, and fails beyond such sides.
+# OpenCV's search takes 170 bytes and a microsecond per pixel, and fails beyond these sides.
 MOST_PIXELS, _MOST_SIDES = 48_000_000, 23_000
-# Its searches: a quick one, and two that are tried in turn.
+# Its searches: a quick one, and two that are tried one after the other.
 _FLAGS = (
     0,
     cv2.CALIB_CB_ACCURACY,
     cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
 )
-# Dark and light squares, apart by so much of the contrast there, meet at so many corners of each
-# row and column; glare hides some.
+# Minimum gap between dark and light squares as a share of the local contrast, and minimum share of
+# such corners in each row and column, as glare hides some.
 _APART, _CHECKERED = 0.25, 0.5
 
 
 def find_checkerboard(
     image: Image, target: Target, *, quick: bool = False
 ) -> DetectedCorners | NotFound:
-    """Finds the inner corners of a checkerboard (Duda and Frese 2018, through OpenCV).
+    """Inner corners of a checkerboard in a (h, w) grey image, or why there are none.
 
-    Corner 0 becomes the one whose outward diagonal square is dark. Where the board looks the same
-    after a turn by 180 degrees that does not settle it, and the robot's motion has to.
-
-    Args:
-        image: (h, w) grey image.
-        target: A checkerboard target.
-        quick: Whether to search in the image alone: OpenCV also searches in one of twice the size,
-            which takes four times as long.
-
-    Returns:
-        The corners, or why there are none.
+    Duda and Frese (2018), through OpenCV. Corner 0 is the one whose outward diagonal square is
+    dark. For a board with a symmetry by 180 degrees this is ambiguous, and the robot's motion has
+    to decide. With `quick`, only the image's size is searched; OpenCV also searches at twice the
+    size, which takes four times as long.
     """
     height, width = image.shape
     if min(image.shape) < 2 or height + width > _MOST_SIDES or height * width > MOST_PIXELS:
@@ -58,34 +51,40 @@ def find_checkerboard(
 def _is_checkered(image: Image, grid: FloatArray) -> bool:
     """Whether dark and light squares meet at the corners of a (rows, columns, 2) grid.
 
-    Of small boards OpenCV sometimes leaves out a row, and takes the board's edge for the last one.
+    For small boards OpenCV sometimes skips a row and takes the board's edge as the last one.
     """
-    wide = grid
+    extended = grid
     for axis in (0, 1):
-        first, last = np.take(wide, [0], axis), np.take(wide, [-1], axis)
-        before, after = 2 * first - np.take(wide, [1], axis), 2 * last - np.take(wide, [-2], axis)
-        wide = np.concatenate([before, wide, after], axis=axis)
-    levels = _levels(image, wide)
-    one = np.stack([levels[:-1, :-1], levels[1:, 1:]])
-    other = np.stack([levels[:-1, 1:], levels[1:, :-1]])
-    apart = np.maximum(other.min(axis=0) - one.max(axis=0), one.min(axis=0) - other.max(axis=0))
-    meet = apart > _APART * np.ptp(np.concatenate([one, other]), axis=0)
+        first, last = np.take(extended, [0], axis), np.take(extended, [-1], axis)
+        before, after = (
+            2 * first - np.take(extended, [1], axis),
+            2 * last - np.take(extended, [-2], axis),
+        )
+        extended = np.concatenate([before, extended, after], axis=axis)
+    levels = _levels(image, extended)
+    diagonal = np.stack([levels[:-1, :-1], levels[1:, 1:]])
+    antidiagonal = np.stack([levels[:-1, 1:], levels[1:, :-1]])
+    gap = np.maximum(
+        antidiagonal.min(axis=0) - diagonal.max(axis=0),
+        diagonal.min(axis=0) - antidiagonal.max(axis=0),
+    )
+    meet = gap > _APART * np.ptp(np.concatenate([diagonal, antidiagonal]), axis=0)
     return all(bool(np.all(meet.mean(axis=axis) >= _CHECKERED)) for axis in (0, 1))
 
 
 def _right_handed(grid: FloatArray) -> FloatArray:
-    """Mirrors the (rows, columns, 2) grid where x to y does not turn as it does on the board."""
+    """Mirrors the (rows, columns, 2) grid if its handedness differs from the board's."""
     x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]
 
 
 def _dark_corner_first(image: Image, grid: FloatArray) -> FloatArray:
-    """Turns the grid by the least turn that makes its first corner's outward square dark."""
-    # That square has the colour of the one diagonally inside, and the inner squares alternate.
-    # Where no turn changes the colour, the board is symmetric and the grid stays as it is.
+    """Rotates the grid by the least turn that makes its first corner's outward square dark."""
+    # That square has the colour of the one diagonally inside, and the inner squares alternate. If
+    # no turn changes the colour, the board is symmetric and the grid remains.
     turns = (0, 2, 1, 3) if grid.shape[0] == grid.shape[1] else (0, 2)
-    turned = (np.rot90(grid, quarter) for quarter in turns)
-    return next((array for array in turned if _starts_dark(image, array)), grid)
+    rotated = (np.rot90(grid, quarter) for quarter in turns)
+    return next((array for array in rotated if _starts_dark(image, array)), grid)
 
 
 def _starts_dark(image: Image, grid: FloatArray) -> bool:
@@ -96,7 +95,7 @@ def _starts_dark(image: Image, grid: FloatArray) -> bool:
 
 
 def _levels(image: Image, grid: FloatArray) -> FloatArray:
-    """Grey levels (rows - 1, columns - 1) in the middles of a grid's squares."""
+    """Grey levels (rows - 1, columns - 1) at the centres of a grid's squares."""
     centres = (grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4
-    at = np.clip(np.round(centres).astype(int), 0, np.array(image.shape[::-1]) - 1)
-    return np.asarray(image[at[..., 1], at[..., 0]], float)
+    pixels = np.clip(np.round(centres).astype(int), 0, np.array(image.shape[::-1]) - 1)
+    return np.asarray(image[pixels[..., 1], pixels[..., 0]], float)

@@ -1,4 +1,4 @@
-"""Finding grids of circles: blobs that lie on a lattice, and which of its points the grid has."""
+"""Detection of grids of circles: blobs on a lattice."""
 
 from collections import deque
 from dataclasses import dataclass, replace
@@ -13,23 +13,22 @@ from visioncal.core.types import FloatArray, Image, IntArray, Target
 from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.targets import circle_places
 
-# Dark is darker than its surroundings, so wide as a share of the image's shorter side, by so many
-# levels. Blobs have areas [px] and fill the ellipse of their moments; a square fills 0.955 of it,
-# and a circle of few pixels somewhat less than all: their median separates them.
+# Threshold: window as a share of the image's shorter side, and grey levels below its mean. Blobs
+# have a minimum area [px] and fill the ellipse of their moments: squares fill 0.955, circles of few
+# pixels a little less than all of it; the median separates them.
 _SURROUNDINGS, _DARKER, _LEAST_AREA, _FILL, _ROUND = 0.12, 12, 12.0, 0.88, 0.97
-# The inner edge of a blob has so much of its width.
+# Minimum width of a blob's inner edge, relative to its outer edge.
 _INNER = 0.5
-# Neighbours on a lattice are not wider or narrower in any direction by more.
+# Largest ratio of widths of neighbouring blobs, in any direction.
 _ALIKE = 1.6
-# A lattice is looked for from so many blobs; its neighbours lie within so much of a step from where
-# the steps before lead, and its first steps are among so many nearest blobs.
+# Number of seed blobs; tolerance of predicted neighbours in steps; number of nearest blobs that are
+# candidates for the first steps.
 _SEEDS, _OFF, _NEAREST = 16, 0.3, 8
-# Fewer blobs are no grid.
+# Minimum number of blobs.
 _LEAST = 9
-# The diameter that is seen may differ by so much from the stated one, as a share of it, and by so
-# many pixels: ink and light spread.
+# Tolerance of the stated diameter: relative, plus pixels, as ink and light spread.
 _DIAMETER, _SPREAD_PX = 0.2, 3.0
-# Bases of a lattice: by which matrices one leads to another.
+# Transformations between bases of one lattice.
 _BASES = np.array(
     [
         pair
@@ -37,7 +36,7 @@ _BASES = np.array(
         if pair[0] * pair[3] - pair[1] * pair[2] in (1, -1)
     ]
 ).reshape(-1, 2, 2)
-# From a basis of a staggered grid, whose circles lie where column and row are both even or odd.
+# Basis of a staggered grid: circles lie where column and row are both even or both odd.
 _STAGGER = np.array([[1, 1], [1, -1]])
 
 
@@ -46,12 +45,12 @@ class Circles:
     """A grid of circles in an image.
 
     Attributes:
-        columns: Circles along x, in each row.
-        rows: Rows.
+        columns: Number of circles in each row.
+        rows: Number of rows.
         asymmetric: Whether every second row is shifted by half a step.
-        px: (n, 2) about where the centres are, row by row [px].
-        share: The diameter over the distance of neighbouring columns or rows.
-        diameter_px: Its median [px].
+        px: (n, 2) approximate centres, row by row [px].
+        share: Diameter over the spacing of neighbouring columns or rows.
+        diameter_px: Median diameter [px].
     """
 
     columns: int
@@ -63,16 +62,9 @@ class Circles:
 
 
 def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Finds the centres of a grid of circles, to a pixel or so.
+    """Centres of a grid of circles in a (h, w) grey image, to about a pixel, or why there are none.
 
-    Where the grid looks the same after a turn, the one that turns least against the image is taken.
-
-    Args:
-        image: (h, w) grey image.
-        target: A grid of circles.
-
-    Returns:
-        The centres, or why there are none.
+    For a symmetric grid, the numbering with the least rotation in the image is used.
     """
     seen = seen_grids(image)
     for circles in seen:
@@ -90,12 +82,12 @@ def find_circles(image: Image, target: Target) -> DetectedCorners | NotFound:
                 )
             return DetectedCorners(np.arange(len(circles.px)), circles.px)
     layout = "asymmetric" if target.asymmetric else "symmetric"
-    wanted = f"{layout} grid of {target.columns} x {target.rows} circles"
+    requested = f"{layout} grid of {target.columns} x {target.rows} circles"
     if not seen:
-        return NotFound(f"no board: no {wanted} is seen")
-    found = seen[0]
+        return NotFound(f"no board: no {requested} is seen")
+    best = seen[0]
     return NotFound(
-        f"{_article(found.asymmetric)} grid of {found.columns} x {found.rows} circles is seen, "
+        f"{_article(best.asymmetric)} grid of {best.columns} x {best.rows} circles is seen, "
         f"and the target is {_article(target.asymmetric)} one of {target.columns} x {target.rows}",
         misfit=True,
     )
@@ -106,13 +98,9 @@ def _article(asymmetric: bool) -> str:
 
 
 def seen_grids(image: Image) -> tuple[Circles, ...]:
-    """Finds a grid of circles in all its numberings, those first that turn least from upright.
+    """A grid of circles in a (h, w) grey image, in each order that forms a grid, or nothing.
 
-    Args:
-        image: (h, w) grey image.
-
-    Returns:
-        The same circles in any order in which they are a grid; none where they are not.
+    The least rotated order comes first.
     """
     blobs = _blobs(image)
     if len(blobs.px) < _LEAST:
@@ -135,16 +123,16 @@ def seen_grids(image: Image) -> tuple[Circles, ...]:
 
 
 def _turn(grid: Circles) -> float:
-    """The angle of the first row against the image's rows [rad]."""
-    along = grid.px[grid.columns - 1] - grid.px[0]
-    return float(np.arctan2(along[1], along[0]))
+    """Angle of the first row against the image's rows [rad]."""
+    first_row = grid.px[grid.columns - 1] - grid.px[0]
+    return float(np.arctan2(first_row[1], first_row[0]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Blobs:
-    """Dark blobs: their middles (n, 2) [px], and the second moments (n, 2, 2) of each [px^2].
+    """Dark blobs: centres (n, 2) [px], and second moments (n, 2, 2) [px^2].
 
-    `fill` (n,) says which share of the ellipse of its moments each fills.
+    `fill` (n,) is the share of the ellipse of its moments that each fills.
     """
 
     px: FloatArray
@@ -152,7 +140,6 @@ class _Blobs:
     fill: FloatArray
 
     def at(self, chosen: IntArray) -> Self:
-        """Some of them."""
         return replace(
             self, px=self.px[chosen], moments=self.moments[chosen], fill=self.fill[chosen]
         )
@@ -162,47 +149,54 @@ class _Blobs:
         """(n,) diameters of circles of the same area [px]."""
         return np.asarray(4.0 * np.linalg.det(self.moments) ** 0.25)
 
-    def alike(self, one: int, other: int) -> bool:
-        """Whether two blobs could be the same shape, seen from about the same side."""
-        ratios = np.linalg.eigvals(np.linalg.solve(self.moments[one], self.moments[other])).real
+    def alike(self, first: int, second: int) -> bool:
+        """Whether two blobs could be the same shape in a similar view."""
+        ratios = np.linalg.eigvals(np.linalg.solve(self.moments[first], self.moments[second])).real
         return bool(np.abs(np.log(np.maximum(ratios, 1e-9))).max() < 2.0 * np.log(_ALIKE))
 
 
 def _blobs(image: Image) -> _Blobs:
-    """Dark blobs that fill the ellipse of their moments."""
     block = 2 * int(_SURROUNDINGS * min(image.shape) / 2) + 3
     dark = cv2.adaptiveThreshold(
         image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, _DARKER
     )
-    middles, moments, fills = [], [], []
+    centres, moments, fills = [], [], []
     for contour in cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
-        of = cv2.moments(contour)
-        area = of["m00"]
+        contour_moments = cv2.moments(contour)
+        area = contour_moments["m00"]
         if area < _LEAST_AREA:
             continue
-        covariance = np.array([[of["mu20"], of["mu11"]], [of["mu11"], of["mu02"]]]) / area
+        covariance = (
+            np.array(
+                [
+                    [contour_moments["mu20"], contour_moments["mu11"]],
+                    [contour_moments["mu11"], contour_moments["mu02"]],
+                ]
+            )
+            / area
+        )
         ellipse = 4.0 * np.pi * np.sqrt(max(np.linalg.det(covariance), 0.0))
         if area < _FILL * ellipse or ellipse <= 0.0:
             continue
         fills.append(area / ellipse)
-        middles.append((of["m10"] / area, of["m01"] / area))
-        # A contour runs through the outermost dark pixels' centres, half a pixel inside the edge.
+        centres.append((contour_moments["m10"] / area, contour_moments["m01"] / area))
+        # A contour passes through the outermost dark pixels' centres, half a pixel inside the edge.
         radius = np.sqrt(area / np.pi)
         moments.append(((radius + 0.5) / radius) ** 2 * covariance)
-    found = _Blobs(np.reshape(middles, (-1, 2)), np.reshape(moments, (-1, 2, 2)), np.array(fills))
-    # What is larger than its surroundings has an edge inside too, not far from the outer one.
-    found = found.at(np.argsort(-found.diameters, kind="stable"))
-    pairs = cKDTree(found.px).query_pairs(2.0) if len(found.px) else set()
-    wide = found.diameters
-    inner = [max(pair) for pair in pairs if wide[max(pair)] > _INNER * wide[min(pair)]]
-    return found.at(np.setdiff1d(np.arange(len(found.px)), inner))
+    blobs = _Blobs(np.reshape(centres, (-1, 2)), np.reshape(moments, (-1, 2, 2)), np.array(fills))
+    # Blobs larger than the threshold's window also have an inner edge close to the outer one.
+    blobs = blobs.at(np.argsort(-blobs.diameters, kind="stable"))
+    pairs = cKDTree(blobs.px).query_pairs(2.0) if len(blobs.px) else set()
+    widths = blobs.diameters
+    inner = [max(pair) for pair in pairs if widths[max(pair)] > _INNER * widths[min(pair)]]
+    return blobs.at(np.setdiff1d(np.arange(len(blobs.px)), inner))
 
 
 def _lattice(blobs: _Blobs) -> tuple[IntArray, IntArray]:
-    """The largest set of points that lie on one lattice: (n, 2) steps, and which points, (n,)."""
+    """Largest set of points on one lattice: (n, 2) lattice coordinates, and point indices (n,)."""
     px, tree = blobs.px, cKDTree(blobs.px)
     best: dict[tuple[int, int], int] = {}
-    # The largest come first; letters and scratches are smaller than a board's circles.
+    # Largest first: letters and scratches are smaller than a board's circles.
     for seed in range(min(_SEEDS, len(px))):
         steps = _first_steps(px, tree, seed)
         grown = _grown(blobs, tree, seed, steps) if steps is not None else {}
@@ -211,16 +205,16 @@ def _lattice(blobs: _Blobs) -> tuple[IntArray, IntArray]:
 
 
 def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
-    """Two steps (2, 2) that lead from a point to others, forwards and backwards [px]."""
-    near = tree.query(px[seed], k=min(_NEAREST + 1, len(px)))[1][1:]
+    """Two steps (2, 2) [px] to neighbours of a point that has opposite neighbours as well."""
+    neighbours = tree.query(px[seed], k=min(_NEAREST + 1, len(px)))[1][1:]
     steps: list[FloatArray] = []
-    for other in near.tolist():
-        step = px[other] - px[seed]
+    for neighbour in neighbours.tolist():
+        step = px[neighbour] - px[seed]
         length = float(np.linalg.norm(step))
         if tree.query(px[seed] - step)[0] > _OFF * length:
             continue
-        slant = [abs(float(step[0] * array[1] - step[1] * array[0])) for array in steps]
-        if all(value > _OFF * length * float(np.linalg.norm(steps[0])) for value in slant):
+        cross_products = [abs(float(step[0] * array[1] - step[1] * array[0])) for array in steps]
+        if all(value > _OFF * length * float(np.linalg.norm(steps[0])) for value in cross_products):
             steps.append(step)
         if len(steps) == 2:
             return np.array(steps)
@@ -230,51 +224,51 @@ def _first_steps(px: FloatArray, tree: cKDTree, seed: int) -> FloatArray | None:
 def _grown(
     blobs: _Blobs, tree: cKDTree, seed: int, steps: FloatArray
 ) -> dict[tuple[int, int], int]:
-    """The points that steps lead to, each from its neighbour, by their place on the lattice."""
+    """Points reached by repeated steps, by their lattice coordinates."""
     px = blobs.px
-    places, taken = {(0, 0): seed}, {seed}
+    places, used = {(0, 0): seed}, {seed}
     waiting = deque([((0, 0), steps)])
     while waiting:
-        place, local = waiting.popleft()
+        coordinates, local = waiting.popleft()
         for axis, sign in product((0, 1), (1, -1)):
-            there = (place[0] + sign * (axis == 0), place[1] + sign * (axis == 1))
-            away, other = tree.query(px[places[place]] + sign * local[axis])
-            if there in places or other in taken:
+            neighbour = (coordinates[0] + sign * (axis == 0), coordinates[1] + sign * (axis == 1))
+            distance, blob = tree.query(px[places[coordinates]] + sign * local[axis])
+            if neighbour in places or blob in used:
                 continue
-            if away > _OFF * np.linalg.norm(local[axis]):
+            if distance > _OFF * np.linalg.norm(local[axis]):
                 continue
-            if not blobs.alike(places[place], int(other)):
+            if not blobs.alike(places[coordinates], int(blob)):
                 continue
-            places[there] = int(other)
-            taken.add(int(other))
-            onward = local.copy()
-            onward[axis] = sign * (px[other] - px[places[place]])
-            waiting.append((there, onward))
+            places[neighbour] = int(blob)
+            used.add(int(blob))
+            updated = local.copy()
+            updated[axis] = sign * (px[blob] - px[places[coordinates]])
+            waiting.append((neighbour, updated))
     return places
 
 
 def _grid(places: IntArray, px: FloatArray, asymmetric: bool) -> tuple[int, int, IntArray] | None:
-    """Columns, rows and the order of points whose (n, 2) places fill a grid, right-handed."""
+    """Columns, rows and order of points whose (n, 2) coordinates fill a right-handed grid."""
     places = places - places.min(axis=0)
     width, rows = (places.max(axis=0) + 1).tolist()
     columns = width // 2 if asymmetric else width
     if columns * rows != len(places) or columns < 2 or rows < 2:
         return None
-    wanted = circle_places(columns, rows, asymmetric=asymmetric)
+    expected = circle_places(columns, rows, asymmetric=asymmetric)
     order = np.lexsort((places[:, 0], places[:, 1]))
-    if not np.array_equal(places[order], wanted):
+    if not np.array_equal(places[order], expected):
         return None
     x, y = px[order[columns - 1]] - px[order[0]], px[order[-columns]] - px[order[0]]
     return (columns, rows, order) if x[0] * y[1] - x[1] * y[0] > 0 else None
 
 
 def _share(places: IntArray, px: FloatArray, diameters: FloatArray) -> float:
-    """Median diameter over the distance of neighbours, as areas have it; 0 where none is seen."""
+    """Median diameter over the neighbours' spacing, from areas; 0 without a homography."""
     homography = np.asarray(cv2.findHomography(places.astype(float), px)[0], dtype=float)
     if homography.shape != (3, 3):
         return 0.0
     ends = places[:, None] + 0.25 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    there = cv2.perspectiveTransform(ends.reshape(1, -1, 2), homography)[0].reshape(-1, 4, 2)
-    across, down = 2.0 * (there[:, 0] - there[:, 1]), 2.0 * (there[:, 2] - there[:, 3])
-    areas = np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
+    ends_px = cv2.perspectiveTransform(ends.reshape(1, -1, 2), homography)[0].reshape(-1, 4, 2)
+    step_x, step_y = 2.0 * (ends_px[:, 0] - ends_px[:, 1]), 2.0 * (ends_px[:, 2] - ends_px[:, 3])
+    areas = np.abs(step_x[:, 0] * step_y[:, 1] - step_x[:, 1] * step_y[:, 0])
     return float(np.median(diameters / np.sqrt(areas)))

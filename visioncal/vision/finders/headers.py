@@ -1,4 +1,4 @@
-"""The size that an image file claims, read from its header before anything is decoded."""
+"""Image size from a file's header, read before decoding."""
 
 import struct
 from collections.abc import Iterator
@@ -8,15 +8,15 @@ MOST_PIXELS = 160_000_000
 _PNG, _JPEG, _BMP = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"BM"
 _TIFF = {b"II*\0": "<", b"MM\0*": ">"}
 SIGNATURES = (_PNG, _JPEG, _BMP, *_TIFF)
-# Start-of-frame markers of JPEG; the three others between them are tables.
+# Start-of-frame markers of JPEG; the three excluded ones are tables.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _SCAN = 0xDA
-# Tags of TIFF, and how a value is packed by its type.
+# Tags of TIFF, and format of a value by its type.
 _WIDTH, _HEIGHT, _PACKED = 256, 257, {1: "B", 3: "H", 4: "I"}
 
 
 def claimed_size(data: bytes) -> tuple[int, int] | None:
-    """Reads (width, height) [px] in the header of a png, jpg, tif or bmp; None without one."""
+    """Size (width, height) [px] in the header of a png, jpg, tif or bmp; None without one."""
     try:
         if data.startswith(_PNG):
             return struct.unpack_from(">II", data, 16)
@@ -31,25 +31,25 @@ def claimed_size(data: bytes) -> tuple[int, int] | None:
 
 
 def start_of_scan(data: bytes) -> int:
-    """Finds where the picture of a JPEG begins, behind thumbnails; -1 without one."""
+    """Offset of a JPEG's image data, after thumbnails; -1 without one."""
     return next((at for marker, at in _segments(data) if marker == _SCAN), -1)
 
 
 def _segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """The markers of a JPEG's header with their places, up to the first scan."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        yield data[at + 1], at
-        if data[at + 1] == _SCAN:
+    """Markers of a JPEG's header with their offsets, up to the first scan."""
+    offset = 2
+    while offset + 4 <= len(data) and data[offset] == 0xFF:
+        yield data[offset + 1], offset
+        if data[offset + 1] == _SCAN:
             return
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        offset += 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
 
 
 def _size_of_jpeg(data: bytes) -> tuple[int, int] | None:
-    at = next((at for marker, at in _segments(data) if marker in _FRAMES), None)
-    if at is None:
+    offset = next((offset for marker, offset in _segments(data) if marker in _FRAMES), None)
+    if offset is None:
         return None
-    height, width = struct.unpack_from(">HH", data, at + 5)
+    height, width = struct.unpack_from(">HH", data, offset + 5)
     return width, height
 
 
@@ -57,8 +57,8 @@ def _size_of_tiff(data: bytes, order: str) -> tuple[int, int] | None:
     (start,) = struct.unpack_from(f"{order}I", data, 4)
     (count,) = struct.unpack_from(f"{order}H", data, start)
     sizes = {}
-    for at in range(start + 2, start + 2 + 12 * count, 12):
-        tag, kind = struct.unpack_from(f"{order}HH", data, at)
+    for offset in range(start + 2, start + 2 + 12 * count, 12):
+        tag, kind = struct.unpack_from(f"{order}HH", data, offset)
         if tag in (_WIDTH, _HEIGHT) and kind in _PACKED:
-            (sizes[tag],) = struct.unpack_from(f"{order}{_PACKED[kind]}", data, at + 8)
+            (sizes[tag],) = struct.unpack_from(f"{order}{_PACKED[kind]}", data, offset + 8)
     return (sizes[_WIDTH], sizes[_HEIGHT]) if len(sizes) == 2 else None

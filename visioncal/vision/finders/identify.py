@@ -1,4 +1,4 @@
-"""Naming the target in a photograph of which nothing is known."""
+"""Identification of an unknown target in a photograph."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -20,15 +20,15 @@ from visioncal.vision.finders.imaging import check_grey, why_hard_to_see
 from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.targets import DEFAULT_RELATIVE_SIGMA
 
-# Edges wider than this hide the bits of small markers [px].
+# Wider edges hide the bits of small markers [px].
 _MAX_BLUR_PX = 6.0
 _LISTED = 12
-# A picture whose sides are twice as long or more is searched at this size too.
+# Images with at least twice these sides are also searched at this size.
 _USUAL_PIXELS, _MUCH_LARGER = 2e6, 0.5
-# So many markers on one lattice are a board, even where its corners are not found.
+# Number of markers on one lattice that prove a board without its corners.
 _SURE_MARKERS = 8
-# Dark squares pass for circles in staggered rows, as wide as the rows are apart; blur widens
-# printed ones from 0.7 to 0.9.
+# Dark squares look like staggered circles as wide as the rows' spacing; blur widens printed circles
+# from 0.7 to 0.9.
 _WIDE = 0.95
 _MAYBE_CHARUCO = (
     "The light squares are not plain: rather a ChArUco board whose markers are too blurred to "
@@ -38,29 +38,29 @@ _MAYBE_CHARUCO = (
 
 @dataclass(frozen=True)
 class Identity:
-    """What a photograph shows, all but its size.
+    """An identified target, without its size.
 
     Attributes:
-        kind: What is printed.
+        kind: Kind of target.
         columns: Squares (ChArUco) or inner corners (checkerboard) along x; 1 for a marker.
-        rows: The same along y; of tags for an AprilGrid.
-        whole: Whether the board is seen to end there; where not, it may have more.
-        dictionary: The smallest dictionary that holds the markers; empty without markers.
-        larger: Other dictionaries that hold the same markers.
-        legacy: Whether a ChArUco board has the layout that OpenCV printed before 4.6; with an odd
-            number of rows both layouts are the same.
-        marker_share: A marker's side over a square's; 0 except for ChArUco.
-        marker_share_sigma: Standard deviation of that.
-        marker_ids: The ids that were decoded, ascending; of single markers, the target's first.
-        first_id: The least id of an AprilGrid.
-        spacing: White between its tags, as a share of their side.
-        border: Dark modules around their bits.
+        rows: Likewise along y; rows of tags for an AprilGrid.
+        whole: Whether the board's end is visible; otherwise it may be larger.
+        dictionary: Smallest dictionary that contains the markers; empty without markers.
+        larger: Other dictionaries that contain the same markers.
+        legacy: Whether a ChArUco board has OpenCV's layout before 4.6; with an odd number of rows
+            both layouts are the same.
+        marker_share: Marker side over square side; 0 except for ChArUco.
+        marker_share_sigma: Its standard deviation.
+        marker_ids: Decoded ids, ascending; for single markers, the target's first.
+        first_id: Smallest id of an AprilGrid.
+        spacing: Gap between its tags, as a share of their side.
+        border: Number of dark modules around its tags' bits.
         asymmetric: Whether every second row of circles is shifted.
-        diameter_share: Their diameter over the distance of rows; 0 without circles.
-        square_px: Side of a checkerboard's squares, or distance of rows of circles, about [px].
-        corners_seen: Corners that the finder of that kind finds.
-        corners: Corners that the target has.
-        notes: What else there is to know, in sentences.
+        diameter_share: Circles' diameter over the spacing of rows; 0 without circles.
+        square_px: Approximate side of a checkerboard's squares, or spacing of rows of circles [px].
+        corners_seen: Number of corners that the detector of this kind finds.
+        corners: Number of corners of the target.
+        notes: Remarks, in sentences.
     """
 
     kind: TargetKind
@@ -85,16 +85,11 @@ class Identity:
 
     @property
     def is_filled(self) -> bool:
-        """Whether the light squares of a checkerboard hold what may be markers."""
+        """Whether a checkerboard's light squares may contain markers."""
         return _MAYBE_CHARUCO in self.notes
 
     def target(self, name: str, square_m: float) -> Target:
-        """Builds the target.
-
-        Args:
-            name: Its name.
-            square_m: Measured side of a square, or of the marker for a single one [m].
-        """
+        """The target, with the measured side of a square, or of a single marker [m]."""
         return Target(
             name,
             self.kind,
@@ -115,23 +110,22 @@ class Identity:
 
 @typed
 def identify(image: Image) -> Identity:
-    """Names the target in an image: ChArUco board, AprilGrid, checkerboard, circles or marker.
+    """Identifies the target in an image: ChArUco, AprilGrid, checkerboard, circles or marker.
 
     Args:
         image: (h, w) grey image.
 
     Returns:
-        The target whose corners are the most; others that are seen too are named in its notes.
+        The target with the most corners; its notes list other visible ones.
 
     Raises:
-        DataError: There is none, and the message says what was looked for and what may help; or
-            the image is not grey.
+        DataError: There is no target, or the image is not grey.
     """
     check_grey(image, "image")
     identity = _identity(image)
     if identity is not None:
         return identity
-    # Details of a picture much larger than what the finders were made for hide its board.
+    # In images much larger than the detectors are made for, details hide the board.
     scale = (_USUAL_PIXELS / image.size) ** 0.5
     if scale < _MUCH_LARGER:
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -156,29 +150,29 @@ def identify(image: Image) -> Identity:
 
 
 def _identity(image: Image) -> Identity | None:
-    """The target whose corners are the most; None where there is none."""
+    """The target with the most corners; None if there is none."""
     markers = decode_markers(image)
     boards = _charucos(image, markers)
     singles = _singles(tuple(marker for marker in genuine(markers) if marker.family not in boards))
     grids = _aprilgrids(image)
-    found = [*boards.values(), *grids]
-    if not found:
+    candidates = [*boards.values(), *grids]
+    if not candidates:
         squares = _checkerboards(image)
-        # Circles in staggered rows pass for a checkerboard, and the dark squares of a blurred board
-        # for circles; what lies in the light squares tells that there are squares.
+        # Staggered circles look like a checkerboard, and dark squares of a blurred board like
+        # circles; content in the light squares proves squares.
         circles = [] if any(square.is_filled for square in squares) else _circles(image)
         if squares and any(
             circle.asymmetric and circle.diameter_share > _WIDE for circle in circles
         ):
             circles = []
-        found = circles or [*squares, *singles]
-    if not found:
+        candidates = circles or [*squares, *singles]
+    if not candidates:
         return None
-    best = max(found, key=lambda value: value.corners_seen)
-    # A grid's tags are no single ones.
-    around = () if best.kind == "aprilgrid" else singles
-    beside = (value for value in (*found, *around) if value is not best)
-    return replace(best, notes=(*best.notes, *dict.fromkeys(_notes_beside(beside))))
+    best = max(candidates, key=lambda candidate: candidate.corners_seen)
+    # A grid's tags are not single markers.
+    other_markers = () if best.kind == "aprilgrid" else singles
+    others = (candidate for candidate in (*candidates, *other_markers) if candidate is not best)
+    return replace(best, notes=(*best.notes, *dict.fromkeys(_notes_beside(others))))
 
 
 def _notes_beside(others: Iterable[Identity]) -> Iterator[str]:
@@ -190,20 +184,20 @@ def _notes_beside(others: Iterable[Identity]) -> Iterator[str]:
 
 
 def _charucos(image: Image, markers: tuple[Marker, ...]) -> dict[str, Identity]:
-    """The best board by its family."""
-    found = {}
+    """Best board of each marker family."""
+    by_family = {}
     for family in sorted({marker.family for marker in markers}):
         members = [marker for marker in markers if marker.family == family]
         lattices = find_lattices(image, members) if len(members) >= LEAST_MARKERS else ()
-        named = [_charuco(image, family, lattice) for lattice in lattices]
-        boards = [identity for identity in named if identity is not None]
+        identities = [_charuco(image, family, lattice) for lattice in lattices]
+        boards = [identity for identity in identities if identity is not None]
         if boards:
-            found[family] = _decided(boards)
-    return found
+            by_family[family] = _decided(boards)
+    return by_family
 
 
 def _decided(boards: list[Identity]) -> Identity:
-    """Of boards that the same markers may be of, the one with the most corners."""
+    """The board with the most corners among several that the same markers fit."""
     best = max(boards, key=lambda board: board.corners_seen)
     rivals = [
         board for board in boards if board is not best and board.corners_seen == best.corners_seen
@@ -219,7 +213,7 @@ def _decided(boards: list[Identity]) -> Identity:
 
 
 def _charuco(image: Image, family: str, lattice: Lattice) -> Identity | None:
-    """Names a board, and confirms it by the finder that calibrations use."""
+    """Identifies a board, and confirms it by the detector that calibrations use."""
     ids = tuple(sorted({marker.number for marker in lattice.markers}))
     names = holding(family, max(lattice.columns * lattice.rows // 2, ids[-1] + 1))
     if not names:
@@ -319,7 +313,7 @@ def _aprilgrids(image: Image) -> list[Identity]:
 
 
 def _circles(image: Image) -> list[Identity]:
-    # Of the ways to number them, one as wide as it is high or wider, as people count.
+    # Of the possible numberings, one that is at least as wide as high.
     grids = sorted(
         seen_grids(image), key=lambda value: not value.asymmetric and value.columns < value.rows
     )
@@ -349,14 +343,14 @@ def _circles(image: Image) -> list[Identity]:
 
 
 def _singles(markers: tuple[Marker, ...]) -> list[Identity]:
-    """The family of which the most markers are seen, and its largest marker."""
+    """The largest marker of the family with the most markers."""
     if not markers:
         return []
     members: list[Marker] = []
-    # The likest marker comes first; of two families with as many, its own is taken.
+    # The most similar marker comes first; its family wins ties.
     for family in dict.fromkeys(marker.family for marker in markers):
-        its = [marker for marker in markers if marker.family == family]
-        members = its if len(its) > len(members) else members
+        family_markers = [marker for marker in markers if marker.family == family]
+        members = family_markers if len(family_markers) > len(members) else members
     largest = max(members, key=lambda member: member.side_px)
     others = tuple(sorted(member.number for member in members if member is not largest))
     ids = (largest.number, *others)

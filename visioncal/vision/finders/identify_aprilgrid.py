@@ -1,7 +1,7 @@
-"""Inferring an AprilGrid from the ids and the places of its tags.
+"""Identification of an AprilGrid from the ids and positions of its tags.
 
-The ids count the tags row by row from the lower left. Hence the number of columns says where each
-tag lies, and a hypothesis is right where one view of a plane carries those places to the image.
+Ids count the tags row by row from the lower left. Each number of columns therefore predicts the
+tags' positions; it is right if a homography maps these to the image.
 """
 
 from dataclasses import dataclass, replace
@@ -21,20 +21,20 @@ from visioncal.vision.finders.layout import LAYOUT_MISFIT
 from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.targets import APRILGRID_DICTIONARY, DEFAULT_RELATIVE_SIGMA
 
-# Fewer tags are single ones; no printable grid has more columns.
+# Fewer tags are single markers; no printable grid has more columns.
 _LEAST_TAGS, _MOST_COLUMNS = 4, 24
 _USUAL_SPACING = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """An AprilGrid as an image shows it, with tags of 1 m.
+    """An AprilGrid in an image, with tags of 1 m.
 
     Attributes:
-        target: All but its size.
-        whole: Whether it is seen to end above its uppermost row.
-        ids: The tags that were read, ascending.
-        corners: How many corners the finder of AprilGrids finds.
+        target: The grid, without its size.
+        whole: Whether its end above the uppermost row is visible.
+        ids: Ids of the tags that were read, ascending.
+        corners: Number of corners that the AprilGrid detector finds.
     """
 
     target: Target
@@ -44,9 +44,9 @@ class Grid:
 
 
 def find_grid(image: Image) -> Grid | None:
-    """Infers an AprilGrid of Kalibr's family, with borders of one or two modules; None without."""
+    """Identifies an AprilGrid of Kalibr's family with borders of one or two modules, or None."""
     read = {border: grid_tags(image, APRILGRID_DICTIONARY, border, np.inf) for border in (2, 1)}
-    # With a wrong border a few tags are read, and misplaced.
+    # With the wrong border a few tags are read at wrong positions.
     border = max(read, key=lambda index: len(read[index][0]))
     ids, px = read[border]
     if len(ids) < _LEAST_TAGS:
@@ -57,10 +57,10 @@ def find_grid(image: Image) -> Grid | None:
     first += columns * int((ids.min() - first) // columns)
     rows = int((ids.max() - first) // columns) + 1
     target = _target(columns, rows, first, border)
-    numbers, every = ids - first, np.ones(len(ids), bool)
-    quads = refined_tags(image, laid(target, numbers, px, every)[0], _USUAL_SPACING)
+    numbers, all_tags = ids - first, np.ones(len(ids), bool)
+    quads = refined_tags(image, laid(target, numbers, px, all_tags)[0], _USUAL_SPACING)
     target = replace(target, spacing=round(seen_spacing(target, numbers, quads), 2))
-    # Rows that the image cuts off below are counted, as ids begin with 0.
+    # Rows below the image are included, as ids start with 0.
     if first and not lacks_a_line(image, *_one_more(target, numbers, below=True), quads):
         target = replace(target, rows=rows + first // columns, marker_id=first % columns)
     whole = lacks_a_line(image, *_one_more(target, ids - target.marker_id, below=False), quads)
@@ -69,27 +69,27 @@ def find_grid(image: Image) -> Grid | None:
 
 
 def _columns(ids: IntArray, px: FloatArray, border: int) -> tuple[int, int]:
-    """The number of columns, and an id in the first of them; 0 where no number fits."""
-    every = np.ones(len(ids), bool)
+    """Number of columns, and an id in the first column; 0 if none fits."""
+    all_tags = np.ones(len(ids), bool)
     tried = range(1, _MOST_COLUMNS + 1)
-    # Ids begin with 0 unless the tags say otherwise.
+    # Ids start with 0 unless the tags contradict it.
     for starts in (
-        [(item, 0) for item in tried],
-        [(item, at) for item in tried for at in range(1, item)],
+        [(count, 0) for count in tried],
+        [(count, offset) for count in tried for offset in range(1, count)],
     ):
         misfits = {}
         for columns, first in starts:
             numbers = ids - first + columns * (first > 0)
             target = _target(columns, int(numbers.max()) // columns + 1, 0, border)
-            misfits[columns, first] = laid(target, numbers, px, every)[1]
-        best = min(misfits, key=lambda index: misfits[index], default=(0, 0))
+            misfits[columns, first] = laid(target, numbers, px, all_tags)[1]
+        best = min(misfits, key=lambda key: misfits[key], default=(0, 0))
         if misfits.get(best, np.inf) <= LAYOUT_MISFIT:
             return best
     return 0, 0
 
 
 def _one_more(target: Target, numbers: IntArray, *, below: bool) -> tuple[Target, IntArray]:
-    """The grid with one row more, and the numbers of its tags there."""
+    """The grid with one more row, and its tags' numbers there."""
     return replace(target, rows=target.rows + 1), numbers + (target.columns if below else 0)
 
 

@@ -1,4 +1,4 @@
-"""Finding a checkerboard of unknown size."""
+"""Detection of a checkerboard of unknown size."""
 
 from dataclasses import dataclass, replace
 
@@ -17,30 +17,27 @@ from visioncal.vision.finders.identify_plane import (
     typical_contrast,
 )
 
-# The corner finder takes a second for ten million pixels, and needs squares of some ten.
+# Image size of the search: OpenCV takes a second for ten million pixels, and needs squares of about
+# ten.
 _SEARCH_PIXELS = 1.5e6
 _SEED = (3, 3)
 _MOST = 100
-# How far from a corner its four squares are looked at, in squares.
+# Distance from a corner at which its four squares are sampled [squares].
 _REACH = 0.25
-# The same beyond the last corners, where the image may show little white around the board.
+# Likewise beyond the last corners, where the image may show little white around the board.
 _REACHES_OUT = (_REACH, 0.1, 0.05)
-# Of the corners along one more line, so many must alternate for the line to belong to the board.
+# Share of alternating corners at which a further line belongs to the board.
 _MOST_OF = 0.8
-# Fewer of them in the image do not show whether the board goes on.
+# Share of corners in the image that is needed to decide whether the board continues.
 _ENOUGH = 0.5
 _OUTWARD = {"left": (-1.0, 0.0), "top": (0.0, -1.0), "right": (1.0, 0.0), "bottom": (0.0, 1.0)}
-# Places in a square, from its middle, where a marker would be, in squares.
+# Sample positions in a square where a marker would be, from its centre [squares].
 _INSIDE = np.stack(np.meshgrid(*2 * [np.linspace(-0.3, 0.3, 7)]), axis=-1).reshape(-1, 2)
-# Grey levels that scatter more in light squares than in dark ones, by this share of the contrast,
-# are no shading.
+# Excess scatter of light squares over dark ones, as a share of the contrast, that is not shading.
 _TEXTURE = 0.1
-# A corner that is farther off is none of the board's, in squares.
+# Tolerance of a board's corners [squares].
 _OFF = 0.15
-_ATTEMPTS = (
-    0,
-    cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE,
-)
+_ATTEMPTS = (0, cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE)
 
 
 @dataclass(frozen=True)
@@ -48,12 +45,12 @@ class Squares:
     """A checkerboard.
 
     Attributes:
-        columns: Inner corners along its longer side.
-        rows: The same along the other.
-        cut: Whether it may go on outside the image.
-        found: Whether the corner finder finds a board of just this size.
-        filled: Whether the light squares are not plain, as where markers are too blurred to read.
-        square_px: About their side [px].
+        columns: Number of inner corners along its longer side.
+        rows: Likewise along the other.
+        cut: Whether it may continue outside the image.
+        found: Whether the corner detector finds a board of exactly this size.
+        filled: Whether the light squares are not plain, as with markers too blurred to read.
+        square_px: Approximate side of a square [px].
     """
 
     columns: int
@@ -66,7 +63,7 @@ class Squares:
 
 @dataclass(frozen=True)
 class _Extent:
-    """Lines of corners that belong to the board, in the numbering of the seed: both ends count."""
+    """First and last lines of corners on the board, numbered as in the first grid, inclusive."""
 
     left: int
     top: int
@@ -85,18 +82,12 @@ class _Extent:
 
 
 def find_squares(image: Image) -> Squares | None:
-    """Finds a checkerboard and counts its inner corners.
+    """The largest checkerboard in a (h, w) grey image, with its inner corners counted, or None.
 
-    The corner finder (Duda and Frese 2018, through OpenCV) is allowed to find a larger board than
-    asked for, but then often stops early, or goes on over the rim. Its grid is therefore only a
-    start: lines of corners are taken off and added as the colours around them say.
-
-    Args:
-        image: (h, w) grey image.
-
-    Returns:
-        The largest board, confirmed by an exact search where that succeeds; None where there is
-        none.
+    The corner detector (Duda and Frese 2018, through OpenCV) may return a larger board than
+    requested, but then often stops early or continues over the rim. Its grid is therefore only a
+    start: lines of corners are removed and added by the colours around them, and the result is
+    preferably confirmed by an exact search.
     """
     scale = min(1.0, float(np.sqrt(_SEARCH_PIXELS / image.size)))
     small = image
@@ -112,9 +103,9 @@ def find_squares(image: Image) -> Squares | None:
         if not found:
             continue
         grid = np.asarray(px, dtype=float).reshape(*np.asarray(meta).shape[:2], 2)
-        here = _counted(small, grid, scale)
-        if here is not None and (best is None or _rank(here) > _rank(best)):
-            best = here
+        candidate = _counted(small, grid, scale)
+        if candidate is not None and (best is None or _rank(candidate) > _rank(best)):
+            best = candidate
         if best is not None and best.found:
             break
     return best
@@ -125,7 +116,7 @@ def _rank(squares: Squares) -> tuple[bool, int]:
 
 
 def _counted(image: Image, grid: FloatArray, scale: float) -> Squares | None:
-    """Counts a board's corners, starting from the (rows, columns, 2) ones that were found."""
+    """Counts a board's corners, starting from a detected (rows, columns, 2) grid."""
     rows, columns = grid.shape[:2]
     extent = _Extent(0, 0, columns - 1, rows - 1)
     plane = _plane(image, extent.corners(), grid.reshape(-1, 2))
@@ -142,24 +133,25 @@ def _counted(image: Image, grid: FloatArray, scale: float) -> Squares | None:
     columns, rows = max(grown.size), min(grown.size)
     if rows < _SEED[1]:
         return None
-    found = _is_there(image, (columns, rows))
+    is_found = any(
+        cv2.findChessboardCornersSB(image, (columns, rows), flags=flags)[0] for flags in _ATTEMPTS
+    )
     filled = _filled(image, plane, shrunk, typical)
-    return Squares(columns, rows, cut, found, filled, _side_px(plane, grown) / scale)
+    return Squares(columns, rows, cut, is_found, filled, _side_px(plane, grown) / scale)
 
 
 def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
-    """Fits the view of the board that the most corners agree with."""
+    """Fits the view of the board that has the most inliers."""
     tolerance_px = _OFF * float(np.median(np.linalg.norm(np.diff(px, axis=0), axis=1)))
     planes = [robust_plane(lens_of(image, bend), corners, px, tolerance_px) for bend in BENDS]
-    found = [plane for plane in planes if plane is not None]
-    if not found:
+    candidates = [plane for plane in planes if plane is not None]
+    if not candidates:
         return None
-    plane, right = max(found, key=lambda pair: int(pair[1].sum()))
-    return bent_plane(plane, corners[right], px[right])
+    plane, inliers = max(candidates, key=lambda pair: int(pair[1].sum()))
+    return bent_plane(plane, corners[inliers], px[inliers])
 
 
 def _side_px(plane: Plane, extent: _Extent) -> float:
-    """The median side of a board's squares [px]."""
     px = plane.to_px(extent.corners()).reshape(*extent.size[::-1], 2)
     sides = [np.linalg.norm(np.diff(px, axis=axis), axis=2).ravel() for axis in (0, 1)]
     return float(np.median(np.concatenate(sides)))
@@ -184,15 +176,15 @@ def _share_alternating(image: Image, plane: Plane, corners: FloatArray, typical:
 def _alternate_as(
     image: Image, plane: Plane, extent: _Extent, corners: FloatArray, reach: float
 ) -> bool:
-    """Whether more corners alternate as those of the board do, seen equally near."""
-    known = extent.corners()
-    typical = typical_contrast(contrasts(image, plane, known, reach), known)
+    """Whether enough corners alternate as those of the board do at the same distance."""
+    inner = extent.corners()
+    typical = typical_contrast(contrasts(image, plane, inner, reach), inner)
     values = contrasts(image, plane, corners, reach)
     return bool(alternating(values, corners, typical).mean() >= _MOST_OF)
 
 
 def _shrunk(image: Image, plane: Plane, extent: _Extent, typical: float) -> _Extent | None:
-    """Takes off the outer lines that do not alternate, the worst first."""
+    """Removes outer lines that do not alternate, the worst first."""
     while min(extent.size) >= _SEED[0]:
         shares = {
             side: _share_alternating(image, plane, _outermost(extent, side).corners(), typical)
@@ -206,7 +198,7 @@ def _shrunk(image: Image, plane: Plane, extent: _Extent, typical: float) -> _Ext
 
 
 def _grown(image: Image, plane: Plane, extent: _Extent) -> tuple[_Extent, bool]:
-    """Adds the next lines that alternate; also says whether the image cuts one of them."""
+    """Adds further lines that alternate, and says whether the image cuts off one of them."""
     cut = False
     sides = list(_OUTWARD)
     while sides and max(extent.size) < _MOST:
@@ -228,17 +220,13 @@ def _grown(image: Image, plane: Plane, extent: _Extent) -> tuple[_Extent, bool]:
 
 
 def _filled(image: Image, plane: Plane, extent: _Extent, typical: float) -> bool:
-    """Whether the grey levels within light squares scatter as they do not in dark ones."""
+    """Whether grey levels scatter more within light squares than within dark ones."""
     inner = replace(extent, right=extent.right - 1, bottom=extent.bottom - 1)
     squares = inner.corners()
     scatter = plane.levels(image, squares[:, None] + 0.5 + _INSIDE).std(axis=1)
-    # Below and right of a corner at an even place the square is as light as `typical` says.
+    # The square below and right of an even corner has the brightness given by the sign of
+    # `typical`.
     even = squares.sum(axis=1) % 2 == 0
     light = even if typical > 0 else ~even
-    more = np.median(scatter[light]) - np.median(scatter[~light])
-    return bool(more > _TEXTURE * abs(typical))
-
-
-def _is_there(image: Image, size: tuple[int, int]) -> bool:
-    """Whether the corner finder, asked for just this board, finds it."""
-    return any(cv2.findChessboardCornersSB(image, size, flags=flags)[0] for flags in _ATTEMPTS)
+    excess = np.median(scatter[light]) - np.median(scatter[~light])
+    return bool(excess > _TEXTURE * abs(typical))

@@ -1,4 +1,4 @@
-"""Decoding markers of every family at once, and separating real ones from look-alikes."""
+"""Decoding of markers of all families, and rejection of false positives."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,8 +9,8 @@ import numpy as np
 from visioncal.core.types import FloatArray, Image
 from visioncal.vision.targets import aruco_dictionary
 
-# By family: its dictionaries from the smallest on. Each holds the markers of those before it under
-# the same ids, so that the largest decodes them all.
+# Dictionaries by family, smallest first. Each contains the markers of the previous ones under the
+# same ids, so that the largest decodes all.
 FAMILIES: dict[str, tuple[str, ...]] = {
     **{
         bits: tuple(f"DICT_{bits}_{count}" for count in (50, 100, 250, 1000))
@@ -23,12 +23,12 @@ FAMILIES: dict[str, tuple[str, ...]] = {
     "36h10": ("DICT_APRILTAG_36h10",),
     "36h11": ("DICT_APRILTAG_36h11",),
 }
-# Pixels a module when a marker is compared with how it should look.
+# Pixels per module in the comparison of a marker with its ideal.
 _MODULE_PX = 4
-# White around a marker that is compared too, in modules: half of what it has to have.
+# White margin included in the comparison [modules]: half of the required one.
 _RING = 0.5
-# Correlation with the ideal marker. A strongly bending lens lowers it to 0.55. Codes of sixteen
-# bits are found by chance in other markers' squares, with up to 0.8; longer codes are not.
+# Minimum correlation with the ideal marker. Strong lens distortion lowers it to 0.55. Codes of
+# sixteen bits occur by chance in other markers' squares, with up to 0.8; longer codes do not.
 _LIKE, _SHORT_LIKE = 0.5, 0.83
 _SHORT_MODULES = 6
 
@@ -41,7 +41,7 @@ class Marker:
         family: Its family, a key of `FAMILIES`.
         number: Its id.
         px: (4, 2) corners in OpenCV's order [px].
-        likeness: Correlation of its picture with the ideal one, -1 to 1.
+        likeness: Correlation of its image with the ideal marker, -1 to 1.
     """
 
     family: str
@@ -51,14 +51,14 @@ class Marker:
 
     @cached_property
     def centre(self) -> FloatArray:
-        """Where its diagonals meet, (2,), which perspective keeps [px]."""
+        """Intersection of its diagonals, (2,), which is invariant under perspective [px]."""
         a, b, c, d = self.px
-        across, along = c - a, d - b
-        turn = across[0] * along[1] - across[1] * along[0]
-        if turn == 0.0:
+        diagonal_ac, diagonal_bd = c - a, d - b
+        cross_product = diagonal_ac[0] * diagonal_bd[1] - diagonal_ac[1] * diagonal_bd[0]
+        if cross_product == 0.0:
             return np.asarray(self.px.mean(axis=0))
-        share = ((b - a)[0] * along[1] - (b - a)[1] * along[0]) / turn
-        return np.asarray(a + share * across)
+        share = ((b - a)[0] * diagonal_bd[1] - (b - a)[1] * diagonal_bd[0]) / cross_product
+        return np.asarray(a + share * diagonal_ac)
 
     @cached_property
     def side_px(self) -> float:
@@ -67,24 +67,20 @@ class Marker:
 
 
 def decode_markers(image: Image) -> tuple[Marker, ...]:
-    """Decodes the markers of all families (Garrido-Jurado et al. 2014; OpenCV).
+    """Markers of all families in a (h, w) grey image (Garrido-Jurado et al. 2014; OpenCV).
 
-    Args:
-        image: (h, w) grey image.
-
-    Returns:
-        The markers, look-alikes included: a lattice or `Marker.likeness` separates them.
+    They include false positives, which a lattice or `Marker.likeness` separates.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     dictionaries = [aruco_dictionary(names[-1]) for names in FAMILIES.values()]
     detector = cv2.aruco.ArucoDetector(dictionaries, parameters)
-    corners, ids, _, which = detector.detectMarkersMultiDict(image)
+    corners, ids, _, family_indices = detector.detectMarkersMultiDict(image)
     if not corners:
         return ()
     families = list(FAMILIES)
     markers = []
-    for px, number, index in zip(corners, np.ravel(ids), np.ravel(which), strict=True):
+    for px, number, index in zip(corners, np.ravel(ids), np.ravel(family_indices), strict=True):
         quad = np.asarray(px, dtype=float).reshape(4, 2)
         family = families[int(index)]
         likeness = _likeness(image, quad, family, int(number))
@@ -93,9 +89,9 @@ def decode_markers(image: Image) -> tuple[Marker, ...]:
 
 
 def genuine(markers: tuple[Marker, ...]) -> tuple[Marker, ...]:
-    """Keeps the markers that look as they should; of several at one place, the likest."""
+    """Markers that resemble their ideal; of several at one position, the most similar."""
     kept: list[Marker] = []
-    for marker in sorted(markers, key=lambda value: -value.likeness):
+    for marker in sorted(markers, key=lambda candidate: -candidate.likeness):
         apart = all(
             np.linalg.norm(marker.centre - other.centre) > max(marker.side_px, other.side_px) / 2
             for other in kept
@@ -107,13 +103,13 @@ def genuine(markers: tuple[Marker, ...]) -> tuple[Marker, ...]:
 
 
 def holding(family: str, count: int) -> tuple[str, ...]:
-    """Lists the dictionaries of a family that have at least so many markers, smallest first."""
+    """Dictionaries of a family with at least `count` markers, smallest first."""
     names = FAMILIES[family]
     return tuple(name for name in names if len(aruco_dictionary(name).bytesList) >= count)
 
 
 def modules_along(family: str) -> int:
-    """Counts the modules along a marker's side, its dark border included."""
+    """Number of modules along a marker's side, including its dark border."""
     return int(aruco_dictionary(FAMILIES[family][0]).markerSize) + 2
 
 
@@ -123,7 +119,7 @@ def _likeness(image: Image, px: FloatArray, family: str, number: int) -> float:
     ring = round(_RING * _MODULE_PX)
     ideal = cv2.aruco.generateImageMarker(dictionary, number, side)
     ideal = np.pad(ideal, ring, constant_values=255).astype(np.float32)
-    # Pixel centres are at integers; the marker's edge runs half a pixel before its first one.
+    # Pixel centres are at integers; the marker's edge is half a pixel before the first one.
     frame = ring - 0.5 + side * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     flat_from_image = cv2.getPerspectiveTransform(px.astype(np.float32), frame.astype(np.float32))
     seen = cv2.warpPerspective(

@@ -1,4 +1,4 @@
-"""What a named target is called: as a description to keep, as JSON, and in words."""
+"""An identified target as a description to keep, as JSON, and in words."""
 
 from typing import Any
 
@@ -8,12 +8,10 @@ from visioncal.vision.targets import board_words, target_document
 
 
 def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
-    """Writes an identity as the content of a JSON document; what does not apply is absent.
+    """An identity as the content of a JSON document, without fields that do not apply.
 
-    Args:
-        identity: The target.
-        square_m: Measured side of a square, or of a single marker [m], where it is known: the
-            document then holds the target's description too.
+    With a measured side of a square, or of a single marker [m], it has the target's description
+    too.
     """
     document: dict[str, Any] = {
         "kind": identity.kind,
@@ -22,11 +20,7 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
         "notes": list(identity.notes),
     }
     if identity.kind != "marker":
-        document |= {
-            "columns": identity.columns,
-            "rows": identity.rows,
-            "whole": identity.whole,
-        }
+        document |= {"columns": identity.columns, "rows": identity.rows, "whole": identity.whole}
     if identity.dictionary:
         document |= {
             "dictionary": identity.dictionary,
@@ -52,13 +46,10 @@ def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
 
 
 def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
-    """Writes an identity as a target's description.
+    """An identity as a target's description; `source` names the image in its first line.
 
-    Args:
-        identity: The target.
-        square_m: Measured side of a square, or of a single marker [m]. Where it is not known, the
-            sizes become comments that say what to measure.
-        source: Where it was seen, for the first line.
+    Without a measured side of a square, or of a single marker [m], sizes become comments on what to
+    measure.
     """
     size, what, where = "square_m", "side of a square", "measured over many squares"
     if identity.kind == "marker":
@@ -73,7 +64,7 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
         lines.append(
             f"# Fill in what a picture cannot show, the {what}, and remove the # before it."
         )
-    # Any size would do where it is not known: those lines are written out below.
+    # An unknown size is arbitrary here: its lines are replaced below.
     document = target_document(identity.target("board", 1.0 if square_m is None else square_m))
     sized = {size, "square_sigma_m", "marker_m", "diameter_m"}
     for key, value in document.items():
@@ -87,7 +78,7 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
 
 
 def describe(identity: Identity) -> str:
-    """Names a target in a few words."""
+    """The target in a few words."""
     words = board_words(identity.target("board", 1.0), "" if identity.whole else "at least ")
     if identity.kind == "marker":
         return words
@@ -96,9 +87,9 @@ def describe(identity: Identity) -> str:
         "aprilgrid": f"{identity.spacing:g} of a tag apart",
         "charuco": f"markers of {identity.marker_share:.3f} of a square",
     }
-    own = (more[identity.kind],) if identity.kind in more else ()
+    details = (more[identity.kind],) if identity.kind in more else ()
     seen = f"{identity.corners_seen} of {identity.corners} corners seen"
-    return ", ".join([words, *own, seen])
+    return ", ".join([words, *details, seen])
 
 
 def _remark(identity: Identity, key: str) -> str:

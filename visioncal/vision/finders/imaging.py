@@ -1,4 +1,4 @@
-"""Decoding image files, and measuring how sharp they are."""
+"""Decoding of image files, and measurement of their sharpness."""
 
 import zlib
 from pathlib import Path
@@ -14,35 +14,27 @@ from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes
 from visioncal.core.types import FloatArray, Image, Image16
 from visioncal.vision.finders.headers import MOST_PIXELS, SIGNATURES, claimed_size, start_of_scan
 
-# Half-widths of the window around a corner in which its edges' width is measured [px].
+# Half-widths of the window around a corner in which the edge width is measured [px].
 _REACH_PX = (4, 12)
-# Corners measured in an image: the median of these is stable to some percent.
+# Number of corners measured in an image; their median is stable to some percent.
 _SAMPLE = 12
-# Rows that are scaled at a time.
+# Number of rows scaled at a time.
 _STRIP = 256
-# Under this many grey levels a picture shows nothing that a detector could use.
+# Minimum contrast that detectors need [grey levels].
 _LEAST_CONTRAST = 12
-# What to do about an image in colour.
+# Instruction for an image in colour.
 GREY = "Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)."
 
 
 def looks_like_image(data: bytes) -> bool:
-    """Tells whether a file begins as png, jpg, tif or bmp do; damage further on does not matter."""
+    """Whether a file starts as png, jpg, tif or bmp; later damage does not matter."""
     return data.startswith(SIGNATURES)
 
 
 def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
-    """Decodes an image file as the sensor saw it: without EXIF rotation.
+    """Decodes a png, jpg or tif file to a (h, w) grey or (h, w, 3) BGR image, or says why not.
 
-    A camera's matrix belongs to the sensor's own orientation, so a viewer's hint to rotate the
-    picture is not followed.
-
-    Args:
-        data: The content of a png, jpg or tif file.
-        colour: Whether to keep colours, as blue, green and red; grey otherwise.
-
-    Returns:
-        The (h, w) or (h, w, 3) image, or why there is none, in words.
+    EXIF rotation for viewers is ignored: the camera matrix refers to the sensor's orientation.
     """
     if not data:
         return "unreadable: the file is empty"
@@ -69,10 +61,10 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
 
 
 def check_grey(image: Image, label: str) -> None:
-    """Refuses an image in colour.
+    """Checks that an image is grey.
 
     Raises:
-        DataError: It has more than rows and columns, or fewer.
+        DataError: It does not have exactly two dimensions.
     """
     if image.ndim != 2:
         raise DataError(
@@ -83,10 +75,10 @@ def check_grey(image: Image, label: str) -> None:
 
 
 def encode_png(image: Image | Image16) -> bytes:
-    """Writes a (h, w) or (h, w, 3) image of 8 or 16 bits as png, without loss.
+    """Encodes a (h, w) or (h, w, 3) image of 8 or 16 bits as png.
 
     Raises:
-        DataError: It is no such image.
+        DataError: The array has another shape or type.
     """
     pixels: npt.NDArray[np.integer[Any]] = np.asarray(image)
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim not in (2, 3) or not pixels.size:
@@ -102,7 +94,7 @@ def read_image(path: Path) -> Image:
     """Reads a (h, w) grey image; see `decode_image`.
 
     Raises:
-        DataError: The file is missing, or no image that can be read.
+        DataError: The file is missing or cannot be decoded.
     """
     image = decode_image(read_bytes(path, MOST_IMAGE_BYTES))
     if isinstance(image, str):
@@ -116,10 +108,10 @@ def read_image(path: Path) -> Image:
 
 
 def _to_eight_bits(image: npt.NDArray[Any]) -> Image:
-    """Scales by the brightest levels: cameras of 10 or 12 bits fill the lower part of 16."""
+    """Scales to the brightest levels, as 10 or 12 bit cameras fill the lower part of 16 bits."""
     top = float(np.percentile(_levels(image[::4, ::4]), 99.9))
     scaled = np.empty(image.shape, dtype=np.uint8)
-    # In strips: the largest images in floats would fill the memory.
+    # In strips, as the largest images would not fit into memory as floats.
     for at in range(0, len(image), _STRIP):
         strip = _levels(image[at : at + _STRIP])
         scaled[at : at + _STRIP] = np.clip(strip * (255.0 / max(top, 1e-9)), 0, 255)
@@ -131,7 +123,7 @@ def _levels(image: npt.NDArray[Any]) -> FloatArray:
 
 
 def _is_cut_short(data: bytes) -> bool:
-    """Looks for the end that PNG and JPEG files carry: decoders fill up what is missing."""
+    """Whether the end marker of a PNG or JPEG is missing: decoders fill up missing data."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-64:]
     if data.startswith(b"\xff\xd8"):
@@ -141,29 +133,22 @@ def _is_cut_short(data: bytes) -> bool:
 
 
 def _is_damaged_png(data: bytes) -> bool:
-    """Checks the sums of a PNG's chunks: decoders go on past damage, with other pixels."""
-    at, parts = 8, memoryview(data)
-    while at + 12 <= len(data):
-        length = int.from_bytes(parts[at : at + 4], "big")
-        end = at + 8 + length
-        if zlib.crc32(parts[at + 4 : end]) != int.from_bytes(parts[end : end + 4], "big"):
+    """Whether a PNG chunk's checksum is wrong: decoders continue past damage with wrong pixels."""
+    start, view = 8, memoryview(data)
+    while start + 12 <= len(data):
+        length = int.from_bytes(view[start : start + 4], "big")
+        end = start + 8 + length
+        if zlib.crc32(view[start + 4 : end]) != int.from_bytes(view[end : end + 4], "big"):
             return True
-        at = end + 4
+        start = end + 4
     return False
 
 
 def blur_at_corners(image: Image, px: FloatArray) -> float:
-    """Measures the width of the edges that meet in chessboard corners.
+    """Median edge width (sigma) at a sample of (n, 2) chessboard corners, n >= 1 [px].
 
-    A step edge blurred by a Gaussian of sigma s has the central difference 2 Phi(1 / s) - 1 times
-    half the step at its steepest; solved for s, this holds down to half a pixel.
-
-    Args:
-        image: (h, w) grey image.
-        px: (n, 2) corners, n >= 1.
-
-    Returns:
-        The median sigma over a sample of the corners [px].
+    A step edge blurred by a Gaussian of sigma s has a steepest central difference of 2 Phi(1 / s) -
+    1 times half the step; solved for s, this holds down to half a pixel.
     """
     chosen = px[:: max(1, len(px) // _SAMPLE)]
     spacing = np.linalg.norm(np.diff(px, axis=0), axis=1).min(initial=4 * _REACH_PX[1])
@@ -176,7 +161,7 @@ def blur_at_corners(image: Image, px: FloatArray) -> float:
 
 
 def why_hard_to_see(image: Image, max_blur_px: float) -> str:
-    """Says what about an image hides a target: too little contrast, or blur; empty if neither."""
+    """Reason why a target is hard to detect: low contrast, or blur; empty if neither."""
     low, high = np.percentile(image[::4, ::4], [2, 98])
     if high - low < _LEAST_CONTRAST:
         return (
@@ -193,15 +178,15 @@ def why_hard_to_see(image: Image, max_blur_px: float) -> str:
 
 
 def blur_of_edges(image: Image) -> float:
-    """The sigma of the sharpest edges of an image [px]; see `blur_at_corners`."""
+    """Sigma of the sharpest edges of an image [px]; see `blur_at_corners`."""
     return float(_edge_sigma(image[None])[0])
 
 
 def _edge_sigma(patches: Image) -> FloatArray:
     levels = patches.astype(np.float32)
-    by_row = (levels[:, 2:, 1:-1] - levels[:, :-2, 1:-1]) / 2
-    by_column = (levels[:, 1:-1, 2:] - levels[:, 1:-1, :-2]) / 2
-    slope = np.hypot(by_row, by_column).reshape(len(levels), -1)
+    dv = (levels[:, 2:, 1:-1] - levels[:, :-2, 1:-1]) / 2
+    du = (levels[:, 1:-1, 2:] - levels[:, 1:-1, :-2]) / 2
+    gradient = np.hypot(dv, du).reshape(len(levels), -1)
     low, high = np.percentile(levels.reshape(len(levels), -1), [2, 98], axis=1)
-    steepest = np.percentile(slope, 99.5, axis=1) / np.maximum(high - low, 1.0)
+    steepest = np.percentile(gradient, 99.5, axis=1) / np.maximum(high - low, 1.0)
     return np.asarray(1.0 / ndtri(0.5 + np.clip(steepest, 1e-3, 0.499)), dtype=float)

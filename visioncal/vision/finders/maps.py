@@ -1,4 +1,4 @@
-"""Maps from pixels to a board about each of its corners, which those around it determine."""
+"""Maps from pixels to the board around each corner, determined by its neighbours."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,24 +10,24 @@ from scipy.spatial import cKDTree
 
 from visioncal.core.types import FloatArray, IntArray, Mask
 
-# Corners around a corner that shape its map, and how far away they count half [squares].
+# Number of neighbours that determine a corner's map, and distance of half weight [squares].
 _AROUND, _NEAR = 25, 1.5
-# Held by so much to a plain homography, a map stays determined where corners are few.
+# Ridge towards a plain homography, which keeps a map determined with few corners.
 _RIDGE = np.diag([1e-6, 1e-4, 1e-4, *[1e-2] * 7])
-# Radial distortion has two coefficients and an axis near the image's middle, of about so much. So
-# many corners determine it in so many steps, or until the squares change by less than a share of
-# them, and no place is drawn further from the axis than by the inverse of the last.
+# Prior sigmas of radial distortion: two coefficients, and the axis relative to the image's centre.
+# Minimum number of corners, largest number of steps, relative change of the cost at convergence,
+# and smallest divisor of the distortion model.
 _RADIAL_SIGMAS = np.array([0.5, 0.5, 0.1, 0.1])
 _RADIAL_CORNERS, _RADIAL_STEPS, _RADIAL_STEADY, _LEAST_RADIAL = 8, 6, 0.01, 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class OpticalAxis:
-    """About what a lens distorts radially.
+    """Approximate axis of a lens's radial distortion.
 
     Attributes:
-        px: (2,) the middle of the image, near which it is [px].
-        reach_px: How far the image reaches from there [px].
+        px: (2,) centre of the image, near which it is [px].
+        reach_px: Half the image's diagonal [px].
     """
 
     px: FloatArray
@@ -35,7 +35,7 @@ class OpticalAxis:
 
     @classmethod
     def of(cls, shape: tuple[int, ...], origin: FloatArray | IntArray) -> Self:
-        """That of an image of so many rows and columns, a part of which begins at `origin`."""
+        """Axis for an image of this shape, relative to a part of it that starts at `origin`."""
         middle = (np.array(shape[::-1]) - 1) / 2
         return cls(middle - origin, float(np.linalg.norm(middle)))
 
@@ -43,127 +43,131 @@ class OpticalAxis:
 def maps_about(
     board: FloatArray, px: FloatArray, good: Mask, chosen: IntArray, axis: OpticalAxis | None = None
 ) -> tuple[Callable[[FloatArray], FloatArray], IntArray, FloatArray]:
-    """The maps about the chosen m corners: a homography of all, and a cubic polynomial on top.
+    """Maps around m chosen corners: a common homography, and a cubic polynomial for each.
 
     Args:
-        board: (n, 2) the corners on the board [squares].
-        px: (n, 2) where they are, to a part of a pixel [px].
-        good: (n,) those that make the maps.
-        chosen: (m,) those about which they are made.
-        axis: The lens's, whose radial distortion is taken off before the homography; None leaves it
-            to the polynomials.
+        board: (n, 2) corners on the board [squares].
+        px: (n, 2) their positions in the image [px].
+        good: (n,) mask of the corners that determine the maps.
+        chosen: (m,) indices of the corners to map.
+        axis: Axis of the lens, whose radial distortion is removed before the homography; None
+            leaves it to the polynomials.
 
     Returns:
-        What maps pixels (m, k, 2) to the board, from each corner; the (m, k) corners around each;
-        and what makes polynomials of values there, (m, 10, k).
+        Function that maps pixels (m, k, 2) to the board relative to each corner; (m, k) neighbours
+        of each corner; and the linear operators (m, 10, k) from their values to polynomial
+        coefficients.
 
     Raises:
-        numpy.linalg.LinAlgError: The corners lie as no board's do.
+        numpy.linalg.LinAlgError: The corners do not form a board.
     """
     undistorted = None if axis is None else _undistorted(px[good], board[good], axis)
-    flat = undistorted or _homography(px, board)
-    own = flat(px[chosen])[:, None]
-    distances, around = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
-    off = flat(px)[around] - own
-    terms = _terms(off)
-    weighed = terms * (good[around] / (1.0 + (distances / _NEAR) ** 2))[..., None]
-    weighed = weighed.transpose(0, 2, 1)
-    smoother = np.linalg.solve(weighed @ terms + _RIDGE, weighed)
-    bends = smoother @ (board[around] - board[chosen, None] - off)
-    # The corner itself is where its map is zero.
-    bends[:, 0] = 0.0
+    flatten = undistorted or _homography(px, board)
+    origin = flatten(px[chosen])[:, None]
+    distances, neighbours = cKDTree(board).query(board[chosen], min(_AROUND, len(px)))
+    offsets = flatten(px)[neighbours] - origin
+    terms = _terms(offsets)
+    weighted = terms * (good[neighbours] / (1.0 + (distances / _NEAR) ** 2))[..., None]
+    weighted = weighted.transpose(0, 2, 1)
+    smoother = np.linalg.solve(weighted @ terms + _RIDGE, weighted)
+    coefficients = smoother @ (board[neighbours] - board[chosen, None] - offsets)
+    # A map is zero at its own corner.
+    coefficients[:, 0] = 0.0
 
     def on_board(places: FloatArray) -> FloatArray:
-        off = flat(places) - own
-        return np.asarray(off + _terms(off) @ bends)
+        offsets = flatten(places) - origin
+        return np.asarray(offsets + _terms(offsets) @ coefficients)
 
-    return on_board, around, smoother
+    return on_board, neighbours, smoother
 
 
 def _homography(places: FloatArray, board: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Maps places to a board (n, 2) as a pinhole's image of it is; for numbers about one."""
-    middle, scale = places.mean(axis=0), float(np.abs(places - places.mean(axis=0)).max())
-    found = cv2.findHomography((places - middle) / scale, board)[0]
-    if found is None:
+    """Function that maps (n, 2) points to the board by a homography of normalised points."""
+    centre, scale = places.mean(axis=0), float(np.abs(places - places.mean(axis=0)).max())
+    homography = cv2.findHomography((places - centre) / scale, board)[0]
+    if homography is None:
         raise np.linalg.LinAlgError
-    flat_from_places = np.asarray(found, float)
-    return lambda at: _mapped(flat_from_places, (at - middle) / scale)
+    flat_from_places = np.asarray(homography, float)
+    return lambda at: _mapped(flat_from_places, (at - centre) / scale)
 
 
 def _undistorted(
     px: FloatArray, board: FloatArray, axis: OpticalAxis
 ) -> Callable[[FloatArray], FloatArray] | None:
-    """Likewise, the radial distortion of a lens taken off; None where it is not determined.
+    """As `_homography`, after removal of radial distortion; None if that is not determined.
 
-    A place o from the axis, of length r, goes to o / (1 + a r^2 + b r^4) (Fitzgibbon 2001). Each
-    Gauss-Newton step of a, b and the axis is followed by the homography's own least squares.
+    A point o relative to the axis, at distance r, maps to o / (1 + a r^2 + b r^4) (Fitzgibbon
+    2001). Each Gauss-Newton step of a, b and the axis is followed by a least-squares homography.
     """
     if len(px) < _RADIAL_CORNERS:
         return None
 
-    def straight(at: FloatArray, lens: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        off = (at - axis.px) / axis.reach_px - lens[2:]
-        powers = np.sum(off**2, axis=-1, keepdims=True) ** [1, 2]
-        shrink = 1.0 + powers @ lens[:2, None]
-        return off / shrink, powers, shrink
+    def undistort(
+        points: FloatArray, lens: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        offsets = (points - axis.px) / axis.reach_px - lens[2:]
+        powers = np.sum(offsets**2, axis=-1, keepdims=True) ** [1, 2]
+        divisor = 1.0 + powers @ lens[:2, None]
+        return offsets / divisor, powers, divisor
 
     lens, cost, least, best = np.zeros(4), np.inf, np.inf, None
     for _ in range(_RADIAL_STEPS):
-        flat, powers, shrink = straight(px, lens)
-        if not np.all(shrink > _LEAST_RADIAL):
+        flat, powers, divisor = undistort(px, lens)
+        if not np.all(divisor > _LEAST_RADIAL):
             break
         homography = np.asarray(cv2.findHomography(flat, board)[0], float)
         if homography.shape != (3, 3):
             break
-        seen = _mapped(homography, flat)
-        rest = board - seen
-        before, cost = cost, float(np.sum(rest**2))
+        predicted = _mapped(homography, flat)
+        residuals = board - predicted
+        previous, cost = cost, float(np.sum(residuals**2))
         if cost < least:
             least, best = cost, (lens, homography)
-        if abs(before - cost) < _RADIAL_STEADY * before:
+        if abs(previous - cost) < _RADIAL_STEADY * previous:
             break
-        ahead = (flat @ homography[2, :2] + homography[2, 2])[:, None]
-        ones = np.column_stack([flat, np.ones(len(flat))]) / ahead
-        by_flat = (homography[:2, :2] - seen[..., None] * homography[2, :2]) / ahead[..., None]
+        depth = (flat @ homography[2, :2] + homography[2, 2])[:, None]
+        ones = np.column_stack([flat, np.ones(len(flat))]) / depth
+        numerator = homography[:2, :2] - predicted[..., None] * homography[2, :2]
+        jacobian_flat = numerator / depth[..., None]
         outward = 2.0 * (lens[0] + 2.0 * lens[1] * powers[:, :1]) * flat
-        by_axis = flat[..., None] * outward[:, None] - np.eye(2) / shrink[..., None]
+        jacobian_axis = flat[..., None] * outward[:, None] - np.eye(2) / divisor[..., None]
         jacobian = np.zeros((len(px), 2, 12))
         jacobian[:, 0, :3] = jacobian[:, 1, 3:6] = ones
-        jacobian[:, :, 6:8] = -seen[..., None] * ones[:, None, :2]
-        jacobian[:, :, 8:10] = by_flat @ flat[..., None] * (-powers / shrink)[:, None]
-        jacobian[:, :, 10:] = by_flat @ by_axis
-        held = np.sqrt(np.mean(rest**2)) / _RADIAL_SIGMAS[:, None] * np.eye(4, 12, 8)
-        system = np.concatenate([jacobian.reshape(-1, 12), held])
-        wanted = np.concatenate([rest.ravel(), -held[:, 8:] @ lens])
-        lens = lens + np.linalg.lstsq(system, wanted)[0][8:]
-    return None if best is None else lambda at: _mapped(best[1], straight(at, best[0])[0])
+        jacobian[:, :, 6:8] = -predicted[..., None] * ones[:, None, :2]
+        jacobian[:, :, 8:10] = jacobian_flat @ flat[..., None] * (-powers / divisor)[:, None]
+        jacobian[:, :, 10:] = jacobian_flat @ jacobian_axis
+        prior = np.sqrt(np.mean(residuals**2)) / _RADIAL_SIGMAS[:, None] * np.eye(4, 12, 8)
+        system = np.concatenate([jacobian.reshape(-1, 12), prior])
+        right_side = np.concatenate([residuals.ravel(), -prior[:, 8:] @ lens])
+        lens = lens + np.linalg.lstsq(system, right_side)[0][8:]
+    return None if best is None else lambda points: _mapped(best[1], undistort(points, best[0])[0])
 
 
 def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:
-    """Maps (..., 2) places by a (3, 3) homography."""
-    ahead = places @ homography[2, :2] + homography[2, 2]
-    return np.asarray((places @ homography[:2, :2].T + homography[:2, 2]) / ahead[..., None])
+    """Maps (..., 2) points by a (3, 3) homography."""
+    depth = places @ homography[2, :2] + homography[2, 2]
+    return np.asarray((places @ homography[:2, :2].T + homography[:2, 2]) / depth[..., None])
 
 
 def _terms(at: FloatArray) -> FloatArray:
-    """(..., 10) powers and products of (..., 2) places, up to the third order."""
+    """(..., 10) monomials of (..., 2) coordinates up to the third order."""
     x, y = at[..., 0], at[..., 1]
     ones, xx, xy, yy = np.ones_like(x), x * x, x * y, y * y
     return np.stack([ones, x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y], axis=-1)
 
 
 def map_of_all(board: FloatArray, places: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """One map from places to the whole board: a homography and a cubic polynomial on top.
+    """One map from image coordinates to the whole board: a homography and a cubic polynomial.
 
     Args:
         board: (n, 2) corners on the board [squares].
-        places: (n, 2) where they are, by any two coordinates of a plane.
+        places: (n, 2) their positions, in any two coordinates of a plane.
 
     Returns:
-        What maps places (..., 2) to the board.
+        Function that maps positions (..., 2) to the board.
 
     Raises:
-        numpy.linalg.LinAlgError: The corners lie as no board's do.
+        numpy.linalg.LinAlgError: The corners do not form a board.
     """
     flattened = _homography(places, board)
     centre, size = board.mean(axis=0), float(np.abs(board - board.mean(axis=0)).max())
@@ -171,13 +175,13 @@ def map_of_all(board: FloatArray, places: FloatArray) -> Callable[[FloatArray], 
     def flat(at: FloatArray) -> FloatArray:
         return np.asarray((flattened(at) - centre) / size)
 
-    off = (board - centre) / size - flat(places)
+    offsets = (board - centre) / size - flat(places)
     terms = _terms(flat(places))
     ridge = len(board) * _RIDGE
-    bends = np.linalg.solve(terms.T @ terms + ridge, terms.T @ off)
+    coefficients = np.linalg.solve(terms.T @ terms + ridge, terms.T @ offsets)
 
     def on_board(at: FloatArray) -> FloatArray:
-        near = flat(at)
-        return np.asarray(centre + size * (near + _terms(near) @ bends))
+        flattened_at = flat(at)
+        return np.asarray(centre + size * (flattened_at + _terms(flattened_at) @ coefficients))
 
     return on_board

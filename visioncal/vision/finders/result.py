@@ -1,4 +1,4 @@
-"""What a finder returns."""
+"""Results of detection."""
 
 from dataclasses import dataclass
 
@@ -7,15 +7,15 @@ from visioncal.core.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class DetectedCorners:
-    """Corners that were found.
+    """Detected corners.
 
     Attributes:
-        ids: (n,) ascending.
+        ids: (n,) corner ids, ascending.
         px: (n, 2) positions [px].
-        weights: (n,) by how much more than usual each is known, as the ratio of standard
-            deviations; None where all are as usual.
-        blur_px: Width of the edges, as a Gaussian's sigma, in the direction in which they are wider
-            [px]; None where it is not measured.
+        weights: (n,) accuracy relative to the usual one, as the ratio of standard deviations; None
+            if all are usual.
+        blur_px: Edge width as a Gaussian's sigma, in the direction of the wider edges [px]; None if
+            not measured.
     """
 
     ids: IntArray
@@ -26,7 +26,7 @@ class DetectedCorners:
 
 @dataclass(frozen=True)
 class NotFound:
-    """Why the target was not found, in words; `misfit` where another layout was seen instead."""
+    """Why the target was not found, in words; `misfit` if another layout was seen instead."""
 
     reason: str
     misfit: bool = False

@@ -1,4 +1,4 @@
-"""Finding tags whose corners are known points."""
+"""Detection of tags whose corners are known points."""
 
 from collections.abc import Mapping
 
@@ -11,30 +11,22 @@ from visioncal.vision.finders.result import DetectedCorners, NotFound
 from visioncal.vision.finders.template import refine_tags
 from visioncal.vision.targets import aruco_dictionary, corner_positions, tag_corners
 
-# So many whole tags in one plane show whether they lie as described.
+# Minimum number of complete tags in one plane for a check of the layout.
 _LEAST_TAGS = 2
 
 
 def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
-    """Finds the corners of a rig's tags.
-
-    Args:
-        image: (h, w) grey image.
-        target: A rig whose points are corners of tags.
-
-    Returns:
-        The corners, or why there are none.
-    """
+    """Corners of a rig's tags in a (h, w) grey image, or why there are none."""
     if min(image.shape) < 2:
         return NotFound("the image is a line")
     dictionary = aruco_dictionary(target.dictionary)
-    found, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
+    found_px, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(image)
     numbers = [] if ids is None else [int(number) for number in ids.ravel()]
-    known = tag_corners(target)
+    corner_ids = tag_corners(target)
     quads = {
         number: np.asarray(px, dtype=float).reshape(4, 2)
-        for number, px in zip(numbers, found, strict=True)
-        if number in known and numbers.count(number) == 1
+        for number, px in zip(numbers, found_px, strict=True)
+        if number in corner_ids and numbers.count(number) == 1
     }
     if not quads:
         seen = f"; seen instead: {', '.join(map(str, numbers[:5]))}" if numbers else ""
@@ -51,7 +43,7 @@ def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
         parts = [refine_tags(image, modules, quad[None]) for quad in quads.values()]
     else:
         parts = [refine_tags(image, modules, np.array(list(quads.values())), places)]
-    points = np.concatenate([known[quad] for quad in quads])
+    points = np.concatenate([corner_ids[quad] for quad in quads])
     fitted = np.array([not reason for part in parts for reason in part.reasons]) & (points >= 0)
     if not fitted.any():
         return NotFound("no corner of the tags seen is like the print")
@@ -62,7 +54,7 @@ def find_tags(image: Image, target: Target) -> DetectedCorners | NotFound:
 
 
 def _in_plane(target: Target, quads: Mapping[int, FloatArray]) -> FloatArray | None:
-    """The (t, 4, 2) places of tags [m] where all are whole, two or more, in the plane z = 0."""
+    """(t, 4, 2) positions of at least two complete tags in the plane z = 0 [m]; else None."""
     known = tag_corners(target)
     numbers = np.array([known[quad] for quad in quads])
     places = corner_positions(target)

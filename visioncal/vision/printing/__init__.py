@@ -1,4 +1,4 @@
-"""Printable boards: a target's dark shapes, laid out on a page and written at their exact size."""
+"""Printable boards: a target's dark shapes on a page, written at exact size."""
 
 from visioncal.vision.printing.files import write_board
 from visioncal.vision.printing.page import Page, Sheet, arrange, pages_named

@@ -1,7 +1,7 @@
-"""Drawing a sheet as PDF, SVG and PNG, every one of them at its exact size.
+"""Drawing of a sheet as PDF, SVG and PNG, each at exact size.
 
-PDF and SVG carry coordinates to a millionth of a point. The dark of a board is one path, filled at
-once: there is no edge between neighbouring cells at which a renderer could leave a seam.
+PDF and SVG have coordinates to a millionth of a point. The dark area of a board is one path with a
+single fill, so that renderers show no seams between neighbouring cells.
 """
 
 import io
@@ -26,7 +26,7 @@ _PT_PER_MM = 72.0 / _MM_PER_INCH
 _FONT = "DejaVu Sans"
 _GREY = "#444444"
 _LINE_PT = 0.5
-# The ruler's line above the quiet zone, its ticks, its label, its arrow [mm].
+# Distance of the ruler's line from the quiet zone; its ticks, label and arrow [mm].
 _BASE_MM, _TICK_MM, _END_TICK_MM, _LABEL_MM = 0.8, 0.8, 2.4, 1.2
 _HEAD_MM, _HALF_HEAD_MM, _TIP_MM, _LETTER_MM = 2.2, 0.6, 4.0, 5.5
 
@@ -37,24 +37,19 @@ def to_pdf(sheet: Sheet) -> bytes:
 
 
 def to_svg(sheet: Sheet) -> bytes:
-    """Draws a sheet as SVG; its text is drawn as shapes, which need no font."""
+    """Draws a sheet as SVG, with text as shapes that need no font."""
     return _saved(sheet, "svg", {"Date": None, "Creator": "visioncal"})
 
 
 def to_png(sheet: Sheet, dpi: float) -> bytes:
-    """Draws a sheet as PNG, whose grey at edges keeps their places to a part of a pixel.
-
-    Args:
-        sheet: The sheet.
-        dpi: Pixels an inch, which the file states too.
-    """
+    """Draws a sheet as PNG, with anti-aliased edges that keep sub-pixel positions."""
     return _saved(sheet, "png", {"Software": "visioncal"}, dpi)
 
 
 def not_in_font(text: str) -> str:
-    """Gives the letters of a text that the sheets' font does not have."""
+    """Characters of a text that the sheets' font does not have."""
     font = get_font(findfont(_FONT))
-    return "".join(name for name in text if not font.get_char_index(ord(name)))
+    return "".join(character for character in text if not font.get_char_index(ord(character)))
 
 
 def _saved(
@@ -69,7 +64,7 @@ def _saved(
 
 @contextmanager
 def _style() -> Iterator[None]:
-    """Settings under which the same sheet gives the same bytes, whatever a user has set."""
+    """Settings that give the same bytes for the same sheet, whatever the user's settings."""
     settings: dict[Any, Any] = {
         "font.family": _FONT,
         "path.simplify": False,
@@ -91,7 +86,7 @@ def _style() -> Iterator[None]:
 def _figure(sheet: Sheet) -> Figure:
     page = sheet.page
     figure = Figure(figsize=(page.width_mm / _MM_PER_INCH, page.height_mm / _MM_PER_INCH))
-    # From mm, y down from the page's top left corner, to inches, y up from its bottom left one.
+    # From mm, y down from the page's top left corner, to inches, y up from the bottom left one.
     inches_from_mm = Affine2D().translate(0.0, -page.height_mm).scale(1.0, -1.0)
     on_page = inches_from_mm.scale(1.0 / _MM_PER_INCH) + figure.dpi_scale_trans
     origin = np.array(sheet.origin_mm)
@@ -108,7 +103,7 @@ def _figure(sheet: Sheet) -> Figure:
             fontsize=FONT_PT,
             color="black" if number == 0 else _GREY,
             va="top",
-            # A name may hold the signs that matplotlib takes for formulas.
+            # A name may contain characters that matplotlib would parse as formulas.
             parse_math=False,
         )
     return figure
@@ -131,25 +126,21 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
     side = 1e3 * (sheet.pattern.box[across] - sheet.pattern.quiet_m) - _BASE_MM
 
     def at(along: float, away: float) -> FloatArray:
-        place = np.array(sheet.origin_mm)
-        place[axis] += along
-        place[across] += side - away
-        return place
+        position = np.array(sheet.origin_mm)
+        position[axis] += along
+        position[across] += side - away
+        return position
 
     half = _LINE_PT / _PT_PER_MM / 2
     tip = length + _TIP_MM
-    # Lines are filled rectangles, so that every renderer puts them where they are.
+    # Lines are filled rectangles, which every renderer positions exactly.
     bars = [_bar(at(-half, -half), at(tip - _HEAD_MM, half))]
     for tick in np.arange(0.0, length + 1.0, 10.0):
         tall = _END_TICK_MM if tick in (0.0, length) else _TICK_MM
         bars.append(_bar(at(tick - half, 0.0), at(tick + half, tall)))
     bars.append(
         np.array(
-            [
-                at(tip, 0.0),
-                at(tip - _HEAD_MM, _HALF_HEAD_MM),
-                at(tip - _HEAD_MM, -_HALF_HEAD_MM),
-            ]
+            [at(tip, 0.0), at(tip - _HEAD_MM, _HALF_HEAD_MM), at(tip - _HEAD_MM, -_HALF_HEAD_MM)]
         )
     )
     _fill(figure, bars, _GREY, on_page)
@@ -157,10 +148,10 @@ def _draw_ruler(figure: Figure, sheet: Sheet, axis: int, on_page: Transform) -> 
     if length > 0.0:
         labels.append((f"{length:g} mm", length / 2, _LABEL_MM + FONT_PT / _PT_PER_MM / 2.6))
     for text, along, away in labels:
-        place = at(along, away)
+        position = at(along, away)
         figure.text(
-            float(place[0]),
-            float(place[1]),
+            float(position[0]),
+            float(position[1]),
             text,
             transform=on_page,
             fontsize=FONT_PT - 1,

@@ -1,4 +1,4 @@
-"""Writing a board's files."""
+"""Writes a board's files."""
 
 from pathlib import Path
 
@@ -12,40 +12,39 @@ from visioncal.vision.printing.page import Sheet
 from visioncal.vision.printing.request import OF_TAGS
 from visioncal.vision.targets import target_document, target_from_document
 
-# Beyond this many pixels a page takes gigabytes to draw.
+# Larger pages take gigabytes of memory to draw.
 _MOST_PIXELS = 2.5e8
 _LEAST_DPI = 50.0
-# Whatever its letters, such a name keeps below the 255 bytes that file systems take.
+# Names of this length stay below the 255 bytes of file systems in any script.
 _LONGEST_NAME = 60
 
 
 def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple[Path, ...]:
     """Writes a board as PDF, SVG, PNG and TOML, named after the target.
 
-    The files appear all at once. A `.toml` that is there and describes the
-    same target stays as it is, with its comments.
+    The files appear all at once. An existing `.toml` that describes the same target is kept, with
+    its comments.
 
     Args:
-        folder: Where to; it is made where there is none.
-        sheet: The arranged board.
-        dpi: Pixels an inch of the PNG.
-        force: Whether files that are there may be replaced.
+        folder: Output folder; created if it does not exist.
+        sheet: Arranged board.
+        dpi: Pixels per inch of the PNG.
+        force: Whether existing files may be replaced.
 
     Returns:
-        The files that were written, the PDF first.
+        The written files, the PDF first.
 
     Raises:
-        DataError: A file is there already, the folder cannot be written, or the PNG would be too
-            large.
+        DataError: A file exists, the folder cannot be written, or the PNG would be too large.
     """
-    # matplotlib takes half a second to import, which help and refusals need not wait for.
+    # matplotlib takes half a second to import, which help and error messages do not need.
     from visioncal.vision.printing.drawing import not_in_font, to_pdf, to_png, to_svg
 
     name = sheet.target.name
     _check_name(name, not_in_font(name))
     _check_dpi(sheet, dpi)
     files = {ending: folder / f"{name}.{ending}" for ending in ("pdf", "svg", "png", "toml")}
-    # The folder may have a name that no file system takes.
+    # The folder's name may be invalid for the file system.
     with named_errors(folder):
         kept = _describes(files["toml"], sheet.target)
         for ending, path in files.items():
@@ -68,7 +67,7 @@ def write_board(folder: Path, sheet: Sheet, *, dpi: float, force: bool) -> tuple
 
 
 def _check_name(name: str, not_in_font: str) -> None:
-    """Refuses what cannot be the name of a file, or be printed on the sheet."""
+    """Checks that a name is valid for files and printable with the sheet's font."""
     wrong = sorted({*not_in_font, *'/\\:*?"<>|'} & set(name))
     if not name.strip() or name.startswith(".") or wrong or len(name) > _LONGEST_NAME:
         raise DataError(
@@ -91,14 +90,14 @@ def _check_dpi(sheet: Sheet, dpi: float) -> None:
 
 
 def _describes(path: Path, target: Target) -> bool:
-    """Whether a file is there and describes this very target."""
+    """Whether a file exists and describes the same target."""
     if not path.is_file():
         return False
     try:
-        there = target_from_document(read_toml(path, path.name), target.name)
+        described = target_from_document(read_toml(path, path.name), target.name)
     except DataError:
         return False
-    return there == target
+    return described == target
 
 
 def _description(sheet: Sheet) -> str:

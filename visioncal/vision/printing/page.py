@@ -1,4 +1,4 @@
-"""Where a board, its rulers and its text go on a page."""
+"""Layout of a board, its rulers and its text on a page."""
 
 import re
 import textwrap
@@ -9,7 +9,7 @@ from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Target
 from visioncal.vision.printing.pattern import Pattern, draw_pattern
 
-# Portrait: width and height [mm] (ISO 216; ANSI Y14.1).
+# Width and height in portrait [mm] (ISO 216; ANSI Y14.1).
 _PAGES_MM = {
     "A5": (148.0, 210.0),
     "A4": (210.0, 297.0),
@@ -24,29 +24,29 @@ _PAGES_MM = {
 _OWN_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*x\s*(\d+(?:\.\d+)?)(?:\s*mm)?", re.IGNORECASE)
 _LEAST_MM, _MOST_MM = 20.0, 3000.0
 
-# Office printers leave this much of the paper's edge white.
+# Margin that office printers leave white.
 EDGE_MM = 5.0
 # Height of the strip that holds a ruler, its ticks and its label.
 RULER_MM = 4.0
 _FULL_RULER_MM, _STEP_MM = 100.0, 10.0
-# What a ruler's axis needs beyond its last tick: the arrow and its letter.
+# Length of a ruler beyond its last tick, for the arrow and its letter.
 ARROW_MM = 8.0
 
 FONT_PT = 7.0
 LINE_MM = 3.1
-# What is measured over whole squares.
+# Kinds that are measured over whole squares.
 _OF_SQUARES = ("charuco", "checkerboard")
-# The text's gap to the white around the board.
+# Gap of the text to the quiet zone.
 _GAP_MM = 0.5
-# Width of a line over its number of letters, with some room to spare.
+# Width per letter of a line, rounded up.
 _LETTER_MM = 1.3
-# Text beside a narrow board may be this wide.
+# Width of text below a narrow board.
 _TEXT_MM = 170.0
 
 
 @dataclass(frozen=True)
 class Page:
-    """A sheet of paper: its name for messages, its width and height [mm]."""
+    """A sheet of paper: its name for messages, and its width and height [mm]."""
 
     name: str
     width_mm: float
@@ -58,16 +58,16 @@ class Page:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A page with everything that is printed on it, in mm from its top left corner, y down.
+    """A page with its printed content, in mm from its top left corner, y down.
 
     Attributes:
         target: The target.
-        pattern: Its shapes.
+        pattern: Its dark shapes.
         page: The paper.
-        origin_mm: Where the origin of the target's frame is.
-        ruler_mm: Lengths of the rulers along x and y; they start level with the origin.
-        lines: The text below the board.
-        text_mm: The text's top left corner.
+        origin_mm: Origin of the target's frame.
+        ruler_mm: Lengths of the rulers along x and y; they start at the origin's coordinates.
+        lines: Lines of text below the board.
+        text_mm: Top left corner of the text.
     """
 
     target: Target
@@ -81,7 +81,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class _Room:
-    """What a board needs: white on its left, top and right, and all of it [mm]."""
+    """Space that a board needs: margins on its left, top and right, and in total [mm]."""
 
     left: float
     top: float
@@ -91,12 +91,12 @@ class _Room:
 
 
 def pages_named(text: str, landscape: bool | None) -> tuple[Page, ...]:
-    """Reads the name or the size of a page.
+    """Pages by name or size.
 
     Args:
-        text: A name, as `A4`, or a size, as `500x300` (width x height, mm).
-        landscape: Turn the page on its long side; on its short side where False. None leaves a
-            named page open, and takes a size as it is given.
+        text: A name, such as `A4`, or a size, such as `500x300` (width x height, mm).
+        landscape: True for landscape, False for portrait. None allows both for a named page, and
+            keeps a size as given.
 
     Returns:
         The pages that the text allows, landscape first.
@@ -105,9 +105,9 @@ def pages_named(text: str, landscape: bool | None) -> tuple[Page, ...]:
         DataError: There is no such page, or its size is out of range.
     """
     names = {name.lower(): name for name in _PAGES_MM}
-    own = _OWN_SIZE.fullmatch(text.strip())
-    if own is not None:
-        sides, name = (float(own[1]), float(own[2])), "page"
+    custom = _OWN_SIZE.fullmatch(text.strip())
+    if custom is not None:
+        sides, name = (float(custom[1]), float(custom[2])), "page"
     elif text.strip().lower() in names:
         name = names[text.strip().lower()]
         sides = _PAGES_MM[name]
@@ -125,19 +125,19 @@ def pages_named(text: str, landscape: bool | None) -> tuple[Page, ...]:
             culprits=[text],
         )
     long, short = max(sides), min(sides)
-    if landscape is None and own is not None:
+    if landscape is None and custom is not None:
         return (Page(name, *sides),)
-    lying, standing = Page(name, long, short), Page(name, short, long)
+    wide, tall = Page(name, long, short), Page(name, short, long)
     if landscape is None:
-        return lying, standing
-    return (lying,) if landscape else (standing,)
+        return wide, tall
+    return (wide,) if landscape else (tall,)
 
 
 def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
-    """Arranges a target on the first of the pages that has room for it.
+    """Arranges a target on the first page with enough room.
 
     Raises:
-        DataError: None has; the message says what is needed, and what would fit.
+        DataError: No page has enough room.
     """
     pattern = draw_pattern(target)
     for page in pages:
@@ -147,9 +147,9 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
     left, top, right, bottom = pattern.box
     needed = _room(target, pattern, pages[0])
     sides = {"charuco": "square", "checkerboard": "square", "circles": "distance"}
-    what = sides.get(target.kind, "side")
+    side_name = sides.get(target.kind, "side")
     largest = largest_side_mm(target, pages)
-    smaller = f", or a {what} of {largest} mm, the largest that fits" if largest else ""
+    smaller = f", or a {side_name} of {largest} mm, the largest that fits" if largest else ""
     raise DataError(
         f"{target.name} does not fit on {', '.join(map(str, pages))}: the print measures "
         f"{1e3 * (right - left):g} x {1e3 * (bottom - top):g} mm, and with the white around it, "
@@ -160,14 +160,9 @@ def arrange(target: Target, pages: tuple[Page, ...]) -> Sheet:
 
 
 def largest_side_mm(target: Target, pages: tuple[Page, ...]) -> int:
-    """Finds the largest square that fits, in whole millimetres; the marker's side for a marker.
+    """Largest square side that fits one of the pages [mm], whole; 0 if none does.
 
-    Args:
-        target: The target; its markers grow with its squares.
-        pages: The pages that it may be printed on.
-
-    Returns:
-        The side [mm]; 0 where not even one millimetre fits.
+    For a marker it is the marker's own side; markers scale with squares.
     """
     fits, fails = 0, 1 + int(max(max(page.width_mm, page.height_mm) for page in pages))
     while fails - fits > 1:
@@ -202,24 +197,24 @@ def _room(target: Target, pattern: Pattern, page: Page) -> _Room:
 
 
 def _centred(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet:
-    """Centres the print between the edges of a page that has room for it."""
+    """Centres the print on a page with enough room."""
     left, top, right, bottom = (1e3 * side for side in pattern.box)
     width, height = right - left, bottom - top
     x = min(max((page.width_mm - width) / 2, room.left), page.width_mm - width - room.right)
     y = (page.height_mm - room.height) / 2 + room.top
     text_width = _text_width_mm(width, page)
     lines = _lines(target, text_width)
-    across = _ruler_mm(page.width_mm - (x - left))
-    down = _ruler_mm(page.height_mm - LINE_MM * len(lines) - (y - top))
-    # The text stays clear of the board and of a ruler that is longer than the board.
+    ruler_x = _ruler_mm(page.width_mm - (x - left))
+    ruler_y = _ruler_mm(page.height_mm - LINE_MM * len(lines) - (y - top))
+    # The text stays below the board, and below a ruler that is longer than the board.
     below_board = y + height + 1e3 * pattern.quiet_m + _GAP_MM
-    below_ruler = y - top + down + ARROW_MM
+    below_ruler = y - top + ruler_y + ARROW_MM
     return Sheet(
         target,
         pattern,
         page,
         origin_mm=(x - left, y - top),
-        ruler_mm=(across, down),
+        ruler_mm=(ruler_x, ruler_y),
         lines=lines,
         text_mm=(
             max(EDGE_MM, min(x, x + width / 2 - text_width / 2)),
@@ -229,7 +224,7 @@ def _centred(target: Target, pattern: Pattern, page: Page, room: _Room) -> Sheet
 
 
 def _ruler_mm(room_mm: float) -> float:
-    """Length of a ruler that starts this far from the paper's edge."""
+    """Length of a ruler that starts at this distance from the paper's edge."""
     whole = _STEP_MM * ((room_mm - EDGE_MM - ARROW_MM) // _STEP_MM)
     return min(max(whole, 0.0), _FULL_RULER_MM)
 
@@ -246,29 +241,29 @@ def _lines(target: Target, width_mm: float) -> tuple[str, ...]:
 
 
 def _sentences(target: Target) -> tuple[str, str, str]:
-    """What the board is, where its frame is, and what to do with it."""
+    """Description of the board, its frame, and instructions to print and measure it."""
     side_mm = f"{1e3 * target.square_m:g} mm"
     printed = "Print at 100 %, not fitted to the page, and check both rulers."
     match target.kind:
         case "marker":
-            what = f"marker {target.marker_id} of {target.dictionary}, {side_mm} a side"
+            description = f"marker {target.marker_id} of {target.dictionary}, {side_mm} a side"
             origin = "the marker's centre"
             measure = "Measure the dark square's side and write it into size_m, in metres."
         case "checkerboard":
-            what = (
+            description = (
                 f"checkerboard, {target.columns} x {target.rows} inner corners, squares of "
                 f"{side_mm}"
             )
             origin = "the inner corner at the top left"
         case "charuco":
             layout = "legacy layout" if target.legacy else "layout of OpenCV 4.6 and later"
-            what = (
+            description = (
                 f"ChArUco, {target.columns} x {target.rows} squares of {side_mm}, markers of "
                 f"{1e3 * target.marker_m:g} mm, {target.dictionary}, {layout}"
             )
             origin = "the print's top left corner"
         case "aprilgrid":
-            what = (
+            description = (
                 f"AprilGrid, {target.columns} x {target.rows} tags of {side_mm}, "
                 f"{1e3 * target.spacing * target.square_m:g} mm apart, {target.dictionary} from id "
                 f"{target.marker_id} at the lower left"
@@ -281,11 +276,11 @@ def _sentences(target: Target) -> tuple[str, str, str]:
                 "into size_m, in metres."
             )
         case "points":
-            what = f"{len(target.point_tags) // 4} tags of {target.dictionary}"
+            description = f"{len(target.point_tags) // 4} tags of {target.dictionary}"
             origin = "the origin of the table of their corners"
             measure = "Measure the tags' corners and write them into that table, in metres."
         case "circles":
-            what = (
+            description = (
                 f"{'asymmetric' if target.asymmetric else 'symmetric'} grid of {target.columns} x "
                 f"{target.rows} circles of {1e3 * target.diameter_m:g} mm, rows {side_mm} apart"
             )
@@ -305,4 +300,4 @@ def _sentences(target: Target) -> tuple[str, str, str]:
         f"Frame: origin at {origin}, level with the zeros of both rulers; x to the right, y down, "
         "z into the page."
     )
-    return f"{target.name}: {what}", frame, f"{printed} {measure}"
+    return f"{target.name}: {description}", frame, f"{printed} {measure}"

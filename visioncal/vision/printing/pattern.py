@@ -1,4 +1,4 @@
-"""The dark shapes of a target, in its own frame."""
+"""Dark shapes of a target, in its own frame."""
 
 from dataclasses import dataclass
 
@@ -8,23 +8,23 @@ from visioncal.core.types import FloatArray, Mask, Target
 from visioncal.vision.prints import dark_cells, dark_discs
 from visioncal.vision.targets import extent_m
 
-# White that finders need around squares; markers need one of their own modules.
+# Quiet zone that detectors need around squares; markers need one module.
 _QUIET_M = 0.0025
-# A circle: the middles of its sides are within a two-thousandth of its radius.
+# A polygon whose sides deviate from the circle by less than 0.05 % of the radius.
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """What is printed of a target.
+    """Printed shapes of a target.
 
     Attributes:
-        loops: Closed outlines, (n, 2) each, in the target's frame [m]; the last point joins the
-            first. Dark is what they wind around once; a hole's outline runs the other way. No two
-            of them share more than a point, so that no renderer can leave a seam.
+        loops: Closed outlines, (n, 2) each, in the target's frame [m]; the last point connects to
+            the first. Dark is the area with winding number one; a hole's outline has the opposite
+            direction. Two outlines share at most a point, so that renderers show no seams.
         box: Left, top, right and bottom of the print in the target's frame [m].
-        quiet_m: White that has to stay around the print [m].
+        quiet_m: Width of the quiet zone around the print [m].
     """
 
     loops: tuple[FloatArray, ...]
@@ -33,10 +33,10 @@ class Pattern:
 
 
 def draw_pattern(target: Target) -> Pattern:
-    """Draws a target: its corners are where `targets.corner_positions` has them.
+    """Shapes of a target; its corners are those of `targets.corner_positions`.
 
     Raises:
-        DataError: It is a rig of points.
+        DataError: The target is a rig of points that cannot be printed.
     """
     (left, top), (right, bottom) = (array.tolist() for array in extent_m(target))
     grids = dark_cells(target)
@@ -55,13 +55,13 @@ def outlines(dark: Mask) -> tuple[FloatArray, ...]:
     """Traces the borders of the dark cells of a grid.
 
     Every dark cell has four directed sides, with the cell on their right as seen on the page. Sides
-    between two dark cells cancel; what is left joins to loops.
+    between two dark cells cancel; the others are joined to loops.
 
     Args:
-        dark: (rows, columns) cells.
+        dark: (rows, columns) mask of dark cells.
 
     Returns:
-        (n, 2) loops of the corners (x, y), in cells; (0, 0) is the outer corner of the first cell.
+        (n, 2) loops of corners (x, y), in cells; (0, 0) is the outer corner of the first cell.
     """
     sides: set[tuple[tuple[int, int], tuple[int, int]]] = set()
     for y, x in np.argwhere(dark).tolist():
@@ -71,27 +71,27 @@ def outlines(dark: Mask) -> tuple[FloatArray, ...]:
                 sides.remove((end, start))
             else:
                 sides.add((start, end))
-    onward: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    successors: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for start, end in sorted(sides):
-        onward.setdefault(start, []).append(end)
+        successors.setdefault(start, []).append(end)
     loops = []
-    while onward:
-        at = first = next(iter(onward))
+    while successors:
+        point = first = next(iter(successors))
         loop: list[tuple[int, int]] = []
-        while not loop or at != first:
-            loop.append(at)
-            # Where two cells touch in a point, either way closes a loop of the same windings.
-            ends = onward[at]
-            following = ends.pop()
+        while not loop or point != first:
+            loop.append(point)
+            # Where two cells touch in a point, both continuations give the same winding numbers.
+            ends = successors[point]
+            successor = ends.pop()
             if not ends:
-                del onward[at]
-            at = following
+                del successors[point]
+            point = successor
         loops.append(_without_straight(np.array(loop, dtype=float)))
     return tuple(loops)
 
 
 def _without_straight(loop: FloatArray) -> FloatArray:
-    """Drops the points of a loop at which it does not turn."""
+    """Drops the points of a loop where its direction does not change."""
     before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
     turns = before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]
     return np.asarray(loop[turns])

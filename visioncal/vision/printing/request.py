@@ -1,4 +1,4 @@
-"""From a few requirements to a target: sizes that are left open become the largest that fit."""
+"""Targets from partial requirements: sizes left open become the largest that fit."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,40 +14,40 @@ from visioncal.vision.targets import (
     target_from_document,
 )
 
-# A marker's share of its square: it leaves at least one module of white on every side.
+# Marker side over square side: at least one module of white on every side.
 _MARKER_SHARE = 0.75
-# Kalibr's pages have so much white between their tags, as a share of a tag's side.
+# Gap between tags as a share of a tag's side, as on Kalibr's pages.
 _SPACING = 0.3
-# The diameter of circles as a share of the distance of neighbours: as much edge as white between.
+# Diameter of circles over the spacing of neighbours: as much dark as white between them.
 _DIAMETER_SHARE = 0.5
 # Kinds whose size is that of a tag.
 OF_TAGS = ("marker", "aprilgrid")
-# Smaller squares are lost to the printer's dots.
+# Smaller squares are limited by the printer's resolution.
 _LEAST_MM = 5
-# Nobody measures a smaller one to its 0.1 %.
+# Smallest side that can be measured to 0.1 %.
 _SMALLEST_MM = 0.1
 _USUAL = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
 
 
 @dataclass(frozen=True)
 class BoardRequest:
-    """A board that somebody wants; None and empty texts are chosen.
+    """Requirements of a board; None and empty texts are chosen automatically.
 
     Attributes:
-        kind: What is printed.
-        columns: Squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles
-            along x.
-        rows: The same along y.
-        square_mm: Side of a square; of the marker itself for a single marker and an AprilGrid [mm].
+        kind: Kind of target.
+        columns: Number of squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or
+            circles along x.
+        rows: Likewise along y.
+        square_mm: Side of a square, or of the marker for a single marker and an AprilGrid [mm].
         marker_mm: Side of the markers in a ChArUco board [mm].
         dictionary: ArUco dictionary by OpenCV's name.
-        legacy: Whether a ChArUco board gets the layout that OpenCV printed before 4.6.
-        marker_id: The id of a single marker; the least one of an AprilGrid.
-        name: The target's name.
-        spacing: White between the tags of an AprilGrid, as a share of their side.
-        border: Dark modules around their bits.
+        legacy: Whether a ChArUco board has OpenCV's layout before 4.6.
+        marker_id: Id of a single marker; the smallest one of an AprilGrid.
+        name: Name of the target.
+        spacing: Gap between the tags of an AprilGrid, as a share of their side.
+        border: Number of dark modules around their bits.
         diameter_mm: Diameter of circles [mm].
-        asymmetric: Whether every second row of them is shifted.
+        asymmetric: Whether every second row of circles is shifted.
     """
 
     kind: TargetKind
@@ -66,14 +66,14 @@ class BoardRequest:
 
 
 def side_metres(option: str, side_mm: float) -> float:
-    """Turns a side given in millimetres into metres.
+    """Converts a side from millimetres to metres.
 
     Args:
-        option: By which option it was given, for messages.
+        option: Name of its option, for messages.
         side_mm: Side of a square or of a marker [mm].
 
     Raises:
-        DataError: It is no number, or none that a board could have.
+        DataError: It is out of range.
     """
     most_mm = 1e3 * LARGEST_M
     if not _SMALLEST_MM <= side_mm <= most_mm:
@@ -85,22 +85,22 @@ def side_metres(option: str, side_mm: float) -> float:
 
 
 def requested_target(request: BoardRequest, pages: tuple[Page, ...]) -> Target:
-    """Builds the target that is wished for.
+    """Builds the requested target.
 
     Args:
-        request: The sizes. A side left out becomes the largest in whole millimetres that fits one
-            of the pages, a marker's side three quarters of its square's, in whole millimetres.
-        pages: The pages that it may be printed on.
+        request: Requirements. An open side becomes the largest in whole millimetres that fits one
+            of the pages; an open marker side three quarters of its square's, in whole millimetres.
+        pages: Pages that it may be printed on.
 
     Raises:
-        DataError: A wish is missing or cannot be met.
+        DataError: A requirement is missing or cannot be met.
     """
     if request.square_mm is not None:
         return _target(request, request.square_mm)
     smallest = _target(request, _LEAST_MM)
     largest = largest_side_mm(smallest, pages)
     if largest < _LEAST_MM:
-        # Says what would be needed.
+        # Raises an error with the required size.
         arrange(smallest, pages)
     return _target(request, largest)
 
@@ -131,13 +131,12 @@ def _target(request: BoardRequest, square_mm: float) -> Target:
     if request.kind == "charuco":
         marker_mm = request.marker_mm
         if marker_mm is None:
-            # Under ten millimetres a whole number would be too far from the share; a nanometre
-            # is as good as any number.
+            # Below ten millimetres whole numbers are too coarse; rounded to a nanometre.
             marker_mm = round(_MARKER_SHARE * square_mm, 6)
             marker_mm = float(int(marker_mm)) if square_mm >= 2 * _LEAST_MM else marker_mm
         document |= {
             "marker_m": side_metres("--marker-mm", marker_mm),
-            "dictionary": request.dictionary or _enough(request),
+            "dictionary": request.dictionary or _sufficient_dictionary(request),
             "legacy": request.legacy,
         }
     label = request.name or request.kind
@@ -145,8 +144,8 @@ def _target(request: BoardRequest, square_mm: float) -> Target:
     return target if request.name else target_from_document(document, _name(target))
 
 
-def _enough(request: BoardRequest) -> str:
-    """The first of the usual dictionaries that has enough markers."""
+def _sufficient_dictionary(request: BoardRequest) -> str:
+    """The first of the usual dictionaries with enough markers."""
     needed = (request.columns or 0) * (request.rows or 0) // 2
     for name in _USUAL:
         if len(aruco_dictionary(name).bytesList) >= needed:
