@@ -186,15 +186,15 @@ def spoken(foreign: Foreign) -> Foreign:
     notes: list[str] = []
     foreign = _images_or_poses(foreign, notes)
     points = foreign.columns.get("point", ())
-    observed = np.zeros(len(foreign.robot), dtype=bool)
+    saw = np.zeros(len(foreign.robot), dtype=bool)
     for cells in (foreign.images, foreign.corners, points):
-        observed |= np.array([bool(cell) for cell in cells] or [False])
+        saw |= np.array([bool(cell) for cell in cells] or [False])
     if foreign.camera is not None:
-        observed |= foreign.camera.there
-    dropped = [foreign.robot.places[index] for index in np.flatnonzero(~observed)]
-    if len(dropped) == len(observed):
+        saw |= foreign.camera.there
+    dropped = [foreign.robot.places[index] for index in np.flatnonzero(~saw)]
+    if len(dropped) == len(saw):
         raise DataError(
-            f"{foreign.name} has {len(observed)} poses of the robot, but neither images nor poses of "
+            f"{foreign.name} has {len(saw)} poses of the robot, but neither images nor poses of "
             "the target: nothing says what a camera saw.",
             culprits=[foreign.robot.places[0]],
             next_step="Name the images with --images, or the target's poses with --camera-columns "
@@ -202,10 +202,10 @@ def spoken(foreign: Foreign) -> Foreign:
         )
     if dropped:
         notes.append(
-            f"{len(dropped)} of {len(observed)} rows are left out, as they have neither an image nor a "
+            f"{len(dropped)} of {len(saw)} rows are left out, as they have neither an image nor a "
             f"pose of the target: {some_of(dropped)}."
         )
-    return replace(rows_of(foreign, np.flatnonzero(observed)), notes=(*foreign.notes, *notes))
+    return replace(rows_of(foreign, np.flatnonzero(saw)), notes=(*foreign.notes, *notes))
 
 
 def _images_or_poses(foreign: Foreign, notes: list[str]) -> Foreign:

@@ -357,20 +357,20 @@ def _by_time(
     robot_s, robot_poses, robot_rows = _with_pose(*robot)
     camera_s, camera_poses, camera_rows = _with_pose(*camera)
     paired = pair_streams(robot_s, robot_poses, camera_s, camera_poses)
-    camera_numbers = camera[1].rows(camera_rows)
-    sampled = camera_numbers.rows(paired.rows)
+    seen = camera[1].rows(camera_rows)
+    sampled = seen.rows(paired.rows)
     return Foreign(
         name=name,
         robot=PoseNumbers.written(paired.base_from_flange, robot[1].reading, sampled.places),
         camera=sampled,
         stamps_s=camera_s[paired.rows],
-        sweep=ForeignSweep(robot_s, robot[1].rows(robot_rows), camera_s, camera_numbers),
+        sweep=ForeignSweep(robot_s, robot[1].rows(robot_rows), camera_s, seen),
         notes=(
             *notes,
             f"The camera's clock is about {1e3 * paired.match.offset_s:+.0f} ms ahead of the "
             "robot's, as both turn alike there with a correlation of "
             f"{paired.match.correlation:.2f}; calibrate estimates it finer.",
-            f"All {len(camera_numbers)} samples of the camera are kept as views, and the robot's as a stream "
+            f"All {len(seen)} samples of the camera are kept as views, and the robot's as a stream "
             "beside them: calibrate takes the robot's poses from there.",
         ),
     )
