@@ -11,7 +11,7 @@ from visioncal.cli.options import NeedOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.interchange.outputs import RECORDING, REPORT
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.batch import Batch
 
@@ -66,8 +66,8 @@ def batch_command(
     """Calibrate many sessions at once, and report which stand out of their fleet.
 
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
-    them, those first that stand out among robots of the same model. What is done already is kept:
-    started again, it goes on where it was. Exit status 0: there are results; 2: of no session.
+    them, outliers among robots of the same model first. Existing results are kept: started again,
+    an interrupted batch continues. Exit status 0: there are results; 2: of no session.
     """
     from visioncal.interchange.batch import batch
 

@@ -83,7 +83,7 @@ def calibrate_command(
     solved together, in one frame; other commands take one of each out of that result (--camera,
     --robot, --target).
     """
-    # What help and a mistyped option need not wait for.
+    # Imported late, so that --help stays fast.
 
     from visioncal.calibration.pipeline import run, run_dense
     from visioncal.calibration.pipeline.running import Asked
@@ -94,7 +94,7 @@ def calibrate_command(
     from visioncal.interchange.merge_results import leftover
     from visioncal.interchange.outputs import RECORDING, write_outputs
 
-    # Of several sessions, the recording is the session of them all.
+    # Of several sessions, the recording is that of the joined session.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
     with naming(session, out):
         loaded = _joined([need.session(session) for session in sessions], shared=robot_shared)

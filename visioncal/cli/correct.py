@@ -13,7 +13,7 @@ from visioncal.core.choices import WIDEST_RAD
 
 @dataclass(frozen=True)
 class CorrectOptions:
-    """Which targets are corrected, what they are of, and what the arm carries through them."""
+    """Options of the targets, their frame, and the arm's payload and temperature."""
 
     targets: Annotated[
         Path,
@@ -86,7 +86,7 @@ def correct_command(asked: CorrectOptions) -> None:
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.corrected import correct_table
 
     correct_table(asked)

@@ -1,4 +1,4 @@
-"""The targets of `visioncal correct`: read, corrected, written and reported."""
+"""Reads, corrects, writes and reports the targets of `visioncal correct`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -35,14 +35,14 @@ from visioncal.session.columns import no_celsius
 
 _SHOWN = 10
 _MOST_DEG = 720.0
-# Elsewhere a millimetre turns no joint by more than some tenths of a degree; beyond the second, how
-# far it is matters no more.
+# Away from singularities a millimetre turns joints by some tenths of a degree at most; beyond the
+# second limit the exact value does not matter.
 _SINGULAR_DEG, _MOST_TURN_DEG = 5.0, 90.0
 _TOOLS = "flange_from_"
 
 
 def correct_table(asked: CorrectOptions) -> None:
-    """Corrects a table of targets, and writes and prints what comes of it.
+    """Corrects a table of targets, and writes and prints the result.
 
     Raises:
         DataError: Something cannot be read or written, or targets are out of reach.
@@ -92,7 +92,7 @@ def correct_table(asked: CorrectOptions) -> None:
 
 
 def _warm(calibration: Calibration, words: str | None) -> Calibration:
-    """The calibration of the arm as warm as is stated."""
+    """The calibration at the stated temperatures."""
     if words is None:
         return calibration
     count = calibration.drift.joint_count
@@ -119,7 +119,7 @@ def _loads(count: int, payload_kg: float, payload_m: str) -> Loads:
 
 
 def _rigid(arm: CalibratedArm, payload_kg: float) -> Iterator[str]:
-    """Says where a payload changes nothing."""
+    """Warns where a payload has no effect."""
     if payload_kg and not arm.compliance.any():
         yield (
             f"--payload-kg {payload_kg:g} changes nothing: the calibration has no joints that bend "
@@ -128,7 +128,7 @@ def _rigid(arm: CalibratedArm, payload_kg: float) -> Iterator[str]:
 
 
 def _tool(calibration: Calibration, name: str | None) -> FloatArray:
-    """(4, 4) `flange_from_tool`; the identity where the targets are of the flange."""
+    """(4, 4) `flange_from_tool` [m]; the identity where the targets are of the flange."""
     if name is None:
         return np.eye(4)
     placed = calibration.placed
@@ -145,7 +145,7 @@ def _tool(calibration: Calibration, name: str | None) -> FloatArray:
 
 
 def _seeds(own: FloatArray, words: str | None) -> FloatArray:
-    """The rows' seeds (m, n), that of the option in the first where it has none."""
+    """Seeds of the rows (m, n); the first takes that of the option where it has none."""
     if words is None:
         return own
     form = ",".join(f"q{index}" for index in range(1, own.shape[1] + 1))
@@ -157,7 +157,7 @@ def _seeds(own: FloatArray, words: str | None) -> FloatArray:
 
 
 def _unreachable(targets: Targets, corrected: Corrected) -> Iterator[tuple[str, str]]:
-    """The rows that are not reached: where they stand, and why not."""
+    """Rows that cannot be reached, with the reason."""
     for row in np.flatnonzero(~corrected.reached):
         off_mm, off_deg = 1e3 * corrected.off_m[row], np.rad2deg(corrected.off_rad[row])
         near = f"the nearest posture leaves {mm_and_deg(off_mm, off_deg)}"
@@ -192,7 +192,7 @@ def _doubts(calibration: Calibration) -> Iterator[str]:
 def _turns(
     arm: CalibratedArm, targets: Targets, corrected: Corrected, widest_deg: float
 ) -> Iterator[str]:
-    """Says where the arm had to turn far, and may have taken another branch."""
+    """Warns where joints turned far from the seed, possibly onto another branch."""
     turned = np.rad2deg(corrected.turned_rad)
     wide = np.flatnonzero(corrected.reached & (turned.max(axis=1) > widest_deg))
     for row in wide[:_SHOWN]:
@@ -207,7 +207,7 @@ def _turns(
 
 
 def _singular(arm: CalibratedArm, targets: Targets, q: FloatArray, rows: IntArray) -> Iterator[str]:
-    """Says where a correction of a millimetre turns a joint far, and so does the way there."""
+    """Warns near singularities, where a correction of a millimetre turns a joint far."""
     turns = arm.turns_deg_per_mm(q[rows])
     near = np.flatnonzero(turns.max(axis=1) > _SINGULAR_DEG)
     if not len(near):
@@ -224,7 +224,7 @@ def _singular(arm: CalibratedArm, targets: Targets, q: FloatArray, rows: IntArra
 
 
 def _posture(arm: CalibratedArm, q: FloatArray) -> str:
-    """Says in which posture targets without a seed begin."""
+    """States the initial posture of targets without seeds."""
     turning = ~arm.real.chain.prismatic
     words = [
         f"{np.rad2deg(value):.0f}" if turns else f"{1e3 * value:.0f} mm"
@@ -253,7 +253,7 @@ def _report(
     )
     if "sigma_mm" in columns:
         words += f"; predicted sigma {figure(float(np.median(columns['sigma_mm'][rows])))} mm"
-    # Where the table itself is not on stdout, this is the answer.
+    # Where stdout has no table, this is the command's answer.
     (answers() if is_answer else console).print(escape(words))
     for place, why in lost[:_SHOWN]:
         console.print(f"[bold yellow]left out:[/] {escape(f'{place}: {why}')}")

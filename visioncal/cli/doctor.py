@@ -10,11 +10,11 @@ from visioncal.cli.console import answers, naming, print_json
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline.checkup import Checkup
 
-# Something is wrong.
+# Exit status where something is wrong.
 _EXIT_FINDINGS = 3
 
 
@@ -24,9 +24,9 @@ def doctor_command(
 ) -> None:
     """Say what is wrong with a session before it is calibrated, and what to type.
 
-    Files, pairing, units, conventions of the poses, the board, blur, coverage, motion, clocks: in
-    seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2: it cannot be
-    read.
+    Checks files, pairing, units, conventions of the poses, the board, blur, coverage, motion and
+    clocks, in seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2:
+    it cannot be read.
     """
     from visioncal.calibration.pipeline.checkup import doctor, to_document
 

@@ -15,7 +15,7 @@ FRICTION = ("coulomb", "viscous", "offset")
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """What is identified, and what is written of it."""
+    """What is identified, and where it is written."""
 
     session: MotionsArgument
     streams: StreamOptions
@@ -59,7 +59,7 @@ def dynamics_identify_command(asked: IdentifyOptions) -> None:
 
     Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.identified import identify_into
 
     identify_into(asked)

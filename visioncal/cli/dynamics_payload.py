@@ -12,7 +12,7 @@ from visioncal.core.choices import GAIN_SIGMA
 
 @dataclass(frozen=True)
 class PayloadOptions:
-    """What the arm did with the payload, and what is known of it without."""
+    """Session with the payload, and the dynamics identified without it."""
 
     session: MotionsArgument
     streams: StreamOptions
@@ -34,7 +34,7 @@ def dynamics_payload_command(asked: PayloadOptions) -> None:
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.weighed import print_payload
 
     print_payload(asked)

@@ -18,7 +18,7 @@ _missing = partial(typer.Option, rich_help_panel="What its description lacks")
 
 @dataclass(frozen=True)
 class ExcitationOptions:
-    """The motion."""
+    """Options of the motion."""
 
     duration: Annotated[float, _motion(help="How long the exciting motion lasts, in s.")] = 20.0
     harmonics: Annotated[int, _motion(help="Harmonics of that period.")] = 5
@@ -47,7 +47,7 @@ class ExcitationOptions:
 
 @dataclass(frozen=True)
 class ArmOptions:
-    """What the arm may do, carries and lacks."""
+    """Limits, payload and fixed joints of the arm."""
 
     speed: Annotated[float, _limits(help="Share of the greatest speeds.")] = 0.9
     acceleration: Annotated[float, _limits(help="Share of the greatest accelerations.")] = 0.9
@@ -90,7 +90,7 @@ def dynamics_plan_command(
     Writes an exciting motion and sweeps as tables (.csv), programs for a UR (.script), plan.json
     and plan.rrd to look at. Nothing is sent to a robot. Exit status 2: the limits allow none.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.planned_motions import plan_motions
 
     plan_motions(robot, motion, kept, able, out, as_json=as_json)

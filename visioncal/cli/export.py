@@ -12,7 +12,7 @@ from visioncal.core.choices import EXPORT_NAMES, Convention
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, read_text, write_atomically
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.exports import Load
 

@@ -10,7 +10,7 @@ from visioncal.cli.options import AsJson, PartOptions
 from visioncal.core.choices import UNITS_M
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.frames.measured import Tool
     from visioncal.results import Calibration, Frame
@@ -74,7 +74,7 @@ def fixture_command(
 
 
 def _tool(said: str | None, calibration: "Calibration | None", robot: str | None) -> "Tool | None":
-    """Finds the tool that the points were touched with."""
+    """Finds the tool that touched the points."""
     from visioncal.frames.measured import NO_TOOL, Tool
     from visioncal.interchange.result_files import load_placed
 

@@ -1,4 +1,4 @@
-"""What `tcp` and `fixture` share: options, touches or images, where the frame goes, its report."""
+"""Placing of frames by `tcp` and `fixture`: options, touches or images, destination, report."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.interchange.outputs import RECORDING, Written
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.frames.drawing_points import NominalPoints
     from visioncal.results import Calibration, Frame
@@ -38,7 +38,7 @@ PointOption: TypeAlias = Annotated[
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Where a frame goes, and under which name."""
+    """Destination and name of a frame."""
 
     calibration: Annotated[
         Path | None,
@@ -62,7 +62,7 @@ class FrameOptions:
 
 @dataclass(frozen=True)
 class TouchOptions(RobotPoseOptions):
-    """How touches are written, and how well they repeat."""
+    """Convention and repeatability of touches."""
 
     touch_noise: Annotated[
         float | None,
@@ -71,7 +71,7 @@ class TouchOptions(RobotPoseOptions):
 
     @property
     def noise_m(self) -> float | None:
-        """How well a touch repeats [m].
+        """Repeatability of a touch [m].
 
         Raises:
             DataError: It is no length from 0 to 1000 mm.
@@ -87,7 +87,7 @@ class TouchOptions(RobotPoseOptions):
         return 1e-3 * noise_mm
 
     def given(self) -> dict[str, object]:
-        """By their names; None for those that were not given."""
+        """The options by their names; None for those that were not given."""
         own = [var for var in vars(self) if var not in ("joint_unit", "touch_noise")]
         named = {f"--{name.replace('_', '-')}": getattr(self, name) for name in own}
         return {**named, "--touch-noise-mm": self.touch_noise}
@@ -95,14 +95,14 @@ class TouchOptions(RobotPoseOptions):
 
 @dataclass(frozen=True)
 class FrameLocation:
-    """Where a frame goes.
+    """Destination of a frame.
 
     Attributes:
         name: The transform's name.
-        calibration: What is known of the camera and the robot; None for nothing.
-        result: The result that it was taken out of, of a whole cell or itself.
+        calibration: The result of the camera and robot in question; None where none is named.
+        result: The result from which it was extracted, of a cell or itself.
         folder: The output folder that the frame joins; None where it does not.
-        file: The file of frames that it goes into; None likewise.
+        file: The file of frames that it joins; None where it does not.
     """
 
     name: str
@@ -120,18 +120,18 @@ class FrameLocation:
         needs: "Sequence[Part]",
         touched_by: str | None = None,
     ) -> "FrameLocation":
-        """Finds out what is known and where the frame will go, before anything is computed.
+        """Resolves the calibration and the frame's destination, before anything is computed.
 
         Args:
-            options: What the user says of it.
-            kind: What it is of.
-            choice: Which camera and robot of a whole cell are meant.
-            needs: What of them has to be clear.
-            touched_by: The only robot that the touches name; it is meant where the cell has it and
-                the user names none.
+            options: The user's options.
+            kind: The kind of frame.
+            choice: Which camera and robot of a cell are meant.
+            needs: Which of them have to be unambiguous.
+            touched_by: The only robot that the touches name; the default robot where the cell has
+                it.
 
         Raises:
-            DataError: A frame of that name is there, or the place cannot take one.
+            DataError: A frame of that name exists, or the destination cannot take one.
         """
         from visioncal.interchange.result_files import load_result
         from visioncal.results.selecting import placed_name
@@ -156,7 +156,7 @@ class FrameLocation:
         return place
 
     def _frames(self) -> "dict[str, Frame]":
-        """The frames that are there already."""
+        """The frames that exist at the destination."""
         from visioncal.results import FrameFile
 
         if self.file is not None:
@@ -164,11 +164,11 @@ class FrameLocation:
         return {} if self.result is None else dict(self.result.frames)
 
     def _there(self) -> Path | None:
-        """The place that has a frame of this name already."""
+        """The destination, where it has a frame of this name already."""
         return (self.file or self.folder) if self.name in self._frames() else None
 
     def _check_names(self) -> None:
-        """Refuses a name that another frame has: one frame cannot hang in two places."""
+        """Refuses a child frame that exists with another parent."""
         child = self.name.partition("_from_")[2]
         for other in self._frames():
             if other != self.name and other.partition("_from_")[2] == child:
@@ -179,7 +179,7 @@ class FrameLocation:
                 )
 
     def keep(self, frame: "Frame") -> Written:
-        """Writes the frame where it goes; nowhere if nothing was named."""
+        """Writes the frame to its destination, if any."""
         from visioncal.interchange.merge_results import rewrite
         from visioncal.results import FrameFile
 
@@ -204,15 +204,15 @@ def _folder(known: Path) -> Path:
 
 
 def keep_and_report(place: FrameLocation, frame: "Frame", source: Path, *, as_json: bool) -> None:
-    """Writes a frame where it goes, and prints it for people, or as JSON.
+    """Writes a frame to its destination, and prints it for people, or as JSON.
 
     Args:
-        place: Where it goes.
+        place: The destination.
         frame: The frame.
-        source: What it was found from.
+        source: The path of the touches or images.
         as_json: Whether to print JSON.
     """
-    # What is said to be run again has something to replace.
+    # The suggested command runs again, and has a frame to replace then.
     again = [*sys.argv, *([] if "--force" in sys.argv else ["--force"])]
     out = place.file or place.folder or ""
     frame = replace(frame, verdict=frame.verdict.with_paths(source, out, ["visioncal", *again[1:]]))
@@ -265,15 +265,15 @@ def _report_before(place: FrameLocation, frame: "Frame") -> None:
 
 @dataclass(frozen=True)
 class Asked:
-    """What `tcp` or `fixture` is asked for.
+    """Request of `tcp` or `fixture`.
 
     Attributes:
-        kind: What is to be placed.
-        source: What the user named: touches, as a table or a session, or a session of images.
-        goes: Where its frame goes.
-        written: How touches are written.
-        part: Which camera, robot and target of a whole cell are meant.
-        point_mm: Of images: the frame's origin in the target's frame, as the user wrote it.
+        kind: The kind of frame.
+        source: Touches, as a table or a session, or a session of images.
+        goes: Destination of the frame.
+        written: Convention of the touches.
+        part: Which camera, robot and target of a cell are meant.
+        point_mm: For images: the frame's origin in the target's frame, as typed.
         as_json: Whether to print JSON.
     """
 
@@ -295,10 +295,10 @@ def place_frame(
     """Places a tool or a fixture by touches or by a session's images, and keeps and reports it.
 
     Args:
-        asked: What is asked for.
-        by_touches: Places it by touches, with what is known of the robot.
-        drawing: Where points or markers on a fixture are; None where none is given.
-        tool: What touched a fixture, as the user wrote it.
+        asked: The request.
+        by_touches: Places it by touches, given the calibration if there is one.
+        drawing: Points or markers on a fixture; None where none are given.
+        tool: The tool that touched a fixture, as typed.
 
     Raises:
         DataError: The source cannot be read or does not show what is needed, or options contradict

@@ -1,4 +1,4 @@
-"""The dynamics of `visioncal dynamics identify` and `validate`: found, written and reported."""
+"""Identifies, validates, writes and reports dynamics, for `visioncal dynamics`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,11 +23,11 @@ from visioncal.session import Session
 
 
 def identify_into(asked: IdentifyOptions) -> None:
-    """Identifies the dynamics by a session's streams, writes them where asked, and reports them.
+    """Identifies the dynamics from a session's streams, writes them where requested, and reports them.
 
     Raises:
         DataError: The session cannot be read, its streams determine nothing, or there is no such
-            term of friction.
+            friction term.
     """
     request = replace(
         asked.streams.request(),
@@ -55,10 +55,10 @@ def identify_into(asked: IdentifyOptions) -> None:
 def print_predictions(
     session: Path, streams: StreamOptions, against: Path | None, *, as_json: bool
 ) -> None:
-    """Predicts the torques of a session's streams, and says how near that comes.
+    """Predicts the torques of a session's streams, and prints the prediction errors.
 
     Raises:
-        DataError: Nothing was identified, or the streams cannot be predicted from.
+        DataError: There are no identified dynamics, or the streams cannot be predicted.
     """
     identified = identified_of(against, "validate")
     predictions = validate_session(Session.load(session), identified, streams.request())
@@ -71,7 +71,7 @@ def print_predictions(
 
 
 def _report(identified: Identified, proof: Sequence[str]) -> None:
-    """Prints the verdict, what was fitted, and what was found in the samples of the proof."""
+    """Prints the verdict, the fit, and the notes on the validation samples."""
     console = answers()
     print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
     for stream in identified.streams:
@@ -98,7 +98,7 @@ def _report(identified: Identified, proof: Sequence[str]) -> None:
 
 
 def _joint_table(identified: Identified) -> Table:
-    """What each joint's torques and friction came to."""
+    """Table of torque errors and friction by joint."""
     names = [identified.base.model.names[index] for index in identified.base.independent]
     values = dict(zip(names, identified.values.tolist(), strict=True))
     humps = {row["joint"]: row for row in stribeck_rows(identified)}

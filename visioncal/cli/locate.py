@@ -14,7 +14,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, some_of
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.core.types import FloatArray, Target
     from visioncal.frames.located import Located
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from visioncal.session import Session, View
 
 _POSE = "x,y,z,qx,qy,qz,qw"
-# Rounding to four digits leaves a unit quaternion's norm within this of 1.
+# Rounding to four digits keeps a unit quaternion's norm within this of 1.
 _NORM_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """One place, what it is of in words, and what it is of in JSON."""
+    """One located point, with its label in words and in JSON."""
 
     words: str
     document: Mapping[str, Any]
@@ -116,7 +116,7 @@ def locate_command(
         own = target in session.plates
         session = select(session, Choice(camera, robot, target if own else None), parted=False)
         target = None if own else target
-    # Names may be of the session alone.
+    # Names may be those of the session alone.
     named = several and result.cell is None
     known = result if named else result.chosen(Choice(camera, robot), EYE)
     if session is not None:
@@ -164,7 +164,7 @@ def _session(source: Path | None) -> "Session | None":
 
 
 def _chosen(session: "Session", view: int | None) -> "tuple[View, ...]":
-    """The views that are meant."""
+    """The chosen view, or all."""
     chosen = tuple(other for other in session.views if view in (None, other.number))
     if not chosen:
         numbers = some_of([str(other.number) for other in session.views], 20)
@@ -177,7 +177,7 @@ def _chosen(session: "Session", view: int | None) -> "tuple[View, ...]":
 
 
 def _flange(words: str) -> "FloatArray":
-    """Reads a pose of the robot, (4, 4) `base_from_flange`."""
+    """Reads a pose of the robot, (4, 4) `base_from_flange` [m]."""
     import numpy as np
     from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -267,7 +267,7 @@ def _by_views(
     *,
     quiet: bool,
 ) -> tuple[_Found, ...]:
-    # A pixel is placed in a millisecond, and need not wait for what sessions take to import.
+    # Imported late, as a pixel is placed in a millisecond without it.
     from visioncal.calibration.stages.observed import by_reason
     from visioncal.frames.picks import locate_views
 

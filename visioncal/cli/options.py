@@ -1,4 +1,4 @@
-"""Options: each is declared once, as a field of a dataclass or as a type of a parameter."""
+"""Shared options, each declared once, as a field of a dataclass or a parameter's type."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from visioncal.core.choices import ImagesKept
 from visioncal.interchange.outputs import RECORDING, REPORT
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.session import Session
     from visioncal.session.choosing import Choice
@@ -46,7 +46,7 @@ RobotName: TypeAlias = Annotated[
 
 @dataclass(frozen=True)
 class PartOptions:
-    """Which camera, robot and target of a whole cell are meant."""
+    """Which camera, robot and target of a cell are meant."""
 
     camera: CameraName = None
     robot: RobotName = None
@@ -56,7 +56,7 @@ class PartOptions:
 
     @property
     def choice(self) -> "Choice":
-        """The same, as sessions and results take it."""
+        """The choice, for sessions and results."""
         from visioncal.session.choosing import Choice
 
         return Choice(self.camera, self.robot, self.target)
@@ -64,7 +64,7 @@ class PartOptions:
 
 @dataclass(frozen=True)
 class NeedOptions:
-    """What the task needs."""
+    """Required accuracy of the task."""
 
     need_mm: Annotated[
         float | None,
@@ -76,7 +76,7 @@ class NeedOptions:
     need_deg: Annotated[float | None, typer.Option(help="The same in rotation, in degrees.")] = None
 
     def session(self, path: Path) -> "Session":
-        """Loads a session with that need.
+        """Loads a session with this need.
 
         Raises:
             DataError: It cannot be read, or the need is no positive number.
@@ -88,7 +88,7 @@ class NeedOptions:
 
 @dataclass(frozen=True)
 class WorkOptions:
-    """How a session is worked on, and what is drawn of its result."""
+    """How a session is processed, and which drawings are made."""
 
     threads: Annotated[
         int | None,

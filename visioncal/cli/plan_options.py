@@ -1,4 +1,4 @@
-"""The options of `visioncal plan`, and what they say."""
+"""The options of `visioncal plan`, and their conversion for the planner."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from visioncal.core.choices import Criterion, Mount
 from visioncal.core.errors import DataError
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.live.planning.cell import Box, Limits, PlanCell
     from visioncal.live.planning.plan import PlanRequest
@@ -21,14 +21,14 @@ _what = partial(typer.Option, rich_help_panel="What is planned")
 _cell = partial(typer.Option, rich_help_panel="The cell, where the source does not say it")
 _limits = partial(typer.Option, rich_help_panel="What the arm must keep")
 _doubt = partial(typer.Option, rich_help_panel="How well it is known")
-# Of a plan until a need is met.
+# Largest number of stops where a need decides it.
 _MOST_FOR_NEED = 40
 _USUAL_STOPS = ", ".join(f"{purpose.stops} for {purpose.name}" for purpose in PURPOSES.values())
 
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """What is planned."""
+    """Options of the plan."""
 
     add: Annotated[
         int | None,
@@ -82,10 +82,10 @@ class PlanOptions:
     seed: Annotated[int, _what(min=0, help="Other possible stops for every number.")] = 0
 
     def request(self, cell: "PlanCell") -> "PlanRequest":
-        """The same, as the planner takes it.
+        """The request for the planner.
 
         Raises:
-            DataError: A number, a box or a purpose is written otherwise.
+            DataError: A number, a box or a purpose is malformed.
         """
         import numpy as np
 
@@ -113,7 +113,7 @@ class PlanOptions:
 
 @dataclass(frozen=True)
 class PlanCellOptions:
-    """What the user says of the cell; None for what is not said."""
+    """Options of the cell; None for those that were not given."""
 
     robot: Annotated[str | None, _cell(help="The robot, where a session names none.")] = None
     target: Annotated[
@@ -168,13 +168,13 @@ class PlanCellOptions:
     ] = None
 
     def options(self, *names: str) -> dict[str, object]:
-        """Some of them by their names; None for those that were not given."""
+        """Some options by their names; None for those that were not given."""
         return {f"--{name}": getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
 class ClearanceOptions:
-    """What the arm must keep, in any motion."""
+    """Clearances that the arm must keep in any motion."""
 
     boxes: Annotated[
         list[str] | None,
@@ -197,16 +197,16 @@ class ClearanceOptions:
 
     @property
     def bodies(self) -> "tuple[Box, ...]":
-        """What is in the way.
+        """Obstacles.
 
         Raises:
-            DataError: A box is written otherwise.
+            DataError: A box is malformed.
         """
         return tuple(_box_of(box) for box in self.boxes or ())
 
     @property
     def floor_m(self) -> float | None:
-        """The height of the floor in the base; None for none.
+        """Height of the floor in the base [m]; None for no floor.
 
         Raises:
             DataError: It is no number.
@@ -218,7 +218,7 @@ class ClearanceOptions:
 
 @dataclass(frozen=True)
 class SightOptions:
-    """What the camera must keep."""
+    """Conditions that the camera must keep."""
 
     tilt_deg: Annotated[
         float,
@@ -239,7 +239,7 @@ class SightOptions:
     ] = None
 
     def limits(self, kept: ClearanceOptions) -> "Limits":
-        """These limits and those of any motion."""
+        """These limits together with those of any motion."""
         from visioncal.live.planning.cell import Limits
 
         return Limits(
@@ -254,7 +254,7 @@ class SightOptions:
 
 
 def _box_of(words: str, option: str = "--box", name: str = "") -> "Box":
-    """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm]."""
+    """Parses a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm]."""
     import numpy as np
 
     from visioncal.core.transforms import compose

@@ -1,4 +1,4 @@
-"""The cell that a plan is for: from a robot and options, a session, or a calibration."""
+"""Builds the cell of a plan, from a robot and options, a session, or a calibration."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,19 +36,19 @@ from visioncal.vision.targets import target_from_document
 
 _SESSION = "session.toml"
 
-# What the arm and the camera must keep, and what is in the way.
+# Limits of the arm and the camera, and obstacles.
 Kept: TypeAlias = tuple[Limits, tuple[Box, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What a plan starts from.
+    """Source of a plan.
 
     Attributes:
-        words: What it is, for people.
-        robot: A robot, if it is one.
-        calibration: An earlier result, if it is one.
-        session: What was recorded, if that was kept.
+        words: Its description, for people.
+        robot: The robot, if it is one.
+        calibration: The result, if it is one.
+        session: The recorded session, if there is one.
     """
 
     words: str
@@ -58,10 +58,10 @@ class Source:
 
 
 def find_source(name: str) -> Source:
-    """Tells robots, sessions and calibrations apart.
+    """Loads a robot, a session or a calibration, whichever is named.
 
     Raises:
-        DataError: What is named cannot be read.
+        DataError: It cannot be read.
     """
     path = Path(name)
     if path.is_dir() and (path / _SESSION).is_file() and not (path / CALIBRATION).is_file():
@@ -86,10 +86,10 @@ def find_source(name: str) -> Source:
 
 
 def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCellOptions]:
-    """Takes one camera, robot and target out of a source of a whole cell, as the words name them.
+    """Extracts one camera, robot and target from a cell's source, as the options name them.
 
     Raises:
-        DataError: There is no such thing, or several are meant.
+        DataError: There is no such thing, or the choice is ambiguous.
     """
     session, result = source.session, source.calibration
     whole = result is not None and result.cell is not None
@@ -108,7 +108,7 @@ def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: 
     """The session to which stops are added.
 
     Raises:
-        DataError: There is none, or it has too few views to begin.
+        DataError: There is none, or it has too few views to start from.
     """
     session = source.session
     if session is None:
@@ -129,7 +129,7 @@ def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: 
 
 
 def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
-    """The cell of a plan of its own, from a calibration or from options.
+    """The cell of a new plan, from a calibration or from options.
 
     Raises:
         DataError: Something is missing or cannot be read.
@@ -137,7 +137,7 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
     if source.calibration is not None:
         refuse_given(words.options("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
-    # What is written wrongly is reported before what is missing.
+    # Malformed options are reported before missing ones.
     numbers = _camera_numbers(words.camera)
     for option, said in (("--cam", words.cam), ("--board", words.board)):
         if said is not None:
@@ -171,7 +171,7 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
 
 
 def pose_of(words: str, option: str) -> FloatArray:
-    """Reads a rough pose: x, y, z [mm], then angles about the fixed axes x, y, z [deg]; (4, 4).
+    """Parses a rough pose: x, y, z [mm], then angles about the fixed axes x, y, z [deg]; (4, 4) [m].
 
     Raises:
         DataError: It is not six numbers.
@@ -273,7 +273,7 @@ def _camera(words: str, resolution: str | None) -> Camera:
 
 
 def _camera_numbers(words: str | None) -> tuple[float, ...] | None:
-    """The camera matrix, where that was given in numbers."""
+    """The numbers of the camera matrix, where they were given."""
     if words is None or "," not in words or Path(words).exists():
         return None
     return numbers_in(words, "--camera", "fx,fy,cx,cy")

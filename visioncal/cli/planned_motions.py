@@ -1,4 +1,4 @@
-"""The motions of `visioncal dynamics plan`: planned, written and reported."""
+"""Plans, writes and reports the motions of `visioncal dynamics plan`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,7 +37,7 @@ def plan_motions(
     """Plans an exciting motion and sweeps, writes them into a folder, and reports them.
 
     Raises:
-        DataError: The robot cannot be read, an option is none, or the limits allow no motion.
+        DataError: The robot cannot be read, an option is invalid, or the limits allow no motion.
     """
     share = Share(
         float(np.deg2rad(kept.margin_deg)),

@@ -1,4 +1,4 @@
-"""The options that say how somebody else wrote the robot's poses."""
+"""Options for the convention of the robot's poses."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -9,7 +9,7 @@ import typer
 from visioncal.core.choices import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.formats import ImportOptions
     from visioncal.robot import Robot
@@ -21,7 +21,7 @@ UNITS = "|".join(UNITS_M)
 
 @dataclass(frozen=True)
 class RobotPoseOptions:
-    """How somebody else wrote the poses of the robot."""
+    """Options for the convention of the robot's poses."""
 
     robot_columns: Annotated[
         str | None,
@@ -53,10 +53,10 @@ class RobotPoseOptions:
     ] = None
 
     def requested(self) -> "ImportOptions":
-        """The same, as files are read.
+        """The import options.
 
         Raises:
-            DataError: A name is empty or there twice.
+            DataError: A name is empty or occurs twice.
         """
         from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 
@@ -70,7 +70,7 @@ class RobotPoseOptions:
 
     @property
     def model(self) -> "Robot | None":
-        """The robot that is named.
+        """The named robot.
 
         Raises:
             DataError: It cannot be read.
@@ -81,10 +81,10 @@ class RobotPoseOptions:
 
 
 def names_in(words: str | None, option: str) -> tuple[str, ...]:
-    """Splits an option of names with commas between.
+    """Splits an option of names separated by commas.
 
     Raises:
-        DataError: A name is empty or there twice.
+        DataError: A name is empty or occurs twice.
     """
     if words is None:
         return ()

@@ -67,7 +67,7 @@ def record_command(
     """Record a session: drive the stops of a plan, or follow an arm guided by hand.
 
     Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
-    recording ended before, the arm stands still, and --resume goes on.
+    recording ended early, the arm stands still, and --resume continues it.
     """
     from visioncal.cli.recorded_cell import (
         ViewLines,

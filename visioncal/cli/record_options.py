@@ -1,4 +1,4 @@
-"""The options of `visioncal record`, and what they say."""
+"""The options of `visioncal record`, and their conversion for drivers."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +10,7 @@ from visioncal.cli.parsing import size_in
 from visioncal.core.choices import PLAN_SPEED, POSE_FORMS, CameraMount
 from visioncal.live.capture.options import CaptureOptions, Keep, Stillness
 
-# Help does not wait for it.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.live.drivers.protocols import DeviceSetup
 
@@ -22,7 +22,7 @@ _camera = partial(typer.Option, rich_help_panel="What the camera is set to")
 
 @dataclass(frozen=True)
 class RecordCellOptions:
-    """The cell, where no plan says it."""
+    """The cell, where there is no plan."""
 
     target: Annotated[
         str | None,
@@ -63,11 +63,11 @@ class TakingOptions:
     )
 
     def options(self, *, single: bool, lost: int) -> CaptureOptions:
-        """The same, as a recording takes it.
+        """The options of a capture.
 
         Args:
-            single: Whether the camera gives each picture once.
-            lost: How many stops in a row may give no view.
+            single: Whether the camera provides each picture only once.
+            lost: Allowed number of consecutive stops without a view.
         """
         return CaptureOptions(
             speed=self.speed,
@@ -81,7 +81,7 @@ class TakingOptions:
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """What the camera is set to."""
+    """Camera settings."""
 
     resolution: Annotated[
         str | None, _camera(metavar="W,H", help="Size of the images in pixels.")
@@ -91,7 +91,7 @@ class DeviceOptions:
     focus: Annotated[int | None, _camera(help="Lens position, in the device's own unit.")] = None
 
     def setup(self) -> "DeviceSetup":
-        """The same, as drivers take it.
+        """The settings for the drivers.
 
         Raises:
             DataError: The resolution is not two numbers.

@@ -1,4 +1,4 @@
-"""The parts of `visioncal record`: the cell from a plan or from options, its stops, its words."""
+"""Parts of `visioncal record`: the cell from a plan or from options, its stops, its messages."""
 
 import math
 import shlex
@@ -46,7 +46,7 @@ class Shown:
 
     def stepped(self, step: CaptureEvent) -> None:
         """Draws a view."""
-        # Rerun takes half a second to import, which recordings that nobody watches need not wait.
+        # Rerun takes half a second to import, which recordings without a viewer need not wait for.
         from visioncal.present.recording.live import LiveView
 
         found = step.found
@@ -68,12 +68,12 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSetup:
-    """What is recorded of, as the user says it.
+    """Setup of a recording.
 
     Attributes:
         mount: Where the camera is.
         target: The board.
-        robot: The arm's model; None where nobody said it.
+        robot: The arm's model; None where unknown.
         plan: The stops; None without a plan.
     """
 
@@ -99,14 +99,14 @@ class RecordedSetup:
 
     @property
     def lens(self) -> Camera | None:
-        """The lens as the plan has it."""
+        """The plan's lens; None without a plan."""
         return None if self.plan is None else self.plan.cell.camera
 
     def check(self, resolution: tuple[int, int], *, drives: bool) -> None:
-        """Checks that the camera's pictures are those that the stops were planned for.
+        """Checks that the camera has the image size of the plan.
 
         Raises:
-            DataError: They are not.
+            DataError: It has another.
         """
         if not drives or self.lens is None or resolution == self.lens.resolution:
             return
@@ -120,10 +120,10 @@ class RecordedSetup:
 
 
 def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> RecordedSetup:
-    """Puts together what is recorded of.
+    """Builds the setup of a recording from a plan or from options.
 
     Raises:
-        DataError: The plan cannot be read, says otherwise than the options, or no board is named.
+        DataError: The plan cannot be read, options contradict it, or no board is named.
     """
     described = described or RecordCellOptions()
     target, robot, mount = described.target, described.robot, described.mount
@@ -164,7 +164,7 @@ def _findable(target: Target) -> Target:
 
 
 def facts_of(scene: RecordedSetup, cell: LiveCell, name: str) -> CaptureFacts:
-    """What is written of the cell besides its views."""
+    """Facts of the cell that are recorded besides its views."""
     camera = cell.camera
     return CaptureFacts(
         name or "session",
@@ -218,11 +218,11 @@ def guided(
 
 @contextmanager
 def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[list[Watcher]]:
-    """Opens the viewer where that is wanted; without a display the recording goes on unseen."""
+    """Opens the viewer if wanted; without a display the recording continues without it."""
     if not wanted:
         yield []
         return
-    # Rerun takes half a second to import, which a recording that nobody watches need not wait for.
+    # Rerun takes half a second to import, which recordings without a viewer need not wait for.
     from visioncal.present.recording import live
     from visioncal.present.viewer.live import live_viewer
 
@@ -250,7 +250,7 @@ def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[
 
 @contextmanager
 def opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
-    """Opens both devices; the block's end lets go of them."""
+    """Opens both devices, and closes them at the end of the block."""
     with closing(open_arm(arm, wish)) as opened:
         if not wish.watch_only and not isinstance(opened, MovingArm):
             raise DriverError(
@@ -263,7 +263,7 @@ def opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iter
 
 
 class ViewLines:
-    """Tells each view in a line."""
+    """A watcher that prints a line for each view."""
 
     def stepped(self, step: CaptureEvent) -> None:
         """Prints the line."""
@@ -279,7 +279,7 @@ def driven(
     *,
     asks: bool,
 ) -> list[CaptureEvent]:
-    """Drives the plan's stops, after a word of the user."""
+    """Drives the plan's stops, after the user's confirmation."""
     leaving = departure(cell, scene.planned, [view.number for view in journal.views], taking)
     report_departure(leaving, cell, taking)
     if not leaving.stops:
@@ -290,7 +290,7 @@ def driven(
 
 
 def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions) -> None:
-    """Says what is about to happen."""
+    """Prints what is about to be driven."""
     say, count = messages().print, len(leaving.stops)
     if not count:
         say("All stops of the plan have their view; nothing is left to drive.")
@@ -342,7 +342,7 @@ def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
 
 
 def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
-    """Says what there is now."""
+    """Prints a summary of the recording, and the next command."""
     if as_json:
         print_json(_summary(journal, steps))
         return
@@ -373,7 +373,7 @@ def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
 
 
 def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
-    """Refuses to drive without a plan, before a device is asked for."""
+    """Refuses to drive without a plan, before a device is opened."""
     if drives:
         _ = scene.planned
         return
@@ -385,7 +385,7 @@ def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
 
 
 def check_not_begun(journal: Journal, camera: str) -> None:
-    """A folder begins with its first picture again, which would go to the wrong pose."""
+    """Refuses to resume from a folder of images, which would start again with the first one."""
     if journal.views:
         raise DataError(
             f"--resume: {camera} begins with its first picture again, and {len(journal.views)} "

@@ -1,4 +1,4 @@
-"""A rehearsal from its plan to its result, as JSON and in words, part by part."""
+"""A rehearsal from plan to result, with its report as JSON and in words."""
 
 import platform
 import sys
@@ -52,21 +52,21 @@ from visioncal.session import Session
 _NEAR_RAD = 2e-3
 _PACKAGES = ("ur-rtde", "depthai", "numpy", "opencv-contrib-python-headless")
 
-# The pace at which a UR moves where its program says nothing else; nobody stands beside this one.
+# The default speed of a UR's program; nobody stands beside this one.
 TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
 
 
-# Fewer than a real plan is chosen from: it matters more that a rehearsal is short.
+# Fewer candidates than for a real plan, as a rehearsal should be short.
 _CANDIDATES = 600
 
 
 def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray) -> TouchTest:
-    """Touches what the camera located, with a tip that knows where the board really is.
+    """Simulated touch test of the located points, with the true pose of the board.
 
     Args:
-        folder: The session's.
+        folder: Folder of the session.
         calibration: Its result.
-        base_from_target: (4, 4) the truth.
+        base_from_target: (4, 4) the true pose [m].
     """
     points = touch_points(Session.load(folder), calibration)
     true = [base_from_target[:3, :3] @ point.board_m + base_from_target[:3, 3] for point in points]
@@ -79,11 +79,11 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
 
 @dataclass(frozen=True, eq=False)
 class RehearsedRecording:
-    """What was recorded.
+    """Recorded views, and the effect of a fault.
 
     Attributes:
-        steps: What became of each stop; of a recording with a fault, the views before and after it.
-        fault: What the fault did; None without one.
+        steps: Outcome of each stop; with a fault, the views before and after it.
+        fault: Effect of the fault; None without one.
     """
 
     steps: tuple[CaptureEvent, ...]
@@ -92,16 +92,16 @@ class RehearsedRecording:
 
 @dataclass(frozen=True)
 class Suffered:
-    """How a recording took a fault.
+    """Effect of a fault on a recording.
 
     Attributes:
         name: The fault.
-        message: What was said.
-        next_step: And what to do.
-        told_after_s: How long after the fault [s].
-        stood_after_s: How long after it the arm stood [s]; None where that is not known, or
-            where it goes on.
-        views_kept: How many views the session had then, every acknowledged one among them.
+        message: The error message.
+        next_step: The remedy in it.
+        told_after_s: Delay of the message after the fault [s].
+        stood_after_s: Delay of the arm's standstill after it [s]; None where unknown, or where it
+            continues.
+        views_kept: Number of views in the session then, including every acknowledged one.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Suffered:
 
 
 def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> RecordedSetup:
-    """Plans stops from the rough guesses, and reads them back as a recording does."""
+    """Plans stops from the rough poses, and reads them back as a recording does."""
     request = PlanRequest(
         purpose_of("hand-eye"), options.stops, candidates=_CANDIDATES, seed=options.seed
     )
@@ -135,10 +135,10 @@ def recorded(
     view: bool,
     resume: bool = False,
 ) -> RehearsedRecording:
-    """Records the plan's stops; where a fault is wanted, through it and on.
+    """Records the plan's stops; with a fault, until it and on after it.
 
     Raises:
-        DriverError: A device failed without being asked to.
+        DriverError: A device failed other than by the fault.
         DataError: The views cannot be written.
     """
     if fault is None:
@@ -171,7 +171,7 @@ def recorded(
 
 
 def calibrated(folder: Path, out: Path) -> tuple[Run, Written]:
-    """Calibrates what was recorded, and writes the result."""
+    """Calibrates the recorded session, and writes the result."""
     session = Session.load(folder)
     with shown_progress(quiet=not sys.stderr.isatty()) as progress:
         found = run(session, progress=progress)
@@ -200,11 +200,11 @@ def _drive(
 
 
 class _Kept:
-    """Keeps the views of a recording that does not come to its end.
+    """A watcher that keeps the views of an interrupted recording.
 
     Attributes:
-        steps: Those that there are.
-        missed_s: When the first stop without one was reported, on the monotonic clock [s].
+        steps: The views.
+        missed_s: Time of the first report of a stop without a view, on the monotonic clock [s].
     """
 
     def __init__(self) -> None:
@@ -212,7 +212,7 @@ class _Kept:
         self.missed_s: float | None = None
 
     def stepped(self, step: CaptureEvent) -> None:
-        """Keeps it."""
+        """Keeps a view, or the time of the first missing one."""
         if isinstance(step.found, TakenView):
             self.steps.append(step)
         elif self.missed_s is None:
@@ -220,7 +220,7 @@ class _Kept:
 
 
 def _check_all_seen(steps: Sequence[CaptureEvent]) -> None:
-    """Raises what a recording ends with where stops gave no view."""
+    """Raises DataError where stops gave no view, as at the end of a recording."""
     without = list(missed(steps))
     if without:
         view, reason = without[0]
@@ -236,20 +236,20 @@ def rehearse(
     """Plans, records and calibrates.
 
     Args:
-        options: What is rehearsed.
+        options: The options of the rehearsal.
         out: The folder for the plan, the session and the result, each in one of its own.
-        fault: What is to happen half way; None for nothing.
-        view: Whether the viewer shows it as it goes.
+        fault: The fault to inject half way; None for none.
+        view: Whether the viewer shows it live.
 
     Raises:
-        DriverError: A device failed without being asked to.
+        DriverError: A device failed other than by the fault.
         DataError: The views cannot be written, or are not enough for a result.
     """
     begun = time.monotonic()
     cell = rehearsed_cell(options)
     scene = planned(cell, options, out / "plan")
     plan_ready = time.monotonic()
-    # Led there by hand, as an operator would, and not quite exactly.
+    # Approximately at the first stop, as if guided there by hand.
     start_q = scene.planned.stops[0].q + _NEAR_RAD
     with closing(Bench(cell, start_q)) as bench:
         witness = Witness(bench)
@@ -283,20 +283,20 @@ def rehearse(
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """A rehearsal that came to its end.
+    """Result of a rehearsal.
 
     Attributes:
-        options: What was asked for.
+        options: The options.
         cell: The cell.
         calibration: The result.
-        written: Where it is.
-        error: Its error, weighed.
-        taken: What was recorded.
-        pace: How long the views took; None where a fault came between.
-        away_mm: For each view, how far the flange was from what was recorded [mm].
-        times_s: How long each part took [s].
+        written: Its files.
+        error: Chi-square test of its error.
+        taken: The recorded views.
+        pace: Durations of the views; None with a fault.
+        away_mm: Distance of the flange from its recorded position, by view [mm].
+        times_s: Duration of each part [s].
         through_depthai: Whether the pictures went through depthai's pipeline.
-        touch_test: Points of the board that a tip touched; None for a board on the flange.
+        touch_test: The touch test; None for a board on the flange.
     """
 
     options: RehearsalOptions
@@ -347,7 +347,7 @@ class Rehearsal:
         return document
 
     def report(self) -> None:
-        """Says it in words."""
+        """Prints the result in words."""
         say, times = answers().print, self.times_s
         print_summary(self.calibration, verbose=False)
         truth = self.cell.truth

@@ -11,11 +11,11 @@ from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.result_files import Stored
 
-# Other numbers come out.
+# Exit status where the numbers differ.
 _EXIT_OTHERS = 3
 
 
@@ -63,7 +63,7 @@ def report_command(
             "they are for --certificate",
             "Give that, too, or leave it out.",
         )
-    # Plots take half a second to import, which help need not wait for.
+    # Imported late, so that --help stays fast.
     from visioncal.present.report import write_report
 
     stored = load_stored(calibration)
@@ -87,14 +87,14 @@ def report_command(
         stored.note,
         stored.review,
     )
-    # The page of a whole cell shows nothing of what a recording has.
+    # A cell's page shows nothing that a recording adds.
     if stored.note and stored.calibration.cell is None:
         say(stored.note)
     say(f"wrote {out}")
 
 
 def _recompute(stored: "Stored") -> None:
-    """Calibrates once more, and ends with what came out."""
+    """Calibrates the recording again, and exits with the outcome."""
     from visioncal.calibration.verification.recompute import recompute
 
     if stored.session is None:

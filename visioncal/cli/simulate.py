@@ -13,13 +13,13 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import SIMULATED_ARMS, SIMULATED_CELLS, CameraMount
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.simulation import CellOptions, SimulatedCell
     from visioncal.simulation.tracked import Tracked
 Read: TypeAlias = Literal["point", "points", "probe"]
 
-# What a cell of one robot takes, whatever is recorded of it.
+# Parameters of a cell of one robot, for any kind of recording.
 _SINGLE = frozenset(
     (
         *("mount", "views", "robot", "camera", "board", "robot_sigma_mm", "robot_sigma_mrad"),
@@ -33,7 +33,7 @@ _ARM = frozenset(
         *("stiffness_knm", "payload_kg"),
     )
 )
-# What a whole cell takes along, which are kinds of their own without one.
+# Kinds of session that a whole cell can include.
 _ALONG = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
     "": _SINGLE | {"touches", "second_board"},
@@ -50,7 +50,7 @@ _TAKES: Mapping[str, frozenset[str]] = {
 
 @dataclass(frozen=True)
 class SimulateOptions:
-    """What is simulated, and what is recorded of it."""
+    """Options of the simulated session."""
 
     folder: Annotated[Path, typer.Argument(help="Where to write the session.")]
     mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand"
@@ -194,7 +194,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
         camera_moved_m=1e-3 * asked.camera_moved_mm,
         seed=asked.seed,
     )
-    # Rendering takes its time.
+    # Checked first, as rendering takes long.
     refuse_filled(folder.absolute())
     if asked.cell is not None:
         cell = whole_cell(asked.cell, options, given, asked.instrument)
@@ -210,7 +210,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
 
 
 def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
-    """A cell of one robot: at stops, in a sweep, or while it warms up."""
+    """A cell of one robot: at stops, in a sweep, or during warm-up."""
     from visioncal.simulation import (
         Round,
         SweepOptions,
@@ -233,7 +233,7 @@ def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
 
 
 def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
-    """Writes a cell, and what its robots touched."""
+    """Writes a cell, and its robots' touches."""
     from visioncal.simulation import touch, write_session
 
     count = len(cell.sights)
@@ -248,7 +248,7 @@ def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
 
 
 def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
-    """What an instrument reads of the arm of a cell."""
+    """Options of an instrument that measures the cell's arm."""
     from visioncal.simulation import ArmOptions
     from visioncal.simulation.tracked import THREE, Tracked
 
@@ -262,7 +262,7 @@ def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
 
 
 def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
-    """What each joint yields to a torque [rad/(N m)]; empty for a rigid arm."""
+    """Compliance of each joint [rad/(N m)]; empty for a rigid arm."""
     from visioncal.simulation import arm_named
 
     if stiffness_knm is None:
@@ -271,7 +271,7 @@ def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
 
 
 def _given_for(context: typer.Context) -> frozenset[str]:
-    """The parameters that the user gave, all of which fit the kind of session asked for."""
+    """The given parameters, after checking that they apply to the kind of session."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
     given = frozenset(
         name for name, source in sources.items() if source and source.name == "COMMANDLINE"

@@ -8,7 +8,7 @@ import typer
 from visioncal.cli.framing import Asked, FrameOptions, PointOption, TouchOptions, place_frame
 from visioncal.cli.options import AsJson, PartOptions
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.results import Calibration, Frame
 

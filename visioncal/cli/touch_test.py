@@ -27,14 +27,14 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.core.types import FloatArray
     from visioncal.frames.touch_test import TouchPoint
     from visioncal.live.capture.hover import Hovering
     from visioncal.results import Calibration
 
-# The gaps are larger than predicted.
+# Exit status where gaps are larger than predicted.
 _EXIT_LARGER = 3
 _FORM = "Flange targets: x, y, z \\[mm], rotation vector \\[rad]; hover first, then touch."
 
@@ -72,10 +72,10 @@ def touch_test_command(
 ) -> None:
     """Prove a calibration: touch what the camera locates, and enter the gaps.
 
-    The session has one image or more of a board as it lies now. Says where to send the robot,
+    The session has one image or more of a board as it lies now. Prints where to send the robot,
     hovering first, corrected where the arm is calibrated; at a terminal it asks for each gap. With
-    all gaps: compared with what was
-    predicted, and kept in the result and its report. Exit status 3: they are larger.
+    all gaps, they are compared with what was predicted, and kept in the result and its report. Exit
+    status 3: they are larger.
     """
     from visioncal.frames.measured import Tool
     from visioncal.frames.touch_test import finding_of, judged, touch_points
@@ -130,7 +130,7 @@ def touch_test_command(
 
 
 def _target(known: "Calibration", point: "TouchPoint", height_m: float) -> dict[str, Any]:
-    """Where to send the robot: as its own controller needs it."""
+    """Targets of the robot for its own controller."""
     from visioncal.results.compensation import correct
 
     touch, hover = point.base_from_flange, point.above(height_m)
@@ -166,7 +166,7 @@ def _report(
 
 
 def _report_point(point: "TouchPoint", target: dict[str, Any], console: Console) -> None:
-    """Says where a point is, and where to send the robot."""
+    """Prints a point's position, and the targets of the robot."""
     x, y, z = 1e3 * point.base_m
     console.print(
         f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within {figure(point.radius95_mm)} "
@@ -198,7 +198,7 @@ def _driven(
     *,
     asks: bool,
 ) -> list[float]:
-    """Brings the tip above each point, and asks for its gap."""
+    """Drives the tip above each point, and asks for its gap."""
     from visioncal.core.transforms import invert
     from visioncal.live.capture.devices import ArmWish, open_arm
     from visioncal.live.capture.hover import Hovering
@@ -226,7 +226,7 @@ def _driven(
 
 
 def _brought(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
-    """Brings the tip there; where the arm refuses, as in local control, a person mends that."""
+    """Drives the tip above a point; retries while the arm refuses, as in local control."""
     while True:
         try:
             hovering.bring(base_from_flange)
@@ -239,7 +239,7 @@ def _brought(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
 
 
 def _pose(numbers: Sequence[float]) -> "FloatArray":
-    """(4, 4) of x, y, z [m] and a rotation vector [rad]."""
+    """(4, 4) pose of x, y, z [m] and a rotation vector [rad]."""
     import numpy as np
     from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -262,7 +262,7 @@ def _gap() -> float:
 
 
 def _line(question: str) -> str:
-    """Asks, and gives the line that was typed."""
+    """Asks, and returns the typed line."""
     try:
         return asked(question)
     except EOFError:

@@ -1,4 +1,4 @@
-"""What `visioncal dynamics payload` and `gains` find by a body on the flange, and its report."""
+"""Payload and drive gains from a body on the flange, for `visioncal dynamics`."""
 
 import numpy as np
 import typer
@@ -26,10 +26,10 @@ from visioncal.session import Session
 
 
 def print_payload(asked: PayloadOptions) -> None:
-    """Weighs what the flange carries.
+    """Estimates the payload, and prints it.
 
     Raises:
-        DataError: Nothing was identified before, or the streams do not determine the payload.
+        DataError: There are no identified dynamics, or the streams do not determine the payload.
     """
     identified = identified_of(asked.against, "payload")
     loaded = conditioned_streams(Session.load(asked.session), identified, asked.streams.request())
@@ -48,10 +48,10 @@ def print_payload(asked: PayloadOptions) -> None:
 
 
 def print_gains(asked: GainsOptions) -> None:
-    """Finds the gains of an arm's drives by a body on its flange.
+    """Estimates the torque constants of an arm's drives from a known body on its flange.
 
     Raises:
-        DataError: There is no such body, or the sessions cannot be read or have no currents.
+        DataError: The body is invalid, or the sessions cannot be read or have no currents.
     """
     body = _body(asked)
     without = of_one_arm(Session.load(asked.session), asked.named)
@@ -88,7 +88,7 @@ def _lines(found: Payload) -> list[str]:
 
 
 def _of_gains(found: Payload) -> str:
-    """What of the mass's sigma the drives' gains make up, where they do."""
+    """The part of the mass's sigma that is due to the drives' gains; empty for none."""
     if not found.gains_sigma_kg:
         return ""
     return f", {significant(found.gains_sigma_kg)} of it from the drives' gains"
@@ -127,7 +127,7 @@ def _body(asked: GainsOptions) -> FloatArray:
 
 
 def _row(name: str, found: Gains, at: int) -> dict[str, str | float]:
-    """The gain of a drive; the joint alone where it is not determined."""
+    """The gain of a drive; only the joint where it is not determined."""
     if not found.determined[at]:
         return {"joint": name}
     gain, sigma = float(found.nm_per_a[at]), float(found.sigma[at])
