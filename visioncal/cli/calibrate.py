@@ -40,14 +40,14 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="auto|hand-eye|offsets|kinematics|elastic|thermal",
-            help="The arm: hand-eye (none comes out), offsets (of its joints), kinematics, elastic "
-            "(joints that bend, too), thermal (drift with temperature, too).",
+            help="What is calibrated of the arm: hand-eye (nothing), offsets (of its joints), "
+            "kinematics, elastic (bending joints, too), thermal (drift with temperature, too).",
         ),
     ] = "auto",
     convention: Annotated[
         Convention | None,
         typer.Option(
-            help="Of the arm's joint table in the result; the stated one where it is left out."
+            help="Convention of the arm's joint table in the result; by default the stated one."
         ),
     ] = None,
     robot_shared: Annotated[
@@ -67,7 +67,7 @@ def calibrate_command(
         ),
     ] = False,
     device: Annotated[
-        str, typer.Option(metavar="auto|cpu|cuda", help="What --dense works on.")
+        str, typer.Option(metavar="auto|cpu|cuda", help="Device for --dense.")
     ] = "auto",
     as_json: AsJson = False,
     verbose: Annotated[

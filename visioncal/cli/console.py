@@ -86,13 +86,13 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         print_json({"error": document})
     console = messages()
     console.print(f"[bold red]error:[/] {escape(error.message)}")
-    unsaid = [culprit for culprit in error.culprits if culprit not in error.message]
-    if all(len(name) < _SHORT for name in unsaid):
-        unsaid = [", ".join(unsaid)] if unsaid else []
-    for culprit in unsaid[:_LISTED_CULPRITS]:
+    other_culprits = [culprit for culprit in error.culprits if culprit not in error.message]
+    if all(len(name) < _SHORT for name in other_culprits):
+        other_culprits = [", ".join(other_culprits)] if other_culprits else []
+    for culprit in other_culprits[:_LISTED_CULPRITS]:
         console.print(f"  - {escape(culprit)}")
-    if len(unsaid) > _LISTED_CULPRITS:
-        console.print(f"  - and {len(unsaid) - _LISTED_CULPRITS} more")
+    if len(other_culprits) > _LISTED_CULPRITS:
+        console.print(f"  - and {len(other_culprits) - _LISTED_CULPRITS} more")
     if next_step:
         console.print(escape(next_step))
 

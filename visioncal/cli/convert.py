@@ -51,9 +51,9 @@ class ConvertOptions(RobotPoseOptions):
         ),
     ] = None
     camera_form: Annotated[str | None, poses_option(help="As --robot-form.")] = None
-    camera_unit: Annotated[str | None, poses_option(metavar=UNITS, help="Of their positions.")] = (
-        None
-    )
+    camera_unit: Annotated[
+        str | None, poses_option(metavar=UNITS, help="Unit of their positions.")
+    ] = None
     camera_inverse: Annotated[
         bool | None,
         poses_option("--camera-inverse/--camera-as-is", help="They give the camera in the target."),
@@ -208,12 +208,12 @@ def _confirmed(guess: "Guess", *, yes: bool) -> "Candidate":
             next_step="Take it with --yes.",
         )
     try:
-        agreed = typer.confirm(f"Read them so: {guess.best.words}?", err=True)
+        is_confirmed = typer.confirm(f"Read them so: {guess.best.words}?", err=True)
     except typer.Abort as error:
         raise DataError(
             "Nothing was written: there was no answer.", next_step="Take the reading with --yes."
         ) from error
-    if not agreed:
+    if not is_confirmed:
         raise DataError("Nothing was written: the reading was declined.")
     return guess.best
 

@@ -40,17 +40,17 @@ def doctor_command(
         raise typer.Exit(_EXIT_FINDINGS)
 
 
-def _print(found: "Checkup", session: Path) -> None:
+def _print(checkup: "Checkup", session: Path) -> None:
     from visioncal.calibration.pipeline.checkup import next_command
 
     console = answers()
-    console.print(escape(f"{found.session}: {'; '.join(found.seen)}"))
-    for at, finding in enumerate(found.findings, 1):
+    console.print(escape(f"{checkup.session}: {'; '.join(checkup.seen)}"))
+    for at, finding in enumerate(checkup.findings, 1):
         console.print(f"[bold]{at}.[/] {escape(finding.words)}")
         if finding.do is not None:
             console.print(escape(f"   {finding.do.words}"))
             if finding.do.command:
                 console.print(f"   [bold]{escape(finding.do.command)}[/]")
-    if found.is_sound:
-        command = next_command(found, session)
+    if checkup.is_sound:
+        command = next_command(checkup, session)
         console.print(f"[bold green]Nothing is wrong.[/] Next: [bold]{escape(command)}[/]")

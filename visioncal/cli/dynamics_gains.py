@@ -29,7 +29,7 @@ class GainsOptions:
     as_json: AsJson = False
 
 
-def dynamics_gains_command(asked: GainsOptions) -> None:
+def dynamics_gains_command(options: GainsOptions) -> None:
     """Find how much torque a drive's current makes, by a body that is known.
 
     Exit status 0: there are gains; 2: there are none, for the reason given.
@@ -37,4 +37,4 @@ def dynamics_gains_command(asked: GainsOptions) -> None:
     # Imported late, so that --help stays fast.
     from visioncal.cli.weighed import print_gains
 
-    print_gains(asked)
+    print_gains(options)

@@ -34,14 +34,14 @@ class IdentifyOptions:
     ] = None
     friction: Annotated[
         str,
-        typer.Option(help=f"What joints have of their own: {', '.join(FRICTION)}; or none."),
+        typer.Option(help=f"Friction terms of the joints: {', '.join(FRICTION)}; or none."),
     ] = "coulomb,viscous,offset"
     rotors: Annotated[
         bool | None,
         typer.Option(
             "--rotors/--no-rotors",
             help="Motors' inertia in the torques, or none in those of sensors behind the gears. "
-            "Default: as unseen torques have it.",
+            "Default: whichever predicts unseen torques better.",
         ),
     ] = None
     stribeck: Annotated[
@@ -54,7 +54,7 @@ class IdentifyOptions:
     as_json: AsJson = False
 
 
-def dynamics_identify_command(asked: IdentifyOptions) -> None:
+def dynamics_identify_command(options: IdentifyOptions) -> None:
     """Identify an arm's inertias and friction from the torques of its motions.
 
     Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
@@ -62,4 +62,4 @@ def dynamics_identify_command(asked: IdentifyOptions) -> None:
     # Imported late, so that --help stays fast.
     from visioncal.cli.identified import identify_into
 
-    identify_into(asked)
+    identify_into(options)

@@ -18,12 +18,12 @@ def dynamics_record_command(
         Path, typer.Argument(help="The session's folder; made, or given another stream.")
     ],
     arm: Annotated[str, typer.Option(help="The arm: ur:HOST.")],
-    stream: Annotated[str, typer.Option(help="What to call the motion.")] = "excite",
+    stream: Annotated[str, typer.Option(help="Name of the recorded stream.")] = "excite",
     robot: Annotated[
         str | None, typer.Option(help="Its model; by default what the controller says.")
     ] = None,
     rest_s: Annotated[
-        float, typer.Option(min=0.5, help="At rest for so many seconds, the motion is over.")
+        float, typer.Option(min=0.5, help="The motion ends after this time at rest (s).")
     ] = 3.0,
 ) -> None:
     """Record angles, speeds and motor currents at the controller's full rate.

@@ -73,27 +73,29 @@ def fixture_command(
     place_frame(asked, by_touches, drawing, tool)
 
 
-def _tool(said: str | None, calibration: "Calibration | None", robot: str | None) -> "Tool | None":
+def _tool(
+    option: str | None, calibration: "Calibration | None", robot: str | None
+) -> "Tool | None":
     """Finds the tool that touched the points."""
     from visioncal.frames.measured import NO_TOOL, Tool
     from visioncal.interchange.result_files import load_placed
 
-    if said == "none":
+    if option == "none":
         return None
     known = {} if calibration is None else calibration.frames
-    if said is None and calibration is None:
+    if option is None and calibration is None:
         raise DataError("The tool that touched the points is not said.", next_step=NO_TOOL)
-    if said is None or said in known or f"flange_from_{said}" in known:
-        return Tool.among(known, "The calibration", said)
-    path, _, name = said.rpartition(":")
-    if Path(said).exists():
-        return Tool.among(load_placed(Path(said), robot).frames, said, None)
+    if option is None or option in known or f"flange_from_{option}" in known:
+        return Tool.among(known, "The calibration", option)
+    path, _, name = option.rpartition(":")
+    if Path(option).exists():
+        return Tool.among(load_placed(Path(option), robot).frames, option, None)
     if path and Path(path).exists():
         return Tool.among(load_placed(Path(path), robot).frames, path, name)
     if known:
-        return Tool.among(known, "The calibration", said)
+        return Tool.among(known, "The calibration", option)
     raise DataError(
-        f"--tool {said}: there is no such file, nor a calibration (-c) that has such a tool.",
-        culprits=[said],
+        f"--tool {option}: there is no such file, nor a calibration (-c) that has such a tool.",
+        culprits=[option],
         next_step=NO_TOOL,
     )

@@ -31,7 +31,7 @@ PointOption: TypeAlias = Annotated[
     typer.Option(
         "--point-mm",
         metavar="X,Y,Z",
-        help="Of images: the frame's origin in the target's frame, such as the tool's tip.",
+        help="For images: the frame's origin in the target's frame, such as the tool's tip.",
     ),
 ]
 
@@ -56,7 +56,7 @@ class FrameOptions:
             help="A file of frames (.json) to put it into instead; made where missing.",
         ),
     ] = None
-    name: Annotated[str | None, typer.Option(help="What to call it: gripper, jig_2.")] = None
+    name: Annotated[str | None, typer.Option(help="Name of the frame: gripper, jig_2.")] = None
     force: Force = False
 
 
@@ -66,7 +66,7 @@ class TouchOptions(RobotPoseOptions):
 
     touch_noise: Annotated[
         float | None,
-        typer.Option("--touch-noise-mm", help="What a touch is known to repeat to, per axis."),
+        typer.Option("--touch-noise-mm", help="Repeatability of a touch, per axis, in mm."),
     ] = None
 
     @property
@@ -136,24 +136,24 @@ class FrameLocation:
         from visioncal.interchange.result_files import load_result
         from visioncal.results.selecting import placed_name
 
-        name, known, out = transform_name(kind, options.name), options.calibration, options.out
-        result = None if known is None else load_result(known)
+        name, path, out = transform_name(kind, options.name), options.calibration, options.out
+        result = None if path is None else load_result(path)
         cell = None if result is None else result.cell
         if cell is not None and choice.robot is None and touched_by in cell.robots:
             choice = replace(choice, robot=touched_by)
         calibration = None if result is None else result.chosen(choice, needs)
         if result is not None:
             name = placed_name(result, choice, needs, name)
-        folder = None if known is None or out is not None else _folder(known)
-        place = cls(name, calibration, result, folder, out)
-        place._check_names()
-        if not options.force and (there := place._there()) is not None:
+        folder = None if path is None or out is not None else _folder(path)
+        location = cls(name, calibration, result, folder, out)
+        location._check_names()
+        if not options.force and (taken_in := location._existing()) is not None:
             raise DataError(
-                f"{there} already has {name}, and nothing is overwritten.",
+                f"{taken_in} already has {name}, and nothing is overwritten.",
                 culprits=[name],
                 next_step="Replace it with --force, or give this one another name with --name.",
             )
-        return place
+        return location
 
     def _frames(self) -> "dict[str, Frame]":
         """The frames that exist at the destination."""
@@ -163,7 +163,7 @@ class FrameLocation:
             return dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
         return {} if self.result is None else dict(self.result.frames)
 
-    def _there(self) -> Path | None:
+    def _existing(self) -> Path | None:
         """The destination, where it has a frame of this name already."""
         return (self.file or self.folder) if self.name in self._frames() else None
 
@@ -192,12 +192,12 @@ class FrameLocation:
         return rewrite(self.folder, replace(self.result, frames=frames))
 
 
-def _folder(known: Path) -> Path:
-    folder = known if known.is_dir() else known.parent
-    if known.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
+def _folder(path: Path) -> Path:
+    folder = path if path.is_dir() else path.parent
+    if path.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
         raise DataError(
-            f"{known} is no output folder that a frame could join.",
-            culprits=[str(known)],
+            f"{path} is no output folder that a frame could join.",
+            culprits=[str(path)],
             next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
         )
     return folder
@@ -287,7 +287,7 @@ class Asked:
 
 
 def place_frame(
-    asked: Asked,
+    request: Asked,
     by_touches: "Callable[[Calibration | None], Frame]",
     drawing: "NominalPoints | None" = None,
     tool: str | None = None,
@@ -295,7 +295,7 @@ def place_frame(
     """Places a tool or a fixture by touches or by a session's images, and keeps and reports it.
 
     Args:
-        asked: The request.
+        request: The request.
         by_touches: Places it by touches, given the calibration if there is one.
         drawing: Points or markers on a fixture; None where none are given.
         tool: The tool that touched a fixture, as typed.
@@ -307,29 +307,29 @@ def place_frame(
     from visioncal.interchange.formats.touches import robots_of
     from visioncal.session.choosing import ARM, EYE, Choice
 
-    kind, part = asked.kind, asked.part
-    session = _image_session(asked.source, {"--tool": tool, **asked.written.given()})
+    kind, part = request.kind, request.part
+    session = _image_session(request.source, {"--tool": tool, **request.written.given()})
     if session is None:
-        own = "the tool's point" if kind == "tool" else "the fixture's origin"
-        refuse_given({"--point-mm": asked.point_mm}, f"touches say where {own} is")
+        origin = "the tool's point" if kind == "tool" else "the fixture's origin"
+        refuse_given({"--point-mm": request.point_mm}, f"touches say where {origin} is")
         refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
-        robots = robots_of(asked.source)
-        if asked.goes.calibration is None and not robots and tool in (None, "none"):
+        robots = robots_of(request.source)
+        if request.goes.calibration is None and not robots and tool in (None, "none"):
             refuse_given({"--robot": part.robot}, "neither touches nor a calibration name robots")
-        only = robots[0] if len(robots) == 1 else None
-        place = FrameLocation.of(asked.goes, kind, Choice(robot=part.robot), ARM, only)
-        frame = by_touches(place.calibration)
+        touched_by = robots[0] if len(robots) == 1 else None
+        location = FrameLocation.of(request.goes, kind, Choice(robot=part.robot), ARM, touched_by)
+        frame = by_touches(location.calibration)
     else:
-        place = FrameLocation.of(asked.goes, kind, replace(part.choice, target=None), EYE)
-        if place.calibration is None:
+        location = FrameLocation.of(request.goes, kind, replace(part.choice, target=None), EYE)
+        if location.calibration is None:
             raise DataError(
                 f"session {session.name!r} has images, and the camera's calibration (-c) is needed "
                 "to place what they show.",
                 culprits=["-c"],
                 next_step="Name the output folder of visioncal calibrate.",
             )
-        frame = _by_images(asked, session, place.calibration, drawing)
-    keep_and_report(place, frame, asked.source, as_json=asked.as_json)
+        frame = _by_images(request, session, location.calibration, drawing)
+    keep_and_report(location, frame, request.source, as_json=request.as_json)
 
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
@@ -355,7 +355,7 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session 
 
 
 def _by_images(
-    asked: Asked,
+    request: Asked,
     session: "Session",
     calibration: "Calibration",
     drawing: "NominalPoints | None",
@@ -367,12 +367,12 @@ def _by_images(
     from visioncal.session.selecting import has_several, select
 
     if has_several(session):
-        session = select(session, asked.part.choice, parted=False)
+        session = select(session, request.part.choice, parted=False)
     if drawing is not None:
         refuse_given(
-            {"--point-mm": asked.point_mm}, "beside --cad the drawing's origin is the frame's"
+            {"--point-mm": request.point_mm}, "beside --cad the drawing's origin is the frame's"
         )
         return marked_fixture(session, calibration, drawing)
-    point = 1e-3 * np.array(numbers_in(asked.point_mm or "0,0,0", "--point-mm", "x,y,z"))
-    with shown_progress(quiet=asked.as_json) as progress:
-        return seen_frame(session, calibration, asked.kind, point, progress=progress)
+    point = 1e-3 * np.array(numbers_in(request.point_mm or "0,0,0", "--point-mm", "x,y,z"))
+    with shown_progress(quiet=request.as_json) as progress:
+        return seen_frame(session, calibration, request.kind, point, progress=progress)

@@ -41,10 +41,10 @@ class PlainCommand(TyperCommand):
             if not wants_json:
                 raise
             param, unknown = getattr(error, "param", None), getattr(error, "option_name", "")
-            named = [*param.opts] if param else [unknown] if unknown else []
+            names = [*param.opts] if param else [unknown] if unknown else []
             raise DataError(
                 error.format_message(),
-                culprits=named[-1:],
+                culprits=names[-1:],
                 next_step=f"{ctx.command_path} --help lists what it takes.",
             ) from None
         self._refuse_empty_paths(ctx, typed)
@@ -53,12 +53,12 @@ class PlainCommand(TyperCommand):
     def _refuse_empty_paths(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
         """Refuses empty paths, as from an unset shell variable."""
         paths = (param for param in self.params if isinstance(ctx.params.get(param.name), Path))
-        takers = {opt for path in paths for opt in path.opts}
+        path_options = {opt for path in paths for opt in path.opts}
         for option, value in (
             *pairwise(typed),
             *(name.split("=", 1) for name in typed if "=" in name),
         ):
-            if option in takers and not value:
+            if option in path_options and not value:
                 raise DataError(
                     f"{option} is empty; a path is needed.",
                     culprits=[option],
@@ -68,13 +68,13 @@ class PlainCommand(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
         """Runs the command; on Ctrl-C, lists the files that it has written."""
-        begun = time.time()
+        start_s = time.time()
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            given = [param for param in ctx.params.values() if isinstance(param, Path)]
-            left = sorted(str(file) for path in given for file in _written_since(path, begun))
-            words = f"written so far: {some_of(left)}" if left else "nothing was written"
+            paths = [param for param in ctx.params.values() if isinstance(param, Path)]
+            written = sorted(str(file) for path in paths for file in _written_since(path, start_s))
+            words = f"written so far: {some_of(written)}" if written else "nothing was written"
             typer.echo(f"stopped by Ctrl-C; {words}", err=True)
             raise typer.Exit(_EXIT_CTRL_C) from None
 
@@ -90,11 +90,11 @@ class PlainCommand(TyperCommand):
                 formatter.write_dl(records)
 
 
-def _written_since(path: Path, begun: float) -> Iterator[Path]:
+def _written_since(path: Path, since_s: float) -> Iterator[Path]:
     """The files at a path that were written since a time [s]."""
     for file in (path, *path.rglob("*")):
         # File systems may round times this coarsely.
-        if file.is_file() and file.stat().st_mtime > begun - 0.01:
+        if file.is_file() and file.stat().st_mtime > since_s - 0.01:
             yield file
 
 
@@ -129,12 +129,12 @@ class LazyGroup(TyperGroup):
     @classmethod
     def imported(cls, name: str) -> Any:  # noqa: ANN401 - a command of typer's
         """A command of this group, with its parameters."""
-        own = f"{cls.prefix}{name}".replace("-", "_")
-        module = import_module(f"visioncal.cli.{own}")
-        if hasattr(module, f"{own}_app"):
-            return get_group(getattr(module, f"{own}_app"))
+        module_name = f"{cls.prefix}{name}".replace("-", "_")
+        module = import_module(f"visioncal.cli.{module_name}")
+        if hasattr(module, f"{module_name}_app"):
+            return get_group(getattr(module, f"{module_name}_app"))
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name, cls=PlainCommand)(with_fields(getattr(module, f"{own}_command")))
+        app.command(name, cls=PlainCommand)(with_fields(getattr(module, f"{module_name}_command")))
         return get_command(app)
 
 
@@ -143,45 +143,45 @@ def with_fields(command: Callable[..., None]) -> Callable[..., None]:
     parameters = inspect.signature(command).parameters.values()
     hints = get_type_hints(command, include_extras=True)
     flat = [
-        one
+        flattened
         for parameter in parameters
-        for one in _each(parameter.name, hints[parameter.name], parameter.default)
+        for flattened in _flattened(parameter.name, hints[parameter.name], parameter.default)
     ]
 
     @wraps(command)
-    def taking_each(**given: Any) -> None:  # noqa: ANN401 - of any type
+    def by_fields(**given: Any) -> None:  # noqa: ANN401 - of any type
         command(
             **{
-                parameter.name: _taken(parameter.name, hints[parameter.name], given)
+                parameter.name: _gathered(parameter.name, hints[parameter.name], given)
                 for parameter in parameters
             }
         )
 
-    del taking_each.__wrapped__
-    taking_each.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
-    taking_each.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
-    return taking_each
+    del by_fields.__wrapped__
+    by_fields.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
+    by_fields.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
+    return by_fields
 
 
-def _each(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:  # noqa: ANN401 - any
+def _flattened(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:  # noqa: ANN401 - any
     """Command-line parameters of a parameter: itself, or the fields of its dataclass."""
     if not _has_fields(kind):
         at = inspect.Parameter.KEYWORD_ONLY
         yield inspect.Parameter(name, at, annotation=kind, default=default)
         return
-    own = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind, include_extras=True)
     for field in fields(kind):
         given = inspect.Parameter.empty if field.default is MISSING else field.default
-        yield from _each(field.name, own[field.name], given)
+        yield from _flattened(field.name, hints[field.name], given)
 
 
-def _taken(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of any type
+def _gathered(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of any type
     """Builds a parameter from the command line's values."""
     if not _has_fields(kind):
         return given[name]
-    own = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind, include_extras=True)
     return kind(
-        **{field.name: _taken(field.name, own[field.name], given) for field in fields(kind)}
+        **{field.name: _gathered(field.name, hints[field.name], given) for field in fields(kind)}
     )
 
 

@@ -33,9 +33,7 @@ Force: TypeAlias = Annotated[
 View: TypeAlias = Annotated[
     bool, typer.Option("--view", help="Show it in the rerun viewer as it goes.")
 ]
-Seed: TypeAlias = Annotated[
-    int, typer.Option("--seed", min=0, help="Another random draw for every number.")
-]
+Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 CameraName: TypeAlias = Annotated[
     str | None, typer.Option("--camera", help="Of a whole cell: which camera, as left.")
 ]
@@ -69,8 +67,8 @@ class NeedOptions:
     need_mm: Annotated[
         float | None,
         typer.Option(
-            help="How near picks have to come, in mm: the verdict is about it. In the place of "
-            "the need in session.toml."
+            help="Required accuracy of picks, in mm, on which the verdict is based; replaces the "
+            "need in session.toml."
         ),
     ] = None
     need_deg: Annotated[float | None, typer.Option(help="The same in rotation, in degrees.")] = None
@@ -93,7 +91,8 @@ class WorkOptions:
     threads: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Images searched at a time; one a core where left out. No result changes."
+            min=1,
+            help="Images searched in parallel; by default one a core. The result is the same.",
         ),
     ] = None
     keep_corners: Annotated[

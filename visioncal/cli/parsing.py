@@ -142,16 +142,16 @@ def named_result(path: "Path | None", option: str, what: str) -> "Path":
 def plane_of(
     words: str, sigma_mm: float, calibration: "Calibration", boards: "Mapping[str, Edge]"
 ) -> "tuple[Plane, str]":
-    """Reads a plane.
+    """Parses a plane.
 
     Args:
-        words: As in `FORMS`; of a frame's name, `base_from_` may be left out.
-        sigma_mm: How well its height is known [mm].
-        calibration: Whose frames can be named.
-        boards: What else can be: targets of a whole cell by the transforms that place them.
+        words: As in `FORMS`; `base_from_` may be left out of a frame's name.
+        sigma_mm: Standard deviation of its height [mm].
+        calibration: The result whose frames can be named.
+        boards: Targets of a cell, which can be named as well, by their transforms.
 
     Returns:
-        The plane, and what to know of its frame before it is trusted; empty where nothing is.
+        The plane, and a warning about its frame; empty where there is none.
 
     Raises:
         DataError: It is none of these, or there is no such frame.

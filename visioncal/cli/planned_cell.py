@@ -92,16 +92,16 @@ def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCel
         DataError: There is no such thing, or the choice is ambiguous.
     """
     session, result = source.session, source.calibration
-    whole = result is not None and result.cell is not None
+    is_cell = result is not None and result.cell is not None
     choice = Choice(words.camera, words.robot, words.target)
-    if not whole and (session is None or not is_to_be_parted(session, choice)):
+    if not is_cell and (session is None or not is_to_be_parted(session, choice)):
         return source, words
     if session is not None and is_to_be_parted(session, choice):
         session = select(session, choice)
     if result is not None:
         result = result.chosen(choice)
-    rest = replace(words, camera=None, robot=None, target=None)
-    return replace(source, session=session, calibration=result), rest
+    others = replace(words, camera=None, robot=None, target=None)
+    return replace(source, session=session, calibration=result), others
 
 
 def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: Progress) -> Begun:
@@ -123,8 +123,8 @@ def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: 
     if words.robot is not None:
         session = _with_robot(session, words.robot)
     guess = _guess(words) if words.cam or words.board else None
-    found = so_far(session, progress=progress)
-    begun = begin(found, guess=guess, limits=kept[0], boxes=kept[1])
+    recorded = so_far(session, progress=progress)
+    begun = begin(recorded, guess=guess, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 
@@ -139,9 +139,9 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
     # Malformed options are reported before missing ones.
     numbers = _camera_numbers(words.camera)
-    for option, said in (("--cam", words.cam), ("--board", words.board)):
-        if said is not None:
-            pose_of(said, option)
+    for option, pose in (("--cam", words.cam), ("--board", words.board)):
+        if pose is not None:
+            pose_of(pose, option)
     needed = ("target", "camera", "cam", "board", *(() if numbers is None else ("resolution",)))
     missing = [f"--{value}" for value in needed if getattr(words, value) is None]
     if missing or source.robot is None:
@@ -171,7 +171,7 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
 
 
 def pose_of(words: str, option: str) -> FloatArray:
-    """Parses a rough pose: x, y, z [mm], then angles about the fixed axes x, y, z [deg]; (4, 4) [m].
+    """Parses a rough pose: x, y, z [mm] and angles about the fixed axes x, y, z [deg]; (4, 4) [m].
 
     Raises:
         DataError: It is not six numbers.
@@ -259,13 +259,13 @@ def _camera(words: str, resolution: str | None) -> Camera:
         return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
     path = Path(words)
     if path.is_dir() or path.suffix.lower() == ".rrd" or "transforms" in content_of(path):
-        found = load_calibration(path, ANY, LENS).camera
-        if found is None:
+        calibrated = load_calibration(path, ANY, LENS).camera
+        if calibrated is None:
             raise DataError(
                 f"--camera: {words} was made from measured poses and knows no camera.",
                 culprits=["--camera"],
             )
-        return found.camera
+        return calibrated.camera
     lens, _ = read_intrinsics(path)
     width, height = lens["resolution"] if "resolution" in lens else _size(resolution)
     distortion = np.array(lens.get("distortion") or np.zeros(5), dtype=float)

@@ -31,10 +31,10 @@ class RobotPoseOptions:
             help="Columns or keys of the robot's poses, position first: X,Y,Z,A,B,C or O_T_EE.",
         ),
     ] = None
-    robot_form: Annotated[str | None, poses_option(help=f"How they are written: {FORMS}.")] = None
-    robot_unit: Annotated[str | None, poses_option(metavar=UNITS, help="Of their positions.")] = (
-        None
-    )
+    robot_form: Annotated[str | None, poses_option(help=f"Their convention: {FORMS}.")] = None
+    robot_unit: Annotated[
+        str | None, poses_option(metavar=UNITS, help="Unit of their positions.")
+    ] = None
     robot_inverse: Annotated[
         bool | None,
         poses_option("--robot-inverse/--robot-as-is", help="They give the base in the flange."),
@@ -47,7 +47,9 @@ class RobotPoseOptions:
             help="Columns or keys of the joint angles.",
         ),
     ] = None
-    joint_unit: Annotated[Literal["rad", "deg"], poses_option(help="What they are in.")] = "rad"
+    joint_unit: Annotated[Literal["rad", "deg"], poses_option(help="Unit of the joint angles.")] = (
+        "rad"
+    )
     robot_model: Annotated[
         str | None, poses_option(help="A built-in robot, or the path of a .urdf or .toml.")
     ] = None

@@ -92,14 +92,14 @@ def _bar(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
-    begun, over = time.monotonic(), Event()
+    start_s, over = time.monotonic(), Event()
 
     def say() -> None:
         last = ""
         while not over.wait(PAUSE_S):
             if steps.line != last:
                 last = steps.line
-                messages().print(f"{last} ({time.monotonic() - begun:.0f} s)", markup=False)
+                messages().print(f"{last} ({time.monotonic() - start_s:.0f} s)", markup=False)
 
     printer = Thread(target=say, daemon=True)
     printer.start()

@@ -52,7 +52,7 @@ def record_command(
         ),
     ] = False,
     views: Annotated[
-        int, typer.Option(min=0, help="With --follow or a manual arm: end after so many.")
+        int, typer.Option(min=0, help="With --follow or a manual arm: end after this number.")
     ] = 0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with a recording that was ended or cut off.")

@@ -35,7 +35,7 @@ class RecordCellOptions:
         str | None, _cell(help="The robot's model: a built-in name, a .urdf or .toml.")
     ] = None
     mount: Annotated[
-        CameraMount | None, _cell(help="Where the camera is; eye-in-hand if nothing is said.")
+        CameraMount | None, _cell(help="Where the camera is; by default eye-in-hand.")
     ] = None
     pose_form: Annotated[
         str | None,
@@ -52,13 +52,13 @@ class TakingOptions:
     frames: Annotated[int, _taking(min=1, max=100, help="Frames a view.")] = 3
     keep: Annotated[Keep, _taking(help="The sharpest of these, or their mean.")] = "sharpest"
     still_px: Annotated[
-        float, _taking(min=0.01, max=10.0, help="Image motion over which nothing is taken.")
+        float, _taking(min=0.01, max=10.0, help="Image motion above which no view is taken.")
     ] = Stillness.image_px
     settle_s: Annotated[
         float,
-        _taking(min=0.0, max=30.0, help="How long arm and image must have been still before."),
+        _taking(min=0.0, max=30.0, help="How long arm and image must be still before a view."),
     ] = Stillness.quiet_s
-    speed: Annotated[float, _moving(help="Of the fastest joint, in rad/s; at most 1.5.")] = (
+    speed: Annotated[float, _moving(help="Speed of the fastest joint, in rad/s; at most 1.5.")] = (
         PLAN_SPEED
     )
 

@@ -49,18 +49,18 @@ class Shown:
         # Rerun takes half a second to import, which recordings without a viewer need not wait for.
         from visioncal.present.recording.live import LiveView
 
-        found = step.found
-        if isinstance(found, Missed):
+        outcome = step.found
+        if isinstance(outcome, Missed):
             return
-        known = None if step.accuracy is None or step.accuracy.is_open else step.accuracy.mm
+        sigma_mm = None if step.accuracy is None or step.accuracy.is_open else step.accuracy.mm
         self.drawing.draw(
             LiveView(
                 step.view,
-                found.frame.image,
-                found.corners.px,
-                found.state.base_from_flange,
-                found.state.q,
-                known,
+                outcome.frame.image,
+                outcome.corners.px,
+                outcome.state.base_from_flange,
+                outcome.state.q,
+                sigma_mm,
                 note_of(step),
             )
         )
@@ -129,15 +129,17 @@ def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> R
     target, robot, mount = described.target, described.robot, described.mount
     if plan is not None:
         given = {"--target": target, "--robot": robot, "--mount": mount}
-        said = [name for name, value in given.items() if value is not None]
-        if said:
+        repeated = [name for name, value in given.items() if value is not None]
+        if repeated:
             raise DataError(
-                f"{', '.join(said)}: the plan says that already.",
-                culprits=said,
+                f"{', '.join(repeated)}: the plan says that already.",
+                culprits=repeated,
                 next_step="Leave it out, or record without --plan.",
             )
-        read = read_plan(plan)
-        return RecordedSetup(read.cell.mount, _findable(read.cell.target), read.cell.robot, read)
+        plan_file = read_plan(plan)
+        return RecordedSetup(
+            plan_file.cell.mount, _findable(plan_file.cell.target), plan_file.cell.robot, plan_file
+        )
     if target is None:
         raise DataError(
             "record: --plan or --target is needed to know what to look for.",
@@ -153,7 +155,7 @@ def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> R
 
 
 def _findable(target: Target) -> Target:
-    """Refuses a rig of points that is not found in images."""
+    """Refuses a rig of points that cannot be detected in images."""
     if target.kind == "points" and not target.point_tags:
         raise DataError(
             f"record: target {target.name} is a rig of points, which no image is searched for.",
@@ -296,7 +298,7 @@ def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions)
         say("All stops of the plan have their view; nothing is left to drive.")
         return
     first, seconds = leaving.stops[0], leaving.duration_s
-    long = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
+    duration = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
     postures = len(leaving.first)
     via = (
         f" by {postures - 1} posture{'s' if postures > 2 else ''} in between"
@@ -306,7 +308,7 @@ def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions)
     say(
         escape(
             f"{cell.arm.name}, {cell.camera.name}: {counted(count, 'stop')} to drive at "
-            f"{taking.speed:g} rad/s, about {long}"
+            f"{taking.speed:g} rad/s, about {duration}"
         )
     )
     say(
@@ -330,13 +332,13 @@ def _confirm(cell: LiveCell) -> None:
 
 def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
     """Ends with status 2 where stops of the plan gave no view."""
-    without = dict(missed(steps))
-    if without:
-        words = "; ".join(f"view {key}: {reason}" for key, reason in without.items())
+    missing = dict(missed(steps))
+    if missing:
+        words = "; ".join(f"view {key}: {reason}" for key, reason in missing.items())
         raise DataError(
-            f"{len(without)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
+            f"{len(missing)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
             f"views are in {journal.folder}.",
-            culprits=[f"view {index}" for index in without],
+            culprits=[f"view {index}" for index in missing],
             next_step="--resume tries them again.",
         )
 
@@ -353,7 +355,7 @@ def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) ->
 
 
 def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
-    known = [
+    predicted = [
         step.accuracy for step in steps if step.accuracy is not None and not step.accuracy.is_open
     ]
     summary: dict[str, Any] = {
@@ -367,8 +369,8 @@ def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
             for step in steps
         ],
     }
-    if known:
-        summary["predicted"] = {"sigma_mm": known[-1].mm, "sigma_deg": known[-1].deg}
+    if predicted:
+        summary["predicted"] = {"sigma_mm": predicted[-1].mm, "sigma_deg": predicted[-1].deg}
     return summary
 
 

@@ -69,10 +69,12 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
         base_from_target: (4, 4) the true pose [m].
     """
     points = touch_points(Session.load(folder), calibration)
-    true = [base_from_target[:3, :3] @ point.board_m + base_from_target[:3, 3] for point in points]
+    true_points = [
+        base_from_target[:3, :3] @ point.board_m + base_from_target[:3, 3] for point in points
+    ]
     gaps = [
-        1e3 * float(np.linalg.norm(point.base_m - at))
-        for point, at in zip(points, true, strict=True)
+        1e3 * float(np.linalg.norm(point.base_m - true))
+        for point, true in zip(points, true_points, strict=True)
     ]
     return judged(points, gaps)
 
@@ -145,12 +147,12 @@ def recorded(
         steps = _drive(bench, scene, folder, watchers, resume=resume, view=view)
         return RehearsedRecording(tuple(steps), None)
     injection = FaultInjection(bench, fault, after=max(1, len(scene.planned.stops) // 2))
-    kept = _Kept()
-    every = (*watchers, kept, injection)
+    keeper = _KeptViews()
+    all_watchers = (*watchers, keeper, injection)
     try:
-        _check_all_seen(_drive(bench, scene, folder, every, resume=False, view=view))
+        _check_all_seen(_drive(bench, scene, folder, all_watchers, resume=False, view=view))
     except VisioncalError as error:
-        reported_s = kept.missed_s or time.monotonic()
+        reported_s = keeper.missed_s or time.monotonic()
         if injection.injected_s is None:
             raise
         report_error(error, as_json=False)
@@ -166,17 +168,17 @@ def recorded(
         raise DriverError(f"rehearse: {fault} did not happen before all views were taken.")
     say(f"  ({fault} is mended; on with --resume)")
     injection.mend()
-    rest = _drive(bench, scene, folder, watchers, resume=True, view=view)
-    return RehearsedRecording((*kept.steps, *rest), suffered)
+    resumed_steps = _drive(bench, scene, folder, watchers, resume=True, view=view)
+    return RehearsedRecording((*keeper.steps, *resumed_steps), suffered)
 
 
 def calibrated(folder: Path, out: Path) -> tuple[Run, Written]:
     """Calibrates the recorded session, and writes the result."""
     session = Session.load(folder)
     with shown_progress(quiet=not sys.stderr.isatty()) as progress:
-        found = run(session, progress=progress)
+        result = run(session, progress=progress)
         progress("write", 0, 1)
-        return found, write_outputs(out, session, found)
+        return result, write_outputs(out, session, result)
 
 
 def _drive(
@@ -195,11 +197,11 @@ def _drive(
         offset_s = cell.clock.unix_offset_s()
         journal = begin(folder, facts, offset_s, len(scene.planned.stops))
         shown = opened.enter_context(shown_in(scene, cell, wanted=view))
-        every = [ViewLines(), *shown, *watchers]
-        return driven(cell, scene, journal, TAKING, every, asks=False)
+        all_watchers = [ViewLines(), *shown, *watchers]
+        return driven(cell, scene, journal, TAKING, all_watchers, asks=False)
 
 
-class _Kept:
+class _KeptViews:
     """A watcher that keeps the views of an interrupted recording.
 
     Attributes:
@@ -221,11 +223,11 @@ class _Kept:
 
 def _check_all_seen(steps: Sequence[CaptureEvent]) -> None:
     """Raises DataError where stops gave no view, as at the end of a recording."""
-    without = list(missed(steps))
-    if without:
-        view, reason = without[0]
+    missing = list(missed(steps))
+    if missing:
+        view, reason = missing[0]
         raise DataError(
-            f"{len(without)} of {len(steps)} stops gave no view; view {view}: {reason}.",
+            f"{len(missing)} of {len(steps)} stops gave no view; view {view}: {reason}.",
             next_step="--resume tries them again.",
         )
 
@@ -245,7 +247,7 @@ def rehearse(
         DriverError: A device failed other than by the fault.
         DataError: The views cannot be written, or are not enough for a result.
     """
-    begun = time.monotonic()
+    start = time.monotonic()
     cell = rehearsed_cell(options)
     scene = planned(cell, options, out / "plan")
     plan_ready = time.monotonic()
@@ -257,24 +259,24 @@ def rehearse(
         taken = recorded(bench, scene, out / "session", [witness], fault, view=view)
     captured = time.monotonic()
     run, written = calibrated(out / "session", out / "result")
-    found = run.calibration
+    calibration = run.calibration
     board = cell.truth.transforms.get("base_from_target")
-    test = None if board is None else touched(out / "session", found, board)
+    test = None if board is None else touched(out / "session", calibration, board)
     ended = time.monotonic()
     return Rehearsal(
         options,
         cell,
-        found,
+        calibration,
         written,
-        explained(found, cell.truth.transforms),
+        explained(calibration, cell.truth.transforms),
         taken,
         None if fault else pace_of(taken.steps, scene.planned, start_q, TAKING),
         tuple(witness.away_mm),
         {
-            "plan": plan_ready - begun,
+            "plan": plan_ready - start,
             "capture": captured - plan_ready,
             "calibrate": ended - captured,
-            "all": ended - begun,
+            "all": ended - start,
         },
         bench.through_depthai,
         test,
@@ -387,10 +389,10 @@ def _report_devices(bench: Bench) -> None:
 
 
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return versions

@@ -104,9 +104,9 @@ def _recompute(stored: "Stored") -> None:
             next_step="Name an output folder of visioncal calibrate, with its recording.rrd.",
         )
     with shown_progress(quiet=False) as progress:
-        found = recompute(stored.calibration, stored.session, progress=progress)
-    answers().print(escape(found.words))
-    if not found.is_same:
+        comparison = recompute(stored.calibration, stored.session, progress=progress)
+    answers().print(escape(comparison.words))
+    if not comparison.is_same:
         raise typer.Exit(_EXIT_OTHERS)
 
 

@@ -34,13 +34,13 @@ _ARM = frozenset(
     )
 )
 # Kinds of session that a whole cell can include.
-_ALONG = frozenset(("instrument", "torques"))
+_WITH_CELL = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
     "": _SINGLE | {"touches", "second_board"},
     "sweep": _SINGLE | {"clock_offset_ms", "readout_ms"},
     "warm_up": _SINGLE | {"currents"},
     "cell": _ARM
-    | _ALONG
+    | _WITH_CELL
     | {"views", "wrong_views", "images", "seed", "recording", "camera_moved_mm", "touches"}
     | {"board_scale", "with_intrinsics"},
     "instrument": _ARM | {"views", "robot", "seed"},
@@ -62,7 +62,7 @@ class SimulateOptions:
     ] = "wide"
     board: Annotated[
         Literal["charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"],
-        typer.Option(help="What is printed."),
+        typer.Option(help="The board's pattern."),
     ] = "charuco"
     second_board: Annotated[
         bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")
@@ -74,14 +74,15 @@ class SimulateOptions:
         float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation (mrad).")
     ] = 0.05
     arm_sigma_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Departure of the arm's lengths (mm).")
+        float,
+        typer.Option(min=0.0, max=100.0, help="Sigma of the errors of the arm's lengths (mm)."),
     ] = 0.0
     arm_sigma_mrad: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Departure of its angles (mrad).")
+        float, typer.Option(min=0.0, max=100.0, help="Sigma of the errors of its angles (mrad).")
     ] = 0.0
     wrong_views: Annotated[int, typer.Option(min=0, help="Views whose reported pose is wrong.")] = 0
     board_scale: Annotated[
-        float, typer.Option(min=0.5, max=2.0, help="Printed over stated size of the board.")
+        float, typer.Option(min=0.5, max=2.0, help="Ratio of printed to stated size of the board.")
     ] = 1.0
     with_intrinsics: Annotated[
         bool, typer.Option(help="Whether the session states the camera's intrinsics.")
@@ -94,13 +95,13 @@ class SimulateOptions:
         typer.Option(help="A sweep without stops: pose pairs by one clock, the robot by another."),
     ] = False
     clock_offset_ms: Annotated[
-        float, typer.Option(help="With --sweep: what the camera's clock is ahead (ms).")
+        float, typer.Option(help="With --sweep: lead of the camera's clock (ms).")
     ] = 37.0
     readout_ms: Annotated[
         float,
         typer.Option(
-            help="With --sweep: how long after its first row an image's last is taken (ms); other "
-            "than 0, the frames have corners (corners.csv) in the place of poses."
+            help="With --sweep: readout time from an image's first row to its last (ms); unless "
+            "0, the frames have corners (corners.csv) in place of poses."
         ),
     ] = 0.0
     warm_up: Annotated[
@@ -150,7 +151,7 @@ class SimulateOptions:
     ] = None
     payload_kg: Annotated[
         list[float] | None,
-        typer.Option(min=0.0, help="What the arm carries; several times for stops in turn."),
+        typer.Option(min=0.0, help="Payload of the arm (kg); repeated for stops in turn."),
     ] = None
     recording: Annotated[
         int,
@@ -221,9 +222,9 @@ def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
     )
 
     if asked.warm_up:
-        how = Round(first=asked.views)
-        warms = WarmUpOptions(options, round=how, temperatures=not asked.currents)
-        return simulate_warm_up(warms)
+        rounds = Round(first=asked.views)
+        warm_up = WarmUpOptions(options, round=rounds, temperatures=not asked.currents)
+        return simulate_warm_up(warm_up)
     if asked.sweep:
         clocks = SweepOptions(
             camera_minus_robot_s=1e-3 * asked.clock_offset_ms, readout_s=1e-3 * asked.readout_ms
@@ -278,7 +279,7 @@ def _given_for(context: typer.Context) -> frozenset[str]:
     )
     kinds = [take for take in _TAKES if context.params.get(take)]
     if "cell" in kinds:
-        kinds = [kind for kind in kinds if kind not in _ALONG]
+        kinds = [kind for kind in kinds if kind not in _WITH_CELL]
     if len(kinds) > 1:
         named = [_option(kind) for kind in kinds]
         raise DataError(
@@ -292,11 +293,11 @@ def _given_for(context: typer.Context) -> frozenset[str]:
     takes = _TAKES[kind]
     if kind == "cell" and context.params.get("torques"):
         takes = takes | {"currents"}
-    for unfit in sorted(given - takes - {"folder", kind}):
-        fit = [_option(name) for name, taken in _TAKES.items() if unfit in taken]
+    for wrong in sorted(given - takes - {"folder", kind}):
+        possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
         raise DataError(
-            f"{_option(unfit)} goes with {' or '.join(fit)}, not with {_option(kind)}.",
-            culprits=[_option(unfit)],
+            f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
+            culprits=[_option(wrong)],
             next_step="Leave it out."
             if kind != "cell"
             else "Leave it out; what a whole cell is made of is said by a file of your own.",

@@ -58,13 +58,13 @@ def whole_cell(
     return cell
 
 
-def exercised(cell: SimulatedCell, asked: SimulateOptions) -> SimulatedCell:
+def exercised(cell: SimulatedCell, options: SimulateOptions) -> SimulatedCell:
     """The cell with torque streams of all its robots."""
-    done = {
-        robot.name: exercise(exercise_options(asked, robot.robot, seed_of(cell.options.seed, at)))
+    exercises = {
+        robot.name: exercise(exercise_options(options, robot.robot, seed_of(cell.options.seed, at)))
         for at, robot in enumerate(cell.layout.robots)
     }
-    return with_exercises(cell, done)
+    return with_exercises(cell, exercises)
 
 
 def _described(
@@ -75,7 +75,12 @@ def _described(
     changes = {"views": "stops", "wrong_views": "stray_images", "seed": "seed"}
     changes |= {"recording": "recording"}
     described = replace(
-        described, **{own: getattr(options, word) for word, own in changes.items() if word in given}
+        described,
+        **{
+            field: getattr(options, parameter)
+            for parameter, field in changes.items()
+            if parameter in given
+        },
     )
     described = replace(
         described,
@@ -94,17 +99,17 @@ def _described(
         frame = frame_name("camera", described.cameras[0].name)
         knocked = Moved(frame, 0, shift_m=options.camera_moved_m, turn_rad=0.0)
         described = replace(described, moved=(*described.moved, knocked))
-    return described if instrument is None else _tracked_too(name, described, instrument)
+    return described if instrument is None else _with_instrument(name, described, instrument)
 
 
 def _with_given(thing: _T, options: CellOptions, given: frozenset[str]) -> _T:
     """A robot or a camera with the user's options."""
-    mine = {field.name for field in fields(thing)}
-    changed = {_FIELDS[name] for name in given & _FIELDS.keys()} & mine
-    return replace(thing, **{name: getattr(options, name) for name in changed})
+    names = {field.name for field in fields(thing)}
+    changes = {_FIELDS[name] for name in given & _FIELDS.keys()} & names
+    return replace(thing, **{name: getattr(options, name) for name in changes})
 
 
-def _tracked_too(name: str, described: NetworkOptions, instrument: Read) -> NetworkOptions:
+def _with_instrument(name: str, described: NetworkOptions, instrument: Read) -> NetworkOptions:
     """The description with an instrument that measures every robot's flange."""
     if described.instruments or described.points:
         raise DataError(
@@ -124,9 +129,9 @@ def _tracked_too(name: str, described: NetworkOptions, instrument: Read) -> Netw
     return replace(described, instruments=(tracker,), points=points)
 
 
-def exercise_options(asked: SimulateOptions, robot: str, seed: int) -> ExerciseOptions:
+def exercise_options(options: SimulateOptions, robot: str, seed: int) -> ExerciseOptions:
     """An arm's motions, without load or with a cube on its flange."""
-    loads = asked.payload_kg or [0.0]
+    loads = options.payload_kg or [0.0]
     if len(loads) > 1:
         raise DataError(
             f"--payload-kg is given {len(loads)} times; with --torques the arm carries one load.",
@@ -135,5 +140,5 @@ def exercise_options(asked: SimulateOptions, robot: str, seed: int) -> ExerciseO
         )
     inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
     load = LinkBody(loads[0], np.array(CENTRE_M), inertia) if loads[0] else None
-    senses = Senses(gains_nm_a=_GAINS_NM_A if asked.currents else ())
+    senses = Senses(gains_nm_a=_GAINS_NM_A if options.currents else ())
     return ExerciseOptions(robot, load, senses, seed=seed)

@@ -52,13 +52,13 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     if cell is not None:
         console.print(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
-        unturned = "" if edge.oriented else ", its rotation not measured"
-        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}{unturned}")
+        no_rotation = "" if edge.oriented else ", its rotation not measured"
+        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}{no_rotation}")
     if cell is not None:
         _print_noise(cell)
     else:
         _print_residuals(calibration)
-    for suspects in left_out(_unsaid(calibration.verdict, calibration.views)):
+    for suspects in left_out(_not_in_verdict(calibration.verdict, calibration.views)):
         console.print(escape(f"  {suspects.words}"))
     if cell is not None:
         console.print(escape(cell.weakest))
@@ -99,13 +99,13 @@ def _print_noise(cell: CellResult) -> None:
         console.print(f"noise of {name}: {', '.join(words)}")
 
 
-def _unsaid(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:
+def _not_in_verdict(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:
     """Views left out for a reason that the verdict does not state."""
-    said = [finding for finding in verdict.findings if finding.without_it]
+    findings = [finding for finding in verdict.findings if finding.without_it]
     for view in views:
-        about = [finding for finding in said if view.view in finding.views]
+        of_view = [finding for finding in findings if view.view in finding.views]
         if not any(
-            finding.kind != "wrong_views" or view.reason in finding.words for finding in about
+            finding.kind != "wrong_views" or view.reason in finding.words for finding in of_view
         ):
             yield view
 
@@ -113,11 +113,11 @@ def _unsaid(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResul
 def truth_table(
     calibration: Calibration, transforms: Mapping[str, FloatArray], camera: Camera
 ) -> Table:
-    """Errors against the truth, in millimetres and degrees and in units of the sigma.
+    """Table of errors against the truth, in millimetres and degrees and in units of sigma.
 
     Args:
         calibration: The result.
-        transforms: (4, 4) the true edges by name.
+        transforms: (4, 4) the true edges by name [m].
         camera: The true lens.
     """
     table = Table("against the truth", "error", "sigma", "error / sigma", box=None)

@@ -124,7 +124,7 @@ def make_command(
         bool | None,
         typer.Option("--landscape/--portrait", help="Left out: as the board fits."),
     ] = None,
-    dpi: Annotated[float, typer.Option(help="Pixels an inch of the PNG.")] = 300.0,
+    dpi: Annotated[float, typer.Option(help="Resolution of the PNG, in pixels per inch.")] = 300.0,
     *,
     board: BoardOptions,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
@@ -232,7 +232,7 @@ def check_command(
 
 
 def _checked(target: "Target") -> None:
-    """Refuses boards that a session could not load, such as a size in metres given as millimetres."""
+    """Refuses boards that no session could load, such as sizes in millimetres taken as metres."""
     from visioncal.vision.targets import target_document, target_from_document
 
     target_from_document(target_document(target), target.name)

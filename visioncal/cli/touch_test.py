@@ -52,11 +52,11 @@ def touch_test_command(
         ),
     ] = None,
     height_mm: Annotated[
-        float, typer.Option(min=1.0, max=1000.0, help="To hover at, first.")
+        float, typer.Option(min=1.0, max=1000.0, help="Hovering height, before the touch.")
     ] = 50.0,
     gaps_mm: Annotated[
         str | None,
-        typer.Option(metavar="A,B,C,D,E", help="Tip to point, as measured, in their order."),
+        typer.Option(metavar="A,B,C,D,E", help="Measured gaps from tip to point, in their order."),
     ] = None,
     drive: Annotated[
         str | None,
@@ -86,8 +86,8 @@ def touch_test_command(
 
     loaded = Session.load(session)
     calibration = named_result(calibration, "-c", "touch-test: the calibration to prove")
-    known = load_result(calibration)
-    if known.cell is not None:
+    result = load_result(calibration)
+    if result.cell is not None:
         raise DataError(
             f"touch-test is for one camera and one robot, and {calibration} is of a whole cell.",
             culprits=["-c"],
@@ -95,7 +95,7 @@ def touch_test_command(
             f"-c {shlex.quote(str(calibration))} --camera NAME --robot NAME say where the board "
             "is, touch it there, and compare.",
         )
-    has_tools = any(frame.startswith("flange_from_") for frame in known.frames)
+    has_tools = any(frame.startswith("flange_from_") for frame in result.frames)
     is_bare = tool == "none" or (tool is None and not has_tools)
     if not (is_bare or has_tools):
         raise DataError(
@@ -104,45 +104,45 @@ def touch_test_command(
             next_step="Find the tip first, and let it join the calibration: "
             f"visioncal tcp TOUCHES -c {shlex.quote(str(calibration))} --name gripper",
         )
-    touching = None if is_bare else Tool.among(known.frames, "The calibration", tool)
+    touching = None if is_bare else Tool.among(result.frames, "The calibration", tool)
     with shown_progress(quiet=as_json):
-        points = touch_points(loaded, known, touching)
-    targets = [_target(known, point, 1e-3 * height_mm) for point in points]
+        points = touch_points(loaded, result, touching)
+    targets = [_target(result, point, 1e-3 * height_mm) for point in points]
     if gaps_mm is not None:
         count = gaps_mm.count(",") + 1
         gaps = [*numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
     elif drive is not None:
-        gaps = _driven(drive, known, points, targets, 1e-3 * height_mm, asks=not yes)
+        gaps = _drive(drive, result, points, targets, 1e-3 * height_mm, asks=not yes)
     elif sys.stdin.isatty() and not as_json:
-        gaps = _asked(points, targets)
+        gaps = _ask_gaps(points, targets)
     else:
         _report(points, targets, as_json=as_json)
         return
     test = judged(points, gaps, touching)
-    proved = replace(known, touch_test=test)
-    written = rewrite(calibration if calibration.is_dir() else calibration.parent, proved)
+    extended = replace(result, touch_test=test)
+    written = rewrite(calibration if calibration.is_dir() else calibration.parent, extended)
     if as_json:
-        document = {"points": targets, "touch_test": to_document(proved)["touch_test"]}
+        document = {"points": targets, "touch_test": to_document(extended)["touch_test"]}
         print_json(document)
     else:
         answers().print(escape(finding_of(test).reason))
     report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
 
 
-def _target(known: "Calibration", point: "TouchPoint", height_m: float) -> dict[str, Any]:
+def _target(calibration: "Calibration", point: "TouchPoint", height_m: float) -> dict[str, Any]:
     """Targets of the robot for its own controller."""
     from visioncal.results.compensation import correct
 
     touch, hover = point.base_from_flange, point.above(height_m)
-    found: dict[str, Any] = {
+    document: dict[str, Any] = {
         "name": point.name,
         "base_m": point.base_m.tolist(),
         "radius95_mm": point.radius95_mm,
     }
-    if known.arm_is_calibrated:
-        sent = correct(known, [hover, touch])
-        (hover, touch), found["q_rad"] = sent.base_from_flange, sent.q[1].tolist()
-    return found | {"hover": _numbers(hover), "touch": _numbers(touch)}
+    if calibration.arm_is_calibrated:
+        corrected = correct(calibration, [hover, touch])
+        (hover, touch), document["q_rad"] = corrected.base_from_flange, corrected.q[1].tolist()
+    return document | {"hover": _numbers(hover), "touch": _numbers(touch)}
 
 
 def _numbers(pose: "FloatArray") -> list[float]:
@@ -178,7 +178,7 @@ def _report_point(point: "TouchPoint", target: dict[str, Any], console: Console)
         console.print(f"  {name}: {', '.join(numbers)}")
 
 
-def _asked(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) -> list[float]:
+def _ask_gaps(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) -> list[float]:
     """Asks for the gaps, one point after the other."""
     console = messages()
     console.print(_FORM)
@@ -189,9 +189,9 @@ def _asked(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) ->
     return gaps
 
 
-def _driven(
+def _drive(
     words: str,
-    known: "Calibration",
+    calibration: "Calibration",
     points: "Sequence[TouchPoint]",
     targets: Sequence[dict[str, Any]],
     height_m: float,
@@ -204,7 +204,7 @@ def _driven(
     from visioncal.live.capture.hover import Hovering
     from visioncal.live.drivers.protocols import MovingArm
 
-    if known.robot is None:
+    if calibration.robot is None:
         raise DataError(
             "--drive: the calibration has no model of the robot.",
             culprits=["--drive"],
@@ -218,14 +218,14 @@ def _driven(
             raise DataError(f"{arm.name} cannot be driven.", culprits=["--drive"])
         for point, target in zip(points, targets, strict=True):
             tip_m = (invert(point.base_from_flange) @ [*point.base_m, 1.0])[:3]
-            hovering = Hovering(arm, known.robot, tip_m, point.base_m, point.normal, height_m)
-            _brought(hovering, _pose(target["hover"]))
+            hovering = Hovering(arm, calibration.robot, tip_m, point.base_m, point.normal, height_m)
+            _bring(hovering, _pose(target["hover"]))
             _report_point(point, target, messages())
             gaps.append(_gap())
     return gaps
 
 
-def _brought(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
+def _bring(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
     """Drives the tip above a point; retries while the arm refuses, as in local control."""
     while True:
         try:

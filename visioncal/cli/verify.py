@@ -47,7 +47,7 @@ def verify_command(
     ] = False,
     policy: Annotated[
         Path | None,
-        typer.Option(help="A table of one's own of when to calibrate again (.toml)."),
+        typer.Option(help="Your own table of when to calibrate again (.toml)."),
     ] = None,
     output: Annotated[
         Path | None,
