@@ -28,8 +28,7 @@ def calibrate_command(
     views: Annotated[
         str | None,
         typer.Option(
-            metavar="1-12,14",
-            help="These views alone, as those before or after something moved.",
+            metavar="1-12,14", help="These views alone, as those before or after something moved."
         ),
     ] = None,
     solver: Annotated[

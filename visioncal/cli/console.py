@@ -100,11 +100,7 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
 def report_written(written: "Written", *, quiet: bool = False, status: int = 0) -> None:
     """Prints which files were written, and exits unless all is well.
 
-    Args:
-        written: The files.
-        quiet: Whether to print only missing files.
-        status: The exit status of the command. Where it is 0, a file that could not be drawn makes
-            it 1.
+    The exit status is `status`, or 1 where that is 0 and a file could not be drawn.
 
     Raises:
         typer.Exit: The status is not 0.

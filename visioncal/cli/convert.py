@@ -72,9 +72,7 @@ class ConvertOptions(RobotPoseOptions):
     image_column: Annotated[
         str | None,
         _camera(
-            "--image-column",
-            "--image-key",
-            help="The column or key that names each row's image.",
+            "--image-column", "--image-key", help="The column or key that names each row's image."
         ),
     ] = None
     corners: Annotated[

@@ -19,7 +19,7 @@ class CorrectOptions:
         Path,
         typer.Argument(
             help="A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
-            "base_from_flange; q1_rad ... may say which posture is meant; others are kept.",
+            "base_from_flange; q1_rad ... may say which posture is meant; others are kept."
         ),
     ]
     calibration: Annotated[

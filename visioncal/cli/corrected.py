@@ -61,7 +61,12 @@ def correct_table(options: CorrectOptions) -> None:
         base_from_flange,
         _seeds(targets.q_seed, options.seed_joints),
         widest_rad=np.deg2rad(_checked_widest(options.widest_deg)),
-        loads=_loads(len(base_from_flange), options.payload_kg, options.payload_m),
+        loads=Loads.alike(
+            len(base_from_flange),
+            options.payload_kg,
+            numbers_in(options.payload_m, "--payload-m", "x,y,z"),
+            (0.0, 0.0, 0.0),
+        ),
     )
     unreachable = tuple(_unreachable(targets, corrected))
     rows = np.flatnonzero(corrected.reached)
@@ -79,8 +84,7 @@ def correct_table(options: CorrectOptions) -> None:
     if options.file is not None:
         write_atomically(options.file, table_to_send(targets, columns, rows))
     if options.as_json:
-        document = _document(targets, columns, rows, unreachable) | {"warnings": warnings}
-        print_json(document)
+        print_json(_document(targets, columns, rows, unreachable) | {"warnings": warnings})
         return
     if options.file is None:
         typer.echo(table_to_send(targets, columns, rows), nl=False)
@@ -95,8 +99,7 @@ def _at_temperatures(calibration: Calibration, words: str | None) -> Calibration
     """The calibration at the stated temperatures."""
     if words is None:
         return calibration
-    count = calibration.drift.joint_count
-    form = ",".join(f"T{index}" for index in range(1, count + 1))
+    form = ",".join(f"T{index + 1}" for index in range(calibration.drift.joint_count))
     temperatures = np.array(numbers_in(words, "--temperatures", form))
     wrong = no_celsius(temperatures)
     if wrong:
@@ -111,11 +114,6 @@ def _checked_widest(degrees: float) -> float:
             culprits=["--widest-deg"],
         )
     return degrees
-
-
-def _loads(count: int, payload_kg: float, payload_m: str) -> Loads:
-    centre = numbers_in(payload_m, "--payload-m", "x,y,z")
-    return Loads.alike(count, payload_kg, centre, (0.0, 0.0, 0.0))
 
 
 def _warn_payload(arm: CalibratedArm, payload_kg: float) -> Iterator[str]:

@@ -18,10 +18,7 @@ if TYPE_CHECKING:
 _EXIT_FINDINGS = 3
 
 
-def doctor_command(
-    session: SessionArgument,
-    as_json: AsJson = False,
-) -> None:
+def doctor_command(session: SessionArgument, as_json: AsJson = False) -> None:
     """Say what is wrong with a session before it is calibrated, and what to type.
 
     Checks files, pairing, units, conventions of the poses, the board, blur, coverage, motion and

@@ -88,19 +88,12 @@ class StreamOptions:
                 culprits=["--gains"],
             ) from error
         return IdentificationRequest(
-            tuple(self.stream or ()),
-            cutoff_hz=self.cutoff_hz,
-            gains_nm_a=gains,
-            robot=self.robot,
+            tuple(self.stream or ()), cutoff_hz=self.cutoff_hz, gains_nm_a=gains, robot=self.robot
         )
 
 
 def friction_terms(words: str, known: Sequence[str]) -> "FrictionTerms":
-    """Reads the option --friction.
-
-    Args:
-        words: The option's value: names separated by commas, or none.
-        known: The existing names, in the order of the terms.
+    """Reads the option --friction: names among `known`, separated by commas, or none.
 
     Raises:
         DataError: There is no such term.

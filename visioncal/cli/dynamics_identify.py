@@ -33,8 +33,7 @@ class IdentifyOptions:
         ),
     ] = None
     friction: Annotated[
-        str,
-        typer.Option(help=f"Friction terms of the joints: {', '.join(FRICTION)}; or none."),
+        str, typer.Option(help=f"Friction terms of the joints: {', '.join(FRICTION)}; or none.")
     ] = "coulomb,viscous,offset"
     rotors: Annotated[
         bool | None,
@@ -48,8 +47,7 @@ class IdentifyOptions:
         bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
     ] = True
     unchecked: Annotated[
-        bool,
-        typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
+        bool, typer.Option("--unchecked", help="Take torques that contradict the robot's inertias.")
     ] = False
     as_json: AsJson = False
 

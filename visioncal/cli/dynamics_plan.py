@@ -29,8 +29,7 @@ class ExcitationOptions:
     sweep_speeds: Annotated[int, _motion(help="Speeds at which each joint sweeps.")] = 6
     no_sweeps: Annotated[bool, _motion("--no-sweeps", help="Only the exciting motion.")] = False
     rate_hz: Annotated[
-        float,
-        _motion("--rate", min=1.0, max=4000.0, help="Sampling rate of the tables, in Hz."),
+        float, _motion("--rate", min=1.0, max=4000.0, help="Sampling rate of the tables, in Hz.")
     ] = 500.0
     starts: Annotated[
         int, _motion(help="Random motions to search from; more take longer and find better ones.")
@@ -52,8 +51,7 @@ class ArmOptions:
     speed: Annotated[float, _limits(help="Fraction of the maximum speeds.")] = 0.9
     acceleration: Annotated[float, _limits(help="Fraction of the maximum accelerations.")] = 0.9
     torque_margin: Annotated[
-        float,
-        _limits(help="Safety factor on the torques of the nominal inertias."),
+        float, _limits(help="Safety factor on the torques of the nominal inertias.")
     ] = 1.2
     tool: Annotated[
         str | None,

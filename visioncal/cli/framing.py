@@ -98,7 +98,6 @@ class FrameLocation:
     """Destination of a frame.
 
     Attributes:
-        name: The transform's name.
         calibration: The result of the camera and robot in question; None where none is named.
         result: The result from which it was extracted, of a cell or itself.
         folder: The output folder that the frame joins; None where it does not.
@@ -204,14 +203,7 @@ def _folder(path: Path) -> Path:
 
 
 def keep_and_report(place: FrameLocation, frame: "Frame", source: Path, *, as_json: bool) -> None:
-    """Writes a frame to its destination, and prints it for people, or as JSON.
-
-    Args:
-        place: The destination.
-        frame: The frame.
-        source: The path of the touches or images.
-        as_json: Whether to print JSON.
-    """
+    """Writes a frame to its destination, and prints it for people, or as JSON."""
     # The suggested command runs again, and has a frame to replace then.
     again = [*sys.argv, *([] if "--force" in sys.argv else ["--force"])]
     out = place.file or place.folder or ""
@@ -246,11 +238,9 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
     undrawn = [undrawn.file for undrawn in written.undrawn]
     recording = None if place.folder is None else place.folder / RECORDING
     if recording is not None and recording not in (*written.files, *undrawn):
-        why = "it is missing or of another result"
-        say(f"{recording} was not renewed: {why}")
+        say(f"{recording} was not renewed: it is missing or of another result")
     if not written.files:
-        where = "-c joins it to a calibration, -o puts it into a file"
-        say(f"nothing was written: {where}")
+        say("nothing was written: -c joins it to a calibration, -o puts it into a file")
     report_written(written)
 
 
@@ -268,13 +258,9 @@ class Asked:
     """Request of `tcp` or `fixture`.
 
     Attributes:
-        kind: The kind of frame.
         source: Touches, as a table or a session, or a session of images.
-        goes: Destination of the frame.
         written: Convention of the touches.
-        part: Which camera, robot and target of a cell are meant.
         point_mm: For images: the frame's origin in the target's frame, as typed.
-        as_json: Whether to print JSON.
     """
 
     kind: FrameKind
@@ -355,10 +341,7 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session 
 
 
 def _by_images(
-    request: Asked,
-    session: "Session",
-    calibration: "Calibration",
-    drawing: "NominalPoints | None",
+    request: Asked, session: "Session", calibration: "Calibration", drawing: "NominalPoints | None"
 ) -> "Frame":
     import numpy as np
 

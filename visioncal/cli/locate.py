@@ -51,14 +51,12 @@ def locate_command(
     pixel: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="U,V",
-            help="A feature, in the image as it was taken; several may be given.",
+            metavar="U,V", help="A feature, in the image as it was taken; several may be given."
         ),
     ] = None,
     plane: Annotated[str | None, typer.Option(help=f"Plane of the features: {FORMS}.")] = None,
     plane_sigma: Annotated[
-        float | None,
-        typer.Option("--plane-sigma-mm", help="Sigma of the plane's height, in mm."),
+        float | None, typer.Option("--plane-sigma-mm", help="Sigma of the plane's height, in mm.")
     ] = None,
     point: Annotated[
         str | None,
@@ -330,8 +328,7 @@ def _report(points: Sequence[_Point], *, as_json: bool) -> None:
     for point in points:
         typer.echo(f"{point.words}: {_line(point.located)}")
         for warning in point.located.warnings:
-            words = warning if warning.startswith(point.words) else f"{point.words}: {warning}"
-            warn(words)
+            warn(warning if warning.startswith(point.words) else f"{point.words}: {warning}")
 
 
 def _line(located: "Located") -> str:

@@ -21,8 +21,7 @@ OutFolder: TypeAlias = Annotated[
     Path, typer.Option("-o", "--out", file_okay=False, help="The folder to write into.")
 ]
 OutFile: TypeAlias = Annotated[
-    Path | None,
-    typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
+    Path | None, typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout.")
 ]
 AsJson: TypeAlias = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON to stdout, without words.")

@@ -25,12 +25,9 @@ _LEAD = "base_from_"
 
 
 def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
-    """Parses an option of numbers.
+    """Parses an option of numbers, such as `12.5,-3,0`.
 
-    Args:
-        words: The option's value: `12.5,-3,0`.
-        option: The option's name, for messages.
-        form: Names of the numbers, separated by commas: `x,y,z`.
+    `form` has their names, separated by commas: `x,y,z`.
 
     Raises:
         DataError: It is not that many finite numbers.
@@ -106,10 +103,7 @@ def _whole_numbers(words: str) -> list[int]:
 def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leave it out.") -> None:
     """Refuses options that do not apply here.
 
-    Args:
-        options: Values by option; None for those that were not given.
-        why: The reason, in words.
-        next_step: What to do instead.
+    Values are by option, None for those that were not given; `why` is the reason in words.
 
     Raises:
         DataError: One is given.
@@ -122,10 +116,7 @@ def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leav
 def named_result(path: "Path | None", option: str, what: str) -> "Path":
     """The path of a result, which an option has to name.
 
-    Args:
-        path: The option's value; None where none is given.
-        option: The option's name.
-        what: Description for messages: `verify: the calibration to check`.
+    `what` describes it in messages: `verify: the calibration to check`.
 
     Raises:
         DataError: None is named.

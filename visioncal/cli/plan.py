@@ -33,7 +33,7 @@ def plan_command(
         str,
         typer.Argument(
             help="A robot (a built-in name, a .urdf or .toml), a session, or an output folder of "
-            "calibrate.",
+            "calibrate."
         ),
     ],
     wanted: PlanOptions,

@@ -35,8 +35,7 @@ class PlanOptions:
         _what(min=1, max=500, help="How many stops to add to a recorded session, which counts."),
     ] = None
     purpose: Annotated[
-        str,
-        _what("--for", metavar="|".join(PURPOSES), help="What they are for."),
+        str, _what("--for", metavar="|".join(PURPOSES), help="What they are for.")
     ] = "hand-eye"
     stops: Annotated[int | None, _what(min=1, max=500, help=f"How many stops: {_USUAL_STOPS}.")] = (
         None

@@ -42,14 +42,7 @@ Kept: TypeAlias = tuple[Limits, tuple[Box, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Source of a plan.
-
-    Attributes:
-        words: Its description, for people.
-        robot: The robot, if it is one.
-        calibration: The result, if it is one.
-        session: The recorded session, if there is one.
-    """
+    """Source of a plan: a robot, a calibration or a session; `words` describes it for people."""
 
     words: str
     robot: Robot | None = None
@@ -242,10 +235,7 @@ def _with_noise(cell: PlanCell, words: PlanCellOptions) -> PlanCell:
         value = getattr(words, name)
         option = f"--{name.replace('_', '-')}"
         if value is not None and not 0.0 <= value < np.inf:
-            raise DataError(
-                f"{option} is {value}; zero or more is needed.",
-                culprits=[option],
-            )
+            raise DataError(f"{option} is {value}; zero or more is needed.", culprits=[option])
     sigma_rad, sigma_m = cell.noise.robots[0].tolist()
     sigma_m = sigma_m if words.noise_mm is None else 1e-3 * words.noise_mm
     sigma_rad = sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))

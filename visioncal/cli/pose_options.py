@@ -41,11 +41,7 @@ class RobotPoseOptions:
     ] = None
     joint_columns: Annotated[
         str | None,
-        poses_option(
-            "--joint-columns",
-            "--joint-key",
-            help="Columns or keys of the joint angles.",
-        ),
+        poses_option("--joint-columns", "--joint-key", help="Columns or keys of the joint angles."),
     ] = None
     joint_unit: Annotated[Literal["rad", "deg"], poses_option(help="Unit of the joint angles.")] = (
         "rad"

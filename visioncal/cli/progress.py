@@ -59,11 +59,7 @@ class Steps:
 
 @contextmanager
 def shown_progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Shows progress as a bar on a terminal, else as occasional lines.
-
-    Args:
-        quiet: Whether to show nothing.
-    """
+    """Shows progress as a bar on a terminal, else as occasional lines; nothing if quiet."""
     steps = Steps()
     if quiet:
         yield steps.report

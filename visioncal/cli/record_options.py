@@ -65,9 +65,8 @@ class TakingOptions:
     def options(self, *, single: bool, lost: int) -> CaptureOptions:
         """The options of a capture.
 
-        Args:
-            single: Whether the camera provides each picture only once.
-            lost: Allowed number of consecutive stops without a view.
+        `single` is for a camera that provides each picture once; `lost` is the allowed number of
+        consecutive stops without a view.
         """
         return CaptureOptions(
             speed=self.speed,

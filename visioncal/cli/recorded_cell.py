@@ -71,8 +71,6 @@ class RecordedSetup:
     """Setup of a recording.
 
     Attributes:
-        mount: Where the camera is.
-        target: The board.
         robot: The arm's model; None where unknown.
         plan: The stops; None without a plan.
     """

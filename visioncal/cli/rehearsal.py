@@ -61,13 +61,7 @@ _CANDIDATES = 600
 
 
 def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray) -> TouchTest:
-    """Simulated touch test of the located points, with the true pose of the board.
-
-    Args:
-        folder: Folder of the session.
-        calibration: Its result.
-        base_from_target: (4, 4) the true pose [m].
-    """
+    """Simulated touch test of located points, with the board's true (4, 4) pose [m]."""
     points = touch_points(Session.load(folder), calibration)
     true_points = [
         base_from_target[:3, :3] @ point.board_m + base_from_target[:3, 3] for point in points
@@ -97,7 +91,6 @@ class Suffered:
     """Effect of a fault on a recording.
 
     Attributes:
-        name: The fault.
         message: The error message.
         next_step: The remedy in it.
         told_after_s: Delay of the message after the fault [s].
@@ -194,8 +187,7 @@ def _drive(
         cell = opened.enter_context(bench.connected())
         begin = Journal.resume if resume else Journal.begin
         facts = facts_of(scene, cell, folder.name)
-        offset_s = cell.clock.unix_offset_s()
-        journal = begin(folder, facts, offset_s, len(scene.planned.stops))
+        journal = begin(folder, facts, cell.clock.unix_offset_s(), len(scene.planned.stops))
         shown = opened.enter_context(shown_in(scene, cell, wanted=view))
         all_watchers = [ViewLines(), *shown, *watchers]
         return driven(cell, scene, journal, TAKING, all_watchers, asks=False)
@@ -235,13 +227,7 @@ def _check_all_seen(steps: Sequence[CaptureEvent]) -> None:
 def rehearse(
     options: RehearsalOptions, out: Path, fault: Faults | None, *, view: bool
 ) -> "Rehearsal":
-    """Plans, records and calibrates.
-
-    Args:
-        options: The options of the rehearsal.
-        out: The folder for the plan, the session and the result, each in one of its own.
-        fault: The fault to inject half way; None for none.
-        view: Whether the viewer shows it live.
+    """Plans, records and calibrates, each into its own folder, with a fault half way if wanted.
 
     Raises:
         DriverError: A device failed other than by the fault.
@@ -288,17 +274,10 @@ class Rehearsal:
     """Result of a rehearsal.
 
     Attributes:
-        options: The options.
-        cell: The cell.
-        calibration: The result.
-        written: Its files.
         error: Chi-square test of its error.
-        taken: The recorded views.
         pace: Durations of the views; None with a fault.
         away_mm: Distance of the flange from its recorded position, by view [mm].
-        times_s: Duration of each part [s].
         through_depthai: Whether the pictures went through depthai's pipeline.
-        touch_test: The touch test; None for a board on the flange.
     """
 
     options: RehearsalOptions

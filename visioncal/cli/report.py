@@ -28,11 +28,7 @@ def report_command(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            help="The file; report.html or certificate.html otherwise.",
-        ),
+        typer.Option("-o", "--out", help="The file; report.html or certificate.html otherwise."),
     ] = None,
     certificate: Annotated[
         bool, typer.Option("--certificate", help="One page to print and sign, instead.")
@@ -80,12 +76,7 @@ def report_command(
         return
     out = out or Path("report.html")
     write_report(
-        out,
-        stored.calibration,
-        stored.session,
-        stored.evidence,
-        stored.note,
-        stored.review,
+        out, stored.calibration, stored.session, stored.evidence, stored.note, stored.review
     )
     # A cell's page shows nothing that a recording adds.
     if stored.note and stored.calibration.cell is None:

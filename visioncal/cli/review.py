@@ -85,10 +85,7 @@ def _row(file: Path, view: int | None) -> int | None:
 
 
 def find_recording(path: Path) -> Path:
-    """Path of a recording or preview.
-
-    Args:
-        path: An `.rrd`, or a folder that holds recording.rrd, or else plan.rrd.
+    """Path of a recording: an `.rrd`, or the recording.rrd, else plan.rrd, in a folder.
 
     Raises:
         DataError: There is none, or it is something else, such as a session's folder.

@@ -113,13 +113,7 @@ def _not_in_verdict(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[V
 def truth_table(
     calibration: Calibration, transforms: Mapping[str, FloatArray], camera: Camera
 ) -> Table:
-    """Table of errors against the truth, in millimetres and degrees and in units of sigma.
-
-    Args:
-        calibration: The result.
-        transforms: (4, 4) the true edges by name [m].
-        camera: The true lens.
-    """
+    """Table of errors against the truth, in millimetres, degrees, pixels and units of sigma."""
     table = Table("against the truth", "error", "sigma", "error / sigma", box=None)
     for name, edge_error in edge_errors(calibration, transforms).items():
         for error, sigma, unit in (

@@ -121,8 +121,7 @@ def make_command(
         ),
     ] = None,
     landscape: Annotated[
-        bool | None,
-        typer.Option("--landscape/--portrait", help="Left out: as the board fits."),
+        bool | None, typer.Option("--landscape/--portrait", help="Left out: as the board fits.")
     ] = None,
     dpi: Annotated[float, typer.Option(help="Resolution of the PNG, in pixels per inch.")] = 300.0,
     *,

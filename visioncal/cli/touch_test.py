@@ -122,8 +122,7 @@ def touch_test_command(
     extended = replace(result, touch_test=test)
     written = rewrite(calibration if calibration.is_dir() else calibration.parent, extended)
     if as_json:
-        document = {"points": targets, "touch_test": to_document(extended)["touch_test"]}
-        print_json(document)
+        print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
         answers().print(escape(finding_of(test).reason))
     report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)

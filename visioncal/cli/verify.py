@@ -46,8 +46,7 @@ def verify_command(
         bool, typer.Option("--collision", help="A collision was reported since.")
     ] = False,
     policy: Annotated[
-        Path | None,
-        typer.Option(help="Your own table of when to calibrate again (.toml)."),
+        Path | None, typer.Option(help="Your own table of when to calibrate again (.toml).")
     ] = None,
     output: Annotated[
         Path | None,

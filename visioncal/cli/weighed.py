@@ -145,8 +145,7 @@ def _report_gains(names: tuple[str, ...], found: Gains) -> None:
             words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
         say(f"{name}: {words}")
     if found.determined.all():
-        gains = ",".join(f"{value:.5g}" for value in found.nm_per_a)
-        typer.echo(f"--gains {gains}")
+        typer.echo(f"--gains {','.join(f'{value:.5g}' for value in found.nm_per_a)}")
     else:
         say(
             "--gains needs all joints: move those that are not determined more, or take a body "

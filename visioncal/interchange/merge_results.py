@@ -20,10 +20,6 @@ def rewrite(folder: Path, calibration: Calibration) -> Written:
     Without a recording that belongs to the result, none is written, and the report says what is
     missing.
 
-    Args:
-        folder: An output folder of `visioncal calibrate`.
-        calibration: The result in it, extended by frames for example.
-
     Returns:
         The files that were written: without the recording where there was none to extend.
 
@@ -39,8 +35,7 @@ def rewrite(folder: Path, calibration: Calibration) -> Written:
             culprits=[str(folder)],
             next_step="Name the output folder that the result was loaded from.",
         )
-    run = Run(calibration, stored.evidence)
-    return write_outputs(folder, stored.session, run, stored.note)
+    return write_outputs(folder, stored.session, Run(calibration, stored.evidence), stored.note)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +81,7 @@ class Leftover:
 def leftover(folder: Path) -> Leftover | None:
     """Finds the frames that a new result in a folder would lose; None where there are none.
 
-    Args:
-        folder: The destination of the new result. An unreadable result there is no error: it has
-            nothing to lose.
+    An unreadable result is no error: it has nothing to lose.
 
     Raises:
         DataError: The file of frames there cannot be read, nor be replaced.

@@ -56,7 +56,6 @@ class Written:
 
     Attributes:
         files: The files, the result first.
-        undrawn: Files that could not be drawn.
     """
 
     files: tuple[Path, ...]
@@ -121,20 +120,9 @@ def write_outputs(
 
 
 def write_check(
-    folder: Path,
-    check: "Check",
-    triggers: "Sequence[Outcome]",
-    verdict: "Verdict",
-    document: str,
+    folder: Path, check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict", document: str
 ) -> Written:
     """Writes a check's page and JSON into a folder, atomically.
-
-    Args:
-        folder: The folder; created where there is none.
-        check: The check.
-        triggers: Outcomes of the policy's triggers.
-        verdict: The verdict.
-        document: The content of verify.json.
 
     Returns:
         The files that were written: the JSON even where drawing the page failed.
@@ -168,11 +156,6 @@ def refuse_calibration(folder: Path) -> None:
 def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Written:
     """Writes a plan's table, program, preview and JSON into a folder, atomically.
 
-    Args:
-        folder: The folder; created where there is none.
-        plan: The plan.
-        document: The content of plan.json.
-
     Returns:
         The files that were written: all but the preview even where drawing that failed. Robots that
         are not programmed like a UR get no program, and that of an earlier plan is removed.
@@ -203,12 +186,6 @@ def write_motions(
 ) -> Written:
     """Writes planned motions as tables, programs, preview and JSON, atomically.
 
-    Args:
-        folder: The folder; created where there is none.
-        plan: The motions.
-        rate_hz: Sampling rate of the tables [Hz].
-        document: The content of plan.json.
-
     Returns:
         The files that were written: all but the preview even where drawing that failed. Robots that
         are not programmed like a UR get no programs; files of an earlier plan that this one lacks
@@ -235,10 +212,6 @@ def write_motions(
 
 def write_dynamics(folder: Path, run: "Run") -> Written:
     """Writes identified dynamics, their report and recording into a folder, atomically.
-
-    Args:
-        folder: The folder; created where there is none.
-        run: The result with its evidence.
 
     Returns:
         The files that were written: the result even where drawing the others failed.
@@ -270,12 +243,7 @@ def _write(
 ) -> Written:
     """Writes results and drawings as one generation; a drawing that fails is left out.
 
-    Args:
-        folder: The folder.
-        results: Writers of the required files; the main result first.
-        drawings: Writers of the other files.
-        others: Files of an earlier generation to remove.
-        without: Drawings to leave out.
+    The main result is first in `results`; files named in `others` and `without` are removed.
     """
     drawings = {name: draw for name, draw in drawings.items() if name not in without}
     undrawn: list[Undrawn] = []

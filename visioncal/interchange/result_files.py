@@ -30,7 +30,6 @@ class Stored:
     """A result with its session and evidence.
 
     Attributes:
-        calibration: The result.
         session: The session that it was computed from; None where it was not kept.
         evidence: Evidence of each view; empty where it was not kept.
         note: Why something is missing, for the user; empty where nothing is.

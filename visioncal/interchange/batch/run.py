@@ -53,8 +53,6 @@ class Batch:
 
     Attributes:
         rows: One a session, the strongest outliers first.
-        table: The file of the rows.
-        page: The page of the rows.
     """
 
     rows: tuple[FleetRow, ...]

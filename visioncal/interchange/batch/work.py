@@ -23,14 +23,7 @@ _SESSION = "session.toml"
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a batch on which its results depend.
-
-    Attributes:
-        level: As in `calibrate`.
-        need_mm: As in `calibrate`.
-        need_deg: As in `calibrate`.
-        without: The files that are left out.
-    """
+    """Options of a batch on which its results depend, as in `calibrate`."""
 
     level: str = "auto"
     need_mm: float | None = None
@@ -44,9 +37,7 @@ class Job:
 
     Attributes:
         name: Its name in the batch.
-        session: Its absolute path.
         folder: Absolute path for its result.
-        options: How it is calibrated.
     """
 
     name: str
@@ -58,10 +49,7 @@ class Job:
 def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list[Job]:
     """One job a session, in their natural order.
 
-    Args:
-        sessions: Folders of sessions, recordings, folders of sessions, or globs.
-        out: Folder for the results.
-        options: How they are calibrated.
+    Sessions are folders, recordings, folders of sessions, or globs.
 
     Returns:
         The jobs, named by their paths below the folder that all sessions share.

@@ -78,14 +78,10 @@ class ArmContent:
     """Content for a format of arms.
 
     Attributes:
-        nominal: The nominal arm.
-        robot: The calibrated arm.
         origin: Where the result comes from, in one line.
-        verdict: The verdict on the result.
         sigma_mm: Predicted standard deviation of a tool's position over the workspace; None where
             unknown.
         functions: Repeatable errors of the joints by their angles; None where none were found.
-        convention: Convention of the joint table, if stated.
         calibration_hash: The hash by which the driver recognises the arm, if stated.
         sag_mm: Largest deflection of the flange under the arm's own weight [mm]; zero for a rigid
             arm.
@@ -214,11 +210,6 @@ class ArmFormat(Format[ArmContent]):
 
 def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmContent:
     """Selects the arm to export.
-
-    Args:
-        source: A calibration.
-        selection: The user's selection.
-        form: The format.
 
     Raises:
         DataError: The source has no calibrated arm, or an option does not apply to the format.

@@ -101,11 +101,6 @@ def _warn_ur(content: ArmContent) -> tuple[str, ...]:
     return warnings
 
 
-def _write_chain(content: ArmContent) -> str:
-    document = {**content.robot.document, "source": "; ".join(content.notes)}
-    return json_text(document)
-
-
 def _write_corrections(content: ArmContent) -> str:
     """A table of corrections: a line for each joint and degree."""
     robot = content.written
@@ -186,7 +181,7 @@ UR_KINEMATICS = ArmFormat(
 ROBOT_JSON = ArmFormat(
     "robot-json",
     "the calibrated arm with all that was found: 4x4 placements, axes, joints' functions [m, rad]",
-    _write_chain,
+    lambda content: json_text({**content.robot.document, "source": "; ".join(content.notes)}),
 )
 
 JOINT_CORRECTIONS = ArmFormat(

@@ -32,7 +32,6 @@ class Load:
     """A tool's load, which no calibration determines.
 
     Attributes:
-        mass_kg: Its mass.
         centre_mm: Its centre of mass in the flange's frame.
     """
 
@@ -47,12 +46,9 @@ class Selection:
     Attributes:
         edge: A transform by name; None for the camera's, or in a format of tools or fixtures for
             the only one of its kind.
-        inverse: Whether its inverse is wanted.
         parent: Exported name of the frame in which the pose is given.
         child: Exported name of the frame whose pose it is; the camera, in a format of lenses.
         number: Number of the controller's tool or base.
-        load: The tool's load.
-        convention: Convention of an arm's joint table.
         calibration_hash: The `hash` of a UR's own kinematics.
         onto: An existing document that is to be updated.
         camera: Which camera of a cell is meant, in a format of lenses.
@@ -103,13 +99,9 @@ class Content:
         parent: Exported name of the parent frame.
         child: Exported name of the child frame.
         frames: Our own names of parent and child.
-        mount: How the camera is mounted; None for a frame that belongs to no calibration.
         lens: The camera, where there is one.
         origin: Where the result comes from, in one line.
-        verdict: The verdict on the result.
         rotation_of: Our name of the frame whose rotation was copied; None where it was measured.
-        number: Number of the controller's tool or base, if stated.
-        load: The tool's load, if stated.
         onto: The existing document to update, where there is one.
     """
 
@@ -213,7 +205,6 @@ class ExportFormat(Format[Content]):
     """A foreign format of a transform or a lens.
 
     Attributes:
-        holds: The kind of content that it holds.
         frames: Its names of our frames; a frame that is missing keeps our name.
         counterpart: The maker's format of fixtures, for one of tools; and vice versa.
         write_all: Builds the document of all transforms of a cell; None where it holds one.

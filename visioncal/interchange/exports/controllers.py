@@ -26,7 +26,6 @@ class Language:
     """Rules of a language for variable names.
 
     Attributes:
-        name: The language's name.
         shape: Pattern of a valid name.
         needed: The same in words.
         taken: Reserved words; lower case where the language ignores case.

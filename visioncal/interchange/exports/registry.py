@@ -69,7 +69,6 @@ class Document:
     """A result in a foreign format.
 
     Attributes:
-        text: The document.
         warnings: What its user should know before it is used, each in plain words.
     """
 
@@ -162,11 +161,6 @@ def _find(name: str) -> ExportFormat | ArmFormat:
 
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
     """Selects the content to export.
-
-    Args:
-        source: A calibration, or a file of frames.
-        selection: The user's selection.
-        form: The format.
 
     Raises:
         DataError: There is no such transform, the format cannot hold the selection, or a frame's
@@ -261,11 +255,7 @@ def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> 
     else:
         what = f"{name} has its parent in {ends_of(name)[0]}"
         step = "Choose a format of any poses for it, as --to ros"
-    raise DataError(
-        f"{form.name} writes {wanted}; {what}.",
-        culprits=[name],
-        next_step=f"{step}.",
-    )
+    raise DataError(f"{form.name} writes {wanted}; {what}.", culprits=[name], next_step=f"{step}.")
 
 
 def _check_takes(form: ExportFormat, selection: Selection) -> None:

@@ -20,11 +20,7 @@ from visioncal.interchange.exports.content import (
     yaml_text,
 )
 
-ROS_FRAMES: Mapping[str, str] = {
-    "base": "base",
-    "flange": "tool0",
-    "cam": "camera_optical_frame",
-}
+ROS_FRAMES: Mapping[str, str] = {"base": "base", "flange": "tool0", "cam": "camera_optical_frame"}
 _MEANINGS: Mapping[str, str] = {
     "base": "the controller's own base frame; base_link may differ (on a UR it is turned by "
     "180 deg about z)",

@@ -34,8 +34,6 @@ class Placement:
 
     Attributes:
         edge: `parent_from_child`.
-        origin: Where it comes from, in one line.
-        verdict: The verdict on it.
         oriented: Whether its rotation was measured.
         turned_as: The frame whose rotation was copied otherwise; empty for its parent's.
     """
@@ -52,11 +50,9 @@ class Placements:
     """All transforms of a source, and its camera.
 
     Attributes:
-        by_name: The transforms by name.
         frames: Names of the tools' and fixtures' transforms.
         words: The kind of source, for messages.
         mount: How the camera is mounted; None where there is no calibration.
-        lens: The camera, where there is one.
         cell: The result of a cell, which relates any two of its frames; None for other sources.
         lenses: Its cameras by frame.
     """
@@ -152,11 +148,7 @@ def is_kind(name: str, kind: Kind) -> bool:
 
 
 def placements(source: Source, camera: str | None = None) -> Placements:
-    """Lists the transforms of a source.
-
-    Args:
-        source: A calibration, or a file of frames.
-        camera: Which of a cell's cameras is meant: its name or its frame.
+    """Lists the transforms of a source; `camera` selects one of a cell, by name or frame.
 
     Raises:
         DataError: There is no such camera, or the source is no cell.

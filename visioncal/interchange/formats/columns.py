@@ -162,10 +162,7 @@ def foreign_from(
 ) -> Foreign:
     """Builds a recording from rows of named values, by their names or the user's options.
 
-    Args:
-        fields: The rows.
-        requested: The user's options.
-        images: A folder that holds the images, where the source is one.
+    `images` is the folder of the images, where the source is one.
 
     Raises:
         DataError: It has neither poses nor joint angles.

@@ -18,11 +18,6 @@ _MUST_AGREE = ("camera", "target", "instrument", "point")
 def exchange_views(session: Session, first: int, second: int) -> Session:
     """Exchanges the images, corners and readings of two views; the session notes it in `corrected`.
 
-    Args:
-        session: The session.
-        first: A view's number.
-        second: Another's, of the same camera and target.
-
     Raises:
         DataError: There are no two such views.
     """

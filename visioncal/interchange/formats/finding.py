@@ -133,12 +133,8 @@ def _images_of(
 ) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
     """Pairs rows with the images of a folder, by number or in order.
 
-    Args:
-        folder: The folder.
-        views: (n,) the rows' numbers.
-        labels: (n,) the rows' places, for messages.
-        numbered: Whether the source's names have these numbers; else rows and images are paired in
-            natural order, and their counts must agree.
+    With `numbered` the rows' numbers are from the source's names; otherwise rows and images are
+    paired in natural order, and their counts must agree.
 
     Returns:
         (n,) paths, None in a row whose number no image has; and a note where order decides.

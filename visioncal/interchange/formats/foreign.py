@@ -29,12 +29,7 @@ class ForeignSweep:
 
 @dataclass(frozen=True, eq=False)
 class FoundCorners:
-    """Corners of a target found by another program in one image.
-
-    Attributes:
-        ids: (k,) their numbers on the target.
-        px: (k, 2) their pixels [px].
-    """
+    """Corners found by another program in one image: (k,) ids on the target, (k, 2) pixels [px]."""
 
     ids: IntArray
     px: FloatArray
@@ -45,7 +40,6 @@ class Foreign:
     """A recording in a foreign format: n rows, each an observation at one robot pose.
 
     Attributes:
-        name: Its name.
         robot: `base_from_flange` of each row.
         camera: `cam_from_target` of each row; None where images are used instead.
         images: (n,) the image of each row; None in a row without one, empty where there are none.

@@ -75,13 +75,10 @@ class ImportOptions:
         robot: Of the robot's poses, `base_from_flange`.
         camera: Of the measured poses of the target, `cam_from_target`.
         joints: Columns or keys of the joint angles.
-        joints_deg: Whether these are in degrees.
         image: The column or key that names each row's image.
         camera_file: A second file, which holds the camera's poses.
-        mount: How the camera is mounted.
         target: A shipped name, the path of a `.toml`, or a one-word description.
         intrinsics: The path of a file with intrinsics, or `estimate`.
-        images: A folder with the images.
         corners: A file with corners that another program found in the images.
         resolution: (width, height) [px].
         robot_model: A built-in robot's name, or the path of a .urdf or a DH .toml.

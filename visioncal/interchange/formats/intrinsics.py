@@ -207,8 +207,7 @@ def _lens(
     if not np.isfinite(values).all() or beyond:
         what = f"{len(coefficients)} coefficients" if beyond else "a number that is not finite"
         raise DataError(
-            f"{where}: {what}; up to {count} of the {model} model are known here.",
-            culprits=[where],
+            f"{where}: {what}; up to {count} of the {model} model are known here.", culprits=[where]
         )
     padded = (coefficients + [0.0] * count)[:count]
     lens: dict[str, Any] = {

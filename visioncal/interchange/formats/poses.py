@@ -267,11 +267,7 @@ def check_radians(
 ) -> None:
     """Checks that angles of unstated unit can be radians.
 
-    Args:
-        poses: The poses.
-        requested: The user's options.
-        whose: `robot` or `camera`, for messages.
-        guesses: Whether the command can try other readings.
+    `guesses` says whether the command can try other readings, which the message then suggests.
 
     Raises:
         DataError: An angle exceeds one turn.

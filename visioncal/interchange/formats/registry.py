@@ -111,10 +111,7 @@ def convert(
 def read_foreign(source: Path, requested: ImportOptions, form: str | None = None) -> Foreign:
     """Reads a foreign recording with the user's options applied.
 
-    Args:
-        source: A file or folder in any of `FOREIGN_FORMATS`.
-        requested: The user's options.
-        form: The name of its format; None to recognise it.
+    Its format is recognised unless `form` names it.
 
     Raises:
         DataError: Its format is unknown, or something in it is wrong.

@@ -77,11 +77,6 @@ def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Gues
 def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = False) -> Foreign:
     """Applies a candidate reading to a recording: poses, pairing, mount and the size of the board.
 
-    Args:
-        foreign: The recording.
-        candidate: The reading.
-        mirrors_poses: Whether the robot's poses may be mirrored.
-
     Raises:
         DataError: It changes the robot's poses where only joint angles are recorded, or mirrors
             them without permission.
@@ -245,14 +240,9 @@ def reread_session(
 ) -> Session:
     """Applies a candidate reading to a session's poses; everything else stays the same.
 
-    For a mirror, corners.csv is mirrored back where it shows the board from behind. The session
-    notes the changes in `corrected`.
-
-    Args:
-        session: The session.
-        candidate: The reading.
-        robot: The robot's poses as they are written; None for the session's own.
-        mirrors_poses: Whether the robot's poses may be mirrored.
+    `robot` has the robot's poses as they are written; None for the session's own. For a mirror,
+    corners.csv is mirrored back where it shows the board from behind. The session notes the changes
+    in `corrected`.
 
     Raises:
         DataError: The resulting session is invalid; or as `reread`.

@@ -60,9 +60,6 @@ def read_touches(
 def robots_of(path: Path) -> tuple[str, ...]:
     """Names of the robots in a table or session of touches, in their order; may be empty.
 
-    Args:
-        path: As for `read_touches`.
-
     Raises:
         DataError: It cannot be read.
     """

@@ -119,11 +119,10 @@ def _pose(path: Path) -> list[float]:
 
 
 def _mount(path: Path, notes: list[str]) -> Mount | None:
-    name = path.resolve().name
-    found = next((mount for mount in MOUNTS if mount in name), None)
-    if found is not None:
-        notes.append(f"The mount is taken from the folder's name: {found}.")
-    return found
+    stated = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
+    if stated is not None:
+        notes.append(f"The mount is taken from the folder's name: {stated}.")
+    return stated
 
 
 def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
