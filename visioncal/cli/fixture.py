@@ -59,14 +59,14 @@ def fixture_command(
 
     drawing = None if cad is None else read_nominal(cad, cad_unit)
 
-    def by_touches(known: "Calibration | None") -> "Frame":
-        touched_with = _tool(tool, known, part.robot)
+    def by_touches(robot_calibration: "Calibration | None") -> "Frame":
+        touched_with = _tool(tool, robot_calibration, part.robot)
         rows = read_touches(
             touches, written.requested(), part.robot, positions=touched_with is None
         )
         noise_m = written.noise_m
         return touched_fixture(
-            rows, touched_with, drawing, known, written.model, touch_noise_m=noise_m
+            rows, touched_with, drawing, robot_calibration, written.model, touch_noise_m=noise_m
         )
 
     asked = Asked("fixture", touches, goes, written, part, point, as_json)
@@ -82,18 +82,18 @@ def _tool(
 
     if option == "none":
         return None
-    known = {} if calibration is None else calibration.frames
+    frames = {} if calibration is None else calibration.frames
     if option is None and calibration is None:
         raise DataError("The tool that touched the points is not said.", next_step=NO_TOOL)
-    if option is None or option in known or f"flange_from_{option}" in known:
-        return Tool.among(known, "The calibration", option)
+    if option is None or option in frames or f"flange_from_{option}" in frames:
+        return Tool.among(frames, "The calibration", option)
     path, _, name = option.rpartition(":")
     if Path(option).exists():
         return Tool.among(load_placed(Path(option), robot).frames, option, None)
     if path and Path(path).exists():
         return Tool.among(load_placed(Path(path), robot).frames, path, name)
-    if known:
-        return Tool.among(known, "The calibration", option)
+    if frames:
+        return Tool.among(frames, "The calibration", option)
     raise DataError(
         f"--tool {option}: there is no such file, nor a calibration (-c) that has such a tool.",
         culprits=[option],

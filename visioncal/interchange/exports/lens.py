@@ -72,8 +72,8 @@ def camera_of(content: Content) -> Camera:
 def _notes(content: Content) -> list[str]:
     estimated = content.lens is not None and content.lens.estimated
     how = "estimated from the session's images" if estimated else "as the session gave it"
-    said = [content.left_of_field] if content.left_of_field else []
-    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *said]
+    field_notes = [content.left_of_field] if content.left_of_field else []
+    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *field_notes]
 
 
 def warn_of_field(content: Content) -> Iterator[str]:

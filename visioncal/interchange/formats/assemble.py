@@ -22,7 +22,7 @@ from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import ImageStore, MemoryImages, Session, Stream
-from visioncal.session import columns as known
+from visioncal.session import columns as session_columns
 from visioncal.session.corners import CornerTable
 from visioncal.vision.finders.imaging import decode_image, looks_like_image
 
@@ -146,11 +146,11 @@ def _with_camera_samples(foreign: Foreign, sweep: ForeignSweep) -> Foreign:
 
 
 def _stream(sweep: ForeignSweep) -> Stream:
-    rows = pose_cells(sweep.robot, known.POSE)
-    numbers = np.array([[float(row[name]) for name in known.POSE] for row in rows])
+    rows = pose_cells(sweep.robot, session_columns.POSE)
+    numbers = np.array([[float(row[name]) for name in session_columns.POSE] for row in rows])
     values = np.hstack([sweep.robot_s[:, None], numbers])
     values.setflags(write=False)
-    return Stream(("stamp_s", *known.POSE), values)
+    return Stream(("stamp_s", *session_columns.POSE), values)
 
 
 def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:
@@ -232,10 +232,10 @@ def _images_or_poses(foreign: Foreign, notes: list[str]) -> Foreign:
 
 def _view_rows(foreign: Foreign) -> list[_ViewRow]:
     images = _image_paths(foreign)
-    robot = pose_cells(foreign.robot, known.POSE)
+    robot = pose_cells(foreign.robot, session_columns.POSE)
     camera: list[dict[str, str]] = [{}] * len(foreign.robot)
     if foreign.camera is not None:
-        camera = pose_cells(foreign.camera, known.MEASURED_CAM_POSE)
+        camera = pose_cells(foreign.camera, session_columns.MEASURED_CAM_POSE)
     extra = _extra_columns(foreign)
     rows = []
     for at in range(len(foreign.robot)):
@@ -294,8 +294,14 @@ def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str
 
 def _extra_columns(foreign: Foreign) -> dict[str, tuple[str, ...]]:
     """Further columns, renamed where a session would take their names for something else."""
-    reserved = {"view", "image", "stamp_s", *known.POSE, *known.MEASURED_CAM_POSE}
-    reserved |= set(known.joint_columns(tuple(foreign.columns)))
+    reserved = {
+        "view",
+        "image",
+        "stamp_s",
+        *session_columns.POSE,
+        *session_columns.MEASURED_CAM_POSE,
+    }
+    reserved |= set(session_columns.joint_columns(tuple(foreign.columns)))
     columns: dict[str, tuple[str, ...]] = {}
     for name, cells in foreign.columns.items():
         unique = name if _is_meant(name, cells) else f"source_{name}"
@@ -312,10 +318,10 @@ def _is_meant(name: str, cells: Sequence[str]) -> bool:
         return filled <= {"fit", "holdout"}
     if name == "stop":
         return all(word.isascii() and word.isdecimal() and len(word) < 10 for word in filled)
-    if name in known.SELECTORS:
+    if name in session_columns.SELECTORS:
         return len(filled) < 2
     finite = (is_number(word) and np.isfinite(float(word)) for word in filled)
-    return not known.is_number(name) or all(finite)
+    return not session_columns.is_number(name) or all(finite)
 
 
 def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:

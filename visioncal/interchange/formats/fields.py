@@ -78,10 +78,10 @@ class Fields:
         Raises:
             DataError: There is no such field; the message lists the existing ones.
         """
-        known = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
-        if name in known:
+        names = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
+        if name in names:
             return name
-        matches = [word for word in known if word.endswith(f".{name}")]
+        matches = [word for word in names if word.endswith(f".{name}")]
         if len(matches) == 1:
             return matches[0]
         if matches:
@@ -92,7 +92,7 @@ class Fields:
         raise DataError(
             f"{self.name} has no column or key {name!r}; it has {self.listing()}.",
             culprits=[name],
-            next_step=did_you_mean(name, known),
+            next_step=did_you_mean(name, names),
         )
 
     def column(self, name: str) -> FloatArray:

@@ -134,7 +134,7 @@ def _halcon_pose(path: Path) -> FloatArray | None:
         return None
     counts = {name: len(words) for name, words in lines.items()}
     if counts != {"f": 1, "r": 3, "t": 3} or not all(
-        is_number(name) for them in lines.values() for name in them
+        is_number(name) for values in lines.values() for name in values
     ):
         raise DataError(f"{path}: f, r and t hold 1, 3 and 3 numbers.", culprits=[str(path)])
     (code,), turns, position = (np.array(lines[name], dtype=float) for name in "frt")
