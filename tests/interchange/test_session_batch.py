@@ -99,7 +99,7 @@ def test_what_was_done_is_kept(fleet, tmp_path):
 
 @pytest.mark.usefixtures("processes")
 def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
-    asked, died = workers._asked, []
+    asked, died = workers._run_job, []
 
     def mortal(worker, job):
         if job.name.endswith("week_0") and ("robot_1" in job.name or not died):
@@ -107,7 +107,7 @@ def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
             worker.kill()
         return asked(worker, job)
 
-    monkeypatch.setattr(workers, "_asked", mortal)
+    monkeypatch.setattr(workers, "_run_job", mortal)
     rows = batch([fleet / "robot_0", fleet / "robot_1"], tmp_path, workers=1, without=BARE).rows
     states = {row.name: row.state for row in rows}
     assert died == ["robot_0/week_0", *3 * ["robot_1/week_0"]]

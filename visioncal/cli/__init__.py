@@ -1,4 +1,4 @@
-"""The command line: thin glue, one file a command."""
+"""The command line: one thin file a command."""
 
 from visioncal.cli.app import main
 

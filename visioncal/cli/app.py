@@ -1,4 +1,4 @@
-"""The application: its commands, and how their ends become exit statuses."""
+"""The application: its commands, and the mapping of errors to exit statuses."""
 
 import atexit
 import gc
@@ -15,12 +15,12 @@ from visioncal.cli.lazy import LazyGroup
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.version import __version__
 
-# As a shell reports a program that SIGPIPE ended.
+# As shells report a program ended by SIGPIPE.
 _EXIT_BROKEN_PIPE = 128 + 13
 
 
 class _Commands(LazyGroup):
-    """All commands, in the order of their work."""
+    """All commands, in the order of a typical workflow."""
 
     listed: ClassVar = {
         "demo": "Simulate a UR cell, calibrate it from its images, and compare with the truth.",
@@ -77,14 +77,14 @@ def _options(
 
 
 def main() -> None:
-    """Runs the command line; an error of the user's input ends with status 2 and one message."""
-    # Commands compute on one BLAS thread. Loaded by numpy and by scipy, it begins one a core, which
-    # takes as long as a small calibration's solve.
+    """Runs the command line; an input error ends with status 2 and one message."""
+    # Commands compute on one BLAS thread. Loaded by both numpy and scipy, BLAS would start one a
+    # core, which takes as long as a small calibration's solve.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # A thousand modules make many objects that stay: looking for garbage among them as often as
-    # Python does takes a twentieth of a small calibration's time, and finds none.
+    # A thousand modules create many permanent objects: garbage collection at Python's default rate
+    # takes a twentieth of a small calibration's time, and finds nothing.
     gc.set_threshold(20_000, 100)
-    # Nor does Python find any among them as it ends, which takes as long again.
+    # The collection at exit would take as long again.
     atexit.register(gc.freeze)
     with _guarded_streams(), _WithoutPandas():
         try:
@@ -100,8 +100,8 @@ def main() -> None:
 class _WithoutPandas:
     """Hides pandas, which no command uses.
 
-    Arrow would import it, where it is installed, to see whether an array is one of pandas: half a
-    second before the first line of a recording.
+    Arrow would import it, where installed, to check for pandas arrays: half a second before the
+    first line of a recording.
     """
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> None:
@@ -118,7 +118,7 @@ class _WithoutPandas:
 
 
 def _refuse(error: VisioncalError) -> None:
-    # Consoles take longer to import than `--version` takes.
+    # Importing a console takes longer than `--version` itself.
     from visioncal.cli.console import EXIT_NO_RESULT, report_error
 
     report_error(error, as_json="--json" in sys.argv[1:])
@@ -136,7 +136,7 @@ def _guarded_streams() -> Iterator[None]:
 def _end(error: OSError) -> None:
     if isinstance(error, BrokenPipeError):
         raise SystemExit(_EXIT_BROKEN_PIPE) from error
-    # A console takes longer to import than `--version` takes.
+    # Importing a console takes longer than `--version` itself.
     from visioncal.cli.console import EXIT_NO_RESULT, report_error
 
     failure = DataError(
@@ -149,19 +149,19 @@ def _end(error: OSError) -> None:
 
 
 def _guarded(stream: TextIO | None, failed: Callable[[OSError], None]) -> TextIO | None:
-    # There is none where it was closed before the program began.
+    # None where it was closed before the program started.
     return None if stream is None else cast(TextIO, _Guarded(stream, failed))
 
 
 class _Guarded:
-    """A text stream that goes nowhere once it has failed."""
+    """A text stream that discards its output once it has failed."""
 
     def __init__(self, stream: TextIO, failed: Callable[[OSError], None]) -> None:
         self._stream = stream
         self._failed = failed
 
     def write(self, text: str) -> int:
-        """Writes a text; that of a stream that has failed is lost."""
+        """Writes a text, or discards it after a failure."""
         try:
             return self._stream.write(text)
         except OSError as error:
@@ -169,14 +169,14 @@ class _Guarded:
             return len(text)
 
     def flush(self) -> None:
-        """Hands on what was written."""
+        """Flushes what was written."""
         try:
             self._stream.flush()
         except OSError as error:
             self._give_up(error)
 
     def _give_up(self, error: OSError) -> None:
-        # What is left in the buffer would fail once more, without a word, when Python ends.
+        # Buffered output would fail again, without a message, when Python exits.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, self._stream.fileno())
         os.close(nowhere)

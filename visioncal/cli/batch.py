@@ -11,7 +11,7 @@ from visioncal.cli.options import NeedOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.interchange.outputs import RECORDING, REPORT
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.batch import Batch
 
@@ -32,7 +32,9 @@ def batch_command(
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, help="How many work at a time, on one core each; one a core."),
+        typer.Option(
+            min=1, help="Number of parallel workers, on one core each; by default one a core."
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
@@ -50,11 +52,11 @@ def batch_command(
         Path | None,
         typer.Option(
             metavar="FILE.toml",
-            help="Simulate cells in the place of sessions: all combinations of the values in it.",
+            help="Simulate cells instead of sessions: all combinations of the values in it.",
         ),
     ] = None,
     level: Annotated[
-        str, typer.Option(metavar="auto|hand-eye|offsets|...", help="As of calibrate.")
+        str, typer.Option(metavar="auto|hand-eye|offsets|...", help="As for calibrate.")
     ] = "auto",
     no_report: Annotated[
         bool, typer.Option("--no-report", help=f"Leave each {REPORT} out.")
@@ -66,8 +68,8 @@ def batch_command(
     """Calibrate many sessions at once, and report which stand out of their fleet.
 
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
-    them, those first that stand out among robots of the same model. What is done already is kept:
-    started again, it goes on where it was. Exit status 0: there are results; 2: of no session.
+    them, outliers among robots of the same model first. Existing results are kept: started again,
+    an interrupted batch continues. Exit status 0: there are results; 2: of no session.
     """
     from visioncal.interchange.batch import batch
 
@@ -91,18 +93,20 @@ def batch_command(
         raise typer.Exit(EXIT_NO_RESULT)
 
 
-def _report(found: "Batch") -> None:
-    console, counts = answers(), found.counts
+def _report(results: "Batch") -> None:
+    console, counts = answers(), results.counts
     named = ("good", "check", "bad", "failed", "kept", "changed", "standing out")
     words = ", ".join(f"{counts[name]} {name}" for name in named if counts[name])
-    console.print(f"{len(found.rows)} sessions: {words}")
-    lines = [f"{row.name}: {row.stands_out}" for row in found.rows if row.score > 0.0][:_MOST_NAMED]
-    lines += [f"{row.name}: {row.change}" for row in found.rows if row.changed][:_MOST_NAMED]
+    console.print(f"{len(results.rows)} sessions: {words}")
+    lines = [f"{row.name}: {row.stands_out}" for row in results.rows if row.score > 0.0][
+        :_MOST_NAMED
+    ]
+    lines += [f"{row.name}: {row.change}" for row in results.rows if row.changed][:_MOST_NAMED]
     failed = [
         f"{row.name}: {row.words} {row.next_step}".rstrip()
-        for row in found.rows
+        for row in results.rows
         if row.state == "failed"
     ]
     for line in [*lines, *failed[:_MOST_NAMED]]:
         console.print(escape(f"  {line}"))
-    console.print(escape(f"written: {found.page}, {found.table}"))
+    console.print(escape(f"written: {results.page}, {results.table}"))

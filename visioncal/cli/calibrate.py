@@ -28,8 +28,7 @@ def calibrate_command(
     views: Annotated[
         str | None,
         typer.Option(
-            metavar="1-12,14",
-            help="These views alone, as those before or after something moved.",
+            metavar="1-12,14", help="These views alone, as those before or after something moved."
         ),
     ] = None,
     solver: Annotated[
@@ -40,14 +39,14 @@ def calibrate_command(
         str,
         typer.Option(
             metavar="auto|hand-eye|offsets|kinematics|elastic|thermal",
-            help="The arm: hand-eye (none comes out), offsets (of its joints), kinematics, elastic "
-            "(joints that bend, too), thermal (drift with temperature, too).",
+            help="What is calibrated of the arm: hand-eye (nothing), offsets (of its joints), "
+            "kinematics, elastic (bending joints, too), thermal (drift with temperature, too).",
         ),
     ] = "auto",
     convention: Annotated[
         Convention | None,
         typer.Option(
-            help="Of the arm's joint table in the result; the stated one where it is left out."
+            help="Convention of the arm's joint table in the result; by default the stated one."
         ),
     ] = None,
     robot_shared: Annotated[
@@ -67,7 +66,7 @@ def calibrate_command(
         ),
     ] = False,
     device: Annotated[
-        str, typer.Option(metavar="auto|cpu|cuda", help="What --dense works on.")
+        str, typer.Option(metavar="auto|cpu|cuda", help="Device for --dense.")
     ] = "auto",
     as_json: AsJson = False,
     verbose: Annotated[
@@ -83,7 +82,7 @@ def calibrate_command(
     solved together, in one frame; other commands take one of each out of that result (--camera,
     --robot, --target).
     """
-    # What help and a mistyped option need not wait for.
+    # Imported late, so that --help stays fast.
 
     from visioncal.calibration.pipeline import run, run_dense
     from visioncal.calibration.pipeline.running import Asked
@@ -94,7 +93,7 @@ def calibrate_command(
     from visioncal.interchange.merge_results import leftover
     from visioncal.interchange.outputs import RECORDING, write_outputs
 
-    # Of several sessions, the recording is the session of them all.
+    # Of several sessions, the recording is that of the joined session.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
     with naming(session, out):
         loaded = _joined([need.session(session) for session in sessions], shared=robot_shared)

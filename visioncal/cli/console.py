@@ -1,4 +1,4 @@
-"""What the commands share: messages to stderr, results to stdout, advice, and signals as Ctrl-C."""
+"""Output shared by the commands: messages to stderr, results to stdout, and errors."""
 
 import json
 import sys
@@ -11,17 +11,17 @@ import typer
 
 from visioncal.core.errors import DataError, VisioncalError
 
-# Help waits for neither.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from rich.console import Console
 
     from visioncal.interchange.outputs import Written
 
-# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check said
-# no (verify).
+# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check
+# failed (verify).
 _EXIT_BUG, EXIT_NO_RESULT = 1, 2
 _LISTED_CULPRITS = 10
-_SHORT = 12  # culprits of fewer letters share a line
+_SHORT = 12  # culprits of fewer characters share a line
 
 
 def messages() -> "Console":
@@ -32,34 +32,34 @@ def messages() -> "Console":
 
 
 def say(words: str) -> None:
-    """Prints a message as it is."""
+    """Prints a message without markup."""
     messages().print(words, markup=False)
 
 
 def warn(words: str) -> None:
-    """Prints what to know before the result is used."""
+    """Prints a warning about the result."""
     from rich.markup import escape
 
     messages().print(f"[bold yellow]warning:[/] {escape(words)}")
 
 
 def print_json(document: object) -> None:
-    """Prints a result for programs."""
+    """Prints a result as JSON."""
     typer.echo(json.dumps(document, indent=2))
 
 
 def answers(*, markup: bool = True) -> "Console":
-    """The console for results as people read them: stdout."""
+    """The console for results: stdout."""
     from rich.console import Console
 
     return Console(highlight=False, soft_wrap=True, markup=markup)
 
 
 def asked(question: str) -> str:
-    """Asks on stderr, which leaves stdout to results, and gives the line that was typed.
+    """Asks on stderr, which keeps stdout for results, and returns the typed line.
 
     Raises:
-        EOFError: Nothing more is typed.
+        EOFError: The input has ended.
     """
     messages().print(question, markup=False, end="")
     line = sys.stdin.readline()
@@ -69,12 +69,12 @@ def asked(question: str) -> str:
 
 
 def report_error(error: VisioncalError, *, as_json: bool) -> None:
-    """Prints an error as one message to stderr, and where asked as a JSON object to stdout, too."""
+    """Prints an error as one message to stderr, and with `as_json` as JSON to stdout, too."""
     from rich.markup import escape
 
     next_step = error.next_step
     if not next_step and error.culprits and isinstance(error, DataError):
-        # The message says what is needed there.
+        # The message says what is needed.
         next_step = f"Correct {error.culprits[0]}, and run the command again."
     if as_json:
         document = {
@@ -86,25 +86,21 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         print_json({"error": document})
     console = messages()
     console.print(f"[bold red]error:[/] {escape(error.message)}")
-    unsaid = [culprit for culprit in error.culprits if culprit not in error.message]
-    if all(len(name) < _SHORT for name in unsaid):
-        unsaid = [", ".join(unsaid)] if unsaid else []
-    for culprit in unsaid[:_LISTED_CULPRITS]:
+    other_culprits = [culprit for culprit in error.culprits if culprit not in error.message]
+    if all(len(name) < _SHORT for name in other_culprits):
+        other_culprits = [", ".join(other_culprits)] if other_culprits else []
+    for culprit in other_culprits[:_LISTED_CULPRITS]:
         console.print(f"  - {escape(culprit)}")
-    if len(unsaid) > _LISTED_CULPRITS:
-        console.print(f"  - and {len(unsaid) - _LISTED_CULPRITS} more")
+    if len(other_culprits) > _LISTED_CULPRITS:
+        console.print(f"  - and {len(other_culprits) - _LISTED_CULPRITS} more")
     if next_step:
         console.print(escape(next_step))
 
 
 def report_written(written: "Written", *, quiet: bool = False, status: int = 0) -> None:
-    """Says which files were written, and ends the command where there is more to say than that.
+    """Prints which files were written, and exits unless all is well.
 
-    Args:
-        written: The files.
-        quiet: Whether to say only what is missing.
-        status: The exit status of the command's answer. Where that is 0, a file that could not be
-            drawn makes it 1.
+    The exit status is `status`, or 1 where that is 0 and a file could not be drawn.
 
     Raises:
         typer.Exit: The status is not 0.
@@ -125,11 +121,11 @@ def report_written(written: "Written", *, quiet: bool = False, status: int = 0) 
 
 @contextmanager
 def naming(session: Path, out: Path | str = "") -> Iterator[None]:
-    """Puts a run's paths into the commands that errors of the block point to."""
+    """Puts a run's paths into the suggested commands of errors raised in the block."""
     try:
         yield
     except VisioncalError as error:
-        # Help need not wait for it.
+        # Imported late, so that --help stays fast.
         from visioncal.core.verdict import with_paths
 
         raise type(error)(

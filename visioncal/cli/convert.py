@@ -17,7 +17,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import FOREIGN_NAMES, CameraMount
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.calibration.guess import Candidate, Guess
     from visioncal.interchange.formats import Foreign, ImportOptions, InDoubt
@@ -30,7 +30,7 @@ _doubt = partial(typer.Option, rich_help_panel="Poses that may be misread, of a 
 
 @dataclass(frozen=True)
 class ConvertOptions(RobotPoseOptions):
-    """How somebody else wrote a recording."""
+    """Options for a foreign recording."""
 
     form: Annotated[str | None, _other("--from", help=f"Its format, by name: {_FORMATS}.")] = None
     mount: Annotated[CameraMount | None, _other(help="Where the camera is.")] = None
@@ -51,9 +51,9 @@ class ConvertOptions(RobotPoseOptions):
         ),
     ] = None
     camera_form: Annotated[str | None, poses_option(help="As --robot-form.")] = None
-    camera_unit: Annotated[str | None, poses_option(metavar=UNITS, help="Of their positions.")] = (
-        None
-    )
+    camera_unit: Annotated[
+        str | None, poses_option(metavar=UNITS, help="Unit of their positions.")
+    ] = None
     camera_inverse: Annotated[
         bool | None,
         poses_option("--camera-inverse/--camera-as-is", help="They give the camera in the target."),
@@ -72,9 +72,7 @@ class ConvertOptions(RobotPoseOptions):
     image_column: Annotated[
         str | None,
         _camera(
-            "--image-column",
-            "--image-key",
-            help="The column or key that names each row's image.",
+            "--image-column", "--image-key", help="The column or key that names each row's image."
         ),
     ] = None
     corners: Annotated[
@@ -96,10 +94,10 @@ class ConvertOptions(RobotPoseOptions):
     ] = None
 
     def requested(self) -> "ImportOptions":
-        """The same, as files are read.
+        """The import options.
 
         Raises:
-            DataError: Names or a resolution are written otherwise.
+            DataError: Names or a resolution are malformed.
         """
         from visioncal.interchange.formats import PoseImportOptions
 
@@ -174,7 +172,7 @@ def convert_command(
 
 
 def _chosen(recorded: "InDoubt | Foreign", *, yes: bool) -> "Candidate":
-    """Tries other readings, prints them, and takes the one that is clearly right or confirmed."""
+    """Tries other readings, prints them, and returns the clearly best or confirmed one."""
     from visioncal.calibration.pipeline.guess_inputs import guess_session
     from visioncal.interchange.formats import Foreign, guess_foreign
 
@@ -208,18 +206,18 @@ def _confirmed(guess: "Guess", *, yes: bool) -> "Candidate":
             next_step="Take it with --yes.",
         )
     try:
-        agreed = typer.confirm(f"Read them so: {guess.best.words}?", err=True)
+        is_confirmed = typer.confirm(f"Read them so: {guess.best.words}?", err=True)
     except typer.Abort as error:
         raise DataError(
             "Nothing was written: there was no answer.", next_step="Take the reading with --yes."
         ) from error
-    if not agreed:
+    if not is_confirmed:
         raise DataError("Nothing was written: the reading was declined.")
     return guess.best
 
 
 def _print_guess(guess: "Guess") -> None:
-    """Prints the readings, the best first, what was found, and what the views leave open."""
+    """Prints the readings, the best first, the conclusion, and what remains ambiguous."""
     from rich.table import Table
 
     console = messages()

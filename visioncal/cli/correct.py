@@ -13,13 +13,13 @@ from visioncal.core.choices import WIDEST_RAD
 
 @dataclass(frozen=True)
 class CorrectOptions:
-    """Which targets are corrected, what they are of, and what the arm carries through them."""
+    """Options of the targets, their frame, and the arm's payload and temperature."""
 
     targets: Annotated[
         Path,
         typer.Argument(
             help="A table with the columns of views.csv: x_m, y_m, z_m, qx, qy, qz, qw of "
-            "base_from_flange; q1_rad ... may say which posture is meant; others are kept.",
+            "base_from_flange; q1_rad ... may say which posture is meant; others are kept."
         ),
     ]
     calibration: Annotated[
@@ -36,8 +36,8 @@ class CorrectOptions:
     tool: Annotated[
         str | None,
         typer.Option(
-            help="What the targets are of, and the corrected ones: a tool of the calibration, or "
-            "cam; else of the flange."
+            help="Frame of the targets and of the corrected ones: a tool of the calibration, or "
+            "cam; by default the flange."
         ),
     ] = None
     seed_joints: Annotated[
@@ -49,10 +49,10 @@ class CorrectOptions:
         ),
     ] = None
     payload_kg: Annotated[
-        float, typer.Option(help="What hangs on the flange, for joints that bend (kg).")
+        float, typer.Option(help="Payload on the flange, for joints that bend (kg).")
     ] = 0.0
     payload_m: Annotated[
-        str, typer.Option(metavar="X,Y,Z", help="Where its centre is, in the flange's frame (m).")
+        str, typer.Option(metavar="X,Y,Z", help="Its centre of mass in the flange's frame (m).")
     ] = "0,0,0"
     widest_deg: Annotated[
         float,
@@ -81,12 +81,12 @@ class CorrectOptions:
         return None if self.out == Path("-") else self.out
 
 
-def correct_command(asked: CorrectOptions) -> None:
+def correct_command(options: CorrectOptions) -> None:
     """Correct targets so that the arm reaches them by its nominal controller.
 
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.corrected import correct_table
 
-    correct_table(asked)
+    correct_table(options)

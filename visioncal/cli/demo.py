@@ -12,7 +12,7 @@ from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.interchange.outputs import write_outputs
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.simulation import CellOptions
 
@@ -53,7 +53,7 @@ def demo_command(
 def _replace_session(
     options: "CellOptions", folder: Path, progress: Callable[[float], None]
 ) -> None:
-    """Simulates a session in the place of an earlier demo's; nothing else is ever removed."""
+    """Simulates a session in place of an earlier demo's; nothing else is ever removed."""
     from visioncal.simulation import simulate, truth_path, write_session
 
     if folder.exists() and truth_path(folder).exists():

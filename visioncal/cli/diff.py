@@ -9,13 +9,13 @@ from visioncal.cli.console import answers, print_json
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.core.number_format import figure
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from rich.table import Table
 
     from visioncal.results.compare import Comparison, LensChange, Significance
 
-# Under a nanometre and a micro-degree lies rounding.
+# Below a nanometre and a micro-degree differences are rounding.
 _DECIMALS = 6
 _LEAST_WIDTH = 110
 _WHOLE_PERCENT, _LEAST_PERCENT = 10.0, 0.01
@@ -51,7 +51,7 @@ def diff_command(
 
 def _print(comparison: "Comparison", paths: tuple[str, str]) -> None:
     console = answers(markup=False)
-    # Of whole cells, names are long: none is cut.
+    # Names of cells' frames are long, and are not truncated.
     console.width = max(console.width, _LEAST_WIDTH)
     for order, path, mount, verdict in zip(
         ("first", "second"), paths, comparison.mounts, comparison.verdicts, strict=True

@@ -10,23 +10,20 @@ from visioncal.cli.console import answers, naming, print_json
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline.checkup import Checkup
 
-# Something is wrong.
+# Exit status where something is wrong.
 _EXIT_FINDINGS = 3
 
 
-def doctor_command(
-    session: SessionArgument,
-    as_json: AsJson = False,
-) -> None:
+def doctor_command(session: SessionArgument, as_json: AsJson = False) -> None:
     """Say what is wrong with a session before it is calibrated, and what to type.
 
-    Files, pairing, units, conventions of the poses, the board, blur, coverage, motion, clocks: in
-    seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2: it cannot be
-    read.
+    Checks files, pairing, units, conventions of the poses, the board, blur, coverage, motion and
+    clocks, in seconds, as nothing is solved. Exit status 0: nothing is wrong; 3: something is; 2:
+    it cannot be read.
     """
     from visioncal.calibration.pipeline.checkup import doctor, to_document
 
@@ -40,17 +37,17 @@ def doctor_command(
         raise typer.Exit(_EXIT_FINDINGS)
 
 
-def _print(found: "Checkup", session: Path) -> None:
+def _print(checkup: "Checkup", session: Path) -> None:
     from visioncal.calibration.pipeline.checkup import next_command
 
     console = answers()
-    console.print(escape(f"{found.session}: {'; '.join(found.seen)}"))
-    for at, finding in enumerate(found.findings, 1):
+    console.print(escape(f"{checkup.session}: {'; '.join(checkup.seen)}"))
+    for at, finding in enumerate(checkup.findings, 1):
         console.print(f"[bold]{at}.[/] {escape(finding.words)}")
         if finding.do is not None:
             console.print(escape(f"   {finding.do.words}"))
             if finding.do.command:
                 console.print(f"   [bold]{escape(finding.do.command)}[/]")
-    if found.is_sound:
-        command = next_command(found, session)
+    if checkup.is_sound:
+        command = next_command(checkup, session)
         console.print(f"[bold green]Nothing is wrong.[/] Next: [bold]{escape(command)}[/]")

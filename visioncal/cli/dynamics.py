@@ -1,4 +1,4 @@
-"""What the commands of `visioncal dynamics` share: which samples, and what was identified."""
+"""Shared options of `visioncal dynamics`: samples, and identified dynamics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from visioncal.core.choices import DYNAMICS_FILE
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.dynamics.identified import Identified
     from visioncal.dynamics.model import FrictionTerms
@@ -34,7 +34,7 @@ AgainstOption: TypeAlias = Annotated[
 
 
 class _Commands(LazyGroup):
-    """Its commands, in the order of their work."""
+    """Its commands, in the order of a typical workflow."""
 
     prefix = "dynamics_"
     listed: ClassVar = {
@@ -57,7 +57,7 @@ dynamics_app = typer.Typer(
 
 @dataclass(frozen=True)
 class StreamOptions:
-    """Which samples are taken, and how they become torques."""
+    """Which samples are used, and how currents become torques."""
 
     stream: Annotated[
         list[str] | None, typer.Option(help="A stream with torques; may be repeated. Default: all.")
@@ -73,7 +73,7 @@ class StreamOptions:
     robot: RobotName = None
 
     def request(self) -> "IdentificationRequest":
-        """The same, as samples are read.
+        """The request for the identification.
 
         Raises:
             DataError: The gains are no numbers.
@@ -88,19 +88,12 @@ class StreamOptions:
                 culprits=["--gains"],
             ) from error
         return IdentificationRequest(
-            tuple(self.stream or ()),
-            cutoff_hz=self.cutoff_hz,
-            gains_nm_a=gains,
-            robot=self.robot,
+            tuple(self.stream or ()), cutoff_hz=self.cutoff_hz, gains_nm_a=gains, robot=self.robot
         )
 
 
 def friction_terms(words: str, known: Sequence[str]) -> "FrictionTerms":
-    """Reads the option --friction.
-
-    Args:
-        words: What the user wrote: names with commas between, or none.
-        known: The names that there are, in the order of the terms.
+    """Reads the option --friction: names among `known`, separated by commas, or none.
 
     Raises:
         DataError: There is no such term.
@@ -118,10 +111,10 @@ def friction_terms(words: str, known: Sequence[str]) -> "FrictionTerms":
 
 
 def identified_of(against: Path | None, command: str) -> "Identified":
-    """Loads what was identified before.
+    """Loads identified dynamics.
 
     Raises:
-        DataError: None is named, or it cannot be read.
+        DataError: None are named, or they cannot be read.
     """
     from visioncal.dynamics.identified import Identified
 

@@ -12,7 +12,7 @@ from visioncal.cli.options import AsJson, RobotName
 
 @dataclass(frozen=True)
 class GainsOptions:
-    """Two sessions of an arm, and the body that it carries in one of them."""
+    """Two sessions of an arm, one of them with a known body on the flange."""
 
     session: MotionsArgument
     loaded: Annotated[Path, typer.Option(help="A session of the same arm with the body on it.")]
@@ -29,12 +29,12 @@ class GainsOptions:
     as_json: AsJson = False
 
 
-def dynamics_gains_command(asked: GainsOptions) -> None:
+def dynamics_gains_command(options: GainsOptions) -> None:
     """Find how much torque a drive's current makes, by a body that is known.
 
     Exit status 0: there are gains; 2: there are none, for the reason given.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.weighed import print_gains
 
-    print_gains(asked)
+    print_gains(options)

@@ -15,7 +15,7 @@ FRICTION = ("coulomb", "viscous", "offset")
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """What is identified, and what is written of it."""
+    """What is identified, and where it is written."""
 
     session: MotionsArgument
     streams: StreamOptions
@@ -33,33 +33,31 @@ class IdentifyOptions:
         ),
     ] = None
     friction: Annotated[
-        str,
-        typer.Option(help=f"What joints have of their own: {', '.join(FRICTION)}; or none."),
+        str, typer.Option(help=f"Friction terms of the joints: {', '.join(FRICTION)}; or none.")
     ] = "coulomb,viscous,offset"
     rotors: Annotated[
         bool | None,
         typer.Option(
             "--rotors/--no-rotors",
             help="Motors' inertia in the torques, or none in those of sensors behind the gears. "
-            "Default: as unseen torques have it.",
+            "Default: whichever predicts unseen torques better.",
         ),
     ] = None
     stribeck: Annotated[
         bool, typer.Option("--stribeck/--no-stribeck", help="Look for humps of dry friction.")
     ] = True
     unchecked: Annotated[
-        bool,
-        typer.Option("--unchecked", help="Take torques that contradict the robot's inertias."),
+        bool, typer.Option("--unchecked", help="Take torques that contradict the robot's inertias.")
     ] = False
     as_json: AsJson = False
 
 
-def dynamics_identify_command(asked: IdentifyOptions) -> None:
+def dynamics_identify_command(options: IdentifyOptions) -> None:
     """Identify an arm's inertias and friction from the torques of its motions.
 
     Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.identified import identify_into
 
-    identify_into(asked)
+    identify_into(options)

@@ -12,7 +12,7 @@ from visioncal.core.choices import GAIN_SIGMA
 
 @dataclass(frozen=True)
 class PayloadOptions:
-    """What the arm did with the payload, and what is known of it without."""
+    """Session with the payload, and the dynamics identified without it."""
 
     session: MotionsArgument
     streams: StreamOptions
@@ -24,17 +24,17 @@ class PayloadOptions:
         ),
     ] = False
     gains_sigma: Annotated[
-        float, typer.Option(min=0.0, help="What each of the --gains is known to, in percent.")
+        float, typer.Option(min=0.0, help="Sigma of each of the --gains, in percent.")
     ] = 100.0 * GAIN_SIGMA
     as_json: AsJson = False
 
 
-def dynamics_payload_command(asked: PayloadOptions) -> None:
+def dynamics_payload_command(options: PayloadOptions) -> None:
     """Weigh what the arm carries, by how much more its drives gave than without it.
 
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.weighed import print_payload
 
-    print_payload(asked)
+    print_payload(options)

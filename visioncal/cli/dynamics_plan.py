@@ -18,19 +18,18 @@ _missing = partial(typer.Option, rich_help_panel="What its description lacks")
 
 @dataclass(frozen=True)
 class ExcitationOptions:
-    """The motion."""
+    """Options of the motion."""
 
-    duration: Annotated[float, _motion(help="How long the exciting motion lasts, in s.")] = 20.0
+    duration: Annotated[float, _motion(help="Duration of the exciting motion, in s.")] = 20.0
     harmonics: Annotated[int, _motion(help="Harmonics of that period.")] = 5
     friction: Annotated[
         str,
         _motion(help=f"What is to be identified besides inertias: {', '.join(FRICTION)}; or none."),
     ] = "coulomb,viscous,offset"
     sweep_speeds: Annotated[int, _motion(help="Speeds at which each joint sweeps.")] = 6
-    no_sweeps: Annotated[bool, _motion("--no-sweeps", help="The exciting motion alone.")] = False
+    no_sweeps: Annotated[bool, _motion("--no-sweeps", help="Only the exciting motion.")] = False
     rate_hz: Annotated[
-        float,
-        _motion("--rate", min=1.0, max=4000.0, help="Rows a second of the tables."),
+        float, _motion("--rate", min=1.0, max=4000.0, help="Sampling rate of the tables, in Hz.")
     ] = 500.0
     starts: Annotated[
         int, _motion(help="Random motions to search from; more take longer and find better ones.")
@@ -38,22 +37,21 @@ class ExcitationOptions:
     seconds: Annotated[
         float | None,
         _motion(
-            help="End the search after so many s of one core, once a motion is found; what is "
-            "found then depends on the computer."
+            help="End the search after this time of one core, in s, once a motion is found; the "
+            "result then depends on the computer."
         ),
     ] = None
-    seed: Annotated[int, _motion(min=0, help="Other random starts for every number.")] = 0
+    seed: Annotated[int, _motion(min=0, help="Random seed of the starts.")] = 0
 
 
 @dataclass(frozen=True)
 class ArmOptions:
-    """What the arm may do, carries and lacks."""
+    """Limits, payload and fixed joints of the arm."""
 
-    speed: Annotated[float, _limits(help="Share of the greatest speeds.")] = 0.9
-    acceleration: Annotated[float, _limits(help="Share of the greatest accelerations.")] = 0.9
+    speed: Annotated[float, _limits(help="Fraction of the maximum speeds.")] = 0.9
+    acceleration: Annotated[float, _limits(help="Fraction of the maximum accelerations.")] = 0.9
     torque_margin: Annotated[
-        float,
-        _limits(help="Torques may be so many times larger than the nominal inertias have them."),
+        float, _limits(help="Safety factor on the torques of the nominal inertias.")
     ] = 1.2
     tool: Annotated[
         str | None,
@@ -69,9 +67,9 @@ class ArmOptions:
     range_deg: Annotated[
         float | None, _missing(help="Range to either side of joints without limits.")
     ] = None
-    speed_deg: Annotated[float | None, _missing(help="Greatest speed, in deg/s.")] = None
+    speed_deg: Annotated[float | None, _missing(help="Maximum speed, in deg/s.")] = None
     acceleration_deg: Annotated[
-        float | None, _missing(help="Greatest acceleration, in deg/s^2.")
+        float | None, _missing(help="Maximum acceleration, in deg/s^2.")
     ] = None
 
 
@@ -81,7 +79,7 @@ def dynamics_plan_command(
     ],
     motion: ExcitationOptions,
     kept: ClearanceOptions,
-    able: ArmOptions,
+    arm_options: ArmOptions,
     out: OutFolder = Path("motions"),
     as_json: AsJson = False,
 ) -> None:
@@ -90,7 +88,7 @@ def dynamics_plan_command(
     Writes an exciting motion and sweeps as tables (.csv), programs for a UR (.script), plan.json
     and plan.rrd to look at. Nothing is sent to a robot. Exit status 2: the limits allow none.
     """
-    # Help does not wait for it.
+    # Imported late, so that --help stays fast.
     from visioncal.cli.planned_motions import plan_motions
 
-    plan_motions(robot, motion, kept, able, out, as_json=as_json)
+    plan_motions(robot, motion, kept, arm_options, out, as_json=as_json)

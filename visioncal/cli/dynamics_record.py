@@ -18,12 +18,12 @@ def dynamics_record_command(
         Path, typer.Argument(help="The session's folder; made, or given another stream.")
     ],
     arm: Annotated[str, typer.Option(help="The arm: ur:HOST.")],
-    stream: Annotated[str, typer.Option(help="What to call the motion.")] = "excite",
+    stream: Annotated[str, typer.Option(help="Name of the recorded stream.")] = "excite",
     robot: Annotated[
         str | None, typer.Option(help="Its model; by default what the controller says.")
     ] = None,
     rest_s: Annotated[
-        float, typer.Option(min=0.5, help="At rest for so many seconds, the motion is over.")
+        float, typer.Option(min=0.5, help="The motion ends after this time at rest (s).")
     ] = 3.0,
 ) -> None:
     """Record angles, speeds and motor currents at the controller's full rate.
@@ -31,7 +31,7 @@ def dynamics_record_command(
     The motion is another's: start its program (such as excitation.script of `dynamics plan`) on the
     pendant once this command waits for it. Exit status 0: it is recorded; 2: it is not.
     """
-    # What help and a mistyped option need not wait for.
+    # Imported late, so that --help stays fast.
 
     from visioncal.cli.console import messages, say
     from visioncal.core.interrupts import ended_like_ctrl_c
@@ -60,7 +60,7 @@ def dynamics_record_command(
 
 
 def _keep(out: Path, name: str, stream: "Stream", model: str) -> None:
-    """Writes a session with the stream, or adds the stream to the one that is there."""
+    """Writes a session with the stream, or adds the stream to an existing one."""
     from visioncal.session import Session, save_stream
 
     if (out / "session.toml").is_file():

@@ -12,7 +12,7 @@ from visioncal.core.choices import EXPORT_NAMES, Convention
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, read_text, write_atomically
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.exports import Load
 
@@ -53,13 +53,13 @@ def export_command(
     ] = None,
     inverse: Annotated[bool, typer.Option("--inverse", help="Write the inverse of it.")] = False,
     parent: Annotated[
-        str | None, typer.Option(help="What to call the frame in which the pose is given.")
+        str | None, typer.Option(help="Exported name of the frame in which the pose is given.")
     ] = None,
     child: Annotated[
-        str | None, typer.Option(help="What to call the frame whose pose it is.")
+        str | None, typer.Option(help="Exported name of the frame whose pose it is.")
     ] = None,
     number: Annotated[
-        int | None, typer.Option(help="Which of the controller's tools or bases it becomes.")
+        int | None, typer.Option(help="Number of the controller's tool or base.")
     ] = None,
     mass_kg: Annotated[
         float | None, typer.Option(help="The tool's mass, for ABB's tooldata (kg).")
@@ -72,7 +72,7 @@ def export_command(
         str | None,
         typer.Option(
             metavar="|".join(get_args(Convention)),
-            help="robot-dh: of its joint table; modified is Craig's.",
+            help="robot-dh: convention of its joint table; modified is Craig's.",
         ),
     ] = None,
     calibration_hash: Annotated[

@@ -10,7 +10,7 @@ from visioncal.cli.options import AsJson, PartOptions
 from visioncal.core.choices import UNITS_M
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.frames.measured import Tool
     from visioncal.results import Calibration, Frame
@@ -59,41 +59,43 @@ def fixture_command(
 
     drawing = None if cad is None else read_nominal(cad, cad_unit)
 
-    def by_touches(known: "Calibration | None") -> "Frame":
-        touched_with = _tool(tool, known, part.robot)
+    def by_touches(robot_calibration: "Calibration | None") -> "Frame":
+        touched_with = _tool(tool, robot_calibration, part.robot)
         rows = read_touches(
             touches, written.requested(), part.robot, positions=touched_with is None
         )
         noise_m = written.noise_m
         return touched_fixture(
-            rows, touched_with, drawing, known, written.model, touch_noise_m=noise_m
+            rows, touched_with, drawing, robot_calibration, written.model, touch_noise_m=noise_m
         )
 
     asked = Asked("fixture", touches, goes, written, part, point, as_json)
     place_frame(asked, by_touches, drawing, tool)
 
 
-def _tool(said: str | None, calibration: "Calibration | None", robot: str | None) -> "Tool | None":
-    """Finds the tool that the points were touched with."""
+def _tool(
+    option: str | None, calibration: "Calibration | None", robot: str | None
+) -> "Tool | None":
+    """Finds the tool that touched the points."""
     from visioncal.frames.measured import NO_TOOL, Tool
     from visioncal.interchange.result_files import load_placed
 
-    if said == "none":
+    if option == "none":
         return None
-    known = {} if calibration is None else calibration.frames
-    if said is None and calibration is None:
+    frames = {} if calibration is None else calibration.frames
+    if option is None and calibration is None:
         raise DataError("The tool that touched the points is not said.", next_step=NO_TOOL)
-    if said is None or said in known or f"flange_from_{said}" in known:
-        return Tool.among(known, "The calibration", said)
-    path, _, name = said.rpartition(":")
-    if Path(said).exists():
-        return Tool.among(load_placed(Path(said), robot).frames, said, None)
+    if option is None or option in frames or f"flange_from_{option}" in frames:
+        return Tool.among(frames, "The calibration", option)
+    path, _, name = option.rpartition(":")
+    if Path(option).exists():
+        return Tool.among(load_placed(Path(option), robot).frames, option, None)
     if path and Path(path).exists():
         return Tool.among(load_placed(Path(path), robot).frames, path, name)
-    if known:
-        return Tool.among(known, "The calibration", said)
+    if frames:
+        return Tool.among(frames, "The calibration", option)
     raise DataError(
-        f"--tool {said}: there is no such file, nor a calibration (-c) that has such a tool.",
-        culprits=[said],
+        f"--tool {option}: there is no such file, nor a calibration (-c) that has such a tool.",
+        culprits=[option],
         next_step=NO_TOOL,
     )

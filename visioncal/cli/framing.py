@@ -1,4 +1,4 @@
-"""What `tcp` and `fixture` share: options, touches or images, where the frame goes, its report."""
+"""Placing of frames by `tcp` and `fixture`: options, touches or images, destination, report."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.interchange.outputs import RECORDING, Written
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.frames.drawing_points import NominalPoints
     from visioncal.results import Calibration, Frame
@@ -31,14 +31,14 @@ PointOption: TypeAlias = Annotated[
     typer.Option(
         "--point-mm",
         metavar="X,Y,Z",
-        help="Of images: the frame's origin in the target's frame, such as the tool's tip.",
+        help="For images: the frame's origin in the target's frame, such as the tool's tip.",
     ),
 ]
 
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Where a frame goes, and under which name."""
+    """Destination and name of a frame."""
 
     calibration: Annotated[
         Path | None,
@@ -56,22 +56,22 @@ class FrameOptions:
             help="A file of frames (.json) to put it into instead; made where missing.",
         ),
     ] = None
-    name: Annotated[str | None, typer.Option(help="What to call it: gripper, jig_2.")] = None
+    name: Annotated[str | None, typer.Option(help="Name of the frame: gripper, jig_2.")] = None
     force: Force = False
 
 
 @dataclass(frozen=True)
 class TouchOptions(RobotPoseOptions):
-    """How touches are written, and how well they repeat."""
+    """Convention and repeatability of touches."""
 
     touch_noise: Annotated[
         float | None,
-        typer.Option("--touch-noise-mm", help="What a touch is known to repeat to, per axis."),
+        typer.Option("--touch-noise-mm", help="Repeatability of a touch, per axis, in mm."),
     ] = None
 
     @property
     def noise_m(self) -> float | None:
-        """How well a touch repeats [m].
+        """Repeatability of a touch [m].
 
         Raises:
             DataError: It is no length from 0 to 1000 mm.
@@ -87,7 +87,7 @@ class TouchOptions(RobotPoseOptions):
         return 1e-3 * noise_mm
 
     def given(self) -> dict[str, object]:
-        """By their names; None for those that were not given."""
+        """The options by their names; None for those that were not given."""
         own = [var for var in vars(self) if var not in ("joint_unit", "touch_noise")]
         named = {f"--{name.replace('_', '-')}": getattr(self, name) for name in own}
         return {**named, "--touch-noise-mm": self.touch_noise}
@@ -95,14 +95,13 @@ class TouchOptions(RobotPoseOptions):
 
 @dataclass(frozen=True)
 class FrameLocation:
-    """Where a frame goes.
+    """Destination of a frame.
 
     Attributes:
-        name: The transform's name.
-        calibration: What is known of the camera and the robot; None for nothing.
-        result: The result that it was taken out of, of a whole cell or itself.
+        calibration: The result of the camera and robot in question; None where none is named.
+        result: The result from which it was extracted, of a cell or itself.
         folder: The output folder that the frame joins; None where it does not.
-        file: The file of frames that it goes into; None likewise.
+        file: The file of frames that it joins; None where it does not.
     """
 
     name: str
@@ -120,55 +119,55 @@ class FrameLocation:
         needs: "Sequence[Part]",
         touched_by: str | None = None,
     ) -> "FrameLocation":
-        """Finds out what is known and where the frame will go, before anything is computed.
+        """Resolves the calibration and the frame's destination, before anything is computed.
 
         Args:
-            options: What the user says of it.
-            kind: What it is of.
-            choice: Which camera and robot of a whole cell are meant.
-            needs: What of them has to be clear.
-            touched_by: The only robot that the touches name; it is meant where the cell has it and
-                the user names none.
+            options: The user's options.
+            kind: The kind of frame.
+            choice: Which camera and robot of a cell are meant.
+            needs: Which of them have to be unambiguous.
+            touched_by: The only robot that the touches name; the default robot where the cell has
+                it.
 
         Raises:
-            DataError: A frame of that name is there, or the place cannot take one.
+            DataError: A frame of that name exists, or the destination cannot take one.
         """
         from visioncal.interchange.result_files import load_result
         from visioncal.results.selecting import placed_name
 
-        name, known, out = transform_name(kind, options.name), options.calibration, options.out
-        result = None if known is None else load_result(known)
+        name, path, out = transform_name(kind, options.name), options.calibration, options.out
+        result = None if path is None else load_result(path)
         cell = None if result is None else result.cell
         if cell is not None and choice.robot is None and touched_by in cell.robots:
             choice = replace(choice, robot=touched_by)
         calibration = None if result is None else result.chosen(choice, needs)
         if result is not None:
             name = placed_name(result, choice, needs, name)
-        folder = None if known is None or out is not None else _folder(known)
-        place = cls(name, calibration, result, folder, out)
-        place._check_names()
-        if not options.force and (there := place._there()) is not None:
+        folder = None if path is None or out is not None else _folder(path)
+        location = cls(name, calibration, result, folder, out)
+        location._check_names()
+        if not options.force and (taken_in := location._existing()) is not None:
             raise DataError(
-                f"{there} already has {name}, and nothing is overwritten.",
+                f"{taken_in} already has {name}, and nothing is overwritten.",
                 culprits=[name],
                 next_step="Replace it with --force, or give this one another name with --name.",
             )
-        return place
+        return location
 
     def _frames(self) -> "dict[str, Frame]":
-        """The frames that are there already."""
+        """The frames that exist at the destination."""
         from visioncal.results import FrameFile
 
         if self.file is not None:
             return dict(FrameFile.load(self.file).frames) if self.file.exists() else {}
         return {} if self.result is None else dict(self.result.frames)
 
-    def _there(self) -> Path | None:
-        """The place that has a frame of this name already."""
+    def _existing(self) -> Path | None:
+        """The destination, where it has a frame of this name already."""
         return (self.file or self.folder) if self.name in self._frames() else None
 
     def _check_names(self) -> None:
-        """Refuses a name that another frame has: one frame cannot hang in two places."""
+        """Refuses a child frame that exists with another parent."""
         child = self.name.partition("_from_")[2]
         for other in self._frames():
             if other != self.name and other.partition("_from_")[2] == child:
@@ -179,7 +178,7 @@ class FrameLocation:
                 )
 
     def keep(self, frame: "Frame") -> Written:
-        """Writes the frame where it goes; nowhere if nothing was named."""
+        """Writes the frame to its destination, if any."""
         from visioncal.interchange.merge_results import rewrite
         from visioncal.results import FrameFile
 
@@ -192,27 +191,20 @@ class FrameLocation:
         return rewrite(self.folder, replace(self.result, frames=frames))
 
 
-def _folder(known: Path) -> Path:
-    folder = known if known.is_dir() else known.parent
-    if known.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
+def _folder(path: Path) -> Path:
+    folder = path if path.is_dir() else path.parent
+    if path.suffix.lower() == ".rrd" or not (folder / "calibration.json").is_file():
         raise DataError(
-            f"{known} is no output folder that a frame could join.",
-            culprits=[str(known)],
+            f"{path} is no output folder that a frame could join.",
+            culprits=[str(path)],
             next_step="Name the folder that calibrate wrote, or a file for the frame with -o.",
         )
     return folder
 
 
 def keep_and_report(place: FrameLocation, frame: "Frame", source: Path, *, as_json: bool) -> None:
-    """Writes a frame where it goes, and prints it for people, or as JSON.
-
-    Args:
-        place: Where it goes.
-        frame: The frame.
-        source: What it was found from.
-        as_json: Whether to print JSON.
-    """
-    # What is said to be run again has something to replace.
+    """Writes a frame to its destination, and prints it for people, or as JSON."""
+    # The suggested command runs again, and has a frame to replace then.
     again = [*sys.argv, *([] if "--force" in sys.argv else ["--force"])]
     out = place.file or place.folder or ""
     frame = replace(frame, verdict=frame.verdict.with_paths(source, out, ["visioncal", *again[1:]]))
@@ -246,11 +238,9 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
     undrawn = [undrawn.file for undrawn in written.undrawn]
     recording = None if place.folder is None else place.folder / RECORDING
     if recording is not None and recording not in (*written.files, *undrawn):
-        why = "it is missing or of another result"
-        say(f"{recording} was not renewed: {why}")
+        say(f"{recording} was not renewed: it is missing or of another result")
     if not written.files:
-        where = "-c joins it to a calibration, -o puts it into a file"
-        say(f"nothing was written: {where}")
+        say("nothing was written: -c joins it to a calibration, -o puts it into a file")
     report_written(written)
 
 
@@ -265,16 +255,12 @@ def _report_before(place: FrameLocation, frame: "Frame") -> None:
 
 @dataclass(frozen=True)
 class Asked:
-    """What `tcp` or `fixture` is asked for.
+    """Request of `tcp` or `fixture`.
 
     Attributes:
-        kind: What is to be placed.
-        source: What the user named: touches, as a table or a session, or a session of images.
-        goes: Where its frame goes.
-        written: How touches are written.
-        part: Which camera, robot and target of a whole cell are meant.
-        point_mm: Of images: the frame's origin in the target's frame, as the user wrote it.
-        as_json: Whether to print JSON.
+        source: Touches, as a table or a session, or a session of images.
+        written: Convention of the touches.
+        point_mm: For images: the frame's origin in the target's frame, as typed.
     """
 
     kind: FrameKind
@@ -287,7 +273,7 @@ class Asked:
 
 
 def place_frame(
-    asked: Asked,
+    request: Asked,
     by_touches: "Callable[[Calibration | None], Frame]",
     drawing: "NominalPoints | None" = None,
     tool: str | None = None,
@@ -295,10 +281,10 @@ def place_frame(
     """Places a tool or a fixture by touches or by a session's images, and keeps and reports it.
 
     Args:
-        asked: What is asked for.
-        by_touches: Places it by touches, with what is known of the robot.
-        drawing: Where points or markers on a fixture are; None where none is given.
-        tool: What touched a fixture, as the user wrote it.
+        request: The request.
+        by_touches: Places it by touches, given the calibration if there is one.
+        drawing: Points or markers on a fixture; None where none are given.
+        tool: The tool that touched a fixture, as typed.
 
     Raises:
         DataError: The source cannot be read or does not show what is needed, or options contradict
@@ -307,29 +293,29 @@ def place_frame(
     from visioncal.interchange.formats.touches import robots_of
     from visioncal.session.choosing import ARM, EYE, Choice
 
-    kind, part = asked.kind, asked.part
-    session = _image_session(asked.source, {"--tool": tool, **asked.written.given()})
+    kind, part = request.kind, request.part
+    session = _image_session(request.source, {"--tool": tool, **request.written.given()})
     if session is None:
-        own = "the tool's point" if kind == "tool" else "the fixture's origin"
-        refuse_given({"--point-mm": asked.point_mm}, f"touches say where {own} is")
+        origin = "the tool's point" if kind == "tool" else "the fixture's origin"
+        refuse_given({"--point-mm": request.point_mm}, f"touches say where {origin} is")
         refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
-        robots = robots_of(asked.source)
-        if asked.goes.calibration is None and not robots and tool in (None, "none"):
+        robots = robots_of(request.source)
+        if request.goes.calibration is None and not robots and tool in (None, "none"):
             refuse_given({"--robot": part.robot}, "neither touches nor a calibration name robots")
-        only = robots[0] if len(robots) == 1 else None
-        place = FrameLocation.of(asked.goes, kind, Choice(robot=part.robot), ARM, only)
-        frame = by_touches(place.calibration)
+        touched_by = robots[0] if len(robots) == 1 else None
+        location = FrameLocation.of(request.goes, kind, Choice(robot=part.robot), ARM, touched_by)
+        frame = by_touches(location.calibration)
     else:
-        place = FrameLocation.of(asked.goes, kind, replace(part.choice, target=None), EYE)
-        if place.calibration is None:
+        location = FrameLocation.of(request.goes, kind, replace(part.choice, target=None), EYE)
+        if location.calibration is None:
             raise DataError(
                 f"session {session.name!r} has images, and the camera's calibration (-c) is needed "
                 "to place what they show.",
                 culprits=["-c"],
                 next_step="Name the output folder of visioncal calibrate.",
             )
-        frame = _by_images(asked, session, place.calibration, drawing)
-    keep_and_report(place, frame, asked.source, as_json=asked.as_json)
+        frame = _by_images(request, session, location.calibration, drawing)
+    keep_and_report(location, frame, request.source, as_json=request.as_json)
 
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
@@ -355,10 +341,7 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session 
 
 
 def _by_images(
-    asked: Asked,
-    session: "Session",
-    calibration: "Calibration",
-    drawing: "NominalPoints | None",
+    request: Asked, session: "Session", calibration: "Calibration", drawing: "NominalPoints | None"
 ) -> "Frame":
     import numpy as np
 
@@ -367,12 +350,12 @@ def _by_images(
     from visioncal.session.selecting import has_several, select
 
     if has_several(session):
-        session = select(session, asked.part.choice, parted=False)
+        session = select(session, request.part.choice, parted=False)
     if drawing is not None:
         refuse_given(
-            {"--point-mm": asked.point_mm}, "beside --cad the drawing's origin is the frame's"
+            {"--point-mm": request.point_mm}, "beside --cad the drawing's origin is the frame's"
         )
         return marked_fixture(session, calibration, drawing)
-    point = 1e-3 * np.array(numbers_in(asked.point_mm or "0,0,0", "--point-mm", "x,y,z"))
-    with shown_progress(quiet=asked.as_json) as progress:
-        return seen_frame(session, calibration, asked.kind, point, progress=progress)
+    point = 1e-3 * np.array(numbers_in(request.point_mm or "0,0,0", "--point-mm", "x,y,z"))
+    with shown_progress(quiet=request.as_json) as progress:
+        return seen_frame(session, calibration, request.kind, point, progress=progress)

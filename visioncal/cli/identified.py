@@ -1,4 +1,4 @@
-"""The dynamics of `visioncal dynamics identify` and `validate`: found, written and reported."""
+"""Identifies, validates, writes and reports dynamics, for `visioncal dynamics`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,43 +22,43 @@ from visioncal.interchange.outputs import write_dynamics
 from visioncal.session import Session
 
 
-def identify_into(asked: IdentifyOptions) -> None:
-    """Identifies the dynamics by a session's streams, writes them where asked, and reports them.
+def identify_into(options: IdentifyOptions) -> None:
+    """Identifies the dynamics from a session's streams, and writes and reports them.
 
     Raises:
         DataError: The session cannot be read, its streams determine nothing, or there is no such
-            term of friction.
+            friction term.
     """
     request = replace(
-        asked.streams.request(),
-        validate_on=asked.validate_on or "",
-        rotors=asked.rotors,
+        options.streams.request(),
+        validate_on=options.validate_on or "",
+        rotors=options.rotors,
         options=Options(
-            terms=replace(friction_terms(asked.friction, FRICTION), slow_rad_s=SLOW_RAD_S),
-            stribeck=asked.stribeck,
-            checked=not asked.unchecked,
+            terms=replace(friction_terms(options.friction, FRICTION), slow_rad_s=SLOW_RAD_S),
+            stribeck=options.stribeck,
+            checked=not options.unchecked,
         ),
     )
-    run = identify_session(Session.load(asked.session), request)
+    run = identify_session(Session.load(options.session), request)
     identified = run.identified
-    written = None if asked.output is None else write_dynamics(asked.output, run)
-    if asked.as_json:
+    written = None if options.output is None else write_dynamics(options.output, run)
+    if options.as_json:
         print_json(to_document(identified))
     else:
         _report(identified, () if run.predicted is None else run.predicted.notes)
     if written is not None:
-        report_written(written, quiet=asked.as_json)
-    elif not asked.as_json:
+        report_written(written, quiet=options.as_json)
+    elif not options.as_json:
         say("nothing was written: -o names a folder for it")
 
 
 def print_predictions(
     session: Path, streams: StreamOptions, against: Path | None, *, as_json: bool
 ) -> None:
-    """Predicts the torques of a session's streams, and says how near that comes.
+    """Predicts the torques of a session's streams, and prints the prediction errors.
 
     Raises:
-        DataError: Nothing was identified, or the streams cannot be predicted from.
+        DataError: There are no identified dynamics, or the streams cannot be predicted.
     """
     identified = identified_of(against, "validate")
     predictions = validate_session(Session.load(session), identified, streams.request())
@@ -70,22 +70,22 @@ def print_predictions(
         _report_prediction(identified, prediction)
 
 
-def _report(identified: Identified, proof: Sequence[str]) -> None:
-    """Prints the verdict, what was fitted, and what was found in the samples of the proof."""
+def _report(identified: Identified, validation_notes: Sequence[str]) -> None:
+    """Prints the verdict, the fit, and the notes on the validation samples."""
     console = answers()
     print_verdict(judge(identified), f"dynamics of {identified.robot.name}")
     for stream in identified.streams:
-        left = f", {stream.left_out} torques left out" if stream.left_out else ""
+        left_out = f", {stream.left_out} torques left out" if stream.left_out else ""
         console.print(
             escape(
                 f"{stream.label}: {stream.samples} samples at {figure(2 * stream.cutoff_hz)} Hz of "
-                f"a motion up to {figure(stream.band_hz)} Hz{left}"
+                f"a motion up to {figure(stream.band_hz)} Hz{left_out}"
             )
         )
         for note in stream.notes:
             console.print(f"  - {escape(note)}")
     fitted = {note for stream in identified.streams for note in stream.notes}
-    for note in (name for name in proof if name not in fitted):
+    for note in (name for name in validation_notes if name not in fitted):
         console.print(f"  - {escape(note)}")
     counts = [(word, identified.determined.count(word)) for _, word in CLASSES]
     shares = ", ".join(f"{count} to {word}" for word, count in counts[:-1])
@@ -98,10 +98,10 @@ def _report(identified: Identified, proof: Sequence[str]) -> None:
 
 
 def _joint_table(identified: Identified) -> Table:
-    """What each joint's torques and friction came to."""
+    """Table of torque errors and friction by joint."""
     names = [identified.base.model.names[index] for index in identified.base.independent]
     values = dict(zip(names, identified.values.tolist(), strict=True))
-    humps = {row["joint"]: row for row in stribeck_rows(identified)}
+    stribeck = {row["joint"]: row for row in stribeck_rows(identified)}
     joints = range(1, identified.robot.joint_count + 1)
     columns: dict[str, list[float | None]] = {"fitted": [*identified.fitted_rms_nm]}
     validation = identified.validation
@@ -112,32 +112,32 @@ def _joint_table(identified: Identified) -> Table:
             columns["before"] = [*validation.known_rms_nm]
     for symbol in ("Fc", "Fv", "Ia"):
         columns[symbol] = [values.get(f"{symbol}{joint}") for joint in joints]
-    columns["Fs/Fc"] = [humps.get(joint, {}).get("static_over_coulomb") for joint in joints]
-    columns["vs"] = [humps.get(joint, {}).get("speed_rad_s") for joint in joints]
-    known = {
+    columns["Fs/Fc"] = [stribeck.get(joint, {}).get("static_over_coulomb") for joint in joints]
+    columns["vs"] = [stribeck.get(joint, {}).get("speed_rad_s") for joint in joints]
+    filled = {
         name: column
         for name, column in columns.items()
         if any(value is not None for value in column)
     }
-    table = Table("joint", *known, box=None)
+    table = Table("joint", *filled, box=None)
     for at, joint in enumerate(joints):
         row = [
             None if group[at] is None else figure(float(group[at] or 0.0))
-            for group in known.values()
+            for group in filled.values()
         ]
         table.add_row(str(joint), *row)
     return table
 
 
 def _report_prediction(identified: Identified, prediction: Prediction) -> None:
-    found = validate(identified, prediction)
+    validation = validate(identified, prediction)
     fitted = identified.fitted_rms_nm
     table = Table("joint", "predicted to [N m]", "of its range", "fitted to [N m]", box=None)
     for joint, name in enumerate(identified.robot.joint_names):
         table.add_row(
             name,
-            figure(float(found.rms_nm[joint])),
-            f"{figure(100.0 * float(found.shares[joint]))} %",
+            figure(float(validation.rms_nm[joint])),
+            f"{figure(100.0 * float(validation.shares[joint]))} %",
             figure(float(fitted[joint])),
         )
     answers().print(table)

@@ -1,4 +1,4 @@
-"""Commands with help in plain text, and groups that import one when it is asked for."""
+"""Commands with plain-text help, and groups that import a command on demand."""
 
 import inspect
 import time
@@ -18,21 +18,21 @@ from typer.main import get_command, get_group
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 
-# As a shell reports a program that SIGINT ended.
+# As shells report a program ended by SIGINT.
 _EXIT_CTRL_C = 128 + 2
-# Of what is wrong, missing or unknown among options; typer exports the first of them alone.
+# Base class of usage errors; typer exports only a subclass.
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
 
 class PlainCommand(TyperCommand):
-    """A command whose help has its options under the headings of their panels.
+    """A command whose help lists its options under the headings of their panels.
 
-    It knows no markup, which takes `[mm]` for a style, and no columns beside each other, for which
-    a terminal of 80 columns has no room.
+    Without markup, which reads `[mm]` as a style, and without columns, which do not fit a terminal
+    of 80 columns.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - typer's own
-        """Reads its options; with `--json`, one that is wrong or unknown is an error as others."""
+        """Parses the options; with `--json`, a usage error becomes a DataError."""
         wants_json = "--json" in args
         typed = list(args)
         try:
@@ -41,24 +41,24 @@ class PlainCommand(TyperCommand):
             if not wants_json:
                 raise
             param, unknown = getattr(error, "param", None), getattr(error, "option_name", "")
-            named = [*param.opts] if param else [unknown] if unknown else []
+            names = [*param.opts] if param else [unknown] if unknown else []
             raise DataError(
                 error.format_message(),
-                culprits=named[-1:],
+                culprits=names[-1:],
                 next_step=f"{ctx.command_path} --help lists what it takes.",
             ) from None
         self._refuse_empty_paths(ctx, typed)
         return rest
 
     def _refuse_empty_paths(self, ctx: Any, typed: list[str]) -> None:  # noqa: ANN401 - typer's own
-        """Refuses paths of no letter, as of a shell's variable that is not set: none is meant."""
+        """Refuses empty paths, as from an unset shell variable."""
         paths = (param for param in self.params if isinstance(ctx.params.get(param.name), Path))
-        takers = {opt for path in paths for opt in path.opts}
+        path_options = {opt for path in paths for opt in path.opts}
         for option, value in (
             *pairwise(typed),
             *(name.split("=", 1) for name in typed if "=" in name),
         ):
-            if option in takers and not value:
+            if option in path_options and not value:
                 raise DataError(
                     f"{option} is empty; a path is needed.",
                     culprits=[option],
@@ -67,19 +67,19 @@ class PlainCommand(TyperCommand):
                 )
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 - typer's own types
-        """Runs it; where Ctrl-C ends it, says which files it leaves behind."""
-        begun = time.time()
+        """Runs the command; on Ctrl-C, lists the files that it has written."""
+        start_s = time.time()
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            given = [param for param in ctx.params.values() if isinstance(param, Path)]
-            left = sorted(str(file) for path in given for file in _written_since(path, begun))
-            words = f"written so far: {some_of(left)}" if left else "nothing was written"
+            paths = [param for param in ctx.params.values() if isinstance(param, Path)]
+            written = sorted(str(file) for path in paths for file in _written_since(path, start_s))
+            words = f"written so far: {some_of(written)}" if written else "nothing was written"
             typer.echo(f"stopped by Ctrl-C; {words}", err=True)
             raise typer.Exit(_EXIT_CTRL_C) from None
 
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - typer's own types
-        """Writes them."""
+        """Writes the options by panel."""
         panels: dict[str, list[tuple[str, str]]] = defaultdict(list)
         for param in self.get_params(ctx):
             if record := param.get_help_record(ctx):
@@ -90,20 +90,20 @@ class PlainCommand(TyperCommand):
                 formatter.write_dl(records)
 
 
-def _written_since(path: Path, begun: float) -> Iterator[Path]:
-    """The files of a path that were written since some time [s]."""
+def _written_since(path: Path, since_s: float) -> Iterator[Path]:
+    """The files at a path that were written since a time [s]."""
     for file in (path, *path.rglob("*")):
-        # File systems keep times as coarse as this.
-        if file.is_file() and file.stat().st_mtime > begun - 0.01:
+        # File systems may round times this coarsely.
+        if file.is_file() and file.stat().st_mtime > since_s - 0.01:
             yield file
 
 
 class LazyGroup(TyperGroup):
-    """A group that lists its commands without an import, and imports the one that is asked for.
+    """A group that lists its commands without imports, and imports a command on demand.
 
     Attributes:
-        listed: By the names of the commands, the first paragraphs of their own helps.
-        prefix: What comes before a name: the command `plan` of prefix `dynamics_` is the function
+        listed: First paragraphs of the commands' help, by name.
+        prefix: Prefix of module names: the command `plan` of prefix `dynamics_` is the function
             `dynamics_plan_command` of the module `dynamics_plan`; a group is the `target_app` of
             `target`.
     """
@@ -117,7 +117,7 @@ class LazyGroup(TyperGroup):
             self.add_command(TyperCommand(name, help=words))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401, ARG002 - typer's
-        """Writes the listing; typer cuts its lines off."""
+        """Writes the listing without typer's truncation."""
         with formatter.section("Commands"):
             formatter.write_dl(list(self.listed.items()))
 
@@ -129,59 +129,59 @@ class LazyGroup(TyperGroup):
     @classmethod
     def imported(cls, name: str) -> Any:  # noqa: ANN401 - a command of typer's
         """A command of this group, with its parameters."""
-        own = f"{cls.prefix}{name}".replace("-", "_")
-        module = import_module(f"visioncal.cli.{own}")
-        if hasattr(module, f"{own}_app"):
-            return get_group(getattr(module, f"{own}_app"))
+        module_name = f"{cls.prefix}{name}".replace("-", "_")
+        module = import_module(f"visioncal.cli.{module_name}")
+        if hasattr(module, f"{module_name}_app"):
+            return get_group(getattr(module, f"{module_name}_app"))
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name, cls=PlainCommand)(with_fields(getattr(module, f"{own}_command")))
+        app.command(name, cls=PlainCommand)(with_fields(getattr(module, f"{module_name}_command")))
         return get_command(app)
 
 
 def with_fields(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose parameters that are dataclasses are given field by field, at any depth."""
+    """A command whose dataclass parameters are replaced by their fields, at any depth."""
     parameters = inspect.signature(command).parameters.values()
     hints = get_type_hints(command, include_extras=True)
     flat = [
-        one
+        flattened
         for parameter in parameters
-        for one in _each(parameter.name, hints[parameter.name], parameter.default)
+        for flattened in _flattened(parameter.name, hints[parameter.name], parameter.default)
     ]
 
     @wraps(command)
-    def taking_each(**given: Any) -> None:  # noqa: ANN401 - of any type
+    def by_fields(**given: Any) -> None:  # noqa: ANN401 - of any type
         command(
             **{
-                parameter.name: _taken(parameter.name, hints[parameter.name], given)
+                parameter.name: _gathered(parameter.name, hints[parameter.name], given)
                 for parameter in parameters
             }
         )
 
-    del taking_each.__wrapped__
-    taking_each.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
-    taking_each.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
-    return taking_each
+    del by_fields.__wrapped__
+    by_fields.__signature__ = inspect.Signature(flat)  # type: ignore[attr-defined]
+    by_fields.__annotations__ = {parameter.name: parameter.annotation for parameter in flat}
+    return by_fields
 
 
-def _each(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:  # noqa: ANN401 - any
-    """What the command line has of a parameter: itself, or the fields of a dataclass."""
+def _flattened(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:  # noqa: ANN401 - any
+    """Command-line parameters of a parameter: itself, or the fields of its dataclass."""
     if not _has_fields(kind):
         at = inspect.Parameter.KEYWORD_ONLY
         yield inspect.Parameter(name, at, annotation=kind, default=default)
         return
-    own = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind, include_extras=True)
     for field in fields(kind):
         given = inspect.Parameter.empty if field.default is MISSING else field.default
-        yield from _each(field.name, own[field.name], given)
+        yield from _flattened(field.name, hints[field.name], given)
 
 
-def _taken(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of any type
-    """A parameter out of what the command line gave."""
+def _gathered(name: str, kind: Any, given: Mapping[str, Any]) -> Any:  # noqa: ANN401 - of any type
+    """Builds a parameter from the command line's values."""
     if not _has_fields(kind):
         return given[name]
-    own = get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind, include_extras=True)
     return kind(
-        **{field.name: _taken(field.name, own[field.name], given) for field in fields(kind)}
+        **{field.name: _gathered(field.name, hints[field.name], given) for field in fields(kind)}
     )
 
 

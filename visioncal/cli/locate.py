@@ -14,7 +14,7 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure, some_of
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.core.types import FloatArray, Target
     from visioncal.frames.located import Located
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from visioncal.session import Session, View
 
 _POSE = "x,y,z,qx,qy,qz,qw"
-# Rounding to four digits leaves a unit quaternion's norm within this of 1.
+# Rounding to four digits keeps a unit quaternion's norm within this of 1.
 _NORM_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """One place, what it is of in words, and what it is of in JSON."""
+class _Point:
+    """One located point, with its label in words and in JSON."""
 
     words: str
     document: Mapping[str, Any]
@@ -39,7 +39,7 @@ def locate_command(
     source: Annotated[
         Path | None,
         typer.Argument(
-            help="A session, or one image (png, jpg, tif); none where pixels are all there is."
+            help="A session, or one image (png, jpg, tif); may be left out with --pixel."
         ),
     ] = None,
     calibration: Annotated[
@@ -51,14 +51,12 @@ def locate_command(
     pixel: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="U,V",
-            help="A feature, in the image as it was taken; several may be given.",
+            metavar="U,V", help="A feature, in the image as it was taken; several may be given."
         ),
     ] = None,
-    plane: Annotated[str | None, typer.Option(help=f"What the features lie in: {FORMS}.")] = None,
+    plane: Annotated[str | None, typer.Option(help=f"Plane of the features: {FORMS}.")] = None,
     plane_sigma: Annotated[
-        float | None,
-        typer.Option("--plane-sigma-mm", help="How well the plane's height is known."),
+        float | None, typer.Option("--plane-sigma-mm", help="Sigma of the plane's height, in mm.")
     ] = None,
     point: Annotated[
         str | None,
@@ -83,7 +81,7 @@ def locate_command(
         str | None,
         typer.Option(
             metavar=_POSE.upper(),
-            help="Where the flange stood at an image, in metres: for a camera on the flange.",
+            help="Pose of the flange at the image, in metres, for a camera on the flange.",
         ),
     ] = None,
     sigma_px: Annotated[
@@ -113,12 +111,14 @@ def locate_command(
     session = _session(source)
     several = session is not None and has_several(session)
     if session is not None and several:
-        own = target in session.plates
-        session = select(session, Choice(camera, robot, target if own else None), parted=False)
-        target = None if own else target
-    # Names may be of the session alone.
-    named = several and result.cell is None
-    known = result if named else result.chosen(Choice(camera, robot), EYE)
+        is_own_target = target in session.plates
+        session = select(
+            session, Choice(camera, robot, target if is_own_target else None), parted=False
+        )
+        target = None if is_own_target else target
+    # Names may be those of the session alone.
+    is_session_name = several and result.cell is None
+    calibrated = result if is_session_name else result.chosen(Choice(camera, robot), EYE)
     if session is not None:
         refuse_given({"--pose": pose}, "the session has the poses of its views")
     else:
@@ -127,31 +127,31 @@ def locate_command(
     if pixel:
         refuse_given({"--point-mm": point, "--target": target}, "a pixel is placed by its plane")
         if session is not None:
-            flange, joints_rad = _flange_of(session, _chosen(session, view), known)
+            flange, joints_rad = _flange_of(session, _chosen(session, view), calibrated)
         elif source is not None:
-            check_size(Eye.of(known), read_image(source), source.name)
+            check_size(Eye.of(calibrated), read_image(source), source.name)
         boards = boards_before(result, Choice(camera, robot), EYE)
-        found = _by_plane(
-            known, boards, pixel, plane, plane_sigma or 0.0, flange, joints_rad, sigma_px
+        points = _by_plane(
+            calibrated, boards, pixel, plane, plane_sigma or 0.0, flange, joints_rad, sigma_px
         )
     else:
         refuse_given({"--plane": plane, "--plane-sigma-mm": plane_sigma}, "it is for --pixel")
         origin_m = 1e-3 * np.array(numbers_in(point or "0,0,0", "--point-mm", "x,y,z"))
-        wanted = None if target is None else _target(target, result)
+        other_target = None if target is None else _target(target, result)
         if session is not None:
-            shown = _chosen(session, view)
-            if wanted is not None and any(other.has_corners for other in shown):
+            views = _chosen(session, view)
+            if other_target is not None and any(other.has_corners for other in views):
                 raise DataError(
                     f"--target: session {session.name!r} has corners of its own target "
                     "(corners.csv), and no image is searched.",
                     culprits=["--target"],
                     next_step="Leave it out, or name one image.",
                 )
-            session = session if wanted is None else replace(session, target=wanted)
-            found = _by_views(session, shown, known, origin_m, sigma_px, quiet=as_json)
+            session = session if other_target is None else replace(session, target=other_target)
+            points = _by_views(session, views, calibrated, origin_m, sigma_px, quiet=as_json)
         else:
-            found = _by_image(source, known, wanted, origin_m, flange, sigma_px)
-    _report(found, as_json=as_json)
+            points = _by_image(source, calibrated, other_target, origin_m, flange, sigma_px)
+    _report(points, as_json=as_json)
 
 
 def _session(source: Path | None) -> "Session | None":
@@ -164,7 +164,7 @@ def _session(source: Path | None) -> "Session | None":
 
 
 def _chosen(session: "Session", view: int | None) -> "tuple[View, ...]":
-    """The views that are meant."""
+    """The chosen view, or all."""
     chosen = tuple(other for other in session.views if view in (None, other.number))
     if not chosen:
         numbers = some_of([str(other.number) for other in session.views], 20)
@@ -177,7 +177,7 @@ def _chosen(session: "Session", view: int | None) -> "tuple[View, ...]":
 
 
 def _flange(words: str) -> "FloatArray":
-    """Reads a pose of the robot, (4, 4) `base_from_flange`."""
+    """Reads a pose of the robot, (4, 4) `base_from_flange` [m]."""
     import numpy as np
     from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -197,9 +197,9 @@ def _flange(words: str) -> "FloatArray":
 def _flange_of(
     session: "Session", views: "Sequence[View]", calibration: "Calibration"
 ) -> "tuple[FloatArray | None, FloatArray | None]":
-    """Where the flange was at the one view that is meant, and a calibrated arm's joints there.
+    """Flange pose and joint angles of a calibrated arm at the one chosen view.
 
-    A camera that stands still needs neither.
+    A stationary camera needs neither.
     """
     from visioncal.frames.session_observations import calibrated_joints, pose_of
     from visioncal.results.picking import check_mount
@@ -234,7 +234,7 @@ def _by_plane(
     flange: "FloatArray | None",
     joints_rad: "FloatArray | None",
     sigma_px: float | None,
-) -> tuple[_Found, ...]:
+) -> tuple[_Point, ...]:
     import numpy as np
 
     from visioncal.frames.locate import locate
@@ -249,7 +249,7 @@ def _by_plane(
     declared, note = plane_of(plane, sigma_mm, calibration, boards)
     places = locate(calibration, px, declared, flange, joints_rad=joints_rad, sigma_px=sigma_px)
     return tuple(
-        _Found(
+        _Point(
             f"pixel ({u:g}, {v:g})",
             {"pixel": [u, v]},
             replace(place, warnings=(*place.warnings, note)) if note else place,
@@ -266,8 +266,8 @@ def _by_views(
     sigma_px: float | None,
     *,
     quiet: bool,
-) -> tuple[_Found, ...]:
-    # A pixel is placed in a millisecond, and need not wait for what sessions take to import.
+) -> tuple[_Point, ...]:
+    # Imported late, as a pixel is placed in a millisecond without it.
     from visioncal.calibration.stages.observed import by_reason
     from visioncal.frames.picks import locate_views
 
@@ -278,7 +278,7 @@ def _by_views(
     for words in (*by_reason(picks.lost), *picks.warnings):
         say(words)
     return tuple(
-        _Found(f"view {view}", {"view": view}, located) for view, located in picks.found.items()
+        _Point(f"view {view}", {"view": view}, located) for view, located in picks.found.items()
     )
 
 
@@ -289,7 +289,7 @@ def _by_image(
     point_m: "FloatArray",
     flange: "FloatArray | None",
     sigma_px: float | None,
-) -> tuple[_Found, ...]:
+) -> tuple[_Point, ...]:
     from visioncal.frames.locate import locate_target
     from visioncal.vision.finders.imaging import read_image
 
@@ -308,7 +308,7 @@ def _by_image(
     located = locate_target(
         calibration, image, target, flange, point_m, sigma_px=sigma_px, label=name
     )
-    return (_Found(name, {"image": name}, located),)
+    return (_Point(name, {"image": name}, located),)
 
 
 def _target(words: str, result: "Calibration") -> "Target":
@@ -321,15 +321,14 @@ def _target(words: str, result: "Calibration") -> "Target":
     return target_named(words, Path(words).stem)
 
 
-def _report(found: Sequence[_Found], *, as_json: bool) -> None:
+def _report(points: Sequence[_Point], *, as_json: bool) -> None:
     if as_json:
-        print_json([_document(item) for item in found])
+        print_json([_document(point) for point in points])
         return
-    for item in found:
-        typer.echo(f"{item.words}: {_line(item.located)}")
-        for warning in item.located.warnings:
-            words = warning if warning.startswith(item.words) else f"{item.words}: {warning}"
-            warn(words)
+    for point in points:
+        typer.echo(f"{point.words}: {_line(point.located)}")
+        for warning in point.located.warnings:
+            warn(warning if warning.startswith(point.words) else f"{point.words}: {warning}")
 
 
 def _line(located: "Located") -> str:
@@ -342,14 +341,14 @@ def _line(located: "Located") -> str:
     )
 
 
-def _document(item: _Found) -> dict[str, Any]:
-    found = item.located
+def _document(point: _Point) -> dict[str, Any]:
+    located = point.located
     return {
-        **item.document,
-        "p_base_m": found.p_base.tolist(),
-        "covariance": found.covariance.tolist(),
-        "sigma_mm": found.sigma_mm.tolist(),
-        "radius95_mm": found.radius95_mm,
-        "budget_mm": dict(found.budget_mm),
-        "warnings": list(found.warnings),
+        **point.document,
+        "p_base_m": located.p_base.tolist(),
+        "covariance": located.covariance.tolist(),
+        "sigma_mm": located.sigma_mm.tolist(),
+        "radius95_mm": located.radius95_mm,
+        "budget_mm": dict(located.budget_mm),
+        "warnings": list(located.warnings),
     }

@@ -1,4 +1,4 @@
-"""Options: each is declared once, as a field of a dataclass or as a type of a parameter."""
+"""Shared options, each declared once, as a field of a dataclass or a parameter's type."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ import typer
 from visioncal.core.choices import ImagesKept
 from visioncal.interchange.outputs import RECORDING, REPORT
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.session import Session
     from visioncal.session.choosing import Choice
@@ -21,8 +21,7 @@ OutFolder: TypeAlias = Annotated[
     Path, typer.Option("-o", "--out", file_okay=False, help="The folder to write into.")
 ]
 OutFile: TypeAlias = Annotated[
-    Path | None,
-    typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout."),
+    Path | None, typer.Option("-o", "--out", help="The file to write; otherwise, or as -, stdout.")
 ]
 AsJson: TypeAlias = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON to stdout, without words.")
@@ -33,9 +32,7 @@ Force: TypeAlias = Annotated[
 View: TypeAlias = Annotated[
     bool, typer.Option("--view", help="Show it in the rerun viewer as it goes.")
 ]
-Seed: TypeAlias = Annotated[
-    int, typer.Option("--seed", min=0, help="Another random draw for every number.")
-]
+Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 CameraName: TypeAlias = Annotated[
     str | None, typer.Option("--camera", help="Of a whole cell: which camera, as left.")
 ]
@@ -46,7 +43,7 @@ RobotName: TypeAlias = Annotated[
 
 @dataclass(frozen=True)
 class PartOptions:
-    """Which camera, robot and target of a whole cell are meant."""
+    """Which camera, robot and target of a cell are meant."""
 
     camera: CameraName = None
     robot: RobotName = None
@@ -56,7 +53,7 @@ class PartOptions:
 
     @property
     def choice(self) -> "Choice":
-        """The same, as sessions and results take it."""
+        """The choice, for sessions and results."""
         from visioncal.session.choosing import Choice
 
         return Choice(self.camera, self.robot, self.target)
@@ -64,19 +61,19 @@ class PartOptions:
 
 @dataclass(frozen=True)
 class NeedOptions:
-    """What the task needs."""
+    """Required accuracy of the task."""
 
     need_mm: Annotated[
         float | None,
         typer.Option(
-            help="How near picks have to come, in mm: the verdict is about it. In the place of "
-            "the need in session.toml."
+            help="Required accuracy of picks, in mm, on which the verdict is based; replaces the "
+            "need in session.toml."
         ),
     ] = None
     need_deg: Annotated[float | None, typer.Option(help="The same in rotation, in degrees.")] = None
 
     def session(self, path: Path) -> "Session":
-        """Loads a session with that need.
+        """Loads a session with this need.
 
         Raises:
             DataError: It cannot be read, or the need is no positive number.
@@ -88,12 +85,13 @@ class NeedOptions:
 
 @dataclass(frozen=True)
 class WorkOptions:
-    """How a session is worked on, and what is drawn of its result."""
+    """How a session is processed, and which drawings are made."""
 
     threads: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Images searched at a time; one a core where left out. No result changes."
+            min=1,
+            help="Images searched in parallel; by default one a core. The result is the same.",
         ),
     ] = None
     keep_corners: Annotated[

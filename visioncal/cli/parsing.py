@@ -1,4 +1,4 @@
-"""Options as they are written: numbers with commas between, a plane, what others leave no use."""
+"""Parses option values: lists of numbers, views, sizes, planes."""
 
 import math
 from collections.abc import Mapping
@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from pathlib import Path
 
     from visioncal.frames.camera_chain import Plane
     from visioncal.results import Calibration, Edge
 
-# Digits of a view's number, or of the width or height of an image, and more than any has.
+# Digits of a view's number, and of the width or height of an image.
 _MOST_DIGITS = 6
 FORMS = (
     "z=20 (of the base, in mm), base_from_fixture or base_from_fixture:z=-5 (of a frame, whose z "
@@ -25,15 +25,12 @@ _LEAD = "base_from_"
 
 
 def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
-    """Reads an option of numbers.
+    """Parses an option of numbers, such as `12.5,-3,0`.
 
-    Args:
-        words: What the user wrote: `12.5,-3,0`.
-        option: The option's name, for messages.
-        form: What is needed, as names with commas between: `x,y,z`.
+    `form` has their names, separated by commas: `x,y,z`.
 
     Raises:
-        DataError: It is not as many finite numbers.
+        DataError: It is not that many finite numbers.
     """
     try:
         values = tuple(float(part) for part in words.split(","))
@@ -48,7 +45,7 @@ def numbers_in(words: str, option: str, form: str) -> tuple[float, ...]:
 
 
 def pair_in(words: str, option: str) -> tuple[int, int]:
-    """Reads the numbers of two views, written as 8,17.
+    """Parses the numbers of two views, written as 8,17.
 
     Raises:
         DataError: It is not two whole numbers.
@@ -63,7 +60,7 @@ def pair_in(words: str, option: str) -> tuple[int, int]:
 
 
 def views_in(words: str, option: str) -> list[int]:
-    """Reads the numbers of views, written as 1-12,14.
+    """Parses numbers of views, written as 1-12,14.
 
     Raises:
         DataError: It is not whole numbers, or a range ends before it begins.
@@ -81,7 +78,7 @@ def views_in(words: str, option: str) -> list[int]:
 
 
 def size_in(words: str) -> tuple[int, int]:
-    """Reads the width and height of images [px], written as 1280,800 or 1280x800.
+    """Parses the width and height of images [px], written as 1280,800 or 1280x800.
 
     Raises:
         DataError: It is not two whole numbers above 0.
@@ -97,19 +94,16 @@ def size_in(words: str) -> tuple[int, int]:
 
 
 def _whole_numbers(words: str) -> list[int]:
-    """The whole numbers between commas; none where something else is among them."""
+    """Whole numbers separated by commas; empty where anything else is among them."""
     cells = [part.strip() for part in words.split(",")]
     are_whole = all(cell.isdecimal() and len(cell) <= _MOST_DIGITS for cell in cells)
     return [int(cell) for cell in cells] if are_whole else []
 
 
 def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leave it out.") -> None:
-    """Refuses options that have no use here.
+    """Refuses options that do not apply here.
 
-    Args:
-        options: By their names; None for those that were not given.
-        why: They have none, in words.
-        next_step: What to do instead.
+    Values are by option, None for those that were not given; `why` is the reason in words.
 
     Raises:
         DataError: One is given.
@@ -122,10 +116,7 @@ def refuse_given(options: Mapping[str, object], why: str, next_step: str = "Leav
 def named_result(path: "Path | None", option: str, what: str) -> "Path":
     """The path of a result, which an option has to name.
 
-    Args:
-        path: What the user wrote; None where nothing is named.
-        option: The option's name.
-        what: What it is, for messages: `verify: the calibration to check`.
+    `what` describes it in messages: `verify: the calibration to check`.
 
     Raises:
         DataError: None is named.
@@ -142,16 +133,16 @@ def named_result(path: "Path | None", option: str, what: str) -> "Path":
 def plane_of(
     words: str, sigma_mm: float, calibration: "Calibration", boards: "Mapping[str, Edge]"
 ) -> "tuple[Plane, str]":
-    """Reads a plane.
+    """Parses a plane.
 
     Args:
-        words: As in `FORMS`; of a frame's name, `base_from_` may be left out.
-        sigma_mm: How well its height is known [mm].
-        calibration: Whose frames can be named.
-        boards: What else can be: targets of a whole cell by the transforms that place them.
+        words: As in `FORMS`; `base_from_` may be left out of a frame's name.
+        sigma_mm: Standard deviation of its height [mm].
+        calibration: The result whose frames can be named.
+        boards: Targets of a cell, which can be named as well, by their transforms.
 
     Returns:
-        The plane, and what to know of its frame before it is trusted; empty where nothing is.
+        The plane, and a warning about its frame; empty where there is none.
 
     Raises:
         DataError: It is none of these, or there is no such frame.

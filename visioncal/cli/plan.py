@@ -15,7 +15,7 @@ from visioncal.core.number_format import some_of
 from visioncal.interchange.outputs import write_plan
 from visioncal.live.planning.purposes import purpose_of
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.cli.planned_cell import Kept, Source
     from visioncal.core.types import Progress
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from visioncal.live.planning.recorded import Begun
 
 _SHOWN = 12
-# The cosine of a board's z to the base's, from which on only a camera below would see it.
+# Cosine between the z axes of board and base above which only a camera below would see the board.
 _FACE_DOWN = 0.7
 
 
@@ -33,7 +33,7 @@ def plan_command(
         str,
         typer.Argument(
             help="A robot (a built-in name, a .urdf or .toml), a session, or an output folder of "
-            "calibrate.",
+            "calibrate."
         ),
     ],
     wanted: PlanOptions,
@@ -80,7 +80,7 @@ def _begin(
     wanted: PlanOptions,
     progress: "Progress",
 ) -> "tuple[PlanCell, Begun | None]":
-    """The cell, and what was recorded of it where stops are added to that."""
+    """The cell, and the recorded session where stops are added to one."""
     from visioncal.cli.planned_cell import begun_session, cell_of
 
     if wanted.add is not None and wanted.stops is not None:

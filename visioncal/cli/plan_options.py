@@ -1,4 +1,4 @@
-"""The options of `visioncal plan`, and what they say."""
+"""The options of `visioncal plan`, and their conversion for the planner."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from visioncal.core.choices import Criterion, Mount
 from visioncal.core.errors import DataError
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.live.planning.cell import Box, Limits, PlanCell
     from visioncal.live.planning.plan import PlanRequest
@@ -21,22 +21,21 @@ _what = partial(typer.Option, rich_help_panel="What is planned")
 _cell = partial(typer.Option, rich_help_panel="The cell, where the source does not say it")
 _limits = partial(typer.Option, rich_help_panel="What the arm must keep")
 _doubt = partial(typer.Option, rich_help_panel="How well it is known")
-# Of a plan until a need is met.
+# Largest number of stops where a need decides it.
 _MOST_FOR_NEED = 40
 _USUAL_STOPS = ", ".join(f"{purpose.stops} for {purpose.name}" for purpose in PURPOSES.values())
 
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """What is planned."""
+    """Options of the plan."""
 
     add: Annotated[
         int | None,
         _what(min=1, max=500, help="How many stops to add to a recorded session, which counts."),
     ] = None
     purpose: Annotated[
-        str,
-        _what("--for", metavar="|".join(PURPOSES), help="What they are for."),
+        str, _what("--for", metavar="|".join(PURPOSES), help="What they are for.")
     ] = "hand-eye"
     stops: Annotated[int | None, _what(min=1, max=500, help=f"How many stops: {_USUAL_STOPS}.")] = (
         None
@@ -44,8 +43,8 @@ class PlanOptions:
     criterion: Annotated[
         Criterion,
         _what(
-            help="I: mean variance of the places that count; D, A, E: of the unknowns; O1: of the "
-            "Jacobian."
+            help="I: mean variance of the relevant positions; D, A, E: of the parameters; O1: of "
+            "the Jacobian."
         ),
     ] = "I"
     wish_mm: Annotated[
@@ -64,28 +63,26 @@ class PlanOptions:
         str | None,
         _what(
             metavar="X,Y,Z:SX,SY,SZ",
-            help="Where the arm's place counts: a box by its centre in the base and its lengths, "
-            "in mm; else all of its reach.",
+            help="Where the arm's accuracy matters: a box by its centre in the base and its "
+            "lengths, in mm; by default all of its reach.",
         ),
     ] = None
     start_joints: Annotated[
         str | None,
         _what(
             metavar="Q1,Q2,...",
-            help="Where the arm stands now, in radians; else the way to the first stop is not "
-            "looked at.",
+            help="The arm's present joint angles, in radians; without them the path to the first "
+            "stop is not checked.",
         ),
     ] = None
-    candidates: Annotated[
-        int, _what(min=12, max=20000, help="From how many possible stops they are chosen.")
-    ] = 1500
-    seed: Annotated[int, _what(min=0, help="Other possible stops for every number.")] = 0
+    candidates: Annotated[int, _what(min=12, max=20000, help="Number of candidate stops.")] = 1500
+    seed: Annotated[int, _what(min=0, help="Random seed of the candidate stops.")] = 0
 
     def request(self, cell: "PlanCell") -> "PlanRequest":
-        """The same, as the planner takes it.
+        """The request for the planner.
 
         Raises:
-            DataError: A number, a box or a purpose is written otherwise.
+            DataError: A number, a box or a purpose is malformed.
         """
         import numpy as np
 
@@ -93,27 +90,27 @@ class PlanOptions:
         from visioncal.live.planning.accuracy import Wish
         from visioncal.live.planning.plan import PlanRequest
 
-        wanted = purpose_of(self.purpose, "--for")
+        purpose = purpose_of(self.purpose, "--for")
         form = ",".join(f"q{index + 1}" for index in range(cell.robot.joint_count))
         start = self.start_joints and numbers_in(self.start_joints, "--start-joints", form)
-        unwished = self.wish_mm is None and self.wish_deg is None
-        needless = self.need_mm is None and self.need_deg is None
+        has_no_wish = self.wish_mm is None and self.wish_deg is None
+        has_no_need = self.need_mm is None and self.need_deg is None
         return PlanRequest(
-            wanted,
-            self.add or self.stops or (wanted.stops if needless else _MOST_FOR_NEED),
+            purpose,
+            self.add or self.stops or (purpose.stops if has_no_need else _MOST_FOR_NEED),
             self.criterion,
-            None if unwished else Wish(self.wish_mm, self.wish_deg),
+            None if has_no_wish else Wish(self.wish_mm, self.wish_deg),
             self.candidates,
             _box_of(self.workspace, "--workspace", "workspace") if self.workspace else None,
             np.array(start) if start else None,
             self.seed,
-            None if needless else Need(self.need_mm, self.need_deg),
+            None if has_no_need else Need(self.need_mm, self.need_deg),
         )
 
 
 @dataclass(frozen=True)
 class PlanCellOptions:
-    """What the user says of the cell; None for what is not said."""
+    """Options of the cell; None for those that were not given."""
 
     robot: Annotated[str | None, _cell(help="The robot, where a session names none.")] = None
     target: Annotated[
@@ -152,61 +149,64 @@ class PlanCellOptions:
         ),
     ] = None
     guess_mm: Annotated[
-        float, _doubt(min=0.1, max=500.0, help="How well both places are known, per axis.")
+        float, _doubt(min=0.1, max=500.0, help="Sigma of both rough positions, per axis, in mm.")
     ] = 20.0
-    guess_deg: Annotated[float, _doubt(min=0.01, max=45.0, help="The same of their rotations.")] = (
-        5.0
-    )
+    guess_deg: Annotated[
+        float, _doubt(min=0.01, max=45.0, help="The same of their rotations, in degrees.")
+    ] = 5.0
     noise_px: Annotated[
-        float | None, _doubt(help="Of a corner in the image; else 0.1, or as recorded.")
+        float | None, _doubt(help="Sigma of a corner in the image; by default 0.1, or as recorded.")
     ] = None
     noise_mm: Annotated[
-        float | None, _doubt(help="Of the robot at a stop, per axis; else 0.03, or as recorded.")
+        float | None,
+        _doubt(help="Sigma of the robot at a stop, per axis; by default 0.03, or as recorded."),
     ] = None
     noise_deg: Annotated[
-        float | None, _doubt(help="The same of its rotation; else 0.003, or as recorded.")
+        float | None, _doubt(help="The same of its rotation; by default 0.003, or as recorded.")
     ] = None
 
     def options(self, *names: str) -> dict[str, object]:
-        """Some of them by their names; None for those that were not given."""
+        """Some options by their names; None for those that were not given."""
         return {f"--{name}": getattr(self, name) for name in names}
 
 
 @dataclass(frozen=True)
 class ClearanceOptions:
-    """What the arm must keep, in any motion."""
+    """Clearances that the arm must keep in any motion."""
 
     boxes: Annotated[
         list[str] | None,
         _limits(
             "--box",
             metavar="NAME:X,Y,Z:SX,SY,SZ",
-            help="Something in the way, by its centre in the base and its lengths, in mm; as often "
-            "as needed.",
+            help="An obstacle, by its centre in the base and its lengths, in mm; may be repeated.",
         ),
     ] = None
     floor: Annotated[
         str, _limits(metavar="Z|none", help="Height of the floor or table in the base, in mm.")
     ] = "0"
     clearance_mm: Annotated[
-        float, _limits(min=0.0, max=1000.0, help="Of the arm from floor, board, boxes and itself.")
+        float,
+        _limits(
+            min=0.0, max=1000.0, help="Distance of the arm from floor, board, boxes and itself."
+        ),
     ] = 30.0
     margin_deg: Annotated[
-        float, _limits(min=0.0, max=90.0, help="Of the joints from their limits.")
+        float, _limits(min=0.0, max=90.0, help="Distance of the joints from their limits.")
     ] = 3.0
 
     @property
     def bodies(self) -> "tuple[Box, ...]":
-        """What is in the way.
+        """Obstacles.
 
         Raises:
-            DataError: A box is written otherwise.
+            DataError: A box is malformed.
         """
         return tuple(_box_of(box) for box in self.boxes or ())
 
     @property
     def floor_m(self) -> float | None:
-        """The height of the floor in the base; None for none.
+        """Height of the floor in the base [m]; None for no floor.
 
         Raises:
             DataError: It is no number.
@@ -218,20 +218,24 @@ class ClearanceOptions:
 
 @dataclass(frozen=True)
 class SightOptions:
-    """What the camera must keep."""
+    """Conditions that the camera must keep."""
 
     tilt_deg: Annotated[
         float,
-        _limits(min=5.0, max=80.0, help="Most between the line of sight and the board's normal."),
+        _limits(
+            min=5.0,
+            max=80.0,
+            help="Largest angle between the line of sight and the board's normal.",
+        ),
     ] = 50.0
     edge_px: Annotated[
-        float, _limits(min=0.0, max=10000.0, help="Of the board from the image's edge.")
+        float, _limits(min=0.0, max=10000.0, help="Distance of the board from the image's edge.")
     ] = 20.0
     distance_mm: Annotated[
         str | None,
         _limits(
             metavar="NEAR,FAR",
-            help="Of the camera from the board; else as the board fills the image.",
+            help="Distance of the camera from the board; by default as the board fills the image.",
         ),
     ] = None
     focus_mm: Annotated[
@@ -239,7 +243,7 @@ class SightOptions:
     ] = None
 
     def limits(self, kept: ClearanceOptions) -> "Limits":
-        """These limits and those of any motion."""
+        """These limits together with those of any motion."""
         from visioncal.live.planning.cell import Limits
 
         return Limits(
@@ -254,7 +258,7 @@ class SightOptions:
 
 
 def _box_of(words: str, option: str = "--box", name: str = "") -> "Box":
-    """Reads a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm]."""
+    """Parses a box: NAME:x,y,z:sx,sy,sz, its centre in the base and its lengths [mm]."""
     import numpy as np
 
     from visioncal.core.transforms import compose

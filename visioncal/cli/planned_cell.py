@@ -1,4 +1,4 @@
-"""The cell that a plan is for: from a robot and options, a session, or a calibration."""
+"""Builds the cell of a plan, from a robot and options, a session, or a calibration."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,20 +36,13 @@ from visioncal.vision.targets import target_from_document
 
 _SESSION = "session.toml"
 
-# What the arm and the camera must keep, and what is in the way.
+# Limits of the arm and the camera, and obstacles.
 Kept: TypeAlias = tuple[Limits, tuple[Box, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """What a plan starts from.
-
-    Attributes:
-        words: What it is, for people.
-        robot: A robot, if it is one.
-        calibration: An earlier result, if it is one.
-        session: What was recorded, if that was kept.
-    """
+    """Source of a plan: a robot, a calibration or a session; `words` describes it for people."""
 
     words: str
     robot: Robot | None = None
@@ -58,10 +51,10 @@ class Source:
 
 
 def find_source(name: str) -> Source:
-    """Tells robots, sessions and calibrations apart.
+    """Loads a robot, a session or a calibration, whichever is named.
 
     Raises:
-        DataError: What is named cannot be read.
+        DataError: It cannot be read.
     """
     path = Path(name)
     if path.is_dir() and (path / _SESSION).is_file() and not (path / CALIBRATION).is_file():
@@ -86,29 +79,29 @@ def find_source(name: str) -> Source:
 
 
 def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCellOptions]:
-    """Takes one camera, robot and target out of a source of a whole cell, as the words name them.
+    """Extracts one camera, robot and target from a cell's source, as the options name them.
 
     Raises:
-        DataError: There is no such thing, or several are meant.
+        DataError: There is no such thing, or the choice is ambiguous.
     """
     session, result = source.session, source.calibration
-    whole = result is not None and result.cell is not None
+    is_cell = result is not None and result.cell is not None
     choice = Choice(words.camera, words.robot, words.target)
-    if not whole and (session is None or not is_to_be_parted(session, choice)):
+    if not is_cell and (session is None or not is_to_be_parted(session, choice)):
         return source, words
     if session is not None and is_to_be_parted(session, choice):
         session = select(session, choice)
     if result is not None:
         result = result.chosen(choice)
-    rest = replace(words, camera=None, robot=None, target=None)
-    return replace(source, session=session, calibration=result), rest
+    others = replace(words, camera=None, robot=None, target=None)
+    return replace(source, session=session, calibration=result), others
 
 
 def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: Progress) -> Begun:
     """The session to which stops are added.
 
     Raises:
-        DataError: There is none, or it has too few views to begin.
+        DataError: There is none, or it has too few views to start from.
     """
     session = source.session
     if session is None:
@@ -123,13 +116,13 @@ def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: 
     if words.robot is not None:
         session = _with_robot(session, words.robot)
     guess = _guess(words) if words.cam or words.board else None
-    found = so_far(session, progress=progress)
-    begun = begin(found, guess=guess, limits=kept[0], boxes=kept[1])
+    recorded = so_far(session, progress=progress)
+    begun = begin(recorded, guess=guess, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 
 def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
-    """The cell of a plan of its own, from a calibration or from options.
+    """The cell of a new plan, from a calibration or from options.
 
     Raises:
         DataError: Something is missing or cannot be read.
@@ -137,11 +130,11 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
     if source.calibration is not None:
         refuse_given(words.options("camera", "resolution", "mount"), "the calibration has its own")
         return _with_noise(_calibrated(source.calibration, source.session, words, kept), words)
-    # What is written wrongly is reported before what is missing.
+    # Malformed options are reported before missing ones.
     numbers = _camera_numbers(words.camera)
-    for option, said in (("--cam", words.cam), ("--board", words.board)):
-        if said is not None:
-            pose_of(said, option)
+    for option, pose in (("--cam", words.cam), ("--board", words.board)):
+        if pose is not None:
+            pose_of(pose, option)
     needed = ("target", "camera", "cam", "board", *(() if numbers is None else ("resolution",)))
     missing = [f"--{value}" for value in needed if getattr(words, value) is None]
     if missing or source.robot is None:
@@ -171,7 +164,7 @@ def cell_of(source: Source, words: PlanCellOptions, kept: Kept) -> PlanCell:
 
 
 def pose_of(words: str, option: str) -> FloatArray:
-    """Reads a rough pose: x, y, z [mm], then angles about the fixed axes x, y, z [deg]; (4, 4).
+    """Parses a rough pose: x, y, z [mm] and angles about the fixed axes x, y, z [deg]; (4, 4) [m].
 
     Raises:
         DataError: It is not six numbers.
@@ -242,10 +235,7 @@ def _with_noise(cell: PlanCell, words: PlanCellOptions) -> PlanCell:
         value = getattr(words, name)
         option = f"--{name.replace('_', '-')}"
         if value is not None and not 0.0 <= value < np.inf:
-            raise DataError(
-                f"{option} is {value}; zero or more is needed.",
-                culprits=[option],
-            )
+            raise DataError(f"{option} is {value}; zero or more is needed.", culprits=[option])
     sigma_rad, sigma_m = cell.noise.robots[0].tolist()
     sigma_m = sigma_m if words.noise_mm is None else 1e-3 * words.noise_mm
     sigma_rad = sigma_rad if words.noise_deg is None else float(np.deg2rad(words.noise_deg))
@@ -259,13 +249,13 @@ def _camera(words: str, resolution: str | None) -> Camera:
         return Camera("brown", _size(resolution), np.array(matrix), np.zeros(5))
     path = Path(words)
     if path.is_dir() or path.suffix.lower() == ".rrd" or "transforms" in content_of(path):
-        found = load_calibration(path, ANY, LENS).camera
-        if found is None:
+        calibrated = load_calibration(path, ANY, LENS).camera
+        if calibrated is None:
             raise DataError(
                 f"--camera: {words} was made from measured poses and knows no camera.",
                 culprits=["--camera"],
             )
-        return found.camera
+        return calibrated.camera
     lens, _ = read_intrinsics(path)
     width, height = lens["resolution"] if "resolution" in lens else _size(resolution)
     distortion = np.array(lens.get("distortion") or np.zeros(5), dtype=float)
@@ -273,7 +263,7 @@ def _camera(words: str, resolution: str | None) -> Camera:
 
 
 def _camera_numbers(words: str | None) -> tuple[float, ...] | None:
-    """The camera matrix, where that was given in numbers."""
+    """The numbers of the camera matrix, where they were given."""
     if words is None or "," not in words or Path(words).exists():
         return None
     return numbers_in(words, "--camera", "fx,fy,cx,cy")

@@ -1,4 +1,4 @@
-"""The motions of `visioncal dynamics plan`: planned, written and reported."""
+"""Plans, writes and reports the motions of `visioncal dynamics plan`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +29,7 @@ def plan_motions(
     robot: str,
     motion: ExcitationOptions,
     kept: ClearanceOptions,
-    able: ArmOptions,
+    arm_options: ArmOptions,
     out: Path,
     *,
     as_json: bool,
@@ -37,26 +37,26 @@ def plan_motions(
     """Plans an exciting motion and sweeps, writes them into a folder, and reports them.
 
     Raises:
-        DataError: The robot cannot be read, an option is none, or the limits allow no motion.
+        DataError: The robot cannot be read, an option is invalid, or the limits allow no motion.
     """
     share = Share(
         float(np.deg2rad(kept.margin_deg)),
-        able.speed,
-        able.acceleration,
-        able.torque_margin,
+        arm_options.speed,
+        arm_options.acceleration,
+        arm_options.torque_margin,
         1e-3 * kept.clearance_mm,
         kept.floor_m,
     )
     arm = load_robot(robot)
-    missing = (able.range_deg, able.speed_deg, able.acceleration_deg)
+    missing = (arm_options.range_deg, arm_options.speed_deg, arm_options.acceleration_deg)
     allowed = allowed_motion(
         arm,
         share,
         missing=Missing(*map(_radians, missing)),
-        bodies=_bodies(arm, kept.bodies, able.tool),
-        payload=None if able.payload is None else _payload(able.payload),
+        bodies=_bodies(arm, kept.bodies, arm_options.tool),
+        payload=None if arm_options.payload is None else _payload(arm_options.payload),
     )
-    wished = ExcitationRequest(
+    request = ExcitationRequest(
         motion.duration,
         motion.harmonics,
         friction_terms(motion.friction, FRICTION),
@@ -64,13 +64,13 @@ def plan_motions(
         motion.seed,
         seconds=np.inf if motion.seconds is None else motion.seconds,
     )
-    swept = None
+    sweep_request = None
     if not motion.no_sweeps:
-        swept = SweepRequest(speeds=motion.sweep_speeds, seed=motion.seed)
+        sweep_request = SweepRequest(speeds=motion.sweep_speeds, seed=motion.seed)
     with shown_progress(quiet=as_json) as progress:
         # The sweeps first: they are quick, and fail for the same reasons.
-        sweeps = None if swept is None else plan_sweeps(allowed, swept)
-        plan = MotionPlan(allowed, excite(allowed, wished, progress), sweeps)
+        sweeps = None if sweep_request is None else plan_sweeps(allowed, sweep_request)
+        plan = MotionPlan(allowed, excite(allowed, request, progress), sweeps)
     document = motion_document(plan)
     written = write_motions(out, plan, motion.rate_hz, document)
     if as_json:
@@ -100,7 +100,7 @@ def _radians(degrees: float | None) -> float | None:
 
 
 def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, ...]:
-    found = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
+    bodies = [Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in boxes]
     if tool is not None:
         length, radius = (1e-3 * number for number in numbers_in(tool, "--tool", "length,radius"))
         if min(length, radius) <= 0.0:
@@ -110,8 +110,8 @@ def _bodies(arm: Robot, boxes: Sequence[Box], tool: str | None) -> tuple[Body, .
             )
         flange = arm.chain.placements[-1]
         tip = flange[:3, 3] + flange[:3, 2] * max(length - radius, 0.0)
-        found.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
-    return tuple(found)
+        bodies.append(capsule("tool", arm.joint_count, flange[:3, 3], tip, radius))
+    return tuple(bodies)
 
 
 def _payload(words: str) -> FloatArray:

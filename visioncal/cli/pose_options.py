@@ -1,4 +1,4 @@
-"""The options that say how somebody else wrote the robot's poses."""
+"""Options for the convention of the robot's poses."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -9,7 +9,7 @@ import typer
 from visioncal.core.choices import POSE_FORMS, UNITS_M
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.formats import ImportOptions
     from visioncal.robot import Robot
@@ -21,7 +21,7 @@ UNITS = "|".join(UNITS_M)
 
 @dataclass(frozen=True)
 class RobotPoseOptions:
-    """How somebody else wrote the poses of the robot."""
+    """Options for the convention of the robot's poses."""
 
     robot_columns: Annotated[
         str | None,
@@ -31,32 +31,30 @@ class RobotPoseOptions:
             help="Columns or keys of the robot's poses, position first: X,Y,Z,A,B,C or O_T_EE.",
         ),
     ] = None
-    robot_form: Annotated[str | None, poses_option(help=f"How they are written: {FORMS}.")] = None
-    robot_unit: Annotated[str | None, poses_option(metavar=UNITS, help="Of their positions.")] = (
-        None
-    )
+    robot_form: Annotated[str | None, poses_option(help=f"Their convention: {FORMS}.")] = None
+    robot_unit: Annotated[
+        str | None, poses_option(metavar=UNITS, help="Unit of their positions.")
+    ] = None
     robot_inverse: Annotated[
         bool | None,
         poses_option("--robot-inverse/--robot-as-is", help="They give the base in the flange."),
     ] = None
     joint_columns: Annotated[
         str | None,
-        poses_option(
-            "--joint-columns",
-            "--joint-key",
-            help="Columns or keys of the joint angles.",
-        ),
+        poses_option("--joint-columns", "--joint-key", help="Columns or keys of the joint angles."),
     ] = None
-    joint_unit: Annotated[Literal["rad", "deg"], poses_option(help="What they are in.")] = "rad"
+    joint_unit: Annotated[Literal["rad", "deg"], poses_option(help="Unit of the joint angles.")] = (
+        "rad"
+    )
     robot_model: Annotated[
         str | None, poses_option(help="A built-in robot, or the path of a .urdf or .toml.")
     ] = None
 
     def requested(self) -> "ImportOptions":
-        """The same, as files are read.
+        """The import options.
 
         Raises:
-            DataError: A name is empty or there twice.
+            DataError: A name is empty or occurs twice.
         """
         from visioncal.interchange.formats import ImportOptions, PoseImportOptions
 
@@ -70,7 +68,7 @@ class RobotPoseOptions:
 
     @property
     def model(self) -> "Robot | None":
-        """The robot that is named.
+        """The named robot.
 
         Raises:
             DataError: It cannot be read.
@@ -81,10 +79,10 @@ class RobotPoseOptions:
 
 
 def names_in(words: str | None, option: str) -> tuple[str, ...]:
-    """Splits an option of names with commas between.
+    """Splits an option of names separated by commas.
 
     Raises:
-        DataError: A name is empty or there twice.
+        DataError: A name is empty or occurs twice.
     """
     if words is None:
         return ()

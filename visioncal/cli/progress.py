@@ -1,4 +1,4 @@
-"""What a command is at, while it works."""
+"""Progress of a command on stderr."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -7,7 +7,7 @@ from threading import Event, Thread
 
 from visioncal.cli.console import messages
 
-# What is done in a step, for people; other names are words already.
+# Descriptions of steps; other names are words already.
 WORDS = {
     "robot": "read the robot",
     "readings": "read the instruments",
@@ -30,15 +30,14 @@ WORDS = {
     "path": "find a clear path",
     "excitation": "search for the motion",
 }
-# Without a terminal, so often a line at most [s].
+# Least interval of lines without a terminal [s].
 PAUSE_S = 2.0
 
 
 class Steps:
-    """The step at work, in words.
+    """The current step, in words.
 
-    The first report of a step has its place among all steps, or nothing done yet; those after it
-    count what the step goes through.
+    The first report of a step is its place among all steps; later ones count within it.
     """
 
     def __init__(self) -> None:
@@ -47,24 +46,20 @@ class Steps:
         self._name = ""
 
     def report(self, name: str, done: int, total: int) -> None:
-        """Takes a report of progress."""
+        """Records a report of progress."""
         self.count = (done, total) if name == self._name and total else None
         self._name, self.words = name, WORDS.get(name, name)
 
     @property
     def line(self) -> str:
-        """The step, and how much of it is done."""
+        """The step, with its count if there is one."""
         counted = "" if self.count is None else f": {self.count[0]} of {self.count[1]}"
         return f"{self.words}{counted}"
 
 
 @contextmanager
 def shown_progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Shows the step at work: as a bar on a terminal, else as a line now and then.
-
-    Args:
-        quiet: Whether to show nothing.
-    """
+    """Shows progress as a bar on a terminal, else as occasional lines; nothing if quiet."""
     steps = Steps()
     if quiet:
         yield steps.report
@@ -84,7 +79,7 @@ def _bar(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
 
         def report(name: str, done: int, total: int) -> None:
             steps.report(name, done, total)
-            # An update to no total keeps the one before.
+            # A total of None in an update would keep the previous one.
             completed, bar.tasks[0].total = steps.count or (0, None)
             bar.update(task, description=steps.words, completed=completed)
 
@@ -93,14 +88,14 @@ def _bar(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
 
 @contextmanager
 def _lines(steps: Steps) -> Iterator[Callable[[str, int, int], None]]:
-    begun, over = time.monotonic(), Event()
+    start_s, over = time.monotonic(), Event()
 
     def say() -> None:
         last = ""
         while not over.wait(PAUSE_S):
             if steps.line != last:
                 last = steps.line
-                messages().print(f"{last} ({time.monotonic() - begun:.0f} s)", markup=False)
+                messages().print(f"{last} ({time.monotonic() - start_s:.0f} s)", markup=False)
 
     printer = Thread(target=say, daemon=True)
     printer.start()

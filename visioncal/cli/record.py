@@ -52,7 +52,7 @@ def record_command(
         ),
     ] = False,
     views: Annotated[
-        int, typer.Option(min=0, help="With --follow or a manual arm: end after so many.")
+        int, typer.Option(min=0, help="With --follow or a manual arm: end after this number.")
     ] = 0,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with a recording that was ended or cut off.")
@@ -67,7 +67,7 @@ def record_command(
     """Record a session: drive the stops of a plan, or follow an arm guided by hand.
 
     Every view is on the disk before the next is taken. Exit status 0: all views are there; 2: the
-    recording ended before, the arm stands still, and --resume goes on.
+    recording ended early, the arm stands still, and --resume continues it.
     """
     from visioncal.cli.recorded_cell import (
         ViewLines,

@@ -1,4 +1,4 @@
-"""The options of `visioncal record`, and what they say."""
+"""The options of `visioncal record`, and their conversion for drivers."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +10,7 @@ from visioncal.cli.parsing import size_in
 from visioncal.core.choices import PLAN_SPEED, POSE_FORMS, CameraMount
 from visioncal.live.capture.options import CaptureOptions, Keep, Stillness
 
-# Help does not wait for it.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.live.drivers.protocols import DeviceSetup
 
@@ -22,7 +22,7 @@ _camera = partial(typer.Option, rich_help_panel="What the camera is set to")
 
 @dataclass(frozen=True)
 class RecordCellOptions:
-    """The cell, where no plan says it."""
+    """The cell, where there is no plan."""
 
     target: Annotated[
         str | None,
@@ -35,7 +35,7 @@ class RecordCellOptions:
         str | None, _cell(help="The robot's model: a built-in name, a .urdf or .toml.")
     ] = None
     mount: Annotated[
-        CameraMount | None, _cell(help="Where the camera is; eye-in-hand if nothing is said.")
+        CameraMount | None, _cell(help="Where the camera is; by default eye-in-hand.")
     ] = None
     pose_form: Annotated[
         str | None,
@@ -52,22 +52,21 @@ class TakingOptions:
     frames: Annotated[int, _taking(min=1, max=100, help="Frames a view.")] = 3
     keep: Annotated[Keep, _taking(help="The sharpest of these, or their mean.")] = "sharpest"
     still_px: Annotated[
-        float, _taking(min=0.01, max=10.0, help="Image motion over which nothing is taken.")
+        float, _taking(min=0.01, max=10.0, help="Image motion above which no view is taken.")
     ] = Stillness.image_px
     settle_s: Annotated[
         float,
-        _taking(min=0.0, max=30.0, help="How long arm and image must have been still before."),
+        _taking(min=0.0, max=30.0, help="How long arm and image must be still before a view."),
     ] = Stillness.quiet_s
-    speed: Annotated[float, _moving(help="Of the fastest joint, in rad/s; at most 1.5.")] = (
+    speed: Annotated[float, _moving(help="Speed of the fastest joint, in rad/s; at most 1.5.")] = (
         PLAN_SPEED
     )
 
     def options(self, *, single: bool, lost: int) -> CaptureOptions:
-        """The same, as a recording takes it.
+        """The options of a capture.
 
-        Args:
-            single: Whether the camera gives each picture once.
-            lost: How many stops in a row may give no view.
+        `single` is for a camera that provides each picture once; `lost` is the allowed number of
+        consecutive stops without a view.
         """
         return CaptureOptions(
             speed=self.speed,
@@ -81,7 +80,7 @@ class TakingOptions:
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """What the camera is set to."""
+    """Camera settings."""
 
     resolution: Annotated[
         str | None, _camera(metavar="W,H", help="Size of the images in pixels.")
@@ -91,7 +90,7 @@ class DeviceOptions:
     focus: Annotated[int | None, _camera(help="Lens position, in the device's own unit.")] = None
 
     def setup(self) -> "DeviceSetup":
-        """The same, as drivers take it.
+        """The settings for the drivers.
 
         Raises:
             DataError: The resolution is not two numbers.

@@ -1,4 +1,4 @@
-"""The parts of `visioncal record`: the cell from a plan or from options, its stops, its words."""
+"""Parts of `visioncal record`: the cell from a plan or from options, its stops, its messages."""
 
 import math
 import shlex
@@ -46,21 +46,21 @@ class Shown:
 
     def stepped(self, step: CaptureEvent) -> None:
         """Draws a view."""
-        # Rerun takes half a second to import, which recordings that nobody watches need not wait.
+        # Rerun takes half a second to import, which recordings without a viewer need not wait for.
         from visioncal.present.recording.live import LiveView
 
-        found = step.found
-        if isinstance(found, Missed):
+        outcome = step.found
+        if isinstance(outcome, Missed):
             return
-        known = None if step.accuracy is None or step.accuracy.is_open else step.accuracy.mm
+        sigma_mm = None if step.accuracy is None or step.accuracy.is_open else step.accuracy.mm
         self.drawing.draw(
             LiveView(
                 step.view,
-                found.frame.image,
-                found.corners.px,
-                found.state.base_from_flange,
-                found.state.q,
-                known,
+                outcome.frame.image,
+                outcome.corners.px,
+                outcome.state.base_from_flange,
+                outcome.state.q,
+                sigma_mm,
                 note_of(step),
             )
         )
@@ -68,12 +68,10 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSetup:
-    """What is recorded of, as the user says it.
+    """Setup of a recording.
 
     Attributes:
-        mount: Where the camera is.
-        target: The board.
-        robot: The arm's model; None where nobody said it.
+        robot: The arm's model; None where unknown.
         plan: The stops; None without a plan.
     """
 
@@ -99,14 +97,14 @@ class RecordedSetup:
 
     @property
     def lens(self) -> Camera | None:
-        """The lens as the plan has it."""
+        """The plan's lens; None without a plan."""
         return None if self.plan is None else self.plan.cell.camera
 
     def check(self, resolution: tuple[int, int], *, drives: bool) -> None:
-        """Checks that the camera's pictures are those that the stops were planned for.
+        """Checks that the camera has the image size of the plan.
 
         Raises:
-            DataError: They are not.
+            DataError: It has another.
         """
         if not drives or self.lens is None or resolution == self.lens.resolution:
             return
@@ -120,24 +118,26 @@ class RecordedSetup:
 
 
 def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> RecordedSetup:
-    """Puts together what is recorded of.
+    """Builds the setup of a recording from a plan or from options.
 
     Raises:
-        DataError: The plan cannot be read, says otherwise than the options, or no board is named.
+        DataError: The plan cannot be read, options contradict it, or no board is named.
     """
     described = described or RecordCellOptions()
     target, robot, mount = described.target, described.robot, described.mount
     if plan is not None:
         given = {"--target": target, "--robot": robot, "--mount": mount}
-        said = [name for name, value in given.items() if value is not None]
-        if said:
+        repeated = [name for name, value in given.items() if value is not None]
+        if repeated:
             raise DataError(
-                f"{', '.join(said)}: the plan says that already.",
-                culprits=said,
+                f"{', '.join(repeated)}: the plan says that already.",
+                culprits=repeated,
                 next_step="Leave it out, or record without --plan.",
             )
-        read = read_plan(plan)
-        return RecordedSetup(read.cell.mount, _findable(read.cell.target), read.cell.robot, read)
+        plan_file = read_plan(plan)
+        return RecordedSetup(
+            plan_file.cell.mount, _findable(plan_file.cell.target), plan_file.cell.robot, plan_file
+        )
     if target is None:
         raise DataError(
             "record: --plan or --target is needed to know what to look for.",
@@ -153,7 +153,7 @@ def scene_of(plan: Path | None, described: RecordCellOptions | None = None) -> R
 
 
 def _findable(target: Target) -> Target:
-    """Refuses a rig of points that is not found in images."""
+    """Refuses a rig of points that cannot be detected in images."""
     if target.kind == "points" and not target.point_tags:
         raise DataError(
             f"record: target {target.name} is a rig of points, which no image is searched for.",
@@ -164,7 +164,7 @@ def _findable(target: Target) -> Target:
 
 
 def facts_of(scene: RecordedSetup, cell: LiveCell, name: str) -> CaptureFacts:
-    """What is written of the cell besides its views."""
+    """Facts of the cell that are recorded besides its views."""
     camera = cell.camera
     return CaptureFacts(
         name or "session",
@@ -218,11 +218,11 @@ def guided(
 
 @contextmanager
 def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[list[Watcher]]:
-    """Opens the viewer where that is wanted; without a display the recording goes on unseen."""
+    """Opens the viewer if wanted; without a display the recording continues without it."""
     if not wanted:
         yield []
         return
-    # Rerun takes half a second to import, which a recording that nobody watches need not wait for.
+    # Rerun takes half a second to import, which recordings without a viewer need not wait for.
     from visioncal.present.recording import live
     from visioncal.present.viewer.live import live_viewer
 
@@ -250,7 +250,7 @@ def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[
 
 @contextmanager
 def opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
-    """Opens both devices; the block's end lets go of them."""
+    """Opens both devices, and closes them at the end of the block."""
     with closing(open_arm(arm, wish)) as opened:
         if not wish.watch_only and not isinstance(opened, MovingArm):
             raise DriverError(
@@ -263,7 +263,7 @@ def opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iter
 
 
 class ViewLines:
-    """Tells each view in a line."""
+    """A watcher that prints a line for each view."""
 
     def stepped(self, step: CaptureEvent) -> None:
         """Prints the line."""
@@ -279,7 +279,7 @@ def driven(
     *,
     asks: bool,
 ) -> list[CaptureEvent]:
-    """Drives the plan's stops, after a word of the user."""
+    """Drives the plan's stops, after the user's confirmation."""
     leaving = departure(cell, scene.planned, [view.number for view in journal.views], taking)
     report_departure(leaving, cell, taking)
     if not leaving.stops:
@@ -290,13 +290,13 @@ def driven(
 
 
 def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions) -> None:
-    """Says what is about to happen."""
+    """Prints what is about to be driven."""
     say, count = messages().print, len(leaving.stops)
     if not count:
         say("All stops of the plan have their view; nothing is left to drive.")
         return
     first, seconds = leaving.stops[0], leaving.duration_s
-    long = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
+    duration = f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"
     postures = len(leaving.first)
     via = (
         f" by {postures - 1} posture{'s' if postures > 2 else ''} in between"
@@ -306,7 +306,7 @@ def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions)
     say(
         escape(
             f"{cell.arm.name}, {cell.camera.name}: {counted(count, 'stop')} to drive at "
-            f"{taking.speed:g} rad/s, about {long}"
+            f"{taking.speed:g} rad/s, about {duration}"
         )
     )
     say(
@@ -330,19 +330,19 @@ def _confirm(cell: LiveCell) -> None:
 
 def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
     """Ends with status 2 where stops of the plan gave no view."""
-    without = dict(missed(steps))
-    if without:
-        words = "; ".join(f"view {key}: {reason}" for key, reason in without.items())
+    missing = dict(missed(steps))
+    if missing:
+        words = "; ".join(f"view {key}: {reason}" for key, reason in missing.items())
         raise DataError(
-            f"{len(without)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
+            f"{len(missing)} of {len(steps)} stops gave no view ({words}). {len(journal.views)} "
             f"views are in {journal.folder}.",
-            culprits=[f"view {index}" for index in without],
+            culprits=[f"view {index}" for index in missing],
             next_step="--resume tries them again.",
         )
 
 
 def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) -> None:
-    """Says what there is now."""
+    """Prints a summary of the recording, and the next command."""
     if as_json:
         print_json(_summary(journal, steps))
         return
@@ -353,7 +353,7 @@ def finish(journal: Journal, steps: Sequence[CaptureEvent], *, as_json: bool) ->
 
 
 def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
-    known = [
+    predicted = [
         step.accuracy for step in steps if step.accuracy is not None and not step.accuracy.is_open
     ]
     summary: dict[str, Any] = {
@@ -367,13 +367,13 @@ def _summary(journal: Journal, steps: Sequence[CaptureEvent]) -> dict[str, Any]:
             for step in steps
         ],
     }
-    if known:
-        summary["predicted"] = {"sigma_mm": known[-1].mm, "sigma_deg": known[-1].deg}
+    if predicted:
+        summary["predicted"] = {"sigma_mm": predicted[-1].mm, "sigma_deg": predicted[-1].deg}
     return summary
 
 
 def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
-    """Refuses to drive without a plan, before a device is asked for."""
+    """Refuses to drive without a plan, before a device is opened."""
     if drives:
         _ = scene.planned
         return
@@ -385,7 +385,7 @@ def check_driven(scene: RecordedSetup, *, drives: bool) -> None:
 
 
 def check_not_begun(journal: Journal, camera: str) -> None:
-    """A folder begins with its first picture again, which would go to the wrong pose."""
+    """Refuses to resume from a folder of images, which would start again with the first one."""
     if journal.views:
         raise DataError(
             f"--resume: {camera} begins with its first picture again, and {len(journal.views)} "

@@ -1,4 +1,4 @@
-"""A rehearsal from its plan to its result, as JSON and in words, part by part."""
+"""A rehearsal from plan to result, with its report as JSON and in words."""
 
 import platform
 import sys
@@ -52,38 +52,34 @@ from visioncal.session import Session
 _NEAR_RAD = 2e-3
 _PACKAGES = ("ur-rtde", "depthai", "numpy", "opencv-contrib-python-headless")
 
-# The pace at which a UR moves where its program says nothing else; nobody stands beside this one.
+# The default speed of a UR's program; nobody stands beside this one.
 TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
 
 
-# Fewer than a real plan is chosen from: it matters more that a rehearsal is short.
+# Fewer candidates than for a real plan, as a rehearsal should be short.
 _CANDIDATES = 600
 
 
 def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray) -> TouchTest:
-    """Touches what the camera located, with a tip that knows where the board really is.
-
-    Args:
-        folder: The session's.
-        calibration: Its result.
-        base_from_target: (4, 4) the truth.
-    """
+    """Simulated touch test of located points, with the board's true (4, 4) pose [m]."""
     points = touch_points(Session.load(folder), calibration)
-    true = [base_from_target[:3, :3] @ point.board_m + base_from_target[:3, 3] for point in points]
+    true_points = [
+        base_from_target[:3, :3] @ point.board_m + base_from_target[:3, 3] for point in points
+    ]
     gaps = [
-        1e3 * float(np.linalg.norm(point.base_m - at))
-        for point, at in zip(points, true, strict=True)
+        1e3 * float(np.linalg.norm(point.base_m - true))
+        for point, true in zip(points, true_points, strict=True)
     ]
     return judged(points, gaps)
 
 
 @dataclass(frozen=True, eq=False)
 class RehearsedRecording:
-    """What was recorded.
+    """Recorded views, and the effect of a fault.
 
     Attributes:
-        steps: What became of each stop; of a recording with a fault, the views before and after it.
-        fault: What the fault did; None without one.
+        steps: Outcome of each stop; with a fault, the views before and after it.
+        fault: Effect of the fault; None without one.
     """
 
     steps: tuple[CaptureEvent, ...]
@@ -92,16 +88,15 @@ class RehearsedRecording:
 
 @dataclass(frozen=True)
 class Suffered:
-    """How a recording took a fault.
+    """Effect of a fault on a recording.
 
     Attributes:
-        name: The fault.
-        message: What was said.
-        next_step: And what to do.
-        told_after_s: How long after the fault [s].
-        stood_after_s: How long after it the arm stood [s]; None where that is not known, or
-            where it goes on.
-        views_kept: How many views the session had then, every acknowledged one among them.
+        message: The error message.
+        next_step: The remedy in it.
+        told_after_s: Delay of the message after the fault [s].
+        stood_after_s: Delay of the arm's standstill after it [s]; None where unknown, or where it
+            continues.
+        views_kept: Number of views in the session then, including every acknowledged one.
     """
 
     name: str
@@ -113,7 +108,7 @@ class Suffered:
 
 
 def planned(cell: RehearsedCell, options: RehearsalOptions, folder: Path) -> RecordedSetup:
-    """Plans stops from the rough guesses, and reads them back as a recording does."""
+    """Plans stops from the rough poses, and reads them back as a recording does."""
     request = PlanRequest(
         purpose_of("hand-eye"), options.stops, candidates=_CANDIDATES, seed=options.seed
     )
@@ -135,22 +130,22 @@ def recorded(
     view: bool,
     resume: bool = False,
 ) -> RehearsedRecording:
-    """Records the plan's stops; where a fault is wanted, through it and on.
+    """Records the plan's stops; with a fault, until it and on after it.
 
     Raises:
-        DriverError: A device failed without being asked to.
+        DriverError: A device failed other than by the fault.
         DataError: The views cannot be written.
     """
     if fault is None:
         steps = _drive(bench, scene, folder, watchers, resume=resume, view=view)
         return RehearsedRecording(tuple(steps), None)
     injection = FaultInjection(bench, fault, after=max(1, len(scene.planned.stops) // 2))
-    kept = _Kept()
-    every = (*watchers, kept, injection)
+    keeper = _KeptViews()
+    all_watchers = (*watchers, keeper, injection)
     try:
-        _check_all_seen(_drive(bench, scene, folder, every, resume=False, view=view))
+        _check_all_seen(_drive(bench, scene, folder, all_watchers, resume=False, view=view))
     except VisioncalError as error:
-        reported_s = kept.missed_s or time.monotonic()
+        reported_s = keeper.missed_s or time.monotonic()
         if injection.injected_s is None:
             raise
         report_error(error, as_json=False)
@@ -166,17 +161,17 @@ def recorded(
         raise DriverError(f"rehearse: {fault} did not happen before all views were taken.")
     say(f"  ({fault} is mended; on with --resume)")
     injection.mend()
-    rest = _drive(bench, scene, folder, watchers, resume=True, view=view)
-    return RehearsedRecording((*kept.steps, *rest), suffered)
+    resumed_steps = _drive(bench, scene, folder, watchers, resume=True, view=view)
+    return RehearsedRecording((*keeper.steps, *resumed_steps), suffered)
 
 
 def calibrated(folder: Path, out: Path) -> tuple[Run, Written]:
-    """Calibrates what was recorded, and writes the result."""
+    """Calibrates the recorded session, and writes the result."""
     session = Session.load(folder)
     with shown_progress(quiet=not sys.stderr.isatty()) as progress:
-        found = run(session, progress=progress)
+        result = run(session, progress=progress)
         progress("write", 0, 1)
-        return found, write_outputs(out, session, found)
+        return result, write_outputs(out, session, result)
 
 
 def _drive(
@@ -192,19 +187,18 @@ def _drive(
         cell = opened.enter_context(bench.connected())
         begin = Journal.resume if resume else Journal.begin
         facts = facts_of(scene, cell, folder.name)
-        offset_s = cell.clock.unix_offset_s()
-        journal = begin(folder, facts, offset_s, len(scene.planned.stops))
+        journal = begin(folder, facts, cell.clock.unix_offset_s(), len(scene.planned.stops))
         shown = opened.enter_context(shown_in(scene, cell, wanted=view))
-        every = [ViewLines(), *shown, *watchers]
-        return driven(cell, scene, journal, TAKING, every, asks=False)
+        all_watchers = [ViewLines(), *shown, *watchers]
+        return driven(cell, scene, journal, TAKING, all_watchers, asks=False)
 
 
-class _Kept:
-    """Keeps the views of a recording that does not come to its end.
+class _KeptViews:
+    """A watcher that keeps the views of an interrupted recording.
 
     Attributes:
-        steps: Those that there are.
-        missed_s: When the first stop without one was reported, on the monotonic clock [s].
+        steps: The views.
+        missed_s: Time of the first report of a stop without a view, on the monotonic clock [s].
     """
 
     def __init__(self) -> None:
@@ -212,7 +206,7 @@ class _Kept:
         self.missed_s: float | None = None
 
     def stepped(self, step: CaptureEvent) -> None:
-        """Keeps it."""
+        """Keeps a view, or the time of the first missing one."""
         if isinstance(step.found, TakenView):
             self.steps.append(step)
         elif self.missed_s is None:
@@ -220,12 +214,12 @@ class _Kept:
 
 
 def _check_all_seen(steps: Sequence[CaptureEvent]) -> None:
-    """Raises what a recording ends with where stops gave no view."""
-    without = list(missed(steps))
-    if without:
-        view, reason = without[0]
+    """Raises DataError where stops gave no view, as at the end of a recording."""
+    missing = list(missed(steps))
+    if missing:
+        view, reason = missing[0]
         raise DataError(
-            f"{len(without)} of {len(steps)} stops gave no view; view {view}: {reason}.",
+            f"{len(missing)} of {len(steps)} stops gave no view; view {view}: {reason}.",
             next_step="--resume tries them again.",
         )
 
@@ -233,23 +227,17 @@ def _check_all_seen(steps: Sequence[CaptureEvent]) -> None:
 def rehearse(
     options: RehearsalOptions, out: Path, fault: Faults | None, *, view: bool
 ) -> "Rehearsal":
-    """Plans, records and calibrates.
-
-    Args:
-        options: What is rehearsed.
-        out: The folder for the plan, the session and the result, each in one of its own.
-        fault: What is to happen half way; None for nothing.
-        view: Whether the viewer shows it as it goes.
+    """Plans, records and calibrates, each into its own folder, with a fault half way if wanted.
 
     Raises:
-        DriverError: A device failed without being asked to.
+        DriverError: A device failed other than by the fault.
         DataError: The views cannot be written, or are not enough for a result.
     """
-    begun = time.monotonic()
+    start = time.monotonic()
     cell = rehearsed_cell(options)
     scene = planned(cell, options, out / "plan")
     plan_ready = time.monotonic()
-    # Led there by hand, as an operator would, and not quite exactly.
+    # Approximately at the first stop, as if guided there by hand.
     start_q = scene.planned.stops[0].q + _NEAR_RAD
     with closing(Bench(cell, start_q)) as bench:
         witness = Witness(bench)
@@ -257,24 +245,24 @@ def rehearse(
         taken = recorded(bench, scene, out / "session", [witness], fault, view=view)
     captured = time.monotonic()
     run, written = calibrated(out / "session", out / "result")
-    found = run.calibration
+    calibration = run.calibration
     board = cell.truth.transforms.get("base_from_target")
-    test = None if board is None else touched(out / "session", found, board)
+    test = None if board is None else touched(out / "session", calibration, board)
     ended = time.monotonic()
     return Rehearsal(
         options,
         cell,
-        found,
+        calibration,
         written,
-        explained(found, cell.truth.transforms),
+        explained(calibration, cell.truth.transforms),
         taken,
         None if fault else pace_of(taken.steps, scene.planned, start_q, TAKING),
         tuple(witness.away_mm),
         {
-            "plan": plan_ready - begun,
+            "plan": plan_ready - start,
             "capture": captured - plan_ready,
             "calibrate": ended - captured,
-            "all": ended - begun,
+            "all": ended - start,
         },
         bench.through_depthai,
         test,
@@ -283,20 +271,13 @@ def rehearse(
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """A rehearsal that came to its end.
+    """Result of a rehearsal.
 
     Attributes:
-        options: What was asked for.
-        cell: The cell.
-        calibration: The result.
-        written: Where it is.
-        error: Its error, weighed.
-        taken: What was recorded.
-        pace: How long the views took; None where a fault came between.
-        away_mm: For each view, how far the flange was from what was recorded [mm].
-        times_s: How long each part took [s].
+        error: Chi-square test of its error.
+        pace: Durations of the views; None with a fault.
+        away_mm: Distance of the flange from its recorded position, by view [mm].
         through_depthai: Whether the pictures went through depthai's pipeline.
-        touch_test: Points of the board that a tip touched; None for a board on the flange.
     """
 
     options: RehearsalOptions
@@ -347,7 +328,7 @@ class Rehearsal:
         return document
 
     def report(self) -> None:
-        """Says it in words."""
+        """Prints the result in words."""
         say, times = answers().print, self.times_s
         print_summary(self.calibration, verbose=False)
         truth = self.cell.truth
@@ -387,10 +368,10 @@ def _report_devices(bench: Bench) -> None:
 
 
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return versions

@@ -15,7 +15,7 @@ from visioncal.core.files import write_json
 from visioncal.core.version import __version__
 from visioncal.live.drivers.extras import refuse_without
 
-# A check said no: the result is there, and it is farther from the truth than it says.
+# Exit status of a failed check: the error is larger than the sigmas explain.
 EXIT_WRONG = 3
 _SUMMARY = "rehearsal.json"
 
@@ -69,7 +69,7 @@ def rehearse_command(
 
 
 def _make_place(out: Path) -> None:
-    """Makes room in the place of an earlier rehearsal; nothing else is ever removed."""
+    """Clears an earlier rehearsal; nothing else is ever removed."""
     mark, session = out / _SUMMARY, out / "session"
     if session.exists():
         if not mark.is_file():
@@ -80,5 +80,5 @@ def _make_place(out: Path) -> None:
             )
         shutil.rmtree(session)
     out.mkdir(parents=True, exist_ok=True)
-    # Until it is over there is no more to say; an interrupted one is replaced by the next.
+    # A placeholder until the end: an interrupted rehearsal is replaced by the next.
     write_json(mark, {"schema": 1, "visioncal": __version__})

@@ -11,11 +11,11 @@ from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.result_files import Stored
 
-# Other numbers come out.
+# Exit status where the numbers differ.
 _EXIT_OTHERS = 3
 
 
@@ -28,11 +28,7 @@ def report_command(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            help="The file; report.html or certificate.html otherwise.",
-        ),
+        typer.Option("-o", "--out", help="The file; report.html or certificate.html otherwise."),
     ] = None,
     certificate: Annotated[
         bool, typer.Option("--certificate", help="One page to print and sign, instead.")
@@ -63,7 +59,7 @@ def report_command(
             "they are for --certificate",
             "Give that, too, or leave it out.",
         )
-    # Plots take half a second to import, which help need not wait for.
+    # Imported late, so that --help stays fast.
     from visioncal.present.report import write_report
 
     stored = load_stored(calibration)
@@ -80,21 +76,16 @@ def report_command(
         return
     out = out or Path("report.html")
     write_report(
-        out,
-        stored.calibration,
-        stored.session,
-        stored.evidence,
-        stored.note,
-        stored.review,
+        out, stored.calibration, stored.session, stored.evidence, stored.note, stored.review
     )
-    # The page of a whole cell shows nothing of what a recording has.
+    # A cell's page shows nothing that a recording adds.
     if stored.note and stored.calibration.cell is None:
         say(stored.note)
     say(f"wrote {out}")
 
 
 def _recompute(stored: "Stored") -> None:
-    """Calibrates once more, and ends with what came out."""
+    """Calibrates the recording again, and exits with the outcome."""
     from visioncal.calibration.verification.recompute import recompute
 
     if stored.session is None:
@@ -104,9 +95,9 @@ def _recompute(stored: "Stored") -> None:
             next_step="Name an output folder of visioncal calibrate, with its recording.rrd.",
         )
     with shown_progress(quiet=False) as progress:
-        found = recompute(stored.calibration, stored.session, progress=progress)
-    answers().print(escape(found.words))
-    if not found.is_same:
+        comparison = recompute(stored.calibration, stored.session, progress=progress)
+    answers().print(escape(comparison.words))
+    if not comparison.is_same:
         raise typer.Exit(_EXIT_OTHERS)
 
 

@@ -14,7 +14,7 @@ from visioncal.core.files import absence
 from visioncal.core.number_format import some_of
 from visioncal.interchange.outputs import PREVIEW, RECORDING
 
-# The first bytes of every recording that rerun writes.
+# The first bytes of every rerun recording.
 _MAGIC = b"RRF2"
 
 
@@ -44,7 +44,7 @@ def review_command(
     if not web and (port is not None or no_open):
         raise typer.BadParameter("--port and --no-open belong to --web.")
     file = find_recording(recording)
-    # Half a second, which help need not wait for.
+    # Imported late, so that --help stays fast.
     from visioncal.present.viewer import review_native, review_web
 
     row = _row(file, view)
@@ -53,7 +53,7 @@ def review_command(
         return
 
     def opened(url: str) -> None:
-        # The URL last: who reads it may end the server at once, and an import would be cut off.
+        # The URL last: its reader may end the server at once, which would interrupt an import.
         say("Ctrl-C ends.")
         typer.echo(url)
         if not no_open and not webbrowser.open(url):
@@ -63,13 +63,13 @@ def review_command(
 
 
 def _row(file: Path, view: int | None) -> int | None:
-    """The place among its views at which a recording is opened; None for the first."""
+    """Index of the view at which a recording is opened; None for the first."""
     from visioncal.interchange.result_files import load_result
     from visioncal.present.recording import read_session
     from visioncal.results.views import worst_view
 
     if view is None:
-        # A plan, and a session that is not calibrated yet, have no worst view.
+        # A plan and an uncalibrated session have no worst view.
         with suppress(DataError):
             result = load_result(file)
             view = worst_view(result.views, result.rms)
@@ -85,13 +85,10 @@ def _row(file: Path, view: int | None) -> int | None:
 
 
 def find_recording(path: Path) -> Path:
-    """Finds the recording that is meant.
-
-    Args:
-        path: An `.rrd`, or a folder that holds recording.rrd, or else plan.rrd.
+    """Path of a recording: an `.rrd`, or the recording.rrd, else plan.rrd, in a folder.
 
     Raises:
-        DataError: There is none, or it is no recording, as a session's folder.
+        DataError: There is none, or it is something else, such as a session's folder.
     """
     file = path / RECORDING if path.is_dir() else path
     if path.is_dir() and not file.is_file() and (path / PREVIEW).is_file():

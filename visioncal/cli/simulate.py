@@ -13,13 +13,13 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import SIMULATED_ARMS, SIMULATED_CELLS, CameraMount
 from visioncal.core.errors import DataError
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.simulation import CellOptions, SimulatedCell
     from visioncal.simulation.tracked import Tracked
 Read: TypeAlias = Literal["point", "points", "probe"]
 
-# What a cell of one robot takes, whatever is recorded of it.
+# Parameters of a cell of one robot, for any kind of recording.
 _SINGLE = frozenset(
     (
         *("mount", "views", "robot", "camera", "board", "robot_sigma_mm", "robot_sigma_mrad"),
@@ -33,14 +33,14 @@ _ARM = frozenset(
         *("stiffness_knm", "payload_kg"),
     )
 )
-# What a whole cell takes along, which are kinds of their own without one.
-_ALONG = frozenset(("instrument", "torques"))
+# Kinds of session that a whole cell can include.
+_WITH_CELL = frozenset(("instrument", "torques"))
 _TAKES: Mapping[str, frozenset[str]] = {
     "": _SINGLE | {"touches", "second_board"},
     "sweep": _SINGLE | {"clock_offset_ms", "readout_ms"},
     "warm_up": _SINGLE | {"currents"},
     "cell": _ARM
-    | _ALONG
+    | _WITH_CELL
     | {"views", "wrong_views", "images", "seed", "recording", "camera_moved_mm", "touches"}
     | {"board_scale", "with_intrinsics"},
     "instrument": _ARM | {"views", "robot", "seed"},
@@ -50,7 +50,7 @@ _TAKES: Mapping[str, frozenset[str]] = {
 
 @dataclass(frozen=True)
 class SimulateOptions:
-    """What is simulated, and what is recorded of it."""
+    """Options of the simulated session."""
 
     folder: Annotated[Path, typer.Argument(help="Where to write the session.")]
     mount: Annotated[CameraMount, typer.Option(help="Where the camera is.")] = "eye-in-hand"
@@ -62,7 +62,7 @@ class SimulateOptions:
     ] = "wide"
     board: Annotated[
         Literal["charuco", "checkerboard", "aprilgrid", "circles", "symmetric-circles", "tags"],
-        typer.Option(help="What is printed."),
+        typer.Option(help="The board's pattern."),
     ] = "charuco"
     second_board: Annotated[
         bool, typer.Option("--second-board", help="A second board, a checkerboard, beside it.")
@@ -74,14 +74,15 @@ class SimulateOptions:
         float, typer.Option(min=0.0, max=100.0, help="Repeatability of its rotation (mrad).")
     ] = 0.05
     arm_sigma_mm: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Departure of the arm's lengths (mm).")
+        float,
+        typer.Option(min=0.0, max=100.0, help="Sigma of the errors of the arm's lengths (mm)."),
     ] = 0.0
     arm_sigma_mrad: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Departure of its angles (mrad).")
+        float, typer.Option(min=0.0, max=100.0, help="Sigma of the errors of its angles (mrad).")
     ] = 0.0
     wrong_views: Annotated[int, typer.Option(min=0, help="Views whose reported pose is wrong.")] = 0
     board_scale: Annotated[
-        float, typer.Option(min=0.5, max=2.0, help="Printed over stated size of the board.")
+        float, typer.Option(min=0.5, max=2.0, help="Ratio of printed to stated size of the board.")
     ] = 1.0
     with_intrinsics: Annotated[
         bool, typer.Option(help="Whether the session states the camera's intrinsics.")
@@ -94,13 +95,13 @@ class SimulateOptions:
         typer.Option(help="A sweep without stops: pose pairs by one clock, the robot by another."),
     ] = False
     clock_offset_ms: Annotated[
-        float, typer.Option(help="With --sweep: what the camera's clock is ahead (ms).")
+        float, typer.Option(help="With --sweep: lead of the camera's clock (ms).")
     ] = 37.0
     readout_ms: Annotated[
         float,
         typer.Option(
-            help="With --sweep: how long after its first row an image's last is taken (ms); other "
-            "than 0, the frames have corners (corners.csv) in the place of poses."
+            help="With --sweep: readout time from an image's first row to its last (ms); unless "
+            "0, the frames have corners (corners.csv) in place of poses."
         ),
     ] = 0.0
     warm_up: Annotated[
@@ -150,7 +151,7 @@ class SimulateOptions:
     ] = None
     payload_kg: Annotated[
         list[float] | None,
-        typer.Option(min=0.0, help="What the arm carries; several times for stops in turn."),
+        typer.Option(min=0.0, help="Payload of the arm (kg); repeated for stops in turn."),
     ] = None
     recording: Annotated[
         int,
@@ -194,7 +195,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
         camera_moved_m=1e-3 * asked.camera_moved_mm,
         seed=asked.seed,
     )
-    # Rendering takes its time.
+    # Checked first, as rendering takes long.
     refuse_filled(folder.absolute())
     if asked.cell is not None:
         cell = whole_cell(asked.cell, options, given, asked.instrument)
@@ -210,7 +211,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
 
 
 def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
-    """A cell of one robot: at stops, in a sweep, or while it warms up."""
+    """A cell of one robot: at stops, in a sweep, or during warm-up."""
     from visioncal.simulation import (
         Round,
         SweepOptions,
@@ -221,9 +222,9 @@ def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
     )
 
     if asked.warm_up:
-        how = Round(first=asked.views)
-        warms = WarmUpOptions(options, round=how, temperatures=not asked.currents)
-        return simulate_warm_up(warms)
+        rounds = Round(first=asked.views)
+        warm_up = WarmUpOptions(options, round=rounds, temperatures=not asked.currents)
+        return simulate_warm_up(warm_up)
     if asked.sweep:
         clocks = SweepOptions(
             camera_minus_robot_s=1e-3 * asked.clock_offset_ms, readout_s=1e-3 * asked.readout_ms
@@ -233,7 +234,7 @@ def _single(options: "CellOptions", asked: SimulateOptions) -> "SimulatedCell":
 
 
 def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
-    """Writes a cell, and what its robots touched."""
+    """Writes a cell, and its robots' touches."""
     from visioncal.simulation import touch, write_session
 
     count = len(cell.sights)
@@ -248,7 +249,7 @@ def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
 
 
 def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
-    """What an instrument reads of the arm of a cell."""
+    """Options of an instrument that measures the cell's arm."""
     from visioncal.simulation import ArmOptions
     from visioncal.simulation.tracked import THREE, Tracked
 
@@ -262,7 +263,7 @@ def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
 
 
 def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
-    """What each joint yields to a torque [rad/(N m)]; empty for a rigid arm."""
+    """Compliance of each joint [rad/(N m)]; empty for a rigid arm."""
     from visioncal.simulation import arm_named
 
     if stiffness_knm is None:
@@ -271,14 +272,14 @@ def _compliance(robot: str, stiffness_knm: float | None) -> tuple[float, ...]:
 
 
 def _given_for(context: typer.Context) -> frozenset[str]:
-    """The parameters that the user gave, all of which fit the kind of session asked for."""
+    """The given parameters, after checking that they apply to the kind of session."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
     given = frozenset(
         name for name, source in sources.items() if source and source.name == "COMMANDLINE"
     )
     kinds = [take for take in _TAKES if context.params.get(take)]
     if "cell" in kinds:
-        kinds = [kind for kind in kinds if kind not in _ALONG]
+        kinds = [kind for kind in kinds if kind not in _WITH_CELL]
     if len(kinds) > 1:
         named = [_option(kind) for kind in kinds]
         raise DataError(
@@ -292,11 +293,11 @@ def _given_for(context: typer.Context) -> frozenset[str]:
     takes = _TAKES[kind]
     if kind == "cell" and context.params.get("torques"):
         takes = takes | {"currents"}
-    for unfit in sorted(given - takes - {"folder", kind}):
-        fit = [_option(name) for name, taken in _TAKES.items() if unfit in taken]
+    for wrong in sorted(given - takes - {"folder", kind}):
+        possible = [_option(name) for name, taken in _TAKES.items() if wrong in taken]
         raise DataError(
-            f"{_option(unfit)} goes with {' or '.join(fit)}, not with {_option(kind)}.",
-            culprits=[_option(unfit)],
+            f"{_option(wrong)} goes with {' or '.join(possible)}, not with {_option(kind)}.",
+            culprits=[_option(wrong)],
             next_step="Leave it out."
             if kind != "cell"
             else "Leave it out; what a whole cell is made of is said by a file of your own.",

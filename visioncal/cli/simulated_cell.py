@@ -1,4 +1,4 @@
-"""Whole cells of `visioncal simulate`, and what is recorded of them beside the cameras' views."""
+"""Whole cells of `visioncal simulate`, with torques and instruments."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -27,7 +27,7 @@ from visioncal.simulation.tracked import THREE, Tracked
 
 _T = TypeVar("_T", RobotAt, CameraAt)
 
-# Fields of robots and cameras, as of a cell of one of each, by the parameters that state them.
+# Fields of robots and cameras, by the parameters that set them.
 _FIELDS: Mapping[str, str] = {
     "robot_sigma_mm": "robot_sigma_m",
     "robot_sigma_mrad": "robot_sigma_rad",
@@ -37,9 +37,9 @@ _FIELDS: Mapping[str, str] = {
     "payload_kg": "payloads",
     "with_intrinsics": "state_intrinsics",
 }
-# Where the centre of a simulated load is, in the flange's frame [m].
+# Centre of a simulated load in the flange's frame [m].
 CENTRE_M = (0.0, 0.0, 0.1)
-# Half of the side of a load that is a cube [m], and torque for a current of each drive [N m/A].
+# Half the side of a cubic load [m], and torque constant of each drive [N m/A].
 _HALF_M = 0.05
 _GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 
@@ -47,7 +47,7 @@ _GAINS_NM_A = (10.0, 10.0, 9.0, 7.0, 7.0, 7.0)
 def whole_cell(
     name: str, options: CellOptions, given: frozenset[str], instrument: Read | None
 ) -> SimulatedCell:
-    """Simulates a whole cell; what the user gives comes before what is described."""
+    """Simulates a whole cell; the user's options override its description."""
     cell = simulate(_described(name, options, given, instrument))
     if not (cell.sights or cell.readings):
         raise DataError(
@@ -58,24 +58,29 @@ def whole_cell(
     return cell
 
 
-def exercised(cell: SimulatedCell, asked: SimulateOptions) -> SimulatedCell:
-    """The cell with streams of torques of all its robots."""
-    done = {
-        robot.name: exercise(exercise_options(asked, robot.robot, seed_of(cell.options.seed, at)))
+def exercised(cell: SimulatedCell, options: SimulateOptions) -> SimulatedCell:
+    """The cell with torque streams of all its robots."""
+    exercises = {
+        robot.name: exercise(exercise_options(options, robot.robot, seed_of(cell.options.seed, at)))
         for at, robot in enumerate(cell.layout.robots)
     }
-    return with_exercises(cell, done)
+    return with_exercises(cell, exercises)
 
 
 def _described(
     name: str, options: CellOptions, given: frozenset[str], instrument: Read | None
 ) -> NetworkOptions:
-    """A cell as it is described, with what the user gives in its place."""
+    """A cell's description, with the user's options in its place."""
     described = read_cell(name)
     changes = {"views": "stops", "wrong_views": "stray_images", "seed": "seed"}
     changes |= {"recording": "recording"}
     described = replace(
-        described, **{own: getattr(options, word) for word, own in changes.items() if word in given}
+        described,
+        **{
+            field: getattr(options, parameter)
+            for parameter, field in changes.items()
+            if parameter in given
+        },
     )
     described = replace(
         described,
@@ -94,18 +99,18 @@ def _described(
         frame = frame_name("camera", described.cameras[0].name)
         knocked = Moved(frame, 0, shift_m=options.camera_moved_m, turn_rad=0.0)
         described = replace(described, moved=(*described.moved, knocked))
-    return described if instrument is None else _tracked_too(name, described, instrument)
+    return described if instrument is None else _with_instrument(name, described, instrument)
 
 
 def _with_given(thing: _T, options: CellOptions, given: frozenset[str]) -> _T:
-    """A robot or a camera with what the user says of it."""
-    mine = {field.name for field in fields(thing)}
-    changed = {_FIELDS[name] for name in given & _FIELDS.keys()} & mine
-    return replace(thing, **{name: getattr(options, name) for name in changed})
+    """A robot or a camera with the user's options."""
+    names = {field.name for field in fields(thing)}
+    changes = {_FIELDS[name] for name in given & _FIELDS.keys()} & names
+    return replace(thing, **{name: getattr(options, name) for name in changes})
 
 
-def _tracked_too(name: str, described: NetworkOptions, instrument: Read) -> NetworkOptions:
-    """A cell with an instrument beside it, which reads every robot's flange."""
+def _with_instrument(name: str, described: NetworkOptions, instrument: Read) -> NetworkOptions:
+    """The description with an instrument that measures every robot's flange."""
     if described.instruments or described.points:
         raise DataError(
             f"--cell {name} has instruments or points of its own.",
@@ -124,9 +129,9 @@ def _tracked_too(name: str, described: NetworkOptions, instrument: Read) -> Netw
     return replace(described, instruments=(tracker,), points=points)
 
 
-def exercise_options(asked: SimulateOptions, robot: str, seed: int) -> ExerciseOptions:
-    """An arm's motions, empty or with a cube on its flange."""
-    loads = asked.payload_kg or [0.0]
+def exercise_options(options: SimulateOptions, robot: str, seed: int) -> ExerciseOptions:
+    """An arm's motions, without load or with a cube on its flange."""
+    loads = options.payload_kg or [0.0]
     if len(loads) > 1:
         raise DataError(
             f"--payload-kg is given {len(loads)} times; with --torques the arm carries one load.",
@@ -135,5 +140,5 @@ def exercise_options(asked: SimulateOptions, robot: str, seed: int) -> ExerciseO
         )
     inertia = loads[0] * 2.0 / 3.0 * _HALF_M**2 * np.eye(3)
     load = LinkBody(loads[0], np.array(CENTRE_M), inertia) if loads[0] else None
-    senses = Senses(gains_nm_a=_GAINS_NM_A if asked.currents else ())
+    senses = Senses(gains_nm_a=_GAINS_NM_A if options.currents else ())
     return ExerciseOptions(robot, load, senses, seed=seed)

@@ -1,4 +1,4 @@
-"""Results as they are summed up for people, and beside the truth of a simulated cell."""
+"""Summaries of results, and their comparison with a simulated truth."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -15,14 +15,14 @@ from visioncal.results import Calibration, CellResult, Remedy, Verdict, ViewResu
 from visioncal.results.compare import edge_errors
 
 _COLOURS = {"good": "bold green", "check": "bold yellow", "bad": "bold red"}
-# Beyond any image, what is predicted is nowhere [px].
+# Larger predicted errors are meaningless, and not shown [px].
 _MOST_PX = 1e4
-# Levels of noise that are nearer to what is said are not mentioned.
+# Smallest noise level that is mentioned.
 _SHOWN_LEVEL = 1.2
 
 
 def print_verdict(verdict: Verdict, name: str) -> None:
-    """Prints whether something can be trusted, and why."""
+    """Prints a verdict with its reasons and next steps."""
     console, colour = answers(), _COLOURS[verdict.status]
     console.print(f"[{colour}]{verdict.status}[/]  {escape(name)}")
     for line in verdict.top:
@@ -35,7 +35,7 @@ def print_verdict(verdict: Verdict, name: str) -> None:
 
 
 def print_steps(steps: Sequence[Remedy]) -> None:
-    """Prints what to do next, each command on a line of its own."""
+    """Prints the next steps, each command on a line of its own."""
     console = answers()
     if steps:
         console.print("What to do next:")
@@ -46,19 +46,19 @@ def print_steps(steps: Sequence[Remedy]) -> None:
 
 
 def print_summary(calibration: Calibration, *, verbose: bool) -> None:
-    """Prints a result for people: the verdict first, then the figures it rests on."""
+    """Prints a result: the verdict first, then the transforms and errors."""
     console, cell = answers(), calibration.cell
     print_verdict(calibration.verdict, calibration.session_name)
     if cell is not None:
         console.print(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
-        unturned = "" if edge.oriented else ", its rotation not measured"
-        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}{unturned}")
+        no_rotation = "" if edge.oriented else ", its rotation not measured"
+        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}{no_rotation}")
     if cell is not None:
         _print_noise(cell)
     else:
         _print_residuals(calibration)
-    for suspects in left_out(_unsaid(calibration.verdict, calibration.views)):
+    for suspects in left_out(_not_in_verdict(calibration.verdict, calibration.views)):
         console.print(escape(f"  {suspects.words}"))
     if cell is not None:
         console.print(escape(cell.weakest))
@@ -73,7 +73,7 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
 
 
 def _print_residuals(calibration: Calibration) -> None:
-    """Prints how many views of one camera were used, and how well those left out fit."""
+    """Prints the number of used views, and the errors of held-out predictions."""
     used = sum(view.used for view in calibration.views)
     held = calibration.validation.held_out
     answers().print(
@@ -99,13 +99,13 @@ def _print_noise(cell: CellResult) -> None:
         console.print(f"noise of {name}: {', '.join(words)}")
 
 
-def _unsaid(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:
-    """The views about which the verdict does not say already why they were left out."""
-    said = [finding for finding in verdict.findings if finding.without_it]
+def _not_in_verdict(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResult]:
+    """Views left out for a reason that the verdict does not state."""
+    findings = [finding for finding in verdict.findings if finding.without_it]
     for view in views:
-        about = [finding for finding in said if view.view in finding.views]
+        of_view = [finding for finding in findings if view.view in finding.views]
         if not any(
-            finding.kind != "wrong_views" or view.reason in finding.words for finding in about
+            finding.kind != "wrong_views" or view.reason in finding.words for finding in of_view
         ):
             yield view
 
@@ -113,13 +113,7 @@ def _unsaid(verdict: Verdict, views: Iterable[ViewResult]) -> Iterator[ViewResul
 def truth_table(
     calibration: Calibration, transforms: Mapping[str, FloatArray], camera: Camera
 ) -> Table:
-    """Errors against the truth, in millimetres and degrees and in units of the sigma.
-
-    Args:
-        calibration: The result.
-        transforms: (4, 4) the true edges by name.
-        camera: The true lens.
-    """
+    """Table of errors against the truth, in millimetres, degrees, pixels and units of sigma."""
     table = Table("against the truth", "error", "sigma", "error / sigma", box=None)
     for name, edge_error in edge_errors(calibration, transforms).items():
         for error, sigma, unit in (
@@ -133,7 +127,7 @@ def truth_table(
         sigmas = np.sqrt(np.diag(calibration.camera.covariance))[:4]
         errors = calibration.camera.camera.matrix - camera.matrix
         for name, error, sigma in zip(("fx", "fy", "cx", "cy"), errors, sigmas, strict=True):
-            # A value that is held has no error to be measured by its sigma.
+            # A fixed parameter has no sigma.
             ratio = f"{abs(error) / sigma:.2f}" if sigma > 0.0 else ""
             table.add_row(name, f"{error:+.2f} px", f"{sigma:.2f} px", ratio)
     return table

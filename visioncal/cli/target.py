@@ -13,7 +13,7 @@ from visioncal.cli.options import AsJson
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.core.types import Target
     from visioncal.vision.printing import BoardRequest, Page
@@ -33,13 +33,13 @@ _USED: dict[_Described, str] = {
     "circles": "--columns --rows --square-mm --diameter-mm --asymmetric --name",
     "marker": "--id --size-mm --dictionary --name",
 }
-# Where no page is named, the first of these that has room.
+# Page sizes to try in order where none is named.
 _PAGES = ("A4", "A3", "A2", "A1", "A0")
 
 
 @dataclass(frozen=True)
 class BoardOptions:
-    """A board as options describe it."""
+    """Options that describe a board."""
 
     kind: Annotated[_Described | None, typer.Option(help="What to print.")] = None
     columns: Annotated[
@@ -79,7 +79,7 @@ class BoardOptions:
 
     @property
     def given(self) -> list[str]:
-        """The options by which it is described."""
+        """The options given to describe it."""
         chosen = [
             field.name for field in fields(self) if getattr(self, field.name) != field.default
         ]
@@ -87,7 +87,7 @@ class BoardOptions:
         return [f"--{names.get(name, name).replace('_', '-')}" for name in chosen if name != "kind"]
 
     def request(self, kind: _Described) -> "BoardRequest":
-        """The same as the printer takes it."""
+        """The request for the printer."""
         from visioncal.vision.printing import BoardRequest
 
         mine = {
@@ -121,10 +121,9 @@ def make_command(
         ),
     ] = None,
     landscape: Annotated[
-        bool | None,
-        typer.Option("--landscape/--portrait", help="Left out: as the board fits."),
+        bool | None, typer.Option("--landscape/--portrait", help="Left out: as the board fits.")
     ] = None,
-    dpi: Annotated[float, typer.Option(help="Pixels an inch of the PNG.")] = 300.0,
+    dpi: Annotated[float, typer.Option(help="Resolution of the PNG, in pixels per inch.")] = 300.0,
     *,
     board: BoardOptions,
     force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
@@ -159,7 +158,7 @@ def make_command(
 
 
 def _refuse_unused(kind: _Described | None, given: list[str]) -> None:
-    """Refuses options that would change nothing."""
+    """Refuses options that have no effect."""
     used = _USED[kind].split() if kind is not None else []
     unused = [option for option in given if option not in used]
     if unused:
@@ -232,7 +231,7 @@ def check_command(
 
 
 def _checked(target: "Target") -> None:
-    """Refuses what a session could not load, such as a size in metres given as millimetres."""
+    """Refuses boards that no session could load, such as sizes in millimetres taken as metres."""
     from visioncal.vision.targets import target_document, target_from_document
 
     target_from_document(target_document(target), target.name)

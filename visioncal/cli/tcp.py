@@ -8,7 +8,7 @@ import typer
 from visioncal.cli.framing import Asked, FrameOptions, PointOption, TouchOptions, place_frame
 from visioncal.cli.options import AsJson, PartOptions
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.results import Calibration, Frame
 
@@ -37,8 +37,8 @@ def tcp_command(
     from visioncal.frames.tcp import touched_tool
     from visioncal.interchange.formats.touches import read_touches
 
-    def by_touches(known: "Calibration | None") -> "Frame":
+    def by_touches(calibration: "Calibration | None") -> "Frame":
         rows = read_touches(touches, written.requested(), part.robot)
-        return touched_tool(rows, known, written.model, touch_noise_m=written.noise_m)
+        return touched_tool(rows, calibration, written.model, touch_noise_m=written.noise_m)
 
     place_frame(Asked("tool", touches, goes, written, part, point, as_json), by_touches)

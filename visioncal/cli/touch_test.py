@@ -27,14 +27,14 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.core.types import FloatArray
     from visioncal.frames.touch_test import TouchPoint
     from visioncal.live.capture.hover import Hovering
     from visioncal.results import Calibration
 
-# The gaps are larger than predicted.
+# Exit status where gaps are larger than predicted.
 _EXIT_LARGER = 3
 _FORM = "Flange targets: x, y, z \\[mm], rotation vector \\[rad]; hover first, then touch."
 
@@ -52,11 +52,11 @@ def touch_test_command(
         ),
     ] = None,
     height_mm: Annotated[
-        float, typer.Option(min=1.0, max=1000.0, help="To hover at, first.")
+        float, typer.Option(min=1.0, max=1000.0, help="Hovering height, before the touch.")
     ] = 50.0,
     gaps_mm: Annotated[
         str | None,
-        typer.Option(metavar="A,B,C,D,E", help="Tip to point, as measured, in their order."),
+        typer.Option(metavar="A,B,C,D,E", help="Measured gaps from tip to point, in their order."),
     ] = None,
     drive: Annotated[
         str | None,
@@ -72,10 +72,10 @@ def touch_test_command(
 ) -> None:
     """Prove a calibration: touch what the camera locates, and enter the gaps.
 
-    The session has one image or more of a board as it lies now. Says where to send the robot,
+    The session has one image or more of a board as it lies now. Prints where to send the robot,
     hovering first, corrected where the arm is calibrated; at a terminal it asks for each gap. With
-    all gaps: compared with what was
-    predicted, and kept in the result and its report. Exit status 3: they are larger.
+    all gaps, they are compared with what was predicted, and kept in the result and its report. Exit
+    status 3: they are larger.
     """
     from visioncal.frames.measured import Tool
     from visioncal.frames.touch_test import finding_of, judged, touch_points
@@ -86,8 +86,8 @@ def touch_test_command(
 
     loaded = Session.load(session)
     calibration = named_result(calibration, "-c", "touch-test: the calibration to prove")
-    known = load_result(calibration)
-    if known.cell is not None:
+    result = load_result(calibration)
+    if result.cell is not None:
         raise DataError(
             f"touch-test is for one camera and one robot, and {calibration} is of a whole cell.",
             culprits=["-c"],
@@ -95,7 +95,7 @@ def touch_test_command(
             f"-c {shlex.quote(str(calibration))} --camera NAME --robot NAME say where the board "
             "is, touch it there, and compare.",
         )
-    has_tools = any(frame.startswith("flange_from_") for frame in known.frames)
+    has_tools = any(frame.startswith("flange_from_") for frame in result.frames)
     is_bare = tool == "none" or (tool is None and not has_tools)
     if not (is_bare or has_tools):
         raise DataError(
@@ -104,45 +104,44 @@ def touch_test_command(
             next_step="Find the tip first, and let it join the calibration: "
             f"visioncal tcp TOUCHES -c {shlex.quote(str(calibration))} --name gripper",
         )
-    touching = None if is_bare else Tool.among(known.frames, "The calibration", tool)
+    touching = None if is_bare else Tool.among(result.frames, "The calibration", tool)
     with shown_progress(quiet=as_json):
-        points = touch_points(loaded, known, touching)
-    targets = [_target(known, point, 1e-3 * height_mm) for point in points]
+        points = touch_points(loaded, result, touching)
+    targets = [_target(result, point, 1e-3 * height_mm) for point in points]
     if gaps_mm is not None:
         count = gaps_mm.count(",") + 1
         gaps = [*numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
     elif drive is not None:
-        gaps = _driven(drive, known, points, targets, 1e-3 * height_mm, asks=not yes)
+        gaps = _drive(drive, result, points, targets, 1e-3 * height_mm, asks=not yes)
     elif sys.stdin.isatty() and not as_json:
-        gaps = _asked(points, targets)
+        gaps = _ask_gaps(points, targets)
     else:
         _report(points, targets, as_json=as_json)
         return
     test = judged(points, gaps, touching)
-    proved = replace(known, touch_test=test)
-    written = rewrite(calibration if calibration.is_dir() else calibration.parent, proved)
+    extended = replace(result, touch_test=test)
+    written = rewrite(calibration if calibration.is_dir() else calibration.parent, extended)
     if as_json:
-        document = {"points": targets, "touch_test": to_document(proved)["touch_test"]}
-        print_json(document)
+        print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
         answers().print(escape(finding_of(test).reason))
     report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
 
 
-def _target(known: "Calibration", point: "TouchPoint", height_m: float) -> dict[str, Any]:
-    """Where to send the robot: as its own controller needs it."""
+def _target(calibration: "Calibration", point: "TouchPoint", height_m: float) -> dict[str, Any]:
+    """Targets of the robot for its own controller."""
     from visioncal.results.compensation import correct
 
     touch, hover = point.base_from_flange, point.above(height_m)
-    found: dict[str, Any] = {
+    document: dict[str, Any] = {
         "name": point.name,
         "base_m": point.base_m.tolist(),
         "radius95_mm": point.radius95_mm,
     }
-    if known.arm_is_calibrated:
-        sent = correct(known, [hover, touch])
-        (hover, touch), found["q_rad"] = sent.base_from_flange, sent.q[1].tolist()
-    return found | {"hover": _numbers(hover), "touch": _numbers(touch)}
+    if calibration.arm_is_calibrated:
+        corrected = correct(calibration, [hover, touch])
+        (hover, touch), document["q_rad"] = corrected.base_from_flange, corrected.q[1].tolist()
+    return document | {"hover": _numbers(hover), "touch": _numbers(touch)}
 
 
 def _numbers(pose: "FloatArray") -> list[float]:
@@ -166,7 +165,7 @@ def _report(
 
 
 def _report_point(point: "TouchPoint", target: dict[str, Any], console: Console) -> None:
-    """Says where a point is, and where to send the robot."""
+    """Prints a point's position, and the targets of the robot."""
     x, y, z = 1e3 * point.base_m
     console.print(
         f"{point.name} at ({x:.2f}, {y:.2f}, {z:.2f}) mm, 95 % within {figure(point.radius95_mm)} "
@@ -178,7 +177,7 @@ def _report_point(point: "TouchPoint", target: dict[str, Any], console: Console)
         console.print(f"  {name}: {', '.join(numbers)}")
 
 
-def _asked(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) -> list[float]:
+def _ask_gaps(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) -> list[float]:
     """Asks for the gaps, one point after the other."""
     console = messages()
     console.print(_FORM)
@@ -189,22 +188,22 @@ def _asked(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]]) ->
     return gaps
 
 
-def _driven(
+def _drive(
     words: str,
-    known: "Calibration",
+    calibration: "Calibration",
     points: "Sequence[TouchPoint]",
     targets: Sequence[dict[str, Any]],
     height_m: float,
     *,
     asks: bool,
 ) -> list[float]:
-    """Brings the tip above each point, and asks for its gap."""
+    """Drives the tip above each point, and asks for its gap."""
     from visioncal.core.transforms import invert
     from visioncal.live.capture.devices import ArmWish, open_arm
     from visioncal.live.capture.hover import Hovering
     from visioncal.live.drivers.protocols import MovingArm
 
-    if known.robot is None:
+    if calibration.robot is None:
         raise DataError(
             "--drive: the calibration has no model of the robot.",
             culprits=["--drive"],
@@ -218,15 +217,15 @@ def _driven(
             raise DataError(f"{arm.name} cannot be driven.", culprits=["--drive"])
         for point, target in zip(points, targets, strict=True):
             tip_m = (invert(point.base_from_flange) @ [*point.base_m, 1.0])[:3]
-            hovering = Hovering(arm, known.robot, tip_m, point.base_m, point.normal, height_m)
-            _brought(hovering, _pose(target["hover"]))
+            hovering = Hovering(arm, calibration.robot, tip_m, point.base_m, point.normal, height_m)
+            _bring(hovering, _pose(target["hover"]))
             _report_point(point, target, messages())
             gaps.append(_gap())
     return gaps
 
 
-def _brought(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
-    """Brings the tip there; where the arm refuses, as in local control, a person mends that."""
+def _bring(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
+    """Drives the tip above a point; retries while the arm refuses, as in local control."""
     while True:
         try:
             hovering.bring(base_from_flange)
@@ -239,7 +238,7 @@ def _brought(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
 
 
 def _pose(numbers: Sequence[float]) -> "FloatArray":
-    """(4, 4) of x, y, z [m] and a rotation vector [rad]."""
+    """(4, 4) pose of x, y, z [m] and a rotation vector [rad]."""
     import numpy as np
     from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -262,7 +261,7 @@ def _gap() -> float:
 
 
 def _line(question: str) -> str:
-    """Asks, and gives the line that was typed."""
+    """Asks, and returns the typed line."""
     try:
         return asked(question)
     except EOFError:

@@ -15,14 +15,14 @@ from visioncal.cli.parsing import named_result
 from visioncal.cli.progress import shown_progress
 from visioncal.interchange.outputs import REPORT, VERIFY, Written, refuse_calibration, write_check
 
-# Help does not wait for them.
+# For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.calibration.verification import Check, Outcome
     from visioncal.core.verdict import Verdict
 
-# A check said no.
+# Exit status of a failed check.
 _EXIT_FAILED = 3
-# What comes of the triggers of the policy.
+# Headings of the policy's triggers by state.
 _TRIGGERED = {
     "fired": "[bold yellow]calibrate again[/] because of",
     "quiet": "no reason to calibrate again",
@@ -46,8 +46,7 @@ def verify_command(
         bool, typer.Option("--collision", help="A collision was reported since.")
     ] = False,
     policy: Annotated[
-        Path | None,
-        typer.Option(help="A table of one's own of when to calibrate again (.toml)."),
+        Path | None, typer.Option(help="Your own table of when to calibrate again (.toml).")
     ] = None,
     output: Annotated[
         Path | None,

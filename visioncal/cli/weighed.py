@@ -1,4 +1,4 @@
-"""What `visioncal dynamics payload` and `gains` find by a body on the flange, and its report."""
+"""Payload and drive gains from a body on the flange, for `visioncal dynamics`."""
 
 import numpy as np
 import typer
@@ -25,100 +25,102 @@ from visioncal.robot import Inertias, matrices
 from visioncal.session import Session
 
 
-def print_payload(asked: PayloadOptions) -> None:
-    """Weighs what the flange carries.
+def print_payload(options: PayloadOptions) -> None:
+    """Estimates the payload, and prints it.
 
     Raises:
-        DataError: Nothing was identified before, or the streams do not determine the payload.
+        DataError: There are no identified dynamics, or the streams do not determine the payload.
     """
-    identified = identified_of(asked.against, "payload")
-    loaded = conditioned_streams(Session.load(asked.session), identified, asked.streams.request())
-    found = estimate_payload(
+    identified = identified_of(options.against, "payload")
+    loaded = conditioned_streams(
+        Session.load(options.session), identified, options.streams.request()
+    )
+    payload = estimate_payload(
         identified,
         loaded,
-        friction_changes=not asked.same_friction,
-        gain_sigma=0.01 * asked.gains_sigma,
+        friction_changes=not options.same_friction,
+        gain_sigma=0.01 * options.gains_sigma,
     )
-    if asked.as_json:
-        print_json(found.document())
+    if options.as_json:
+        print_json(payload.document())
         return
     for note in (note for conditioned in loaded for note in conditioned.notes):
         say(note)
-    typer.echo("\n".join(_lines(found)))
+    typer.echo("\n".join(_lines(payload)))
 
 
-def print_gains(asked: GainsOptions) -> None:
-    """Finds the gains of an arm's drives by a body on its flange.
+def print_gains(options: GainsOptions) -> None:
+    """Estimates the torque constants of an arm's drives from a known body on its flange.
 
     Raises:
-        DataError: There is no such body, or the sessions cannot be read or have no currents.
+        DataError: The body is invalid, or the sessions cannot be read or have no currents.
     """
-    body = _body(asked)
-    without = of_one_arm(Session.load(asked.session), asked.named)
+    body = _body(options)
+    without = of_one_arm(Session.load(options.session), options.named)
     robot = robot_of(without)
-    empty = current_streams(without, robot, asked.cutoff_hz)
+    empty = current_streams(without, robot, options.cutoff_hz)
     full = current_streams(
-        of_one_arm(Session.load(asked.loaded), asked.named),
+        of_one_arm(Session.load(options.loaded), options.named),
         robot,
-        asked.cutoff_hz or empty[0].cutoff_hz,
+        options.cutoff_hz or empty[0].cutoff_hz,
     )
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms(motor_inertia=True)))
-    found = drive_gains(base, empty, full, body)
-    if asked.as_json:
-        print_json([_row(name, found, at) for at, name in enumerate(robot.joint_names)])
+    gains = drive_gains(base, empty, full, body)
+    if options.as_json:
+        print_json([_row(name, gains, at) for at, name in enumerate(robot.joint_names)])
         return
-    _report_gains(robot.joint_names, found)
+    _report_gains(robot.joint_names, gains)
 
 
-def _lines(found: Payload) -> list[str]:
-    mass = f"{matched(found.mass_kg, found.mass_sigma_kg)} kg"
-    centre = _listed(1e3 * found.centre_m, 1e3 * found.centre_sigma_m)
+def _lines(payload: Payload) -> list[str]:
+    mass = f"{matched(payload.mass_kg, payload.mass_sigma_kg)} kg"
+    centre = _with_sigmas(1e3 * payload.centre_m, 1e3 * payload.centre_sigma_m)
     lines = [
-        f"mass {mass} (sigma {significant(found.mass_sigma_kg)}{_of_gains(found)})",
+        f"mass {mass} (sigma {significant(payload.mass_sigma_kg)}{_gains_part(payload)})",
         f"centre {centre} mm in the flange's frame",
     ]
-    if found.consistent:
-        inertia = ", ".join(f"{value:.4g}" for value in found.inertia_kg_m2)
+    if payload.consistent:
+        inertia = ", ".join(f"{value:.4g}" for value in payload.inertia_kg_m2)
         lines.append(f"inertia about it (xx, xy, yy, xz, yz, zz) {inertia} kg m^2")
     else:
         lines.append("its inertia is lost in the noise")
-    left = ", ".join(significant(rm) for rm in found.rms_nm.tolist())
+    left = ", ".join(significant(rm) for rm in payload.rms_nm.tolist())
     lines.append(f"unexplained {left} N m, joint by joint")
-    return [*lines, f"on a UR: {_ur_words(found)}"]
+    return [*lines, f"on a UR: {_ur_words(payload)}"]
 
 
-def _of_gains(found: Payload) -> str:
-    """What of the mass's sigma the drives' gains make up, where they do."""
-    if not found.gains_sigma_kg:
+def _gains_part(payload: Payload) -> str:
+    """The part of the mass's sigma that is due to the drives' gains; empty for none."""
+    if not payload.gains_sigma_kg:
         return ""
-    return f", {significant(found.gains_sigma_kg)} of it from the drives' gains"
+    return f", {significant(payload.gains_sigma_kg)} of it from the drives' gains"
 
 
-def _listed(values: FloatArray, sigmas: FloatArray) -> str:
+def _with_sigmas(values: FloatArray, sigmas: FloatArray) -> str:
     pairs = zip(values.tolist(), sigmas.tolist(), strict=True)
     return ", ".join(
         f"{matched(value, sigma)} (sigma {significant(sigma)})" for value, sigma in pairs
     )
 
 
-def _ur_words(found: Payload) -> str:
+def _ur_words(payload: Payload) -> str:
     """The payload as a UR's program sets it, in kg, m and kg m^2."""
-    centre = ", ".join(f"{value:.5f}" for value in found.centre_m)
-    if not found.consistent:
-        return f"set_target_payload({found.mass_kg:.4f}, [{centre}])"
-    xx, xy, yy, xz, yz, zz = found.inertia_kg_m2.tolist()
+    centre = ", ".join(f"{value:.5f}" for value in payload.centre_m)
+    if not payload.consistent:
+        return f"set_target_payload({payload.mass_kg:.4f}, [{centre}])"
+    xx, xy, yy, xz, yz, zz = payload.inertia_kg_m2.tolist()
     inertia = ", ".join(f"{value:.6f}" for value in (xx, yy, zz, xy, xz, yz))
-    return f"set_target_payload({found.mass_kg:.4f}, [{centre}], [{inertia}])"
+    return f"set_target_payload({payload.mass_kg:.4f}, [{centre}], [{inertia}])"
 
 
-def _body(asked: GainsOptions) -> FloatArray:
+def _body(options: GainsOptions) -> FloatArray:
     """(10,) the body's inertial parameters in the flange's frame."""
-    centre = 1e-3 * np.array(numbers_in(asked.com_mm, "--com-mm", "x,y,z"))
-    about = matrices(np.array(numbers_in(asked.inertia, "--inertia", "xx,xy,yy,xz,yz,zz")))
-    body = Inertias.of_bodies(np.array([asked.mass_kg]), centre[None], about[None])
-    if not (asked.mass_kg > 0.0 and body.consistent):
+    centre = 1e-3 * np.array(numbers_in(options.com_mm, "--com-mm", "x,y,z"))
+    about = matrices(np.array(numbers_in(options.inertia, "--inertia", "xx,xy,yy,xz,yz,zz")))
+    body = Inertias.of_bodies(np.array([options.mass_kg]), centre[None], about[None])
+    if not (options.mass_kg > 0.0 and body.consistent):
         raise DataError(
-            f"--mass-kg {asked.mass_kg:g} and --inertia {asked.inertia} are those of no body.",
+            f"--mass-kg {options.mass_kg:g} and --inertia {options.inertia} are those of no body.",
             culprits=["--mass-kg", "--inertia"],
             next_step="A mass above 0 kg is needed, and an inertia about its centre; none stands "
             "for a body as small as a point.",
@@ -126,11 +128,11 @@ def _body(asked: GainsOptions) -> FloatArray:
     return np.asarray(body.values[0])
 
 
-def _row(name: str, found: Gains, at: int) -> dict[str, str | float]:
-    """The gain of a drive; the joint alone where it is not determined."""
-    if not found.determined[at]:
+def _row(name: str, gains: Gains, joint: int) -> dict[str, str | float]:
+    """The gain of a drive; only the joint where it is not determined."""
+    if not gains.determined[joint]:
         return {"joint": name}
-    gain, sigma = float(found.nm_per_a[at]), float(found.sigma[at])
+    gain, sigma = float(gains.nm_per_a[joint]), float(gains.sigma[joint])
     return {"joint": name, "nm_per_a": gain, "sigma_nm_per_a": sigma}
 
 
@@ -143,8 +145,7 @@ def _report_gains(names: tuple[str, ...], found: Gains) -> None:
             words = f"{matched(gain, sigma)} N m/A (sigma {significant(sigma)})"
         say(f"{name}: {words}")
     if found.determined.all():
-        gains = ",".join(f"{value:.5g}" for value in found.nm_per_a)
-        typer.echo(f"--gains {gains}")
+        typer.echo(f"--gains {','.join(f'{value:.5g}' for value in found.nm_per_a)}")
     else:
         say(
             "--gains needs all joints: move those that are not determined more, or take a body "

@@ -1,1 +1,1 @@
-"""Files in and out: recordings of other programs, exports, and the folder of a result."""
+"""Import of foreign recordings, export of results, and files of a result."""

@@ -1,4 +1,4 @@
-"""What has joined the result of an earlier calibration: written with it anew, or kept beside."""
+"""Writes an extended result into its folder, and keeps frames that a new result would lose."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,20 +16,16 @@ from visioncal.results import Calibration, Frame, FrameFile
 def rewrite(folder: Path, calibration: Calibration) -> Written:
     """Replaces the files of an output folder by those of the same session's extended result.
 
-    Session and evidence come from the recording in the folder; its images stay as they are, byte by
-    byte. Where there is no recording, or none that belongs to the result, it is left alone and the
-    report says what is missing.
-
-    Args:
-        folder: What `visioncal calibrate` has written.
-        calibration: The result in it with what has joined it, such as frames.
+    Session and evidence come from the recording in the folder, whose images are kept byte for byte.
+    Without a recording that belongs to the result, none is written, and the report says what is
+    missing.
 
     Returns:
-        The files that were written: without the recording where that was left alone.
+        The files that were written: without the recording where there was none to extend.
 
     Raises:
         DataError: The folder has no result, one of another session, or cannot be written; the files
-            in it stay as they were.
+            in it are unchanged.
     """
     stored = load_stored(folder)
     if stored.calibration.session_sha256 != calibration.session_sha256:
@@ -39,18 +35,17 @@ def rewrite(folder: Path, calibration: Calibration) -> Written:
             culprits=[str(folder)],
             next_step="Name the output folder that the result was loaded from.",
         )
-    run = Run(calibration, stored.evidence)
-    return write_outputs(folder, stored.session, run, stored.note)
+    return write_outputs(folder, stored.session, Run(calibration, stored.evidence), stored.note)
 
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """Frames of a result that is about to be replaced by one that does not have them.
+    """Frames of a result that a new result without them is about to replace.
 
     Attributes:
-        file: Where they are kept.
+        file: The file in which they are kept.
         frames: By the transforms that place them.
-        before: What the file holds already.
+        before: The frames that the file holds already.
     """
 
     file: Path
@@ -58,13 +53,13 @@ class Leftover:
     before: Mapping[str, Frame]
 
     def keep(self) -> None:
-        """Writes them, beside what the file holds under other names."""
+        """Writes them to the file, beside its frames of other names."""
         FrameFile({**self.before, **self.frames}).save(self.file)
 
     @property
     def words(self) -> str:
-        """What became of them, and which of them to place anew, for the user."""
-        # It comes with all that places frames, and few results have any.
+        """Message to the user: where the frames are kept, and which to place again."""
+        # Imports everything that places frames, and few results have any.
         from visioncal.frames.frame_from_images import rests_on_camera
 
         seen = [name for name, frame in self.frames.items() if rests_on_camera(frame)]
@@ -86,16 +81,14 @@ class Leftover:
 def leftover(folder: Path) -> Leftover | None:
     """Finds the frames that a new result in a folder would lose; None where there are none.
 
-    Args:
-        folder: Where a result is to be written. One that cannot be read is no error: it has
-            nothing to lose.
+    An unreadable result is no error: it has nothing to lose.
 
     Raises:
-        DataError: There is a file of frames beside them that cannot be read, nor be replaced.
+        DataError: The file of frames there cannot be read, nor be replaced.
     """
     file = folder / CALIBRATION
     try:
-        # Reading all of a result takes ten times as long.
+        # Reading a whole result takes ten times as long.
         text = read_bytes(file)
         frames = Calibration.from_json(text, str(file)).frames if b'"frames"' in text else {}
     except DataError:

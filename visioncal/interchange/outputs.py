@@ -1,4 +1,4 @@
-"""What `calibrate`, `align`, `verify`, `plan` and `dynamics` write into a folder."""
+"""Output folders of `calibrate`, `align`, `verify`, `plan` and `dynamics`."""
 
 import shlex
 import traceback
@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import json_text, write_atomically
 from visioncal.core.output_generations import write_generation
 
-# Whoever writes one kind of result need not wait for the imports of all the others.
+# Imported late, so that writing one kind of result does not import all the others.
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline import Run as Calibrated
     from visioncal.calibration.verification import Check, Outcome
@@ -32,17 +32,17 @@ _Writer: TypeAlias = Callable[[Path], None]
 
 
 def review_command(recording: Path) -> str:
-    """The command that opens a recording, which the folder of its result stands for."""
+    """The command that opens a recording, named by its folder."""
     named = recording.parent if recording.name == RECORDING else recording
     return f"visioncal review {shlex.quote(str(named))}"
 
 
 @dataclass(frozen=True)
 class Undrawn:
-    """A file that there is not, because drawing it failed: a bug, which takes no result away.
+    """A file whose drawing failed: a bug, which does not invalidate the result.
 
     Attributes:
-        file: The file; one of an earlier result was taken away.
+        file: The file; one of an earlier result was removed.
         cause: The error and its place in the code.
     """
 
@@ -52,11 +52,10 @@ class Undrawn:
 
 @dataclass(frozen=True)
 class Written:
-    """What was written into a folder.
+    """Files written into a folder.
 
     Attributes:
         files: The files, the result first.
-        undrawn: What is missing beside it.
     """
 
     files: tuple[Path, ...]
@@ -72,28 +71,28 @@ def write_outputs(
     without: Collection[str] = (),
     images: "ImagesKept" = "full",
 ) -> Written:
-    """Writes the files of a result into a folder, all at once whenever it is killed.
+    """Writes the files of a result into a folder, atomically even if it is killed.
 
-    Several threads may do so at once; their figures are drawn one at a time.
+    Several threads may call it at once; their figures are drawn one at a time.
 
     Args:
-        folder: Where to; it is made where there is none.
-        session: What was calibrated; None where it was not kept, which leaves the recording out.
+        folder: The folder; created where there is none.
+        session: The calibrated session; None where it was not kept, which leaves the recording out.
         run: The result and its evidence.
-        note: What the reader should know of the report itself.
-        without: Files that are not wanted, `REPORT` or `RECORDING`; those of an earlier result are
-            taken away.
-        images: What the recording keeps of the images beside their digests.
+        note: A note on the report itself.
+        without: Files to leave out, `REPORT` or `RECORDING`; those of an earlier result are
+            removed.
+        images: How the recording keeps the images, besides their digests.
 
     Returns:
         The files that were written: the result even where drawing the report or recording failed.
 
     Raises:
-        DataError: The folder cannot be written; the files in it stay as they were.
+        DataError: The folder cannot be written; the files in it are unchanged.
     """
 
     def report(path: Path) -> None:
-        # Plots and the recording's codec take half a second to import, which help need not wait
+        # Plots and the recording's codec take half a second to import, which --help need not wait
         # for.
         from visioncal.present.report import write_report
 
@@ -121,26 +120,15 @@ def write_outputs(
 
 
 def write_check(
-    folder: Path,
-    check: "Check",
-    triggers: "Sequence[Outcome]",
-    verdict: "Verdict",
-    document: str,
+    folder: Path, check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict", document: str
 ) -> Written:
-    """Writes a check's page and JSON into a folder, all at once.
-
-    Args:
-        folder: Where to; it is made where there is none.
-        check: The check.
-        triggers: What became of the policy's triggers.
-        verdict: What it found.
-        document: The content of verify.json.
+    """Writes a check's page and JSON into a folder, atomically.
 
     Returns:
         The files that were written: the JSON even where drawing the page failed.
 
     Raises:
-        DataError: The folder cannot be written; the files in it stay as they were.
+        DataError: The folder cannot be written; the files in it are unchanged.
     """
 
     def page(path: Path) -> None:
@@ -166,20 +154,14 @@ def refuse_calibration(folder: Path) -> None:
 
 
 def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Written:
-    """Writes a plan's table, program, preview and JSON into a folder, all at once.
-
-    Args:
-        folder: Where to; it is made where there is none.
-        plan: The plan.
-        document: The content of plan.json.
+    """Writes a plan's table, program, preview and JSON into a folder, atomically.
 
     Returns:
         The files that were written: all but the preview even where drawing that failed. Robots that
-        are not programmed like a UR get no program, and one that an earlier plan left is taken
-        away.
+        are not programmed like a UR get no program, and that of an earlier plan is removed.
 
     Raises:
-        DataError: The folder cannot be written; the files in it stay as they were.
+        DataError: The folder cannot be written; the files in it are unchanged.
     """
 
     def draw(path: Path) -> None:
@@ -202,21 +184,15 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
 def write_motions(
     folder: Path, plan: "MotionPlan", rate_hz: float, document: Mapping[str, Any]
 ) -> Written:
-    """Writes planned motions as tables, programs, preview and JSON, all at once.
-
-    Args:
-        folder: Where to; it is made where there is none.
-        plan: The motions.
-        rate_hz: Samples a second in the tables.
-        document: The content of plan.json.
+    """Writes planned motions as tables, programs, preview and JSON, atomically.
 
     Returns:
         The files that were written: all but the preview even where drawing that failed. Robots that
-        are not programmed like a UR get no programs; what an earlier plan left and this one has not
-        is taken away.
+        are not programmed like a UR get no programs; files of an earlier plan that this one lacks
+        are removed.
 
     Raises:
-        DataError: The folder cannot be written; the files in it stay as they were.
+        DataError: The folder cannot be written; the files in it are unchanged.
     """
 
     def draw(path: Path) -> None:
@@ -235,17 +211,13 @@ def write_motions(
 
 
 def write_dynamics(folder: Path, run: "Run") -> Written:
-    """Writes identified dynamics, their report and recording into a folder, all at once.
-
-    Args:
-        folder: Where to; it is made where there is none.
-        run: The result with its evidence.
+    """Writes identified dynamics, their report and recording into a folder, atomically.
 
     Returns:
         The files that were written: the result even where drawing the others failed.
 
     Raises:
-        DataError: The folder cannot be written; the files in it stay as they were.
+        DataError: The folder cannot be written; the files in it are unchanged.
     """
 
     def report(path: Path) -> None:
@@ -269,33 +241,28 @@ def _write(
     others: Sequence[str] = (),
     without: Collection[str] = (),
 ) -> Written:
-    """Writes results, and what is drawn of them as far as that succeeds, as one generation.
+    """Writes results and drawings as one generation; a drawing that fails is left out.
 
-    Args:
-        folder: Where to.
-        results: What writes each file without which there is nothing; the one that counts first.
-        drawings: What draws the others.
-        others: Files that an earlier generation may have, and this one has not.
-        without: Drawings that are not wanted.
+    The main result is first in `results`; files named in `others` and `without` are removed.
     """
     drawings = {name: draw for name, draw in drawings.items() if name not in without}
     undrawn: list[Undrawn] = []
 
-    def write(aside: Path) -> None:
+    def write(staging: Path) -> None:
         for name, save in results.items():
-            save(aside / name)
+            save(staging / name)
         for name, draw in drawings.items():
             try:
-                draw(aside / name)
+                draw(staging / name)
             except Exception as error:
-                # A disk without room is no bug, and ends as a result that cannot be written does.
+                # A full disk is no bug, and is reported like a result that cannot be written.
                 if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
                     raise
                 undrawn.append(Undrawn(folder / name, _cause(error)))
 
-    # The result last: it is what the others are beside.
-    mine = [*results, *drawings]
-    names = [*(other for other in (*others, *without) if other not in mine), *reversed(mine)]
+    # The result last: the other files belong to it.
+    written = [*results, *drawings]
+    names = [*(other for other in (*others, *without) if other not in written), *reversed(written)]
     return Written(write_generation(folder, names, write), tuple(undrawn))
 
 

@@ -1,4 +1,4 @@
-"""Finds again what an earlier calibration has written."""
+"""Loads the results of earlier calibrations."""
 
 import json
 import shlex
@@ -19,7 +19,7 @@ from visioncal.session.choosing import ANY, ARM, PARTS, Choice, Part
 if TYPE_CHECKING:
     from visioncal.dynamics import Identified
 
-# The files by which a session's folder is recognised.
+# The file by which a session's folder is recognised.
 _SESSION = "session.toml"
 # Frames of a robot without a calibration, in a folder.
 FRAMES = "frames.json"
@@ -27,13 +27,12 @@ FRAMES = "frames.json"
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """A result, with all that was kept of the way to it.
+    """A result with its session and evidence.
 
     Attributes:
-        calibration: The result.
-        session: What it was computed from; None where it was not kept.
-        evidence: What was seen and computed of each view; empty likewise.
-        note: Why something is missing, in words for the user; empty where nothing is.
+        session: The session that it was computed from; None where it was not kept.
+        evidence: Evidence of each view; empty where it was not kept.
+        note: Why something is missing, for the user; empty where nothing is.
         review: The command that opens the recording; empty where there is none.
     """
 
@@ -47,24 +46,24 @@ class Stored:
 def load_calibration(
     path: Path, choice: Choice = ANY, needs: Collection[Part] = PARTS
 ) -> Calibration:
-    """Loads the result of one camera and one robot, or takes it out of that of a whole cell.
+    """Loads the result of one camera and one robot, or extracts it from a cell's.
 
     Args:
         path: An output folder, its calibration.json, or a recording with a result.
-        choice: Which camera, robot and target of a whole cell are meant.
-        needs: What of the three has to be clear.
+        choice: Which camera, robot and target of a cell are meant.
+        needs: Which of the three have to be unambiguous.
 
     Raises:
-        DataError: There is none, it cannot be read, or it is not clear what is meant.
+        DataError: There is none, it cannot be read, or the choice is ambiguous.
     """
     return load_result(path).chosen(choice, needs)
 
 
 def load_result(path: Path) -> Calibration:
-    """Loads a result, of one camera and one robot or of a whole cell.
+    """Loads a result, of one camera and one robot or of a cell.
 
     Args:
-        path: As for `load_calibration`; or the alignment.json of a whole cell.
+        path: As for `load_calibration`; or the alignment.json of a cell.
 
     Raises:
         DataError: There is none, or it cannot be read.
@@ -91,12 +90,12 @@ def load_result(path: Path) -> Calibration:
 
 
 def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile:
-    """Loads a result, or frames that belong to none.
+    """Loads a result, or a file of frames.
 
     Args:
         path: As for `load_calibration`, or a file of frames, recognised by its content, or a folder
             with one and no calibration.json.
-        robot: Which robot of a whole cell is meant.
+        robot: Which robot of a cell is meant.
 
     Raises:
         DataError: There is neither, or it cannot be read.
@@ -109,7 +108,7 @@ def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile
 
 
 def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
-    """Loads what `load_placed` does, the result of a whole cell, or an arm's dynamics.
+    """Loads anything that can be exported: as `load_placed`, a cell's result, or an arm's dynamics.
 
     Args:
         path: As there, or an alignment.json or a dynamics.json, recognised by its content, a folder
@@ -132,13 +131,13 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
 
 
 def _holds_frames(path: Path) -> bool:
-    """Tells a file of frames by its content: every calibration has transforms."""
+    """Whether a file has frames but no transforms, which every calibration has."""
     document = content_of(path)
     return "frames" in document and "transforms" not in document
 
 
 def content_of(path: Path) -> dict[str, object]:
-    """The content of a JSON file; empty of what is none."""
+    """The content of a JSON object's file; empty for any other file."""
     if path.suffix.lower() == ".rrd" or absence(path):
         return {}
     try:
@@ -149,7 +148,7 @@ def content_of(path: Path) -> dict[str, object]:
 
 
 def _refuse_session(path: Path) -> None:
-    """Refuses a session where its result is needed."""
+    """Refuses a session in place of its result."""
     folder = path.parent if path.name == _SESSION else path
     calibrated = path == folder and (folder / CALIBRATION).exists()
     if not calibrated and (folder / _SESSION).is_file():
@@ -172,8 +171,8 @@ def load_stored(path: Path) -> Stored:
         path: An output folder, its calibration.json, or a recording with a result.
 
     Raises:
-        DataError: There is no result, or it cannot be read. A recording that is missing beside a
-            calibration.json, is damaged or belongs to another result is no error but noted.
+        DataError: There is no result, or it cannot be read. A recording beside a calibration.json
+            that is missing, damaged or of another result is no error but noted.
     """
     calibration = load_result(path)
     if path.suffix.lower() == ".rrd":

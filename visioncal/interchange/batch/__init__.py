@@ -1,4 +1,4 @@
-"""Calibrating many sessions at once, on this machine or on a cluster."""
+"""Batch calibration of many sessions, on this machine or on a cluster."""
 
 from visioncal.interchange.batch.run import Batch, batch
 from visioncal.interchange.batch.work import Job, Options, jobs_of

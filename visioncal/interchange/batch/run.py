@@ -1,6 +1,6 @@
-"""Calibrates many sessions, and puts what became of them into a table and a page.
+"""Calibrates many sessions, and writes their results into a table and a page.
 
-Cells may be simulated by the hundred, before one is bought: combinations of what is varied.
+Alternatively it simulates cells: all combinations of given parameters.
 """
 
 import io
@@ -29,7 +29,7 @@ from visioncal.simulation import CAMERAS, CellOptions, read_truth, simulate, wri
 from visioncal.simulation.options import TARGETS
 
 TABLE, PAGE, _CELLS = "batch.parquet", "index.html", "cells"
-# The field of a cell that a key varies, and its unit.
+# Numeric keys: the field of `CellOptions` and the unit.
 _NUMBERS: Mapping[str, tuple[str, float]] = {
     "robot_sigma_mm": ("robot_sigma_m", 1e-3),
     "robot_sigma_mrad": ("robot_sigma_rad", 1e-3),
@@ -37,7 +37,7 @@ _NUMBERS: Mapping[str, tuple[str, float]] = {
     "arm_sigma_mrad": ("dh_sigma_rad", 1e-3),
     "pixel_sigma_px": ("pixel_sigma_px", 1.0),
 }
-# That of the names that a key takes, and what they stand for.
+# Keys with named values: the field of `CellOptions` and the values by name.
 _NAMES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "robot": ("robot", {arm: arm for arm in SIMULATED_ARMS}),
     "mount": ("mount", {name: name for name in ("eye-in-hand", "eye-to-hand")}),
@@ -49,12 +49,10 @@ _SEEDS, _MOST_SEEDS, _MOST_VIEWS = 10, 10_000, 10_000
 
 @dataclass(frozen=True)
 class Batch:
-    """What became of many sessions.
+    """Results of many sessions.
 
     Attributes:
-        rows: One a session, those first that stand out the most.
-        table: The same as a file.
-        page: The same to be looked at.
+        rows: One a session, the strongest outliers first.
     """
 
     rows: tuple[FleetRow, ...]
@@ -63,12 +61,12 @@ class Batch:
 
     @property
     def counts(self) -> Counter[str]:
-        """How many sessions came to each verdict, failed, or were kept; and how many changed."""
-        found = Counter(row.verdict or row.state for row in self.rows)
-        found["kept"] = sum(row.state == "kept" for row in self.rows)
-        found["changed"] = sum(row.changed is True for row in self.rows)
-        found["standing out"] = sum(row.score > 0.0 for row in self.rows)
-        return found
+        """Numbers of sessions by verdict or failure, and of kept, changed and outlying ones."""
+        counts = Counter(row.verdict or row.state for row in self.rows)
+        counts["kept"] = sum(row.state == "kept" for row in self.rows)
+        counts["changed"] = sum(row.changed is True for row in self.rows)
+        counts["standing out"] = sum(row.score > 0.0 for row in self.rows)
+        return counts
 
 
 @typed
@@ -88,27 +86,26 @@ def batch(
 ) -> Batch:
     """Calibrates many sessions, each into a folder of its own.
 
-    What was done before by the same version, of the same facts and with the same options, is kept:
-    what was interrupted goes on where it was. Of a session that cannot be calibrated the row says
-    why.
+    Results of the same version, facts and options are kept, so that an interrupted batch continues.
+    For a session that cannot be calibrated the row says why.
 
     Args:
-        sessions: Folders, recordings, folders with some below them, or globs.
-        out: Where the results go, with `batch.parquet` and `index.html`.
-        workers: How many work at a time, on one thread each; one a core where None.
-        scheduler: The address of a Dask scheduler, whose workers do it; it takes the extra
+        sessions: Folders, recordings, folders of sessions, or globs.
+        out: Folder for the results, with `batch.parquet` and `index.html`.
+        workers: Number of parallel workers of one thread each; None for one a core.
+        scheduler: The address of a Dask scheduler whose workers are used; needs the extra
             `cluster`.
         level: As in `calibrate`.
-        need_mm: Likewise.
-        need_deg: Likewise.
-        without: `report.html` or `recording.rrd`, where they are not wanted.
-        against: The folder of an earlier batch, whose results these are compared with.
-        cells: A file of cells to simulate in the place of sessions; see `write_cells`. Their
-            sessions go into `cells` in the folder.
-        progress: Told of each session.
+        need_mm: As in `calibrate`.
+        need_deg: As in `calibrate`.
+        without: `report.html` or `recording.rrd`, to leave out.
+        against: The folder of an earlier batch to compare with.
+        cells: A file of cells to simulate instead of sessions; see `write_cells`. Their sessions go
+            into `cells` in the folder.
+        progress: Called after each session.
 
     Returns:
-        The rows, and where they are written.
+        The rows, and their files.
 
     Raises:
         DataError: There are no sessions, the folder cannot be written, there is no batch in
@@ -134,31 +131,31 @@ def batch(
         if progress is not None:
             progress("batch", len(rows), len(jobs))
     if against is not None:
-        old, failed = Path(against), {row.name for row in rows if row.state == "failed"}
+        earlier, failed = Path(against), {row.name for row in rows if row.state == "failed"}
         rows = with_changes(
             rows,
-            lambda name: _result(old / name),
+            lambda name: _result(earlier / name),
             lambda name: None if name in failed else _result(folder / name),
         )
     if cells is not None:
-        rows = [_beside_truth(row, folder) for row in rows]
-    found = Batch(tuple(with_outliers(rows)), folder / TABLE, folder / PAGE)
-    write_atomically(found.table, _table(found.rows))
+        rows = [_with_error(row, folder) for row in rows]
+    results = Batch(tuple(with_outliers(rows)), folder / TABLE, folder / PAGE)
+    write_atomically(results.table, _table(results.rows))
     from visioncal.present.report.fleet import fleet_page
 
     write_atomically(
-        found.page, fleet_page(found.rows, cell_figures(rows) if cells is not None else ())
+        results.page, fleet_page(results.rows, cell_figures(rows) if cells is not None else ())
     )
-    return found
+    return results
 
 
-def _beside_truth(row: FleetRow, folder: Path) -> FleetRow:
-    found = _result(folder / row.name)
-    if row.state == "failed" or found is None:
+def _with_error(row: FleetRow, folder: Path) -> FleetRow:
+    calibration = _result(folder / row.name)
+    if row.state == "failed" or calibration is None:
         return row
-    name = camera_edge(found)
-    true = np.asarray(read_truth(row.session).transforms[name])
-    return replace(row, error_mm=pose_difference(found.edges[name].matrix, true)[0])
+    name = camera_edge(calibration)
+    truth = np.asarray(read_truth(row.session).transforms[name])
+    return replace(row, error_mm=pose_difference(calibration.edges[name].matrix, truth)[0])
 
 
 def _result(folder: Path) -> Calibration | None:
@@ -196,19 +193,19 @@ def _kind(annotation: object) -> str:
 
 
 def write_cells(file: Path, folder: Path, progress: Progress | None = None) -> list[Path]:
-    """Simulates all combinations of what a file varies, each some times.
+    """Simulates all combinations of varied parameters, each with several seeds.
 
     Args:
-        file: A TOML file: of each key a list of values, and `seeds`, how many of each.
-        folder: Where the sessions go, without images, each with its truth beside it; those that are
-            there are left alone.
-        progress: Told of each.
+        file: A TOML file with a list of values for each key, and the number of `seeds`.
+        folder: Folder for the sessions, without images, each with its truth beside it; existing
+            ones are kept.
+        progress: Called after each.
 
     Returns:
         The sessions' folders.
 
     Raises:
-        DataError: The file cannot be read, or a key or value in it is none that is known.
+        DataError: The file cannot be read, or a key or value in it is unknown.
     """
     document = read_toml(file, str(file))
     seeds = document.pop("seeds", _SEEDS)
@@ -218,25 +215,25 @@ def write_cells(file: Path, folder: Path, progress: Progress | None = None) -> l
         )
     varied = {key: value if isinstance(value, list) else [value] for key, value in document.items()}
     fields = {key: [_field(file, key, value) for value in values] for key, values in varied.items()}
-    wanted = []
-    for places in product(*(range(len(group)) for group in varied.values())):
-        chosen = dict(zip(varied, places, strict=True))
+    cells = []
+    for indices in product(*(range(len(group)) for group in varied.values())):
+        chosen = dict(zip(varied, indices, strict=True))
         words = "-".join(f"{key}_{varied[key][at]}" for key, at in chosen.items()) or "cell"
         options = replace(CellOptions(), **dict(fields[key][at] for key, at in chosen.items()))
-        wanted += [
+        cells += [
             (folder / words / f"seed_{seed:04d}", replace(options, seed=seed))
             for seed in range(seeds)
         ]
-    for at, (path, options) in enumerate(wanted):
+    for at, (path, options) in enumerate(cells):
         if not path.exists():
             write_session(simulate(options), path, images=False)
         if progress is not None:
-            progress("cells", at + 1, len(wanted))
-    return [path for path, _ in wanted]
+            progress("cells", at + 1, len(cells))
+    return [path for path, _ in cells]
 
 
 def _field(file: Path, key: str, value: object) -> tuple[str, Any]:
-    """The field of a cell that a key names, and its value there."""
+    """The field of `CellOptions` that a key sets, and its value."""
     if key == "views":
         if type(value) is int and 3 <= value <= _MOST_VIEWS:
             return key, value
@@ -251,13 +248,13 @@ def _field(file: Path, key: str, value: object) -> tuple[str, Any]:
             f"{file}: {key} has {value!r}; a number from 0 to 100 is needed.", culprits=[str(file)]
         )
     if key in _NAMES:
-        field, known = _NAMES[key]
-        if value in known:
-            return field, known[str(value)]
+        field, values = _NAMES[key]
+        if value in values:
+            return field, values[str(value)]
         raise DataError(
-            f"{file}: {key} has {value!r}; known are {', '.join(known)}.",
+            f"{file}: {key} has {value!r}; known are {', '.join(values)}.",
             culprits=[key],
-            next_step=did_you_mean(str(value), known) or f"Write one of these in {file}, {key}.",
+            next_step=did_you_mean(str(value), values) or f"Write one of these in {file}, {key}.",
         )
     keys = ("views", *_NUMBERS, *_NAMES, "seeds")
     raise DataError(

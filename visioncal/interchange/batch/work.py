@@ -1,4 +1,4 @@
-"""What a batch is to do, and what a worker does with one session."""
+"""Jobs of a batch, and a worker's calibration of one session."""
 
 import json
 import os
@@ -23,14 +23,7 @@ _SESSION = "session.toml"
 
 @dataclass(frozen=True)
 class Options:
-    """What the results of a batch depend on, beside the sessions.
-
-    Attributes:
-        level: As in `calibrate`.
-        need_mm: Likewise.
-        need_deg: Likewise.
-        without: The files that are not drawn.
-    """
+    """Options of a batch on which its results depend, as in `calibrate`."""
 
     level: str = "auto"
     need_mm: float | None = None
@@ -44,9 +37,7 @@ class Job:
 
     Attributes:
         name: Its name in the batch.
-        session: Its absolute path.
-        folder: Where its result goes, likewise.
-        options: How it is calibrated.
+        folder: Absolute path for its result.
     """
 
     name: str
@@ -58,21 +49,18 @@ class Job:
 def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list[Job]:
     """One job a session, in their natural order.
 
-    Args:
-        sessions: Folders of sessions, recordings, folders that have some below them, or globs.
-        out: Where the results go.
-        options: How they are calibrated.
+    Sessions are folders, recordings, folders of sessions, or globs.
 
     Returns:
-        The jobs. Names are paths below the folder that all sessions share.
+        The jobs, named by their paths below the folder that all sessions share.
 
     Raises:
         DataError: There are no sessions, a glob finds none, or two would have one name.
     """
-    given = {str(session): [*_named(str(session))] for session in sessions}
-    empty = [name for name, found in given.items() if not found]
+    by_argument = {str(session): [*_sessions_of(str(session))] for session in sessions}
+    empty = [name for name, found in by_argument.items() if not found]
     paths = sorted(
-        {path.absolute() for found in given.values() for path in found},
+        {path.absolute() for found in by_argument.values() for path in found},
         key=lambda value: [natural(Path(part)) for part in value.parts],
     )
     if empty or not paths:
@@ -89,39 +77,41 @@ def jobs_of(sessions: Iterable[Path | str], out: Path, options: Options) -> list
             culprits=twice,
             next_step="Leave one of them out.",
         )
-    whole = out.absolute()
-    return [Job(name, path, whole / name, options) for name, path in zip(names, paths, strict=True)]
+    root = out.absolute()
+    return [Job(name, path, root / name, options) for name, path in zip(names, paths, strict=True)]
 
 
-def _named(given: str) -> Iterator[Path]:
-    """The sessions that are meant; what is none is kept, so that its row can say so."""
-    magic = next((at for at, part in enumerate(Path(given).parts) if set(part) & set("*?[")), None)
-    if magic is None or Path(given).exists():
-        yield from _within(Path(given))
+def _sessions_of(given: str) -> Iterator[Path]:
+    """Sessions of a path or glob; a path without a session is kept, so that its row says so."""
+    first_glob = next(
+        (at for at, part in enumerate(Path(given).parts) if set(part) & set("*?[")), None
+    )
+    if first_glob is None or Path(given).exists():
+        yield from _sessions_in(Path(given))
     else:
         parts = Path(given).parts
-        for found in Path(*parts[:magic]).glob(str(Path(*parts[magic:]))):
-            # What lies beside sessions, as their truths and notes, is not meant.
+        for found in Path(*parts[:first_glob]).glob(str(Path(*parts[first_glob:]))):
+            # Other files beside sessions, such as truths and notes, are skipped.
             if found.is_dir() or found.suffix.lower() == ".rrd":
-                yield from _within(found)
+                yield from _sessions_in(found)
 
 
-def _within(path: Path) -> Iterator[Path]:
-    below = []
+def _sessions_in(path: Path) -> Iterator[Path]:
+    folders = []
     if path.is_dir() and not (path / _SESSION).exists():
-        below = [file.parent for file in path.rglob(_SESSION)]
-    yield from below or [path]
+        folders = [file.parent for file in path.rglob(_SESSION)]
+    yield from folders or [path]
 
 
 def work(job: Job) -> FleetRow:
     """Calibrates one session into its folder, unless that has its result already.
 
     Returns:
-        What became of it: where something is wrong, why.
+        The row of its result, or of its error.
     """
     begin = time.perf_counter()
     try:
-        row = _worked(job)
+        row = _calibrated_row(job)
     except VisioncalError as error:
         row = _failed(job, type(error).__name__, error.message, error.next_step)
     except Exception as error:  # noqa: BLE001 - a bug in one of a thousand ends no batch
@@ -130,7 +120,7 @@ def work(job: Job) -> FleetRow:
 
 
 def died(job: Job, tries: int) -> FleetRow:
-    """The row of a session whose workers died of it."""
+    """The row of a session on which the worker processes died."""
     words = f"its worker died {tries} times, without a word"
     return _failed(job, "WorkerDied", words, "It may need more memory: calibrate it by itself.")
 
@@ -146,29 +136,29 @@ def _failed(job: Job, error: str, words: str, next_step: str) -> FleetRow:
     )
 
 
-def _worked(job: Job) -> FleetRow:
+def _calibrated_row(job: Job) -> FleetRow:
     session = Session.load(job.session).needing(job.options.need_mm, job.options.need_deg)
     made_by = {
         "session_sha256": session.digest(),
         "visioncal": __version__,
-        # What the task needs is no fact of what was recorded.
+        # The need is not part of the digest, which is of the recorded facts.
         "need": None if session.need is None else list(map(str, asdict(session.need).values())),
         "options": asdict(job.options) | {"without": list(job.options.without)},
     }
-    kept = _kept(job, made_by)
+    kept = _earlier_row(job, made_by)
     if kept is not None:
         return kept
-    found, written = _calibrated(job, session)
-    row = row_of(job.name, str(job.session), found, __version__)
+    calibration, written = _calibrated(job, session)
+    row = row_of(job.name, str(job.session), calibration, __version__)
     has_report = job.folder / REPORT in written.files
-    row = replace(row, has_picture=_draw(job.folder, session, found), has_report=has_report)
-    # What counts as done comes last.
+    row = replace(row, has_picture=_draw(job.folder, session, calibration), has_report=has_report)
+    # Written last: it marks the session as done.
     write_atomically(job.folder / ROW, json.dumps({**made_by, "row": asdict(row)}, indent=1))
     return row
 
 
-def _kept(job: Job, made_by: Mapping[str, object]) -> FleetRow | None:
-    """The row of an earlier run that made the same; None where there is none."""
+def _earlier_row(job: Job, made_by: Mapping[str, object]) -> FleetRow | None:
+    """The row of an earlier run with the same inputs; None where there is none."""
     try:
         document = json.loads(read_text(job.folder / ROW))
     except (DataError, ValueError):
@@ -187,17 +177,17 @@ def _kept(job: Job, made_by: Mapping[str, object]) -> FleetRow | None:
 
 
 def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
-    """Calibrates on one thread, as `visioncal calibrate` does, and writes what it writes."""
-    done = run(session, level=job.options.level, threads=1).with_paths(job.session, job.folder)
-    written = write_outputs(job.folder, session, done, without=job.options.without)
-    return done.calibration, written
+    """Calibrates on one thread, and writes the outputs of `visioncal calibrate`."""
+    result = run(session, level=job.options.level, threads=1).with_paths(job.session, job.folder)
+    written = write_outputs(job.folder, session, result, without=job.options.without)
+    return result.calibration, written
 
 
-def _draw(folder: Path, session: Session, found: Calibration) -> bool:
+def _draw(folder: Path, session: Session, calibration: Calibration) -> bool:
     """Writes a small picture of the first view that was used; returns whether there is one."""
     from visioncal.present.report.thumbnails import small_picture
 
-    used = {view.view for view in found.views if view.used}
+    used = {view.view for view in calibration.views if view.used}
     for view in session.views:
         if view.number in used and view.image and session.images.exists(view.image):
             picture = small_picture(session.images.read(view.image))

@@ -1,4 +1,4 @@
-"""The program of a worker of this machine: takes jobs and gives rows, by its standard streams."""
+"""Program of a local worker process: reads jobs from stdin and writes rows to stdout."""
 
 import pickle
 import sys
@@ -8,7 +8,7 @@ from visioncal.interchange.batch.work import work
 
 
 def serve(jobs: BinaryIO, rows: BinaryIO) -> None:
-    """Works on one job after the other, until there are no more."""
+    """Works on one job after another, until the end of the stream."""
     while True:
         try:
             job = pickle.load(jobs)
@@ -19,7 +19,7 @@ def serve(jobs: BinaryIO, rows: BinaryIO) -> None:
 
 
 if __name__ == "__main__":
-    answers = sys.stdout.buffer
-    # What a library prints is no answer.
+    row_stream = sys.stdout.buffer
+    # Keeps output of libraries out of the rows.
     sys.stdout = sys.stderr
-    serve(sys.stdin.buffer, answers)
+    serve(sys.stdin.buffer, row_stream)

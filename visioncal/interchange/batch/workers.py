@@ -1,4 +1,4 @@
-"""Gives jobs to workers of one thread each: of Dask's cluster, or processes of this machine."""
+"""Distributes jobs over workers of one thread each: of a Dask cluster, or local processes."""
 
 import os
 import pickle
@@ -14,24 +14,24 @@ from visioncal.core.errors import DataError
 from visioncal.interchange.batch.work import Job, died, work
 from visioncal.results.fleet import FleetRow
 
-# A session that so many workers have died of is not tried again.
+# Number of worker deaths after which a session is given up.
 _TRIES = 3
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-# So long a scheduler may take to answer [s].
-_PATIENCE_S = 10
+# Timeout of the scheduler [s].
+_TIMEOUT_S = 10
 
 
 def rows_of(
     jobs: Sequence[Job], workers: int | None = None, scheduler: str | None = None
 ) -> Iterator[FleetRow]:
-    """The rows of all jobs, as they are done.
+    """The rows of all jobs, in the order in which they finish.
 
     Args:
-        jobs: What to do.
-        workers: How many at a time; one a core where None.
-        scheduler: The address of a Dask scheduler, whose workers then do it; they must see the same
-            files by the same paths. None for this machine: a cluster of Dask's where the extra
-            `cluster` is installed, or else plain processes.
+        jobs: The jobs.
+        workers: Number of parallel workers; None for one a core.
+        scheduler: The address of a Dask scheduler whose workers are used; they must see the same
+            files by the same paths. None for this machine: a local Dask cluster where the extra
+            `cluster` is installed, else plain processes.
 
     Raises:
         DataError: A scheduler is named without the extra, or does not answer.
@@ -61,7 +61,7 @@ def _by_dask(jobs: Sequence[Job], count: int, scheduler: str | None) -> Iterator
     with dask.config.set(settings):
         cluster = None
         if scheduler is None:
-            # Processes of their own programs: others would import the caller's main module.
+            # Separate programs: forked or spawned workers would import the caller's main module.
             cluster = SubprocessCluster(
                 n_workers=count,
                 threads_per_worker=1,
@@ -69,7 +69,7 @@ def _by_dask(jobs: Sequence[Job], count: int, scheduler: str | None) -> Iterator
                 worker_kwargs={"memory_limit": 0, "dashboard": False},
             )
         try:
-            client = Client(cluster or scheduler, timeout=_PATIENCE_S, set_as_default=False)
+            client = Client(cluster or scheduler, timeout=_TIMEOUT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise DataError(
                 f"no scheduler answers at {scheduler}: {error}", culprits=["--scheduler"]
@@ -77,7 +77,7 @@ def _by_dask(jobs: Sequence[Job], count: int, scheduler: str | None) -> Iterator
         try:
             futures = dict(zip(client.map(work, jobs, pure=False), jobs, strict=True))
             for future in as_completed(futures, loop=client.loop):
-                # Only the worker's death is an error: all others are rows.
+                # Only a worker's death is an error: all others are rows.
                 is_row = future.exception() is None
                 yield future.result() if is_row else died(futures[future], _TRIES)
                 future.release()
@@ -88,7 +88,7 @@ def _by_dask(jobs: Sequence[Job], count: int, scheduler: str | None) -> Iterator
 
 
 def _by_processes(jobs: Sequence[Job], count: int) -> Iterator[FleetRow]:
-    """The rows of all jobs, by processes of this machine; one that dies is replaced."""
+    """The rows of all jobs by local processes; one that dies is replaced."""
     waiting: SimpleQueue[Job] = SimpleQueue()
     rows: SimpleQueue[FleetRow | BaseException] = SimpleQueue()
     stopped = Event()
@@ -112,7 +112,7 @@ def _by_processes(jobs: Sequence[Job], count: int) -> Iterator[FleetRow]:
 def _feed(
     waiting: "SimpleQueue[Job]", rows: "SimpleQueue[FleetRow | BaseException]", stopped: Event
 ) -> None:
-    """Keeps one worker busy until nothing waits any more."""
+    """Keeps one worker busy until no jobs are left."""
     worker = None
     try:
         while not stopped.is_set():
@@ -122,21 +122,21 @@ def _feed(
                 return
             row = None
             for _ in range(_TRIES):
-                worker = worker or _started()
-                row = _asked(worker, job)
+                worker = worker or _start_worker()
+                row = _run_job(worker, job)
                 if row is not None:
                     break
-                _ended(worker)
+                _end_worker(worker)
                 worker = None
             rows.put(row or died(job, _TRIES))
     except BaseException as error:  # noqa: BLE001 - whoever waits for rows raises it
         rows.put(error)
     finally:
         if worker is not None:
-            _ended(worker)
+            _end_worker(worker)
 
 
-def _started() -> subprocess.Popen[bytes]:
+def _start_worker() -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-m", "visioncal.interchange.batch.worker"],
         stdin=subprocess.PIPE,
@@ -145,8 +145,8 @@ def _started() -> subprocess.Popen[bytes]:
     )
 
 
-def _asked(worker: subprocess.Popen[bytes], job: Job) -> FleetRow | None:
-    """The row of a job; None where the worker died of it."""
+def _run_job(worker: subprocess.Popen[bytes], job: Job) -> FleetRow | None:
+    """The row of a job; None where the worker died."""
     if worker.stdin is None or worker.stdout is None:
         raise RuntimeError("a worker is spoken to by pipes")
     try:
@@ -158,8 +158,8 @@ def _asked(worker: subprocess.Popen[bytes], job: Job) -> FleetRow | None:
     return row if isinstance(row, FleetRow) else None
 
 
-def _ended(worker: subprocess.Popen[bytes]) -> None:
+def _end_worker(worker: subprocess.Popen[bytes]) -> None:
     worker.kill()
-    # What it was not asked any more is flushed into a pipe that nobody reads.
+    # Buffered requests are flushed into a pipe that nobody reads.
     with suppress(BrokenPipeError), worker:
         pass

@@ -1,4 +1,4 @@
-"""Results in other people's formats: one file a family, one entry a format in the registry."""
+"""Results in foreign formats: one file a family, one registry entry a format."""
 
 from visioncal.interchange.exports.content import Load, Selection
 from visioncal.interchange.exports.registry import EXPORT_FORMATS, Document, document, export

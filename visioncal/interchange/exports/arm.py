@@ -1,4 +1,4 @@
-"""What there is to export of a calibrated arm, and what a file of others cannot hold of it."""
+"""Content of exported arms, and what a foreign format cannot hold of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,24 +26,24 @@ from visioncal.robot import (
     without_functions,
 )
 
-# Postures over which the worst error is looked for, and to which constant links are fitted.
+# Numbers of postures for the largest error, and for fitting constant links.
 _POSTURES, _FITTED = 4000, 800
-# What all the workspace counts beside where the arm was measured: links that leave the least in a
-# small box alone would lead far astray beyond it.
-_ELSEWHERE = 0.1
+# Weight of the workspace relative to the measured ranges: links fitted to a small range alone would
+# have large errors beyond it.
+_WORKSPACE_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class LeftBehind:
-    """How far constant links are off from the arm that was found: rms and at the most [mm]."""
+    """Flange error of fitted constant links against the calibrated arm: rms and maximum [mm]."""
 
     rms_mm: float
     most_mm: float
 
     @classmethod
-    def of(cls, away: FloatArray) -> "LeftBehind":
-        """Of (m, 3) distances [m]."""
-        distances_mm = 1e3 * np.linalg.norm(away, axis=1)
+    def of(cls, differences: FloatArray) -> "LeftBehind":
+        """Statistics of (m, 3) flange differences [m]."""
+        distances_mm = 1e3 * np.linalg.norm(differences, axis=1)
         return cls(float(np.sqrt(np.mean(distances_mm**2))), float(distances_mm.max()))
 
     def __str__(self) -> str:
@@ -52,13 +52,13 @@ class LeftBehind:
 
 @dataclass(frozen=True, eq=False)
 class FittedLinks:
-    """Links and offsets that leave the least of what a file cannot hold of an arm.
+    """Constant links and offsets fitted to an arm that a format cannot fully hold.
 
     Attributes:
-        robot: The arm of these, with the functions that go with them.
-        measured: What it leaves over the ranges in which joints stood at the stops; None where
-            these are not known.
-        workspace: The same all over the workspace.
+        robot: The arm with these links, and with the functions that the format holds.
+        measured: Remaining error over the joint ranges of the stops; None where these are not
+            known.
+        workspace: Remaining error over the workspace.
     """
 
     robot: Robot
@@ -67,7 +67,7 @@ class FittedLinks:
 
     @property
     def words(self) -> str:
-        """What it leaves behind."""
+        """The remaining error in words."""
         if self.measured is None:
             return f"{self.workspace} over the workspace"
         return f"{self.measured} where the arm was measured, {self.workspace} over the workspace"
@@ -75,25 +75,21 @@ class FittedLinks:
 
 @dataclass(frozen=True, eq=False)
 class ArmContent:
-    """What a format of arms writes.
+    """Content for a format of arms.
 
     Attributes:
-        nominal: The arm as it was stated.
-        robot: The arm as it was calibrated.
         origin: Where the result comes from, in one line.
-        verdict: Whether it can be trusted.
-        sigma_mm: Predicted standard deviation of a tool's place over the workspace;
-            None where that is not known.
-        functions: Repeatable errors of its joints by their angles; None where none were found.
-        convention: In which form joints are tabulated, where that was said.
-        calibration_hash: What marks the arm for its driver, where that was said.
-        sag_mm: How far the flange of an arm whose joints bend stands off at the most under its own
-            weight [mm]; zero for a rigid one.
-        cold_c: Least and greatest temperature of its links [deg C], for one that drifts with it.
-        drift_mm: How far that moved its flange at the most, in one posture of the session [mm].
-        links: Links and offsets in which what a form cannot hold is as far as it can be; None where
-            it holds all, or the arm stands for itself.
-        with_corrections: Whether links and the table of joints' corrections go together.
+        sigma_mm: Predicted standard deviation of a tool's position over the workspace; None where
+            unknown.
+        functions: Repeatable errors of the joints by their angles; None where none were found.
+        calibration_hash: The hash by which the driver recognises the arm, if stated.
+        sag_mm: Largest deflection of the flange under the arm's own weight [mm]; zero for a rigid
+            arm.
+        cold_c: Least and greatest reference temperature of its links [deg C], for an arm that
+            drifts.
+        drift_mm: Largest drift of its flange with temperature, in one posture of the session [mm].
+        links: Fitted links, where the format cannot hold the whole arm; else None.
+        with_corrections: Whether the table of joint corrections is used with the links.
     """
 
     nominal: Robot
@@ -117,12 +113,12 @@ class ArmContent:
 
     @property
     def omitted(self) -> tuple[str, ...]:
-        """What no file holds of the arm, and what that costs."""
+        """Effects that no file holds, with their size."""
         return tuple(name for name in (self.sagging, self.drifting) if name)
 
     @property
     def sagging(self) -> str:
-        """What no file holds of an arm whose joints bend, and what that costs; else empty."""
+        """The bending that no file holds, with its size; empty for a rigid arm."""
         if not self.sag_mm or self.links is not None:
             return ""
         return (
@@ -133,7 +129,7 @@ class ArmContent:
 
     @property
     def drifting(self) -> str:
-        """What no file holds of an arm that drifts with its temperature; else empty."""
+        """The thermal drift that no file holds, with its size; empty where there is none."""
         if self.cold_c is None:
             return ""
         low, high = (f"{value:.0f}" for value in self.cold_c)
@@ -146,7 +142,7 @@ class ArmContent:
 
     @property
     def notes(self) -> list[str]:
-        """Lines for a comment: where it comes from, its quality, and what it goes with."""
+        """Comment lines: origin, quality, and what the arm belongs to."""
         quality = f"verdict {self.verdict.status}"
         if self.sigma_mm is not None:
             median, high = self.sigma_mm.median, self.sigma_mm.p95
@@ -161,14 +157,14 @@ class ArmContent:
 
     @property
     def nominal_table(self) -> DHTable:
-        """The nominal arm as a table, whose choices a table of the calibrated one keeps."""
+        """Joint table of the nominal arm, whose free choices that of the calibrated arm keeps."""
         if "convention" in self.nominal.document:
             return table_from_document(self.nominal.document)
         return table_of(self.nominal, "standard")
 
     @property
     def table(self) -> DHTable:
-        """The calibrated arm as a table; where nothing was said, in a form that has no leaps."""
+        """Joint table of the calibrated arm; the default form has no parallel-axis singularity."""
         nominal, form = self.nominal_table, self.convention
         if form is None:
             form = "hayati" if parallel_axes(self.nominal).any() else nominal.convention
@@ -176,23 +172,23 @@ class ArmContent:
 
     @property
     def left_out(self) -> str:
-        """What links and offsets alone leave out, and what that costs; empty for nothing."""
-        bending = ("its joints bend under its own weight, and under a load",) if self.sag_mm else ()
-        missing = (*unwritten(self.robot), *bending)
+        """What links and offsets alone leave out, with the resulting error; empty for nothing."""
+        sag = ("its joints bend under its own weight, and under a load",) if self.sag_mm else ()
+        missing = (*unwritten(self.robot), *sag)
         if not missing:
             return ""
-        said = f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. "
+        text = f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. "
         if not self.with_corrections:
-            said += "Its links and offsets are those that leave the least of that"
-            return said if self.links is None else f"{said}: {self.links.words}"
+            text += "Its links and offsets are those that leave the least of that"
+            return text if self.links is None else f"{text}: {self.links.words}"
         return (
-            f"{said}The table of joint-corrections goes with it: a reader without that is off by "
+            f"{text}The table of joint-corrections goes with it: a reader without that is off by "
             f"up to {omission_mm(self.written):.2g} mm{self.still_bent}"
         )
 
     @property
     def still_bent(self) -> str:
-        """What links and the table of joints' corrections together leave of an arm that bends."""
+        """What links and joint corrections together leave of an arm that bends."""
         if self.links is None:
             return ""
         return (
@@ -203,32 +199,26 @@ class ArmContent:
 
 @dataclass(frozen=True)
 class ArmFormat(Format[ArmContent]):
-    """A form in which others read an arm.
+    """A foreign format of arms.
 
     Attributes:
-        holds: All that was found; links and offsets alone; or joints' functions beside such links.
+        holds: Everything; links and offsets only; or joint functions for use with such links.
     """
 
     holds: Literal["all", "links", "functions"] = "all"
 
 
 def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmContent:
-    """Picks the arm that is to be exported.
-
-    Args:
-        source: A calibration.
-        selection: What is asked for.
-        form: The format that is to hold it.
+    """Selects the arm to export.
 
     Raises:
-        DataError: The source has no calibrated arm, or something was said for which the format
-            has no use.
+        DataError: The source has no calibrated arm, or an option does not apply to the format.
     """
     form.check(selection)
     nominal = source.robot if isinstance(source, Calibration) else None
     arm = source.arm if isinstance(source, Calibration) else None
     if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
-        raise _without_arm(source, form)
+        raise _no_arm_error(source, form)
     if form.holds == "functions" and not unwritten(arm.robot):
         raise DataError(
             f"--to {form.name}: nothing was found of this arm's joints that is a function of "
@@ -237,10 +227,12 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
             next_step="--to robot-urdf and --to robot-dh hold all of its links and offsets.",
         )
     sag_mm = _sag_mm(source)
-    together = form.holds == "functions" or selection.with_corrections
-    robot = arm.robot if together else without_functions(arm.robot)
-    loses = sag_mm > 0.0 or (not together and bool(unwritten(arm.robot)))
-    links = _fitted(source, robot, arm.measured) if form.holds != "all" and loses else None
+    with_functions = form.holds == "functions" or selection.with_corrections
+    robot = arm.robot if with_functions else without_functions(arm.robot)
+    loses = sag_mm > 0.0 or (not with_functions and bool(unwritten(arm.robot)))
+    links = (
+        _fit_constant_links(source, robot, arm.measured) if form.holds != "all" and loses else None
+    )
     return ArmContent(
         nominal,
         arm.robot,
@@ -253,44 +245,46 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
         sag_mm,
         *_drift(source),
         links,
-        together,
+        with_functions,
     )
 
 
-def _fitted(calibration: Calibration, robot: Robot, measured: Sequence[JointRange]) -> FittedLinks:
-    """Fits links to where the calibrated arm stands, where it was measured and all over."""
-    drawn = [(postures(robot, 2 * _FITTED), _ELSEWHERE)]
+def _fit_constant_links(
+    calibration: Calibration, robot: Robot, measured: Sequence[JointRange]
+) -> FittedLinks:
+    """Fits constant links to the calibrated arm, over its measured ranges and the workspace."""
+    samples = [(postures(robot, 2 * _FITTED), _WORKSPACE_WEIGHT)]
     if measured:
         lower, upper = np.array([(joint.lower, joint.upper) for joint in measured]).T
         rng = np.random.default_rng(0)
-        drawn = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *drawn]
-    # One half is fitted, the other one shows what that leaves.
-    q = np.concatenate([array[::2] for array, _ in drawn])
+        samples = [(rng.uniform(lower, upper, (2 * _FITTED, len(lower))), 1.0), *samples]
+    # Half of the postures are fitted, the other half measures the remaining error.
+    q = np.concatenate([angles[::2] for angles, _ in samples])
     weights = np.concatenate(
-        [np.full(len(array[::2]), share / len(array)) for array, share in drawn]
+        [np.full(len(angles[::2]), weight / len(angles)) for angles, weight in samples]
     )
-    found = fit_links(robot, q, calibration.standing(q), weights)
-    left = [
+    fitted = fit_links(robot, q, calibration.standing(q), weights)
+    errors = [
         LeftBehind.of(
-            (calibration.standing(array[1::2]) - found.base_from_flange(array[1::2]))[:, :3, 3]
+            (calibration.standing(angles[1::2]) - fitted.base_from_flange(angles[1::2]))[:, :3, 3]
         )
-        for array, _ in drawn
+        for angles, _ in samples
     ]
-    return FittedLinks(found, left[0] if measured else None, left[-1])
+    return FittedLinks(fitted, errors[0] if measured else None, errors[-1])
 
 
 def _sag_mm(calibration: Calibration) -> float:
-    """How far the flange stands off under its own weight at worst, over the workspace [mm]."""
+    """Largest deflection of the flange under the arm's own weight, over the workspace [mm]."""
     arm = calibration.calibrated_robot
     if arm is None or calibration.elastic is None:
         return 0.0
     q = postures(arm)
-    away = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
-    return 1e3 * float(np.linalg.norm(away, axis=1).max())
+    deflections = calibration.standing(q)[:, :3, 3] - arm.base_from_flange(q)[:, :3, 3]
+    return 1e3 * float(np.linalg.norm(deflections, axis=1).max())
 
 
 def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]:
-    """Temperatures of the links to which the arm belongs, and how far it drifted from that [mm]."""
+    """Reference temperatures of the links [deg C], and the largest drift from there [mm]."""
     if calibration.thermal is None:
         return None, 0.0
     model = calibration.drift
@@ -299,13 +293,13 @@ def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]
 
 
 def omission_mm(robot: Robot) -> float:
-    """How far the flange is off at worst without gear ratios, eccentricity and harmonics [mm].
+    """Largest flange error without gear ratios, eccentricity and harmonics [mm].
 
     Over random postures within the joints' limits, at most a turn from zero.
     """
     q = postures(robot, _POSTURES)
-    away = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
-    return LeftBehind.of(away[:, :3, 3]).most_mm
+    differences = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
+    return LeftBehind.of(differences[:, :3, 3]).most_mm
 
 
 def _convention(name: str) -> Convention:
@@ -317,8 +311,8 @@ def _convention(name: str) -> Convention:
     )
 
 
-def _without_arm(source: Source, form: ArmFormat) -> DataError:
-    """Says why there is no calibrated arm, and how to get one."""
+def _no_arm_error(source: Source, form: ArmFormat) -> DataError:
+    """Error of a source without a calibrated arm, with the remedy."""
     if not isinstance(source, Calibration):
         why, step = "a file of frames has none", "Name the calibration instead"
     elif source.arm is not None:

@@ -1,6 +1,6 @@
-"""A calibrated arm as a file: URDF, joint table, UR's kinematics, a chain, joints' corrections.
+"""Files of a calibrated arm: URDF, joint table, UR's kinematics, chain, joint corrections.
 
-An arm whose dynamics were identified is a URDF, or a chain for a session.
+An arm with identified dynamics is written as a URDF, or as a chain for a session.
 """
 
 import numpy as np
@@ -26,14 +26,14 @@ from visioncal.robot import (
     without_functions,
 )
 
-# Such a way along an axis is no part of an arm: it leads to the common normal of two axes that are
-# nearly parallel [m].
+# A longer offset along an axis is an artefact of nearly parallel axes, whose common normal is far
+# away [m].
 _FAR_M = 10.0
-# A flange is in its place within this, which no tool is mounted to [mm, deg].
-_EXACT = 1e-4
-# Joints without limits have corrections so far either way [deg].
+# Tolerance of the flange's pose, below which no note is needed [mm, deg].
+_TOLERANCE = 1e-4
+# Range of corrections for joints without limits [deg].
 _WIDEST_DEG = 360.0
-# What stands in a file for an arm whose hash is not known: no controller has it.
+# Placeholder for an unknown hash, which no controller has.
 _NO_HASH = "calib_visioncal"
 
 
@@ -48,19 +48,19 @@ def _write_urdf(content: ArmContent) -> str:
 
 
 def _warn_urdf(content: ArmContent) -> tuple[str, ...]:
-    said = _left_out(content)
+    warnings = _warn_left_out(content)
     if "urdf" not in content.nominal.document:
-        return said
+        return warnings
     tip = corrected_tip(content.nominal, content.written)
     if tip != content.robot.tip:
-        said += (
+        warnings += (
             f"no fixed joint places {content.robot.tip}, so that the calibrated one is a link of "
             f"its own in the file: {tip}. Poses are of that.",
         )
-    return said
+    return warnings
 
 
-def _far(table: DHTable) -> tuple[str, ...]:
+def _warn_far(table: DHTable) -> tuple[str, ...]:
     far = int(np.argmax(np.abs(table.d_m)))
     if abs(table.d_m[far]) < _FAR_M:
         return ()
@@ -81,26 +81,24 @@ def _write_ur(content: ArmContent) -> str:
 
 
 def _warn_ur(content: ArmContent) -> tuple[str, ...]:
-    said = _left_out(content)
-    away = log(ur_flange(content.written, content.nominal_table))
-    turned, moved = np.rad2deg(np.linalg.norm(away[:3])), 1e3 * np.linalg.norm(away[3:])
-    if max(turned, moved) > _EXACT:
-        said += (
+    warnings = _warn_left_out(content)
+    difference = log(ur_flange(content.written, content.nominal_table))
+    turned, moved = (
+        np.rad2deg(np.linalg.norm(difference[:3])),
+        1e3 * np.linalg.norm(difference[3:]),
+    )
+    if max(turned, moved) > _TOLERANCE:
+        warnings += (
             f"the flange lies {moved:.2g} mm and {turned:.2g} deg from wrist_3, which has no field "
             "for that: a comment in the file has its pose. What sits on the flange goes behind it.",
         )
     if content.calibration_hash is None:
-        said += (
+        warnings += (
             f"its hash is {_NO_HASH!r}, which no controller has: the driver will report that the "
             "calibration does not match, and go on. Give the one that ur_calibration extracts with "
             "--hash.",
         )
-    return said
-
-
-def _write_chain(content: ArmContent) -> str:
-    document = {**content.robot.document, "source": "; ".join(content.notes)}
-    return json_text(document)
+    return warnings
 
 
 def _write_corrections(content: ArmContent) -> str:
@@ -113,17 +111,17 @@ def _write_corrections(content: ArmContent) -> str:
             continue
         degrees = _degrees(robot, at)
         angles = np.repeat(np.deg2rad(degrees)[:, None], robot.joint_count, axis=1)
-        # The joint as links alone have it: with its offset, and of ratio 1.
+        # The joint with its links alone: with its offset, and a ratio of 1.
         sent = robot.chain.encoded(robot.chain.functions[:, 0] + angles)
         corrections = np.rad2deg(sent - angles)[:, at]
         sigmas = _sigmas_deg(content, at, degrees)
         rows = zip(degrees.tolist(), corrections.tolist(), sigmas, strict=True)
-        lines += [f"{joint},{angle},{more:.6f},{sigma}" for angle, more, sigma in rows]
+        lines += [f"{joint},{angle},{correction:.6f},{sigma}" for angle, correction, sigma in rows]
     return "\n".join([*lines, ""])
 
 
 def _degrees(robot: Robot, joint: int) -> IntArray:
-    """Angles of a joint's corrections: a turn, or all its range where gears err turn after turn."""
+    """Angles of a joint's corrections [deg]: one turn, or its range if its gear ratio is not 1."""
     if robot.chain.functions[joint, 1] == 1.0:
         return np.arange(-180, 180)
     limits = np.rad2deg([robot.lower_rad[joint], robot.upper_rad[joint]])
@@ -132,12 +130,14 @@ def _degrees(robot: Robot, joint: int) -> IntArray:
 
 
 def _sigmas_deg(content: ArmContent, joint: int, degrees: IntArray) -> list[str]:
-    """What corrections of a joint are known to; nothing where that is not known."""
+    """Standard deviations of a joint's corrections; empty cells where unknown."""
     if content.functions is None:
         return [""] * len(degrees)
-    known = np.rad2deg(1e-3 * np.array(content.functions.joints[joint].sigma_mrad))
-    nodes = np.linspace(-180.0, 180.0, len(known), endpoint=False)
-    return [f"{value:.6f}" for value in np.interp(degrees, nodes, known, period=360.0).tolist()]
+    sigmas_deg = np.rad2deg(1e-3 * np.array(content.functions.joints[joint].sigma_mrad))
+    nodes = np.linspace(-180.0, 180.0, len(sigmas_deg), endpoint=False)
+    return [
+        f"{value:.6f}" for value in np.interp(degrees, nodes, sigmas_deg, period=360.0).tolist()
+    ]
 
 
 def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
@@ -150,7 +150,7 @@ def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
     )
 
 
-def _left_out(content: ArmContent) -> tuple[str, ...]:
+def _warn_left_out(content: ArmContent) -> tuple[str, ...]:
     return (f"{content.left_out}.",) if content.left_out else ()
 
 
@@ -167,7 +167,7 @@ ROBOT_DH = ArmFormat(
     "the calibrated arm as a DH table (.toml), --convention standard, modified or hayati [m, rad]",
     lambda content: table_toml(content.table, "visioncal", _notes(content)),
     takes=frozenset({"convention", "with-corrections"}),
-    warn=lambda content: (*_left_out(content), *_far(content.table)),
+    warn=lambda content: (*_warn_left_out(content), *_warn_far(content.table)),
     holds="links",
 )
 UR_KINEMATICS = ArmFormat(
@@ -181,7 +181,7 @@ UR_KINEMATICS = ArmFormat(
 ROBOT_JSON = ArmFormat(
     "robot-json",
     "the calibrated arm with all that was found: 4x4 placements, axes, joints' functions [m, rad]",
-    _write_chain,
+    lambda content: json_text({**content.robot.document, "source": "; ".join(content.notes)}),
 )
 
 JOINT_CORRECTIONS = ArmFormat(
@@ -196,22 +196,22 @@ ARMS = (ROBOT_URDF, ROBOT_DH, UR_KINEMATICS, ROBOT_JSON, JOINT_CORRECTIONS)
 
 
 def write_dynamics(identified: Identified, to: str, selection: Selection) -> str:
-    """Writes an arm with the inertias of its links that were identified, as bodies.
+    """Writes an arm with the identified inertias of its links.
 
     Args:
         identified: The result.
-        to: `robot-urdf`: the URDF that it was described by, or a small one; `robot-json`: a chain,
-            which a session may name as its robot.
-        selection: What is asked for beside; there is nothing to choose.
+        to: `robot-urdf`: its own URDF, or a small one; `robot-json`: a chain, which a session may
+            name as its robot.
+        selection: The user's selection, which must be empty.
 
     Returns:
         The text.
 
     Raises:
-        DataError: The format holds no inertias, something was said for which it has no use, or no
-            inertias were identified.
+        DataError: The format holds no inertias, an option does not apply to it, or no inertias were
+            identified.
     """
-    form = _of_inertias(to)
+    form = _inertia_format(to)
     form.check(selection)
     arm = ArmDynamics.of(identified)
     session = identified.facts["session"]["name"]
@@ -224,13 +224,13 @@ def write_dynamics(identified: Identified, to: str, selection: Selection) -> str
     return small_urdf(arm.weighed(), notes)
 
 
-def _of_inertias(name: str) -> ArmFormat:
-    known = {arm_format.name: arm_format for arm_format in (ROBOT_URDF, ROBOT_JSON)}
-    if name in known:
-        return known[name]
+def _inertia_format(name: str) -> ArmFormat:
+    by_name = {arm_format.name: arm_format for arm_format in (ROBOT_URDF, ROBOT_JSON)}
+    if name in by_name:
+        return by_name[name]
     raise DataError(
         f"Identified dynamics are inertias of an arm's links, which {name} does not hold; "
-        f"{' and '.join(known)} do.",
+        f"{' and '.join(by_name)} do.",
         culprits=[name],
         next_step=f"visioncal export DYNAMICS --to {ROBOT_URDF.name}",
     )

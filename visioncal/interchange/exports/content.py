@@ -1,4 +1,4 @@
-"""What is asked for of a result, what a format is, and what it then writes."""
+"""Selection of what to export, formats, and the content that they write."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,10 +15,10 @@ from visioncal.results import CameraResult, Edge, Verdict
 from visioncal.results.lens import RefittedLens, refitted
 
 _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
-# Any transform; the camera's alone, in its own direction; the lens alone; where something sits on
-# the flange; or where something stands in the base.
+# Any transform; the camera's own, not inverted; the lens only; a pose on the flange; or one in the
+# base.
 Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
-# What of a selection formats have a use for, by its options: of transforms, and of some forms.
+# Options that apply to formats: to all of transforms, and to some formats.
 OfTransforms: TypeAlias = Literal["edge", "inverse", "parent", "child"]
 Takes: TypeAlias = (
     OfTransforms | Literal["number", "load", "convention", "hash", "onto", "with-corrections"]
@@ -29,11 +29,10 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Load:
-    """What a tool weighs, which no calibration determines.
+    """A tool's load, which no calibration determines.
 
     Attributes:
-        mass_kg: Its mass.
-        centre_mm: Where its centre of mass is in the flange's frame.
+        centre_mm: Its centre of mass in the flange's frame.
     """
 
     mass_kg: float
@@ -42,23 +41,20 @@ class Load:
 
 @dataclass(frozen=True)
 class Selection:
-    """What to export; what is None is left to the format.
+    """What to export; None leaves the choice to the format.
 
     Attributes:
         edge: A transform by name; None for the camera's, or in a format of tools or fixtures for
             the only one of its kind.
-        inverse: Whether its inverse is wanted.
-        parent: What to call the frame in which the pose is given.
-        child: What to call the frame whose pose it is; the camera, in a format of lenses.
-        number: Which of the controller's tools or bases it becomes.
-        load: What the tool weighs.
-        convention: In which form the joints of an arm are tabulated.
+        parent: Exported name of the frame in which the pose is given.
+        child: Exported name of the frame whose pose it is; the camera, in a format of lenses.
+        number: Number of the controller's tool or base.
         calibration_hash: The `hash` of a UR's own kinematics.
-        onto: The document of the reader's own that is to be written onto.
-        camera: Which camera of a whole cell is meant, in a format of lenses.
-        robot: Which robot of a whole cell: its part of it is exported as of one camera and robot.
-        target: Which target of a whole cell; likewise.
-        with_corrections: Whether the table of joints' corrections goes with the arm.
+        onto: An existing document that is to be updated.
+        camera: Which camera of a cell is meant, in a format of lenses.
+        robot: Which robot of a cell: its part is exported as of one camera and robot.
+        target: Which target of a cell; likewise.
+        with_corrections: Whether the table of joint corrections is used with the arm.
     """
 
     edge: str | None = None
@@ -77,7 +73,7 @@ class Selection:
 
     @property
     def said(self) -> tuple[Takes, ...]:
-        """What was asked for beside which camera, robot and target are meant."""
+        """The given options, other than the choice of camera, robot and target."""
         options: Mapping[Takes, object] = {
             "edge": self.edge,
             "inverse": self.inverse,
@@ -95,23 +91,18 @@ class Selection:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What a format writes.
+    """Content for a format of transforms or lenses.
 
     Attributes:
-        name: Which transform of the result it is.
+        name: Name of the transform in the result.
         edge: `parent_from_child`: its translation and rotation are the child's pose in the parent.
-        parent: Name of the parent's frame, as its readers know it.
-        child: Name of the child's frame likewise.
+        parent: Exported name of the parent frame.
+        child: Exported name of the child frame.
         frames: Our own names of parent and child.
-        mount: How the camera is mounted; None for a frame that belongs to no calibration.
         lens: The camera, where there is one.
         origin: Where the result comes from, in one line.
-        verdict: Whether it can be trusted.
-        rotation_of: Our name of the frame whose rotation was taken over unmeasured; None where
-            the rotation was measured.
-        number: Which of the controller's tools or bases it becomes, where that was said.
-        load: What the tool weighs, where that was said.
-        onto: The document that is to be written onto, where there is one.
+        rotation_of: Our name of the frame whose rotation was copied; None where it was measured.
+        onto: The existing document to update, where there is one.
     """
 
     name: str
@@ -135,12 +126,12 @@ class Content:
 
     @cached_property
     def plain_lens(self) -> RefittedLens | None:
-        """The lens as matrix and coefficients say it; None where there is no camera."""
+        """The lens refitted without its field; None where there is no camera."""
         return None if self.lens is None else refitted(self.lens)
 
     @property
     def left_of_field(self) -> str:
-        """What matrix and coefficients leave of what the lens does beyond them; else empty."""
+        """Remaining error of the refitted lens, in words; empty where the lens has no field."""
         lens = self.plain_lens
         if lens is None or lens.rms_px == 0.0:
             return ""
@@ -161,26 +152,26 @@ class Content:
 
     @property
     def direction(self) -> str:
-        """What the transform does, in one line."""
+        """The meaning of the transform, in one line."""
         return f"{self.name}, the pose of {self.child} in {self.parent}: p_parent = R p_child + t"
 
     @property
     def notes(self) -> list[str]:
-        """Lines for a comment: where it comes from, its quality, and what it does."""
+        """Comment lines: origin, quality, and the meaning of the transform."""
         is_of_lens = self.lens is not None and any(frame.startswith("cam") for frame in self.frames)
         return [self.origin, self.quality, self.direction, *([_OF_LENS] if is_of_lens else [])]
 
 
 @dataclass(frozen=True)
 class Format(Generic[_T]):
-    """A form in which others read a result.
+    """A foreign format of a result.
 
     Attributes:
-        name: As the command line has it.
-        words: What it is and who reads it, with its units, in one line.
+        name: Its name on the command line.
+        words: Its description with its reader and units, in one line.
         write: Builds the document.
-        takes: What of a selection it has a use for; see `check`.
-        warn: What its user should know or do before the document serves, in sentences.
+        takes: Options that apply to it; see `check`.
+        warn: What its user should know or do before using the document, in sentences.
     """
 
     name: str
@@ -190,14 +181,14 @@ class Format(Generic[_T]):
     warn: Callable[[_T], Iterable[str]] = field(default=lambda _: ())
 
     def check(self, selection: Selection, also: Collection[str] = ()) -> None:
-        """Refuses what it has no place for.
+        """Refuses options that do not apply to the format.
 
         Args:
-            selection: What is asked for.
-            also: What it has a use for beside what it takes.
+            selection: The user's selection.
+            also: Options that apply beside `takes`.
 
         Raises:
-            DataError: Something of the kind was said.
+            DataError: An option does not apply.
         """
         unused = [name for name in selection.said if name not in (*self.takes, *also)]
         if unused:
@@ -211,12 +202,11 @@ class Format(Generic[_T]):
 
 @dataclass(frozen=True)
 class ExportFormat(Format[Content]):
-    """A form in which others read a transform or a lens.
+    """A foreign format of a transform or a lens.
 
     Attributes:
-        holds: What of a result it can hold.
-        frames: What its readers call our frames; ours keep their names where it says nothing.
-        counterpart: The maker's format of fixtures, for one of tools; and the other way round.
+        frames: Its names of our frames; a frame that is missing keeps our name.
+        counterpart: The maker's format of fixtures, for one of tools; and vice versa.
         write_all: Builds the document of all transforms of a cell; None where it holds one.
     """
 
@@ -227,13 +217,13 @@ class ExportFormat(Format[Content]):
 
 
 def numbers(values: FloatArray) -> list[float]:
-    """Turns an array into plain floats, whose text reads back as the same doubles."""
-    # A negative zero would only raise questions.
+    """Converts an array to plain floats, whose text reads back as the same doubles."""
+    # Negative zeros are written as zero.
     return [float(value) + 0.0 for value in values.ravel()]
 
 
 def rows(matrix: FloatArray) -> list[list[float]]:
-    """Turns (n, m) numbers into n lists of plain floats."""
+    """Converts (n, m) numbers to n lists of plain floats."""
     return [numbers(row) for row in matrix]
 
 

@@ -1,7 +1,7 @@
 """Tools and fixtures in the languages of UR's, ABB's and KUKA's controllers.
 
-All take a tool in the flange's own frame and a fixture in the robot's base: the frames of the
-poses that were reported while no tool and no base were active.
+All take a tool in the flange's frame and a fixture in the robot's base: the frames of poses that
+are reported with no active tool or base.
 """
 
 import re
@@ -17,20 +17,19 @@ from visioncal.interchange.exports.content import Content, ExportFormat, comment
 from visioncal.interchange.exports.robots import abb_pose, kuka_frame, pose_texts, ur_pose
 
 _NO_POSE = "[[0,0,0],[1,0,0,0]]"
-# What a FlexPendant writes into a new tool whose load is still to be given.
+# A FlexPendant writes this mass into a new tool whose load is still to be given.
 _NO_LOAD = "[-1,[0,0,0],[1,0,0,0],0,0,0]"
 
 
 @dataclass(frozen=True)
 class Language:
-    """What a language takes for the name of a variable.
+    """Rules of a language for variable names.
 
     Attributes:
-        name: The language's name.
-        shape: What a name looks like.
+        shape: Pattern of a valid name.
         needed: The same in words.
-        taken: Names that it keeps for itself; in small letters where capitals are alike.
-        cased: Whether it distinguishes capitals from small letters.
+        taken: Reserved words; lower case where the language ignores case.
+        cased: Whether it distinguishes upper and lower case.
     """
 
     name: str
@@ -51,7 +50,7 @@ _URSCRIPT_WORDS = """
     and break continue def elif else end enter_critical exit_critical False global halt if in join
     kill local not or pause return run sec struct thread True while xor
 """
-# ABB, "RAPID kernel", lexical elements: identifiers of up to 32 characters, capitals alike, and the
+# ABB, "RAPID kernel", lexical elements: identifiers of up to 32 characters, case ignored, and the
 # reserved words. tool0, wobj0 and load0 are the system's own and cannot be changed.
 RAPID = Language(
     "RAPID",
@@ -61,7 +60,7 @@ RAPID = Language(
     cased=False,
 )
 # Universal Robots, script manual, "Numbers, Variables, and Types", "Flow of Control", "Threads" and
-# "Secondary Programs": the words that these are written with.
+# "Secondary Programs": the keywords.
 URSCRIPT = Language(
     "URScript",
     re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII),
@@ -72,7 +71,7 @@ URSCRIPT = Language(
 
 
 def _check_identifier(name: str, language: Language) -> str:
-    """Gives back a name that the language takes for a variable's."""
+    """Returns a name after checking that it is valid for a variable."""
     compared = name if language.cased else name.lower()
     if not language.shape.fullmatch(name):
         wrong = f"{language.needed}, are needed"
@@ -89,14 +88,14 @@ def _check_identifier(name: str, language: Language) -> str:
 
 def _write_ur_tcp(content: Content) -> str:
     """Writes a call of URScript's set_tcp (script manual, module internals, `set_tcp`)."""
-    # Without the name that newer controllers take, so that older ones read it, too.
+    # Without the name argument of newer controllers, so that older ones read it, too.
     pose = ur_pose(pose_texts(content.matrix, POSE_FORMS["ur"]))
     return comments("#", content.notes) + f"set_tcp({pose})\n"
 
 
 def _write_ur_feature(content: Content) -> str:
-    """Writes a pose into a variable, as a program uses it with pose_trans."""
-    # PolyScope's features are entered by hand; its programs move in a variable of type pose as in a
+    """Writes a pose into a variable, for use with pose_trans."""
+    # PolyScope's features are entered by hand; programs can use a variable of type pose like a
     # feature (script manual, "Numbers, Variables, and Types" and "Scoping rules").
     name = _check_identifier(content.child, URSCRIPT)
     pose = ur_pose(pose_texts(content.matrix, POSE_FORMS["ur"]))
@@ -106,8 +105,8 @@ def _write_ur_feature(content: Content) -> str:
 def _write_abb_tool(content: Content) -> str:
     """Writes RAPID's `tooldata`: robhold, tframe, tload (RAPID reference, data types, `tooldata`).
 
-    `loaddata`'s centre of mass is in the flange's frame [mm]; axes and moments of inertia are
-    left at those of a point.
+    `loaddata`'s centre of mass is in the flange's frame [mm]; its axes and moments of inertia are
+    those of a point mass.
     """
     name = _check_identifier(content.child, RAPID)
     pose = abb_pose(pose_texts(content.matrix, POSE_FORMS["abb"]))
@@ -130,8 +129,8 @@ def _warn_of_load(content: Content) -> Iterator[str]:
 
 def _write_abb_wobj(content: Content) -> str:
     """Writes RAPID's `wobjdata` with the fixture as its user frame."""
-    # robhold, ufprog, ufmec, uframe, oframe (RAPID reference, data types, `wobjdata`): a fixed
-    # frame, and the object's own at its origin.
+    # robhold, ufprog, ufmec, uframe, oframe (RAPID reference, data types, `wobjdata`): a fixed user
+    # frame, with the object frame at its origin.
     name = _check_identifier(content.child, RAPID)
     pose = abb_pose(pose_texts(content.matrix, POSE_FORMS["abb"]))
     notes = comments("!", content.notes)
@@ -139,7 +138,7 @@ def _write_abb_wobj(content: Content) -> str:
 
 
 def _write_kuka(what: Literal["TOOL", "BASE"], content: Content) -> str:
-    """Writes an entry of $CONFIG.DAT, or the frame that is active (KUKA, system variables)."""
+    """Writes an entry of $CONFIG.DAT, or the active frame (KUKA, system variables)."""
     frame = kuka_frame(pose_texts(content.matrix, POSE_FORMS["kuka"]))
     name = f"${what}" if content.number is None else f"{what}_DATA[{content.number}]"
     return f"{comments(';', content.notes)}{name}={frame}\n"

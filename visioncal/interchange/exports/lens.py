@@ -1,4 +1,4 @@
-"""The lens alone: ROS's camera_info, Kalibr's camera chain, the calibration of a Luxonis OAK."""
+"""Lens formats: ROS's camera_info, Kalibr's camera chain, the calibration of a Luxonis OAK."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,7 @@ from visioncal.live.drivers.oak_calibration import calibration_json
 from visioncal.vision.camera import matrix_3x3
 
 _CAMERA = {"cam": "camera"}
-# By the number of coefficients: OpenCV's five, eight, and the fisheye's four.
+# By number of coefficients: OpenCV's five, eight, and the fisheye's four.
 _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
 
 
@@ -48,7 +48,7 @@ OAK = ExportFormat(
 
 
 def camera_of(content: Content) -> Camera:
-    """Gives the camera, whose lens is one of `_ROS_MODELS`, with its field in its coefficients.
+    """The camera with its field refitted into its coefficients; its lens is one of `_ROS_MODELS`.
 
     Raises:
         DataError: There is none, or it has another number of coefficients.
@@ -72,12 +72,12 @@ def camera_of(content: Content) -> Camera:
 def _notes(content: Content) -> list[str]:
     estimated = content.lens is not None and content.lens.estimated
     how = "estimated from the session's images" if estimated else "as the session gave it"
-    said = [content.left_of_field] if content.left_of_field else []
-    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *said]
+    field_notes = [content.left_of_field] if content.left_of_field else []
+    return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *field_notes]
 
 
 def warn_of_field(content: Content) -> Iterator[str]:
-    """Says what coefficients leave of the lens's field."""
+    """Warns of the remaining error of a lens with a field."""
     if content.left_of_field:
         yield f"{content.left_of_field}."
 
@@ -107,8 +107,7 @@ def _write_camera_info(content: Content) -> str:
 
 def _write_kalibr(content: Content) -> str:
     """Writes a camchain.yaml (Kalibr's wiki, "Yaml formats") of one camera."""
-    # Without `T_cam_imu`, which carries points of an inertial sensor into the camera: none was
-    # calibrated.
+    # Without `T_cam_imu`, from an inertial sensor to the camera: none was calibrated.
     camera = camera_of(content)
     coefficients = numbers(camera.distortion)
     if camera.model == "brown":
@@ -127,7 +126,7 @@ def _write_kalibr(content: Content) -> str:
 
 
 def _radtan(coefficients: list[float]) -> list[float]:
-    """Takes k1, k2, p1, p2 of coefficients whose others are all zero."""
+    """The coefficients k1, k2, p1, p2, where all others are zero."""
     beyond = [coefficient for coefficient in coefficients[4:] if coefficient != 0.0]
     if not beyond:
         return coefficients[:4]

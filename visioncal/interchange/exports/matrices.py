@@ -16,8 +16,8 @@ def _write_text(content: Content) -> str:
 
 
 def _write_opencv(content: Content) -> str:
-    """Writes a FileStorage of OpenCV, by OpenCV itself."""
-    # The lens goes under the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
+    """Writes OpenCV's FileStorage, by OpenCV itself."""
+    # The lens has the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     for line in (*content.notes, *([content.left_of_field] if content.left_of_field else [])):
         storage.writeComment(one_line(line), append=False)
@@ -37,9 +37,9 @@ def _write_opencv(content: Content) -> str:
 
 
 def _write_zivid(content: Content) -> str:
-    """Writes what Matrix4x4 of Zivid's SDK loads, in millimetres."""
+    """Writes the file that Matrix4x4 of Zivid's SDK loads, in millimetres."""
     # Fields as in zivid-python, Matrix4x4.save, and zivid-python-samples, save_load_matrix.py.
-    # Without a comment: the SDK has a reader of its own, which is not public.
+    # Without a comment, as the SDK's own parser is not public.
     matrix_mm: FloatArray = content.matrix.copy()
     matrix_mm[:3, 3] *= 1e3
     version = yaml_text({"__version__": {"serializer": 1, "data": 1}})

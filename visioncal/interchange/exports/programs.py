@@ -1,9 +1,9 @@
-"""Tools and fixtures for FANUC: an ASCII program (.LS) that sets UTOOL or UFRAME when it runs.
+"""FANUC tools and fixtures: an ASCII program (.LS) that sets UTOOL or UFRAME when it runs.
 
-A program cannot hold a frame as a constant. It keeps it as a position, and takes that through a
+A program cannot assign a constant frame. It stores it as a position, and copies that through a
 position register (FANUC operator's manual, "frame instructions": UTOOL[i]=PR[j], UFRAME[i]=PR[j]).
-The listing's layout is what a controller prints of such a program (CrossArm,
-docs/fanuc_ls_format.md and tests/fixtures/probes/maketp: loaded, run and printed by ROBOGUIDE).
+The listing's layout is that of a controller's own printout (CrossArm, docs/fanuc_ls_format.md and
+tests/fixtures/probes/maketp: loaded, run and printed by ROBOGUIDE).
 """
 
 from functools import partial
@@ -14,7 +14,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import fixed
 from visioncal.interchange.exports.content import Content, ExportFormat
 
-# The last position register of a controller as it is delivered.
+# The last position register of a controller in its delivered state.
 REGISTER = 100
 # A nanometre and 2e-8 rad. A controller prints three decimals, but loads more.
 _DECIMALS = 6
@@ -42,7 +42,7 @@ _ATTRIBUTES = (
 
 
 def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
-    """Writes the program; what it sets and what it overwrites stand in its remarks."""
+    """Writes the program; its remarks state what it sets and overwrites."""
     if content.number is None:
         raise DataError(
             f"fanuc-{what.lower()} sets {what}[n] of the controller, and n is not said.",
@@ -51,7 +51,7 @@ def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
     instructions = [
         *_remarks(content),
         f"!PR[{REGISTER}] is overwritten",
-        # A controller pads the first of them; the second it does not.
+        # A controller pads the first of them, but not the second.
         f"PR[{REGISTER}]=P[1]   ",
         f"{what}[{content.number}]=PR[{REGISTER}]",
     ]
@@ -69,7 +69,7 @@ def _write(what: Literal["UTOOL", "UFRAME"], content: Content) -> str:
 
 
 def _program_name(what: Literal["UTOOL", "UFRAME"], number: int) -> str:
-    """Names the program, which is its file's name, too: 8 characters are safe everywhere."""
+    """Name of the program and its file: 8 characters are safe everywhere."""
     return f"SET_{what[:2]}{number}"
 
 

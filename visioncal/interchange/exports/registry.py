@@ -1,4 +1,4 @@
-"""The formats that are known, and the way from a result to a document: what of it is meant."""
+"""All export formats, and the selection of content for them."""
 
 import re
 from dataclasses import dataclass, replace
@@ -58,18 +58,17 @@ EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     *ARMS,
 )
 _EVERYTHING = Selection()
-# In the place of a transform's name: all of a cell's.
+# In place of a transform's name: all transforms of a cell.
 _ALL = "all"
-# Such a name needs no quotes in YAML, XML, Python or a shell, and is no option of a command.
+# Such a name needs no quotes in YAML, XML, Python or a shell, and is no command option.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_/.\-]*", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Document:
-    """A result in somebody else's format.
+    """A result in a foreign format.
 
     Attributes:
-        text: The document.
         warnings: What its user should know before it is used, each in plain words.
     """
 
@@ -79,50 +78,51 @@ class Document:
 
 @typed
 def export(source: Source | Identified, to: str, selection: Selection = _EVERYTHING) -> str:
-    """Writes a result in somebody else's format.
+    """Writes a result in a foreign format.
 
     Args:
-        source: A calibration, frames alone, or an arm's identified dynamics.
+        source: A calibration, a file of frames, or an arm's identified dynamics.
         to: The name of a format among `EXPORT_FORMATS`.
-        selection: Which transform, in which direction, and what its frames are to be called; of
-            an arm, in which form.
+        selection: The transform, its direction and its frames' names; or the form of an arm.
 
     Returns:
         The document.
 
     Raises:
-        DataError: There is no such format, transform or calibrated arm, the format cannot hold
-            what is asked for, or a name cannot be written safely.
+        DataError: There is no such format, transform or calibrated arm, the format cannot hold the
+            selection, or a name cannot be written safely.
     """
     return document(source, to, selection).text
 
 
 def document(source: Source | Identified, to: str, selection: Selection = _EVERYTHING) -> Document:
-    """Writes a result as `export` does, with what is to be warned of.
+    """Writes a result as `export` does, together with its warnings.
 
     Raises:
-        DataError: As `export` has it.
+        DataError: As for `export`.
     """
     form = _find(to)
     if isinstance(source, Identified):
         return Document(write_dynamics(source, to, selection), ())
-    source, selection = _of_whole(source, selection, form)
+    source, selection = _robot_part(source, selection, form)
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
         omitted = tuple(f"{name}." for name in arm.omitted)
-        return Document(form.write(arm), (*_of_verdict(arm.verdict), *form.warn(arm), *omitted))
+        return Document(
+            form.write(arm), (*_verdict_warnings(arm.verdict), *form.warn(arm), *omitted)
+        )
     if selection.edge == _ALL:
         contents = _select_all(source, selection, form)
         written = "" if form.write_all is None else form.write_all(contents)
-        return Document(written, _of_verdict(contents[0].verdict))
+        return Document(written, _verdict_warnings(contents[0].verdict))
     content = select(source, selection, form)
-    return Document(form.write(content), (*_of_verdict(content.verdict), *form.warn(content)))
+    return Document(form.write(content), (*_verdict_warnings(content.verdict), *form.warn(content)))
 
 
-def _of_whole(
+def _robot_part(
     source: Source, selection: Selection, form: ExportFormat | ArmFormat
 ) -> tuple[Source, Selection]:
-    """Takes one robot's part out of a whole cell, where one is named or an arm is asked for."""
+    """Extracts one robot's part of a cell, where a robot is named or an arm is exported."""
     if not isinstance(source, Calibration) or source.cell is None:
         if selection.robot is not None or selection.target is not None:
             raise DataError(
@@ -134,14 +134,14 @@ def _of_whole(
     named = selection.robot is not None or selection.target is not None
     if not named and not isinstance(form, ArmFormat):
         return source, selection
-    of_arm = isinstance(form, ArmFormat) or form.holds in ("tool", "fixture")
-    needs = PARTS if selection.target is not None else ARM if of_arm else EYE
+    is_of_robot = isinstance(form, ArmFormat) or form.holds in ("tool", "fixture")
+    needs = PARTS if selection.target is not None else ARM if is_of_robot else EYE
     choice = Choice(selection.camera, selection.robot, selection.target)
-    chosen = source.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
-    return chosen, replace(selection, camera=None, robot=None, target=None)
+    part = source.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
+    return part, replace(selection, camera=None, robot=None, target=None)
 
 
-def _of_verdict(verdict: Verdict) -> tuple[str, ...]:
+def _verdict_warnings(verdict: Verdict) -> tuple[str, ...]:
     if verdict.status != "bad":
         return ()
     return (f"the verdict on this result is bad. {' '.join(verdict.reasons)}",)
@@ -160,53 +160,48 @@ def _find(name: str) -> ExportFormat | ArmFormat:
 
 
 def select(source: Source, selection: Selection, form: ExportFormat) -> Content:
-    """Picks what is to be exported.
-
-    Args:
-        source: A calibration, or frames alone.
-        selection: What is asked for.
-        form: The format that is to hold it.
+    """Selects the content to export.
 
     Raises:
-        DataError: There is no such transform, the format cannot hold what is asked for, or a
-            frame's name cannot be written safely.
+        DataError: There is no such transform, the format cannot hold the selection, or a frame's
+            name cannot be written safely.
     """
-    there = placements(source, selection.camera)
+    available = placements(source, selection.camera)
     _check_takes(form, selection)
-    _check_camera(form, selection, there)
-    return _content(form, selection, there, _named(form, selection, there))
+    _check_camera(form, selection, available)
+    return _content(form, selection, available, _transform_name(form, selection, available))
 
 
 def _select_all(source: Source, selection: Selection, form: ExportFormat) -> tuple[Content, ...]:
-    """Picks all transforms of an aligned cell, each frame's in that on which it hangs."""
-    there = placements(source, selection.camera)
+    """Selects all transforms of an aligned cell, each frame in its parent."""
+    available = placements(source, selection.camera)
     _check_takes(form, selection)
     why = ""
     if form.write_all is None:
         why = f"{form.name} holds one transform"
     elif selection.inverse or selection.parent is not None or selection.child is not None:
         why = "--inverse, --parent and --child are of one transform"
-    elif there.cell is None:
-        why = f"{there.words} is of no whole cell"
+    elif available.cell is None:
+        why = f"{available.words} is of no whole cell"
     if why:
         raise DataError(
             f"--edge all: {why}.",
             culprits=["--edge"],
-            next_step=f"Name one of {', '.join(there.by_name)}.",
+            next_step=f"Name one of {', '.join(available.by_name)}.",
         )
-    return tuple(_content(form, selection, there, name) for name in there.by_name)
+    return tuple(_content(form, selection, available, name) for name in available.by_name)
 
 
-def _content(form: ExportFormat, selection: Selection, there: Placements, name: str) -> Content:
-    placed, frames = there.find(name)
-    rotation_of = None if placed.oriented else placed.turned_as or frames[0]
-    edge = placed.edge
+def _content(form: ExportFormat, selection: Selection, available: Placements, name: str) -> Content:
+    placement, frames = available.find(name)
+    rotation_of = None if placement.oriented else placement.turned_as or frames[0]
+    edge = placement.edge
     if selection.inverse:
         edge, frames = _inverted(edge), (frames[1], frames[0])
         name = f"inverse of {name}"
     parent, child = (
-        _frame(form.frames.get(frame, frame) if chosen is None else chosen)
-        for frame, chosen in zip(frames, (selection.parent, selection.child), strict=True)
+        _checked_frame(form.frames.get(frame, frame) if given is None else given)
+        for frame, given in zip(frames, (selection.parent, selection.child), strict=True)
     )
     if parent == child:
         raise DataError(
@@ -220,10 +215,12 @@ def _content(form: ExportFormat, selection: Selection, there: Placements, name: 
         parent,
         child,
         frames,
-        there.mount,
-        there.lenses.get(frames[1], there.lens) if there.cell is not None else there.lens,
-        placed.origin,
-        placed.verdict,
+        available.mount,
+        available.lenses.get(frames[1], available.lens)
+        if available.cell is not None
+        else available.lens,
+        placement.origin,
+        placement.verdict,
         rotation_of,
         selection.number,
         selection.load,
@@ -231,22 +228,22 @@ def _content(form: ExportFormat, selection: Selection, there: Placements, name: 
     )
 
 
-def _named(form: ExportFormat, selection: Selection, there: Placements) -> str:
+def _transform_name(form: ExportFormat, selection: Selection, available: Placements) -> str:
     if form.holds == "tool" or form.holds == "fixture":
-        name = there.only(form.holds) if selection.edge is None else selection.edge
-        there.find(name)
+        name = available.only(form.holds) if selection.edge is None else selection.edge
+        available.find(name)
         _check_kind(form, form.holds, name, inverse=selection.inverse)
         return name
     if selection.edge is not None:
         return selection.edge
-    if form.holds == "lens" and there.cell is not None:
-        frame = next(name for name, lens in there.lenses.items() if lens is there.lens)
-        return f"{there.cell.tree.parents[frame]}_from_{frame}"
-    return there.default()
+    if form.holds == "lens" and available.cell is not None:
+        frame = next(name for name, lens in available.lenses.items() if lens is available.lens)
+        return f"{available.cell.tree.parents[frame]}_from_{frame}"
+    return available.default()
 
 
 def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> None:
-    """Refuses a tool as a fixture, a fixture as a tool, and anything upside down as either."""
+    """Refuses a tool as a fixture, a fixture as a tool, and the inverse of either."""
     if is_kind(name, kind) and not inverse:
         return
     wanted = "a tool, flange_from_*" if kind == "tool" else "a fixture, base_from_*"
@@ -258,11 +255,7 @@ def _check_kind(form: ExportFormat, kind: Kind, name: str, *, inverse: bool) -> 
     else:
         what = f"{name} has its parent in {ends_of(name)[0]}"
         step = "Choose a format of any poses for it, as --to ros"
-    raise DataError(
-        f"{form.name} writes {wanted}; {what}.",
-        culprits=[name],
-        next_step=f"{step}.",
-    )
+    raise DataError(f"{form.name} writes {wanted}; {what}.", culprits=[name], next_step=f"{step}.")
 
 
 def _check_takes(form: ExportFormat, selection: Selection) -> None:
@@ -282,23 +275,23 @@ def _check_takes(form: ExportFormat, selection: Selection) -> None:
         )
 
 
-def _check_camera(form: ExportFormat, selection: Selection, there: Placements) -> None:
-    """Refuses what the formats of the camera do not hold."""
+def _check_camera(form: ExportFormat, selection: Selection, available: Placements) -> None:
+    """Refuses selections that formats of the camera do not hold."""
     if form.holds not in ("lens", "hand-eye"):
         return
-    if form.holds == "lens" and there.cell is not None:
+    if form.holds == "lens" and available.cell is not None:
         _check_lens_alone(form, selection)
-        if there.lens is None:
-            known = ", ".join(there.lenses) or "none"
+        if available.lens is None:
+            names = ", ".join(available.lenses) or "none"
             raise DataError(
-                f"{form.name} holds one camera; this cell has {known}.",
+                f"{form.name} holds one camera; this cell has {names}.",
                 culprits=[form.name],
-                next_step="Name one with --camera." if there.lenses else "",
+                next_step="Name one with --camera." if available.lenses else "",
             )
         return
-    if there.mount is None or there.mount == "instrument":
+    if available.mount is None or available.mount == "instrument":
         raise DataError(
-            f"{form.name} holds the camera, and {there.words} has none.",
+            f"{form.name} holds the camera, and {available.words} has none.",
             culprits=[form.name],
             next_step="Name the calibration instead, or choose a format of poses: --to ros.",
         )
@@ -325,11 +318,13 @@ def _check_lens_alone(form: ExportFormat, selection: Selection) -> None:
 
 def _inverted(edge: Edge) -> Edge:
     # (T exp(x))^-1 = T^-1 exp(-adjoint(T) x): the lever arm turns rotation into translation.
-    carried = adjoint(edge.matrix)
-    return Edge(invert(edge.matrix), np.asarray(carried @ edge.covariance @ carried.T))
+    adjoint_matrix = adjoint(edge.matrix)
+    return Edge(
+        invert(edge.matrix), np.asarray(adjoint_matrix @ edge.covariance @ adjoint_matrix.T)
+    )
 
 
-def _frame(name: str) -> str:
+def _checked_frame(name: str) -> str:
     if _FRAME.fullmatch(name):
         return name
     raise DataError(

@@ -57,17 +57,9 @@ def _robot(name: str, words: str, mark: str, shape: Callable[[list[str]], str]) 
 
 
 UR = _robot(
-    "ur",
-    "Universal Robots: p[x, y, z, rx, ry, rz] [m, rotation vector in rad]",
-    "#",
-    ur_pose,
+    "ur", "Universal Robots: p[x, y, z, rx, ry, rz] [m, rotation vector in rad]", "#", ur_pose
 )
-KUKA = _robot(
-    "kuka",
-    "KUKA KRL: {X ..,Y ..,Z ..,A ..,B ..,C ..} [mm, deg]",
-    ";",
-    kuka_frame,
-)
+KUKA = _robot("kuka", "KUKA KRL: {X ..,Y ..,Z ..,A ..,B ..,C ..} [mm, deg]", ";", kuka_frame)
 FANUC = _robot("fanuc", "FANUC: X, Y, Z, W, P, R as in an .LS program [mm, deg]", "", _fanuc)
 ABB = _robot(
     "abb", "ABB RAPID pose: [[x,y,z],[q1,q2,q3,q4]] [mm, quaternion w first]", "!", abb_pose

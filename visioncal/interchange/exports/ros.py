@@ -1,10 +1,10 @@
-"""A transform for ROS: the fields of a message, easy_handeye, a launch file, a URDF's joint.
+"""A transform for ROS: message fields, easy_handeye, a launch file, a URDF's joint.
 
-A robot's ROS description calls the controller's own base frame `base`, and the frame of the poses
-that the controller reports without a tool `tool0` (ROS-Industrial, draft REP 199; Universal Robots,
-ur_description, doc/robot_frames.rst). Its `base_link` and `flange` may be turned against those: by
-180 degrees about z in the former case for a UR. Our camera frame, z forward and x right, is what
-REP 103 calls an optical frame.
+A robot's ROS description calls the controller's own base frame `base`, and the frame of poses that
+the controller reports without a tool `tool0` (ROS-Industrial, draft REP 199; Universal Robots,
+ur_description, doc/robot_frames.rst). Its `base_link` and `flange` may be rotated against those: a
+UR's `base_link` by 180 degrees about z. Our camera frame, z forward and x right, is REP 103's
+optical frame.
 """
 
 import re
@@ -20,11 +20,7 @@ from visioncal.interchange.exports.content import (
     yaml_text,
 )
 
-ROS_FRAMES: Mapping[str, str] = {
-    "base": "base",
-    "flange": "tool0",
-    "cam": "camera_optical_frame",
-}
+ROS_FRAMES: Mapping[str, str] = {"base": "base", "flange": "tool0", "cam": "camera_optical_frame"}
 _MEANINGS: Mapping[str, str] = {
     "base": "the controller's own base frame; base_link may differ (on a UR it is turned by "
     "180 deg about z)",
@@ -39,12 +35,12 @@ _NUMBERS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 
 
 def _write_urdf_all(contents: Sequence[Content]) -> str:
-    """Writes a document that `xacro:include` takes in, with the children's links and the joints.
+    """Writes a document for `xacro:include`, with the children's links and the joints.
 
-    `rpy` turns about the parent's fixed axes, x first, then y, then z: the rotation is Rz(yaw)
+    `rpy` rotates about the parent's fixed axes, x first, then y, then z: the rotation is Rz(yaw)
     Ry(pitch) Rx(roll) (ROS wiki, urdf/XML/joint; urdfdom, Rotation::setFromRPY).
     """
-    # A cell's root is a parent alone, and no robot's description has a link for it.
+    # A cell's root is only a parent, and no robot's description has a link for it.
     roots = {content.parent for content in contents if content.frames[0] == "cell"}
     links = "".join(f'  <link name="{root}"/>\n' for root in sorted(roots))
     joints = "".join(map(_urdf_joint, contents))
@@ -96,7 +92,7 @@ def _node(content: Content) -> str:
     options = {"--frame-id": content.parent, "--child-frame-id": content.child} | {
         option: repr(number) for option, number in zip(_NUMBERS, pose, strict=True)
     }
-    # Frames are letters, digits and _ / - . throughout, so that quotes hold them.
+    # Frame names are letters, digits and _ / - . only, so that quotes are safe.
     arguments = "".join(
         f'                "{option}",\n                "{value}",\n'
         for option, value in options.items()
@@ -125,8 +121,8 @@ def _write_launches(contents: Sequence[Content]) -> str:
 def _write_moveit(content: Content) -> str:
     """Writes a launch file laid out as MoveIt 2's calibration does."""
     # moveit_calibration, handeye_control_widget.cpp (ROS 2), puts the mount and both frames first.
-    # The Euler angles that it adds in a comment are left out: its order is not the one that the
-    # publisher's --roll, --pitch and --yaw have.
+    # Its comment with Euler angles is left out: their order differs from the publisher's --roll,
+    # --pitch and --yaw.
     mount = "" if content.mount is None else f"{content.mount.upper()}: "
     first = f'""" {mount}{content.parent} -> {content.child} """\n'
     return first + comments("#", _ros_notes(content)) + _program([content])

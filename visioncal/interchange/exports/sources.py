@@ -1,4 +1,4 @@
-"""What there is to export: a calibration's transforms with its frames, frames alone, or a cell."""
+"""Transforms that can be exported: of a calibration, a file of frames, or a cell."""
 
 import re
 from collections.abc import Mapping
@@ -13,13 +13,13 @@ from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile,
 Source: TypeAlias = Calibration | FrameFile
 Kind: TypeAlias = Literal["tool", "fixture"]
 
-# The camera's or the instrument's transform.
+# Name of the camera's or the instrument's transform by its mount.
 HAND_EYE: Mapping[Mount, str] = {
     "eye-in-hand": "flange_from_cam",
     "eye-to-hand": "base_from_cam",
     "instrument": "base_from_instrument",
 }
-# The frame in which such a thing is placed, by our names: flange, flange_2, ...
+# Parent frames by our names: flange, flange_2, ...
 _PARENTS: Mapping[Kind, re.Pattern[str]] = {
     "tool": re.compile(r"flange(_\w+)?", re.ASCII),
     "fixture": re.compile(r"base(_\w+)?", re.ASCII),
@@ -34,10 +34,8 @@ class Placement:
 
     Attributes:
         edge: `parent_from_child`.
-        origin: Where it comes from, in one line.
-        verdict: Whether to trust it.
         oriented: Whether its rotation was measured.
-        turned_as: Whose rotation it has otherwise; empty for its parent's.
+        turned_as: The frame whose rotation was copied otherwise; empty for its parent's.
     """
 
     edge: Edge
@@ -49,15 +47,13 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """All transforms of a source, and what else is exported of it.
+    """All transforms of a source, and its camera.
 
     Attributes:
-        by_name: The transforms by name.
-        frames: Which of them are tools' and fixtures' frames.
-        words: What the source is, for messages.
+        frames: Names of the tools' and fixtures' transforms.
+        words: The kind of source, for messages.
         mount: How the camera is mounted; None where there is no calibration.
-        lens: The camera, where there is one.
-        cell: The result of the whole cell: it places any of its frames in any other.
+        cell: The result of a cell, which relates any two of its frames; None for other sources.
         lenses: Its cameras by frame.
     """
 
@@ -73,17 +69,17 @@ class Placements:
         """Finds a transform by its name, with our names of its parent and child.
 
         Raises:
-            DataError: There is none, or a robot's pose would be needed.
+            DataError: There is none, or it depends on a robot's pose.
         """
         ends = ends_of(name)
         if name in self.by_name and all(ends):
             return self.by_name[name], ends
         if self.cell is not None and all(ends):
             return _between(self.cell, *ends), ends
-        turned = f"{ends[1]}_from_{ends[0]}"
+        inverse = f"{ends[1]}_from_{ends[0]}"
         hint = did_you_mean(name, self.by_name)
-        if turned in self.by_name:
-            hint = f"Ask for --edge {turned} --inverse."
+        if inverse in self.by_name:
+            hint = f"Ask for --edge {inverse} --inverse."
         raise DataError(
             f"There is no transform {name!r}; {self.words} has {', '.join(self.by_name)}.",
             culprits=[name],
@@ -91,22 +87,22 @@ class Placements:
         )
 
     def default(self) -> str:
-        """Names the transform that is meant where none is named.
+        """Name of the default transform.
 
         Raises:
-            DataError: The source has frames alone, and several.
+            DataError: The source is a file of several frames, or a cell.
         """
         if self.mount is not None:
             return HAND_EYE[self.mount]
         if len(self.frames) == 1 and self.cell is None:
             return self.frames[0]
         if self.cell is not None:
-            known = list(self.cell.tree.parents)
-            # No robot is between the ends of a transform that the cell itself has.
+            frames = list(self.cell.tree.parents)
+            # Transforms of the cell itself never depend on a robot's pose.
             example = next((name for name in self.by_name if "_from_cam" in name), "")
             example = example or list(self.by_name)[-1]
             raise DataError(
-                f"{self.words.capitalize()} has {', '.join(known)}: which is meant is not said.",
+                f"{self.words.capitalize()} has {', '.join(frames)}: which is meant is not said.",
                 culprits=["--edge"],
                 next_step=f"Name two of them, as --edge {example}; or all: --edge all.",
             )
@@ -118,18 +114,18 @@ class Placements:
         )
 
     def only(self, kind: Kind) -> str:
-        """Names the only tool or fixture.
+        """Name of the only tool or fixture.
 
         Raises:
             DataError: There is none, or there are several.
         """
-        known = [frame for frame in self.frames if is_kind(frame, kind)]
-        if len(known) == 1:
-            return known[0]
-        if known:
+        names = [frame for frame in self.frames if is_kind(frame, kind)]
+        if len(names) == 1:
+            return names[0]
+        if names:
             raise DataError(
-                f"{self.words.capitalize()} has {len(known)} {kind}s: {', '.join(known)}.",
-                culprits=known,
+                f"{self.words.capitalize()} has {len(names)} {kind}s: {', '.join(names)}.",
+                culprits=names,
                 next_step="Name one with --edge.",
             )
         others = [name for name in self.by_name if is_kind(name, kind)]
@@ -141,25 +137,21 @@ class Placements:
 
 
 def ends_of(name: str) -> tuple[str, str]:
-    """Gives our names of a transform's parent and child; empty where the name has none."""
+    """Names of a transform's parent and child; empty where the name has none."""
     parent, _, child = name.partition("_from_")
     return parent, child
 
 
 def is_kind(name: str, kind: Kind) -> bool:
-    """Tells whether a transform places something on the flange, or in the base."""
+    """Whether a transform is a pose on the flange, or in the base."""
     return _PARENTS[kind].fullmatch(ends_of(name)[0]) is not None
 
 
 def placements(source: Source, camera: str | None = None) -> Placements:
-    """Lists what a source has.
-
-    Args:
-        source: A calibration, or frames alone.
-        camera: Which of a whole cell's cameras is meant: its name or its frame.
+    """Lists the transforms of a source; `camera` selects one of a cell, by name or frame.
 
     Raises:
-        DataError: There is no such camera, or the source is of one camera.
+        DataError: There is no such camera, or the source is no cell.
     """
     if isinstance(source, Calibration) and source.cell is not None:
         return _of_cell(source, source.cell.lenses, camera)
@@ -185,11 +177,11 @@ def placements(source: Source, camera: str | None = None) -> Placements:
 def _of_cell(
     source: Calibration, lenses: Mapping[str, CameraResult], camera: str | None
 ) -> Placements:
-    # The reference and the cell are one frame: without it, the tree would be in two.
+    # The reference and the cell are one frame; two frames would split the tree.
     tree = source.tree
     edges = {
-        f"{on}_from_{name}": _in_cell(source, tree.edge_of(name))
-        for name, on in tree.parents.items()
+        f"{parent}_from_{name}": _in_cell(source, tree.edge_of(name))
+        for name, parent in tree.parents.items()
         if name not in tree.flanges
     }
     lens = None
@@ -201,16 +193,16 @@ def _of_cell(
 
 
 def _camera(lenses: Mapping[str, CameraResult], camera: str | None) -> str:
-    known = list(lenses)
+    names = list(lenses)
     if camera is None:
-        return known[0]
+        return names[0]
     for frame in (camera, f"cam_{camera}"):
         if frame in lenses:
             return frame
     raise DataError(
-        f"There is no camera {camera!r}; this cell has {', '.join(known) or 'none'}.",
+        f"There is no camera {camera!r}; this cell has {', '.join(names) or 'none'}.",
         culprits=["--camera"],
-        next_step=did_you_mean(camera, known),
+        next_step=did_you_mean(camera, names),
     )
 
 
@@ -220,17 +212,17 @@ def _in_cell(source: Calibration, edge: Edge) -> Placement:
 
 
 def _between(source: Calibration, first: str, second: str) -> Placement:
-    """Any frame in any other; trusted as the cell is, and the tool or the fixture that it has."""
+    """Relates two frames of a cell, with the worst verdict of the cell and their placements."""
     tree = source.tree
-    whole = _in_cell(source, tree.between(first, second))
+    placement = _in_cell(source, tree.between(first, second))
     for parent, frame in filter(None, (tree.placement(first), tree.placement(second))):
-        if _WORST_FIRST.index(frame.verdict.status) < _WORST_FIRST.index(whole.verdict.status):
-            whole = replace(whole, verdict=frame.verdict)
-        origin = f"{whole.origin}; {_of_frame(frame).origin}"
-        whole = replace(whole, origin=origin)
+        if _WORST_FIRST.index(frame.verdict.status) < _WORST_FIRST.index(placement.verdict.status):
+            placement = replace(placement, verdict=frame.verdict)
+        origin = f"{placement.origin}; {_of_frame(frame).origin}"
+        placement = replace(placement, origin=origin)
         if not frame.oriented:
-            whole = replace(whole, oriented=False, turned_as=parent)
-    return whole
+            placement = replace(placement, oriented=False, turned_as=parent)
+    return placement
 
 
 def _of_frame(frame: Frame) -> Placement:

@@ -1,11 +1,11 @@
-"""The forms in which sessions are stored, ours and others': one file a format, one entry each.
+"""Readers of foreign recordings: one file a format, with one entry each in the registry.
 
-Somebody else's recording becomes a session in three steps: `read_foreign` gives its numbers as they
-are written, `assemble` the session that they mean, and `write_session` stores it. Between the first
-and the second, `guess_foreign` can look whether they mean something else. `convert` does them all.
+A foreign recording becomes a session in three steps: `read_foreign` reads its numbers as they are
+written, `assemble` builds the session, and `write_session` stores it. In between, `guess_foreign`
+can test whether the poses are meant in another convention. `convert` does all of this.
 
 A new format is a file with a `ForeignFormat` and its entry in `registry.FOREIGN_FORMATS`. Another
-usual name of a field needs no format: it is added to the keys in `poses`, `fields` (times),
+common name of a field needs no format: it is added to the keys in `poses`, `fields` (times),
 `columns` (images) or `intrinsics`, and a recording with it to the samples of the tests.
 """
 

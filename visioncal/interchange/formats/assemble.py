@@ -1,4 +1,4 @@
-"""A session out of what someone else recorded."""
+"""Builds a session from a foreign recording."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,14 +22,14 @@ from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
 from visioncal.session import ImageStore, MemoryImages, Session, Stream
-from visioncal.session import columns as known
+from visioncal.session import columns as session_columns
 from visioncal.session.corners import CornerTable
 from visioncal.vision.finders.imaging import decode_image, looks_like_image
 
 
 @dataclass(frozen=True, eq=False)
 class FileImages(ImageStore):
-    """Images that lie anywhere, by the paths that the session gives them."""
+    """Image files anywhere on the disk, by their paths in the session."""
 
     files: Mapping[str, Path]
 
@@ -45,10 +45,10 @@ class FileImages(ImageStore):
 
 
 def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:
-    """Adds to a recording what the user says of it besides how its poses are written.
+    """Adds the user's options to a recording, other than those of its poses.
 
     Raises:
-        DataError: A name that the user gives is not known, or a file that he names is wrong.
+        DataError: A name that the user gives is not known, or a named file is wrong.
     """
     if requested.mount is not None:
         foreign = replace(foreign, mount=requested.mount)
@@ -69,25 +69,25 @@ def _with_lens(foreign: Foreign, requested: ImportOptions) -> Foreign:
     if requested.intrinsics == "estimate":
         lens = {name: lens[name] for name in ("name", "model", "resolution") if name in lens}
     elif requested.intrinsics is not None:
-        lens, more = read_intrinsics(Path(requested.intrinsics))
-        notes = (*notes, *more)
+        lens, lens_notes = read_intrinsics(Path(requested.intrinsics))
+        notes = (*notes, *lens_notes)
     if requested.resolution is not None:
         lens["resolution"] = list(requested.resolution)
     return replace(foreign, lens=lens or None, notes=notes)
 
 
 def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
-    """Builds the session of a recording, as its numbers are read and its mount is stated.
+    """Builds the session of a recording, as its poses are read.
 
     Args:
         foreign: The recording; `replace` it to try another reading, mount or order of rows.
-        mount: Taken where the recording states none.
+        mount: Used where the recording states none.
 
     Returns:
-        The session; what was assumed stands among its warnings.
+        The session; assumptions are among its warnings.
 
     Raises:
-        DataError: No mount is known, no row says what the camera saw, or a number is wrong.
+        DataError: No mount is known, no row has an observation, or a number is wrong.
     """
     mount = foreign.mount or mount
     if mount is None:
@@ -96,17 +96,19 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
             culprits=["mount"],
             next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
         )
-    foreign = spoken(foreign if foreign.sweep is None else _swept(foreign, foreign.sweep))
-    rows = _written(foreign)
+    foreign = spoken(
+        foreign if foreign.sweep is None else _with_camera_samples(foreign, foreign.sweep)
+    )
+    rows = _view_rows(foreign)
     document: dict[str, Any] = {"schema": 1, "name": foreign.name, "mount": mount}
     files = {path: file for row in rows for path, file in row.image.items()}
     notes = list(foreign.notes)
     if files:
         _check_images(foreign.name, list(files.values()), notes)
-    shows = bool(files or foreign.corners)
-    if shows:
+    has_images = bool(files or foreign.corners)
+    if has_images:
         document["camera"] = _camera(foreign, list(files.values()))
-    target = foreign.target if shows else None
+    target = foreign.target if has_images else None
     if target is not None:
         document["target"] = target_name(target) or "target.toml"
     robot = _robot(foreign, document)
@@ -124,15 +126,15 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     if foreign.sweep is not None:
         session = session.with_streams({"robot": _stream(foreign.sweep)})
     elif foreign.joints_rad is None and not foreign.robot.there.all():
-        absent = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.there)]
+        missing = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.there)]
         notes.append(
-            f"{len(absent)} of {len(rows)} rows have no pose of the robot: {some_of(absent)}."
+            f"{len(missing)} of {len(rows)} rows have no pose of the robot: {some_of(missing)}."
         )
     return replace(session, warnings=(*notes, *session.warnings))
 
 
-def _swept(foreign: Foreign, sweep: ForeignSweep) -> Foreign:
-    """All that the camera saw, without the robot's poses: those stay in a stream of their own."""
+def _with_camera_samples(foreign: Foreign, sweep: ForeignSweep) -> Foreign:
+    """All samples of the camera, without the robot's poses: those become a stream."""
     return replace(
         foreign,
         robot=PoseNumbers.nowhere(sweep.camera.places),
@@ -144,51 +146,53 @@ def _swept(foreign: Foreign, sweep: ForeignSweep) -> Foreign:
 
 
 def _stream(sweep: ForeignSweep) -> Stream:
-    rows = pose_cells(sweep.robot, known.POSE)
-    numbers = np.array([[float(row[name]) for name in known.POSE] for row in rows])
+    rows = pose_cells(sweep.robot, session_columns.POSE)
+    numbers = np.array([[float(row[name]) for name in session_columns.POSE] for row in rows])
     values = np.hstack([sweep.robot_s[:, None], numbers])
     values.setflags(write=False)
-    return Stream(("stamp_s", *known.POSE), values)
+    return Stream(("stamp_s", *session_columns.POSE), values)
 
 
 def _check_images(name: str, files: Sequence[Path], notes: list[str]) -> None:
     missing = [file for file in files if not file.is_file()]
     if not missing:
         return
-    words = f"{len(missing)} of {len(files)} images are missing: {some_of([*map(str, missing)], 3)}"
+    summary = (
+        f"{len(missing)} of {len(files)} images are missing: {some_of([*map(str, missing)], 3)}"
+    )
     if len(missing) == len(files):
         raise DataError(
-            f"{name}: {words}.",
+            f"{name}: {summary}.",
             culprits=[str(missing[0])],
             next_step="Name the folder that holds them with --images.",
         )
-    notes.append(f"{words}. --images names the folder that holds them.")
+    notes.append(f"{summary}. --images names the folder that holds them.")
 
 
 @dataclass(frozen=True)
 class _ViewRow:
-    """One row of views.csv, and the file of its image by the path in the session."""
+    """One row of views.csv, and its image file by the path in the session."""
 
     cells: dict[str, str]
     image: dict[str, Path]
 
 
 def spoken(foreign: Foreign) -> Foreign:
-    """Leaves out the rows that say nothing, and what of the others is not used.
+    """Drops rows without an observation, and stored poses or images that are not used.
 
     Raises:
-        DataError: No row says what a camera saw, or images show a target that is not known.
+        DataError: No row has an observation, or images show an unknown target.
     """
     notes: list[str] = []
-    foreign = _with_one_witness(foreign, notes)
+    foreign = _images_or_poses(foreign, notes)
     points = foreign.columns.get("point", ())
     saw = np.zeros(len(foreign.robot), dtype=bool)
     for cells in (foreign.images, foreign.corners, points):
         saw |= np.array([bool(cell) for cell in cells] or [False])
     if foreign.camera is not None:
         saw |= foreign.camera.there
-    silent = [foreign.robot.places[index] for index in np.flatnonzero(~saw)]
-    if len(silent) == len(saw):
+    dropped = [foreign.robot.places[index] for index in np.flatnonzero(~saw)]
+    if len(dropped) == len(saw):
         raise DataError(
             f"{foreign.name} has {len(saw)} poses of the robot, but neither images nor poses of "
             "the target: nothing says what a camera saw.",
@@ -196,16 +200,16 @@ def spoken(foreign: Foreign) -> Foreign:
             next_step="Name the images with --images, or the target's poses with --camera-columns "
             "or --camera-file. Touches of a point need a column `point`.",
         )
-    if silent:
+    if dropped:
         notes.append(
-            f"{len(silent)} of {len(saw)} rows are left out, as they have neither an image nor a "
-            f"pose of the target: {some_of(silent)}."
+            f"{len(dropped)} of {len(saw)} rows are left out, as they have neither an image nor a "
+            f"pose of the target: {some_of(dropped)}."
         )
     return replace(rows_of(foreign, np.flatnonzero(saw)), notes=(*foreign.notes, *notes))
 
 
-def _with_one_witness(foreign: Foreign, notes: list[str]) -> Foreign:
-    """Chooses between images and stored poses of the target where there are both."""
+def _images_or_poses(foreign: Foreign, notes: list[str]) -> Foreign:
+    """Chooses between images and stored target poses where there are both."""
     if not (foreign.images or foreign.corners):
         return foreign
     what = "corners" if foreign.corners else "images"
@@ -226,12 +230,12 @@ def _with_one_witness(foreign: Foreign, notes: list[str]) -> Foreign:
     return replace(foreign, images=(), corners=())
 
 
-def _written(foreign: Foreign) -> list[_ViewRow]:
+def _view_rows(foreign: Foreign) -> list[_ViewRow]:
     images = _image_paths(foreign)
-    robot = pose_cells(foreign.robot, known.POSE)
+    robot = pose_cells(foreign.robot, session_columns.POSE)
     camera: list[dict[str, str]] = [{}] * len(foreign.robot)
     if foreign.camera is not None:
-        camera = pose_cells(foreign.camera, known.MEASURED_CAM_POSE)
+        camera = pose_cells(foreign.camera, session_columns.MEASURED_CAM_POSE)
     extra = _extra_columns(foreign)
     rows = []
     for at in range(len(foreign.robot)):
@@ -247,8 +251,8 @@ def _written(foreign: Foreign) -> list[_ViewRow]:
 
 def _corner_table(foreign: Foreign) -> CornerTable:
     views = foreign.views or range(len(foreign.robot))
-    both = zip(views, foreign.corners, strict=True)
-    shown = [(view, corners) for view, corners in both if corners is not None]
+    pairs = zip(views, foreign.corners, strict=True)
+    shown = [(view, corners) for view, corners in pairs if corners is not None]
     counts = [len(corners.ids) for _, corners in shown]
     return CornerTable(
         np.repeat([view for view, _ in shown], counts),
@@ -273,49 +277,55 @@ def _scalars(foreign: Foreign, at: int) -> dict[str, str]:
 
 
 def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str]]:
-    """Writes poses so that reading them gives the same numbers; nothing for a row without one."""
+    """Cells of poses that read back as the same numbers; empty for a row without a pose."""
     poses = numbers.poses()
     values = np.hstack([numbers.positions, numbers.rotations])
-    there = numbers.there
-    # Where they are written as our own are, nothing is computed.
-    if numbers.reading != Reading() and there.any():
+    present = numbers.there
+    # Numbers already in our own convention are copied without computation.
+    if numbers.reading != Reading() and present.any():
         values = np.full((len(numbers), 7), np.nan)
-        transforms = RigidTransform.from_matrix(poses[there])
-        values[there] = np.hstack([transforms.translation, transforms.rotation.as_quat()])
+        transforms = RigidTransform.from_matrix(poses[present])
+        values[present] = np.hstack([transforms.translation, transforms.rotation.as_quat()])
     return [
-        dict(zip(names, map(repr, row), strict=True)) if is_pose else {}
-        for row, is_pose in zip(values.tolist(), there, strict=True)
+        dict(zip(names, map(repr, row), strict=True)) if has_pose else {}
+        for row, has_pose in zip(values.tolist(), present, strict=True)
     ]
 
 
 def _extra_columns(foreign: Foreign) -> dict[str, tuple[str, ...]]:
-    """Names the other columns so that none is taken for one of ours that it is not."""
-    written = {"view", "image", "stamp_s", *known.POSE, *known.MEASURED_CAM_POSE}
-    written |= set(known.joint_columns(tuple(foreign.columns)))
+    """Further columns, renamed where a session would take their names for something else."""
+    reserved = {
+        "view",
+        "image",
+        "stamp_s",
+        *session_columns.POSE,
+        *session_columns.MEASURED_CAM_POSE,
+    }
+    reserved |= set(session_columns.joint_columns(tuple(foreign.columns)))
     columns: dict[str, tuple[str, ...]] = {}
     for name, cells in foreign.columns.items():
-        own = name if _is_meant(name, cells) else f"source_{name}"
-        while own in written or own in columns:
-            own = f"source_{own}"
-        columns[own] = cells
+        unique = name if _is_meant(name, cells) else f"source_{name}"
+        while unique in reserved or unique in columns:
+            unique = f"source_{unique}"
+        columns[unique] = cells
     return columns
 
 
 def _is_meant(name: str, cells: Sequence[str]) -> bool:
-    """Tells whether a column with a name that sessions know holds what they mean by it."""
+    """Whether a column with a name known to sessions holds what sessions mean by it."""
     filled = {cell for cell in cells if cell}
     if name == "role":
         return filled <= {"fit", "holdout"}
     if name == "stop":
         return all(word.isascii() and word.isdecimal() and len(word) < 10 for word in filled)
-    if name in known.SELECTORS:
+    if name in session_columns.SELECTORS:
         return len(filled) < 2
     finite = (is_number(word) and np.isfinite(float(word)) for word in filled)
-    return not known.is_number(name) or all(finite)
+    return not session_columns.is_number(name) or all(finite)
 
 
 def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
-    """Names the images in the session; where a name is taken it gets a number before it."""
+    """Paths of images in the session; a name already in use gets a number in front."""
     if not foreign.images:
         return [None] * len(foreign.robot)
     paths: dict[Path, str] = {}
@@ -324,7 +334,7 @@ def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
         if file is None or file in paths:
             continue
         names = chain([file.name], (f"{number}_{file.name}" for number in count(at)))
-        # Not every file system distinguishes capitals from small letters.
+        # Some file systems do not distinguish upper and lower case.
         paths[file] = next(name for name in names if name.casefold() not in taken)
         taken.add(paths[file].casefold())
     return [
@@ -339,11 +349,11 @@ def _camera(foreign: Foreign, files: Sequence[Path]) -> dict[str, Any]:
         if size is not None:
             lens["resolution"] = list(size)
         elif "matrix" in lens or foreign.corners:
-            seen = "how large the images are is not known"
+            problem = "how large the images are is not known"
             if "matrix" in lens:
-                seen = "the intrinsics do not say for which size of image they hold"
+                problem = "the intrinsics do not say for which size of image they hold"
             raise DataError(
-                f"{foreign.name}: {seen}, and no image can be read.",
+                f"{foreign.name}: {problem}, and no image can be read.",
                 culprits=["resolution"],
                 next_step="Say --resolution WIDTH,HEIGHT.",
             )
@@ -357,7 +367,7 @@ def _image_size(file: Path) -> tuple[int, int] | None:
 
 def _image_bytes(file: Path) -> bytes:
     data = read_bytes(file, MOST_IMAGE_BYTES)
-    # A camera that failed leaves empty files; what else is no image is not to be handed on.
+    # A failed camera leaves empty files, which are kept; anything else that is no image is refused.
     if data and not looks_like_image(data):
         raise DataError(
             f"{file} is no image (png, jpg, tif, bmp).",
@@ -368,7 +378,7 @@ def _image_bytes(file: Path) -> bytes:
 
 
 def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
-    """Names the robot's model in the document, reads it, and checks that it is one."""
+    """Reads and checks the robot's model, and names it in the document."""
     if foreign.arm is None:
         return None
     arm = {name: str(value) for name, value in foreign.arm.items()}

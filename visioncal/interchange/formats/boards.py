@@ -1,4 +1,4 @@
-"""Targets, as a name, a file, or a description in one word."""
+"""Targets by shipped name, file, or a one-word description."""
 
 import re
 from collections.abc import Mapping
@@ -25,11 +25,11 @@ FORMS = (
 
 
 def described_target(words: str) -> Mapping[str, Any]:
-    """Finds the description of a target.
+    """Reads the description of a target.
 
     Args:
-        words: A shipped name, the path of a `.toml`, of a Kalibr `.yaml`, or a description in one
-            word as in `FORMS`.
+        words: A shipped name, the path of a `.toml` or of a Kalibr `.yaml`, or a one-word
+            description as in `FORMS`.
 
     Returns:
         The content of its `.toml`.
@@ -53,12 +53,12 @@ def described_target(words: str) -> Mapping[str, Any]:
 
 
 def target_named(words: str, name: str = "") -> Target:
-    """The target that `described_target` finds, called by its words where it has no other name."""
+    """The target of `described_target`; its words are its name unless another is given."""
     return target_from_document(described_target(words), name or words)
 
 
 def _of_kalibr(path: Path) -> dict[str, Any]:
-    """Reads the target file of Kalibr: an AprilGrid, or a checkerboard of squares."""
+    """Reads a target file of Kalibr: an AprilGrid, or a checkerboard of squares."""
     content = read_yaml(path)
     table = DocumentTable(content if isinstance(content, dict) else {}, path.name)
     if table.choice("target_type", ("aprilgrid", "checkerboard")) == "aprilgrid":
@@ -115,6 +115,6 @@ def _in_one_word(words: str) -> dict[str, Any] | None:
 
 
 def target_name(document: Mapping[str, Any]) -> str | None:
-    """Finds the shipped target with this content; None where there is none."""
+    """Name of the shipped target with this content; None where there is none."""
     shipped = ((name, read_target(name, None)[1]) for name in target_names())
     return next((name for name, content in shipped if content == document), None)

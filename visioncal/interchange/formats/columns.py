@@ -1,4 +1,4 @@
-"""Tables, JSON and .npz with named columns or keys, a row a view; lines of a pendant; two files."""
+"""Tables, JSON and .npz with a row a view; lines of a pendant; a second file of camera poses."""
 
 import re
 from collections import defaultdict
@@ -44,7 +44,7 @@ from visioncal.interchange.formats.streams import in_seconds, pair_streams, seco
 DOCUMENTS = (".json", ".yaml", ".yml", ".xml")
 ENDINGS = (".csv", ".tsv", ".txt", ".log", ".npz", ".npy", *DOCUMENTS, *PROGRAMS)
 _IMAGE_NAMES = ("image", "img", "filename", "file", "image_file", "image_path")
-# How many numbers poses have in one field.
+# Numbers of values that a pose in one field may have.
 _WHOLE_POSES = (6, 7, 12, 16)
 
 
@@ -88,8 +88,8 @@ def read_document(path: Path) -> object:
 
 
 def _fields_of_document(document: object, path: Path) -> Fields:
-    """Takes a list of records, the longest such lists inside a mapping, or a mapping of lists."""
-    # In a mapping, names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
+    """Rows from a list of records, the longest such lists in a mapping, or a mapping of lists."""
+    # Names with numbers (`robot_0`, `board_0`, `robot_1`, ...) are rows as well.
     if isinstance(document, Mapping):
         numbered = _numbered(document)
         if len(numbered) > 1:
@@ -119,7 +119,7 @@ def _fields_of_document(document: object, path: Path) -> Fields:
 
 
 def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
-    """Groups matrices by the numbers that their names end with, or that are their names."""
+    """Groups matrices by the numbers at the end of their names, or that are their names."""
     rows: dict[int, dict[str, object]] = defaultdict(dict)
     for name, value in document.items():
         if isinstance(value, Mapping) and all(
@@ -152,7 +152,7 @@ def _pose_file(path: Path) -> Path | None:
     if path.is_file():
         return path if path.suffix.lower() in ENDINGS else None
     files = [file for file in listed(path) if file.suffix.lower() in ENDINGS]
-    # Beside a file of intrinsics or notes, the name decides.
+    # Beside a file of intrinsics or notes, the file's name decides.
     named = [file for file in files if re.search("pose|robot", file.stem.lower())]
     return next((group[0] for group in (files, named) if len(group) == 1), None)
 
@@ -160,15 +160,12 @@ def _pose_file(path: Path) -> Path | None:
 def foreign_from(
     fields: Fields, requested: ImportOptions, *, images: Path | None = None
 ) -> Foreign:
-    """Takes rows of named values for a recording, as their names or the user say.
+    """Builds a recording from rows of named values, by their names or the user's options.
 
-    Args:
-        fields: The rows.
-        requested: What the user says of them.
-        images: A folder that holds the images, where the source is one.
+    `images` is the folder of the images, where the source is one.
 
     Raises:
-        DataError: There are no poses and no joints in it.
+        DataError: It has neither poses nor joint angles.
     """
     unnamed = unnamed_columns(fields)
     given = (*requested.robot.names, *requested.camera.names, *requested.joints)
@@ -177,9 +174,9 @@ def foreign_from(
     used.update(robot_names)
     camera_names = pose_names(fields, requested.camera.names, unnamed["camera"], "camera", used)
     used.update(camera_names)
-    of_joints = requested.joints or joint_names(fields, used)
-    used.update(of_joints)
-    if not robot_names and not of_joints:
+    joint_fields = requested.joints or joint_names(fields, used)
+    used.update(joint_fields)
+    if not robot_names and not joint_fields:
         raise DataError(
             f"{fields.name}: which of its fields are the robot's poses is not known; it has "
             f"{fields.listing()}.",
@@ -194,10 +191,10 @@ def foreign_from(
         camera, more = poses_from(fields, camera_names, requested.camera, "camera")
         notes = (*notes, *more)
     joints = None
-    if of_joints:
-        joints, more = joints_from(fields, of_joints, degrees=requested.joints_deg)
+    if joint_fields:
+        joints, more = joints_from(fields, joint_fields, degrees=requested.joints_deg)
         notes = (*notes, *more)
-    # The coordinates of a field that is taken.
+    # Components of a field that is used.
     used |= {text for text in fields.texts if text.rpartition(".")[0] in used}
     stamps = stamp_name(fields, used)
     if stamps and stamps in unnamed["time"]:
@@ -205,7 +202,7 @@ def foreign_from(
     used |= {stamps, "view"} if view_numbers(fields) else {stamps}
     paths, image_name, more = _images(fields, requested, images, used)
     if camera is None and not paths:
-        _check_no_more_poses(fields, used)
+        _check_no_unnamed_poses(fields, used)
     return Foreign(
         name=fields.name,
         robot=robot,
@@ -221,25 +218,25 @@ def foreign_from(
     )
 
 
-def _check_no_more_poses(fields: Fields, used: Collection[str]) -> None:
-    """Raises DataError where fields may be poses of the target, of which nobody says so."""
-    rest = [
+def _check_no_unnamed_poses(fields: Fields, used: Collection[str]) -> None:
+    """Raises DataError where unnamed fields may be poses of the target."""
+    candidates = [
         name
-        for name, number in fields.numbers.items()
-        if number.ndim > 1 and number[0].size in _WHOLE_POSES and name not in used
+        for name, numbers in fields.numbers.items()
+        if numbers.ndim > 1 and numbers[0].size in _WHOLE_POSES and name not in used
     ]
-    if rest:
+    if candidates:
         raise DataError(
             f"{fields.name}: which of its fields are the target's poses is not known; "
-            f"{some_of(rest)} may be.",
-            culprits=rest,
+            f"{some_of(candidates)} may be.",
+            culprits=candidates,
             next_step="Name them with --camera-columns; where they are of the camera in the "
             "target, with --camera-inverse.",
         )
 
 
 def view_numbers(fields: Fields) -> tuple[int, ...]:
-    """The numbers in a column `view`, where they are whole and each is there once."""
+    """Numbers in a column `view`, where they are whole and unique; else empty."""
     cells = fields.texts.get("view", ())
     whole = all(cell.isascii() and cell.isdecimal() and len(cell) < 10 for cell in cells)
     return tuple(int(cell) for cell in cells) if whole and len(set(cells)) == len(cells) else ()
@@ -248,7 +245,7 @@ def view_numbers(fields: Fields) -> tuple[int, ...]:
 def _images(
     fields: Fields, requested: ImportOptions, folder: Path | None, taken: Collection[str]
 ) -> tuple[tuple[Path | None, ...], str, tuple[str, ...]]:
-    """Pairs the rows with images: (paths, the field that names them, what was assumed)."""
+    """Pairs the rows with images: (paths, the field that names them, notes on assumptions)."""
     beside = requested.images or folder
     name = fields.find(requested.image) if requested.image else _image_name(fields, beside, taken)
     if name in fields.texts:
@@ -267,11 +264,14 @@ def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> 
     if name := next(usual, ""):
         return name
     files = [] if folder is None else listed(folder)
-    there = {name for file in files if is_image_name(file.name) for name in (file.name, file.stem)}
+    image_names = {
+        name for file in files if is_image_name(file.name) for name in (file.name, file.stem)
+    }
     naming = [
         name
         for name, cells in free.items()
-        if any(cells) and all(not cell or is_image_name(cell) or cell in there for cell in cells)
+        if any(cells)
+        and all(not cell or is_image_name(cell) or cell in image_names for cell in cells)
     ]
     if len(naming) > 1:
         raise DataError(
@@ -293,12 +293,10 @@ TABLE = ForeignFormat(
 def with_camera_file(
     robot_fields: Fields, camera_fields: Fields, requested: ImportOptions
 ) -> Foreign:
-    """Joins a file of the robot's poses with one of the camera's.
-
-    By time where both have times, else row by row.
+    """Joins a file of robot poses with one of camera poses, by time if possible, else by row.
 
     Raises:
-        DataError: Either holds no poses, they are not as many, or their motions do not agree.
+        DataError: Either holds no poses, their numbers differ, or their motions do not agree.
     """
     robot, robot_names, first = _poses(robot_fields, requested.robot, "robot")
     camera, camera_names, second = _poses(camera_fields, requested.camera, "camera")
@@ -317,11 +315,13 @@ def with_camera_file(
 def _poses(
     fields: Fields, requested: PoseImportOptions, whose: str
 ) -> tuple[PoseNumbers, tuple[str, ...], tuple[str, ...]]:
-    """Takes the poses of one file: (poses, the fields that hold them, what was assumed)."""
+    """Reads the poses of one file: (poses, the fields that hold them, notes on assumptions)."""
     unnamed = unnamed_columns(fields)["robot"]
-    # A file of the camera's poses alone calls them what a robot's file calls its own.
-    ways = (pose_names(fields, requested.names, unnamed, name, ()) for name in (whose, "robot"))
-    names = next(filter(None, ways), ())
+    # A file of camera poses alone may use the names of a robot's file.
+    candidates = (
+        pose_names(fields, requested.names, unnamed, name, ()) for name in (whose, "robot")
+    )
+    names = next(filter(None, candidates), ())
     if not names:
         raise DataError(
             f"{fields.name}: which of its fields are the {whose}'s poses is not known; it has "
@@ -351,8 +351,8 @@ def _by_time(
     camera: tuple[FloatArray, PoseNumbers],
     notes: tuple[str, ...],
 ) -> Foreign:
-    robot_s, robot_poses, robot_rows = _known(*robot)
-    camera_s, camera_poses, camera_rows = _known(*camera)
+    robot_s, robot_poses, robot_rows = _with_pose(*robot)
+    camera_s, camera_poses, camera_rows = _with_pose(*camera)
     paired = pair_streams(robot_s, robot_poses, camera_s, camera_poses)
     seen = camera[1].rows(camera_rows)
     sampled = seen.rows(paired.rows)
@@ -373,8 +373,10 @@ def _by_time(
     )
 
 
-def _known(stamps_s: FloatArray, numbers: PoseNumbers) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Leaves out the samples without a pose: (times, (m, 4, 4) poses, their rows)."""
+def _with_pose(
+    stamps_s: FloatArray, numbers: PoseNumbers
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Samples that have a pose: (times [s], (m, 4, 4) poses [m], their rows)."""
     rows = np.flatnonzero(numbers.there)
     if len(rows) < 3:
         place = numbers.places[0]

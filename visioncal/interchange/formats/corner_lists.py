@@ -1,9 +1,9 @@
-"""Corners that another program has found: a row for each corner, or lists of them for each image.
+"""Corners found by another program: a row a corner, or a list for each image.
 
-Tables have the image, the place and perhaps the corner's number in columns, as mrcal's
-`corners.vnl` does: there the corners of an image are all those of the board, row by row, and `-`
-stands for one that was not found. Documents have a list for each image: side by side, as OpenCV's
-samples write `image_points`, or in records with the corners' numbers and the image's name.
+Tables have columns for the image, the pixel and optionally the corner's number, as mrcal's
+`corners.vnl`: without numbers, an image has all the board's corners row by row, with `-` for one
+that was not found. Documents have a list for each image: parallel lists, as OpenCV's samples write
+`image_points`, or records with the corners' numbers and the image's name.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,63 +22,59 @@ from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.columns import DOCUMENTS, read_document
 from visioncal.interchange.formats.foreign import Foreign, FoundCorners
 
-# What others call the image, a corner's number and its place; of one corner, and of all.
+# Names of the image, of a corner's number and of its pixel: of one corner, and of lists.
 _IMAGE = ("image", "img", "filename", "file", "image_name", "image_file", "image_path", "frame")
 _IMAGES = tuple(f"{name}s" for name in _IMAGE)
 _POINT = ("point", "point_id", "corner", "corner_id", "charuco_id", "id")
 _POINTS = ("ids", "charuco_ids", "corner_ids", "point_ids", "all_ids", "allids")
 _U, _V = ("u_px", "x_px", "u", "x", "img_loc_x"), ("v_px", "y_px", "v", "y", "img_loc_y")
-_PLACES = (
+_PIXEL_LISTS = (
     *("charuco_corners", "image_points", "imagepoints", "img_points", "imgpoints", "corners"),
     *("all_corners", "allcorners", "uv", "pixels", "points"),
 )
-# mrcal halves an image so many times before it finds a corner; `-` takes one away.
+# How often mrcal halved the image before it found the corner; `-` where it found none.
 _LEVEL = "level"
 
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """What was found in one image, by its name; empty where the file names none."""
+    """Corners found in one image; an empty name where the file has none."""
 
     name: str
-    found: FoundCorners
+    corners: FoundCorners
 
 
 def with_corners(foreign: Foreign, path: Path) -> Foreign:
-    """Joins the corners in a file with the rows of a recording.
-
-    By the images' names where both have them, else in order.
+    """Adds the corners in a file to a recording, by the images' names if possible, else in order.
 
     Raises:
         DataError: The file holds no corners, or they are not of this recording's images.
     """
     is_document = path.suffix.lower() in (*DOCUMENTS, ".npz")
     images = list(_of_document(path) if is_document else _of_table(path))
-    if not any(image.found.ids.size for image in images):
+    if not any(image.corners.ids.size for image in images):
         raise DataError(f"{path} holds no corners.", culprits=[str(path)])
-    count, names = (
-        len(foreign.robot),
-        [Path(image.name.replace("\\", "/")).name for image in images],
-    )
-    rows = [None if image is None else image.name for image in foreign.images]
+    count = len(foreign.robot)
+    names = [Path(image.name.replace("\\", "/")).name for image in images]
+    row_names = [None if image is None else image.name for image in foreign.images]
     notes = foreign.notes
-    if all(names) and any(rows):
-        found = dict(zip(names, images, strict=True))
-        if len(found) < len(names):
+    if all(names) and any(row_names):
+        by_name = dict(zip(names, images, strict=True))
+        if len(by_name) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise DataError(
                 f"{path.name} has corners of {twice} twice; each image is needed once.",
                 culprits=[twice],
                 next_step="Leave the other camera's images out.",
             )
-        if not found.keys() & set(rows):
+        if not by_name.keys() & set(row_names):
             raise DataError(
                 f"{path.name} has corners of {some_of(names, 3)}; the recording's images are "
-                f"{some_of([row for row in rows if row], 3)}.",
+                f"{some_of([row for row in row_names if row], 3)}.",
                 culprits=[str(path)],
                 next_step="Name the column of the images that it is about with --image-column.",
             )
-        paired = [found.get(row or "") for row in rows]
+        paired = [by_name.get(row or "") for row in row_names]
     elif len(images) == count:
         order = (
             sorted(images, key=lambda image: natural(Path(image.name))) if all(names) else images
@@ -93,18 +89,18 @@ def with_corners(foreign: Foreign, path: Path) -> Foreign:
             next_step="Give as many of both, or a column with each pose's image (--image-column).",
         )
     corners = tuple(
-        image.found if image is not None and image.found.ids.size else None for image in paired
+        image.corners if image is not None and image.corners.ids.size else None for image in paired
     )
-    # What the other program did not find is not searched, and what is missing not missed.
+    # Images without found corners are dropped, so that a missing file is not an error.
     pictures = tuple(
-        image if image is not None and of is not None and image.is_file() else None
-        for image, of in zip(foreign.images, corners, strict=bool(foreign.images))
+        image if image is not None and found is not None and image.is_file() else None
+        for image, found in zip(foreign.images, corners, strict=bool(foreign.images))
     )
     return replace(foreign, corners=corners, images=pictures if any(pictures) else (), notes=notes)
 
 
 def _of_table(path: Path) -> Iterator[_Image]:
-    """Takes the images of a table in the order of their first rows."""
+    """Reads the images of a table in the order of their first rows."""
     columns, rows, places = _table(path)
     lower = [column.lower() for column in columns]
 
@@ -119,11 +115,11 @@ def _of_table(path: Path) -> Iterator[_Image]:
             culprits=[str(path)],
             next_step="Begin it with a header such as filename,id,x,y.",
         )
-    found: dict[str, list[tuple[float, float, float]]] = {}
+    by_image: dict[str, list[tuple[float, float, float]]] = {}
     counts: dict[str, int] = {}
     for row, place in zip(rows, places, strict=True):
         number = counts[row[image]] = counts.get(row[image], -1) + 1
-        mine = found.setdefault(row[image], [])
+        image_corners = by_image.setdefault(row[image], [])
         if {"-", "nan"} & {row[u], row[v], row[level] if level >= 0 else ""} or not row[u]:
             continue
         cells = (str(number) if point < 0 else row[point], row[u], row[v])
@@ -131,21 +127,21 @@ def _of_table(path: Path) -> Iterator[_Image]:
             raise DataError(
                 f"{place}: {' '.join(cells)[:60]!r}; numbers are needed.", culprits=[place]
             )
-        mine.append((float(cells[0]), float(cells[1]), float(cells[2])))
-    for name, corners in found.items():
+        image_corners.append((float(cells[0]), float(cells[1]), float(cells[2])))
+    for name, corners in by_image.items():
         numbers = np.array(corners).reshape(-1, 3)
         yield _Image(name, _checked(numbers[:, 0], numbers[:, 1:], f"{path.name}, {name}"))
 
 
 def _table(path: Path) -> tuple[Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-    """The columns of a table, its rows, and where each stands."""
+    """Columns of a table, its rows, and the place of each row for messages."""
     if path.suffix.lower() != ".vnl":
         table = read_table(path)
         return table.columns, table.rows, [table.place(at) for at in range(len(table.rows))]
     lines = [
         (at, line.strip()) for at, line in enumerate(read_plain_text(path).splitlines(), start=1)
     ]
-    # Comments have two signs, or one and an exclamation mark; the header has one.
+    # Comments start with ## or #!; the header with a single #.
     headers = [
         name[1:].split() for _, name in lines if name[:1] == "#" and name[1:2] not in ("#", "!")
     ]
@@ -170,14 +166,14 @@ def _of_document(path: Path) -> Iterator[_Image]:
     records = list(_records(document))
     if not records:
         raise DataError(
-            f"{path.name} has no list of corners; one is called {', '.join(_PLACES[:6])} or the "
-            "like, for each image or in a record of it.",
+            f"{path.name} has no list of corners; one is called {', '.join(_PIXEL_LISTS[:6])} or "
+            "the like, for each image or in a record of it.",
             culprits=[str(path)],
         )
     for at, record in enumerate(records):
-        name = _named(record, _IMAGE)
+        name = _value_of(record, _IMAGE)
         where = f"{path.name}, {name or f'entry {at}'}"
-        places, ids = _named(record, _PLACES), _named(record, (*_POINTS, *_POINT))
+        places, ids = _value_of(record, _PIXEL_LISTS), _value_of(record, (*_POINTS, *_POINT))
         try:
             if isinstance(places, list):
                 places = [
@@ -201,43 +197,43 @@ def _records(document: object) -> Iterator[Mapping[str, object]]:
     """Finds the records of images in a document: each has a list of corners."""
     if isinstance(document, list):
         yield from (
-            value for value in document if isinstance(value, Mapping) and _has_corners(value)
+            value for value in document if isinstance(value, Mapping) and _has_pixel_list(value)
         )
     if not isinstance(document, Mapping):
         return
-    places = _named(document, _PLACES)
+    places = _value_of(document, _PIXEL_LISTS)
     if places is None:
         for name, value in document.items():
-            if isinstance(value, Mapping) and _has_corners(value):
+            if isinstance(value, Mapping) and _has_pixel_list(value):
                 yield {"image": name, **value}
             elif isinstance(value, list):
                 yield from _records(value)
     elif not isinstance(places, list | np.ndarray) or not _is_of_images(places):
         yield document
     else:
-        ids, names = _named(document, _POINTS), _named(document, _IMAGES)
+        ids, names = _value_of(document, _POINTS), _value_of(document, _IMAGES)
         for at, place in enumerate(places):
-            beside = {"ids": ids, "image": names}
-            own = {
-                key: them[at]
-                for key, them in beside.items()
-                if isinstance(them, list | np.ndarray) and len(them) == len(places)
+            lists = {"ids": ids, "image": names}
+            fields = {
+                key: values[at]
+                for key, values in lists.items()
+                if isinstance(values, list | np.ndarray) and len(values) == len(places)
             }
-            yield {"corners": place, **own}
+            yield {"corners": place, **fields}
 
 
 def _is_of_images(places: Sequence[object] | Array) -> bool:
-    """Whether a list has a list of corners for each image, and is not itself one of corners."""
-    some = (place for place in places if isinstance(place, list | np.ndarray) and len(place) > 1)
-    return any(isinstance(value[0], list | np.ndarray) for value in some)
+    """Whether a list holds lists of corners, one for each image, rather than corners."""
+    lists = (place for place in places if isinstance(place, list | np.ndarray) and len(place) > 1)
+    return any(isinstance(value[0], list | np.ndarray) for value in lists)
 
 
-def _has_corners(record: Mapping[str, object]) -> bool:
-    return any(name.lower() in _PLACES for name in map(str, record))
+def _has_pixel_list(record: Mapping[str, object]) -> bool:
+    return any(name.lower() in _PIXEL_LISTS for name in map(str, record))
 
 
-def _named(record: Mapping[str, object], names: Sequence[str]) -> object:
-    """The value of the first of some names, in whatever case; None where there is none."""
+def _value_of(record: Mapping[str, object], names: Sequence[str]) -> object:
+    """The first value under one of some names, in any case; None where there is none."""
     lower = {str(name).lower(): value for name, value in record.items()}
     return next((lower[name] for name in names if name in lower), None)
 

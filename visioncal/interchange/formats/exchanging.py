@@ -1,4 +1,4 @@
-"""Two views of a session that were exchanged, put right."""
+"""Exchanges the observations of two views of a session."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,21 +9,14 @@ from visioncal.core.errors import DataError
 from visioncal.session import Session
 from visioncal.session.columns import INSTRUMENT_POSITION, INSTRUMENT_QUATERNION, MEASURED_CAM_POSE
 
-# What a view shows; the rest of its row says where the robot stood.
-_SHOWN = ("image", *MEASURED_CAM_POSE, *INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION)
-# Whose it is.
-_BY_WHOM = ("camera", "target", "instrument", "point")
+# Columns of what a view shows; the rest of its row is the robot's pose.
+_OBSERVED = ("image", *MEASURED_CAM_POSE, *INSTRUMENT_POSITION, *INSTRUMENT_QUATERNION)
+# Columns that must agree between the two views.
+_MUST_AGREE = ("camera", "target", "instrument", "point")
 
 
 def exchange_views(session: Session, first: int, second: int) -> Session:
-    """Gives each of two views the image, corners and readings of the other.
-
-    The session says so in `corrected`.
-
-    Args:
-        session: The session.
-        first: A view's number.
-        second: Another's, of the same camera and target.
+    """Exchanges the images, corners and readings of two views; the session notes it in `corrected`.
 
     Raises:
         DataError: There are no two such views.
@@ -38,25 +31,27 @@ def exchange_views(session: Session, first: int, second: int) -> Session:
                 f"{min(cells, default=0)} to {max(cells, default=0)}.",
                 culprits=["--exchange"],
             )
-    one, other = cells[first], cells[second]
-    apart = [name for name in _BY_WHOM if one.get(name, "") != other.get(name, "")]
-    if first == second or apart:
-        what = f"are of another {' and '.join(apart)}" if apart else "are the same view"
+    first_cells, second_cells = cells[first], cells[second]
+    differing = [
+        name for name in _MUST_AGREE if first_cells.get(name, "") != second_cells.get(name, "")
+    ]
+    if first == second or differing:
+        what = f"are of another {' and '.join(differing)}" if differing else "are the same view"
         raise DataError(
             f"Views {first} and {second} {what}: two views that see the same are exchanged.",
             culprits=["--exchange"],
         )
-    for name in {*_SHOWN} & {*session.columns}:
-        one[name], other[name] = other[name], one[name]
+    for name in {*_OBSERVED} & {*session.columns}:
+        first_cells[name], second_cells[name] = second_cells[name], first_cells[name]
     corners = session.corner_table
     if corners is not None:
         is_first, is_second = corners.views == first, corners.views == second
         views = np.where(is_first, second, np.where(is_second, first, corners.views))
         corners = replace(corners, views=views)
-    said = f"the images of views {first} and {second} were exchanged"
+    note = f"the images of views {first} and {second} were exchanged"
     rows: Sequence[dict[str, str]] = [*cells.values()]
     return Session.assemble(
-        {**session.document, "corrected": [*session.declaration.corrected, said]},
+        {**session.document, "corrected": [*session.declaration.corrected, note]},
         session.columns,
         [[row[name] for name in session.columns] for row in rows],
         session.images,

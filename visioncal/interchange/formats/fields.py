@@ -1,4 +1,4 @@
-"""Rows with named values, before it is known what they mean: tables, JSON, arrays."""
+"""Rows of named values from tables, JSON or arrays, not yet interpreted."""
 
 import re
 from collections import Counter
@@ -17,21 +17,21 @@ from visioncal.core.types import FloatArray
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 _TIME_NAMES = ("stamp_s", "t", "time", "timestamp", "stamp", "time_s", "#timestamp")
-# Columns of a table without a header, by their number: times, then poses of the robot and the
-# camera, each a position with a quaternion or a matrix by rows.
-_UNNAMED = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
-_UNNAMED |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
-_LISTED = 40
-_NO_QUATERNION = 0.01
+# Layout of a table without a header by its number of columns: (times, robot pose, camera pose),
+# each pose a position with a quaternion or a matrix by rows.
+_LAYOUTS = {6: (0, 6, 0), 7: (0, 7, 0), 8: (1, 7, 0), 14: (0, 7, 7), 16: (0, 16, 0)}
+_LAYOUTS |= {15: (1, 7, 7), 17: (1, 16, 0), 32: (0, 16, 16), 33: (1, 16, 16)}
+_MOST_LISTED = 40
+_NORM_TOLERANCE = 0.01
 _MOST_DEG = 360.5
-# Counts of rows are whole and small; seconds of an epoch are not.
+# Row counts are whole and below this; seconds of an epoch are not.
 _LARGEST_COUNT = 1e6
-# What stands before the poses of each where they are in rows by turns.
+# Labels of alternating rows of robot and camera poses.
 _LABELS = {
     "robot_pose": ("robot", "hand", "gripper", "flange", "tcp", "tool", "ee", "arm", "base"),
     "camera_pose": ("camera", "cam", "eye", "target", "board", "marker", "tag", "object"),
 }
-# A pose and its covariance have fewer numbers; lists of corners and images have more.
+# A pose with its covariance has fewer numbers; lists of corners and images have more.
 _MOST_NUMBERS = 200
 
 
@@ -40,15 +40,14 @@ class Fields:
     """Named values of n rows.
 
     Attributes:
-        name: What the recording is called.
+        name: Name of the recording.
         folder: What the names of images are relative to.
-        places: (n,) where each row stands, for messages.
+        places: (n,) place of each row in the source, for messages.
         numbers: (n, ...) arrays by name; NaN where a row has none.
         texts: (n,) texts by name, of every column of a table and of single numbers.
         views: (n,) the rows' numbers, where their files' names have them.
-        ragged: What is wrong with fields whose rows differ in shape.
-        form: A name among `POSE_FORMS` where the rows themselves say in which form the robot's
-            poses are.
+        ragged: Error messages of fields whose rows differ in shape, by name.
+        form: A name among `POSE_FORMS` where the rows state the form of the robot's poses.
     """
 
     name: str
@@ -64,7 +63,7 @@ class Fields:
         return len(self.places)
 
     def rows(self, chosen: Sequence[int]) -> Self:
-        """The same of some rows alone."""
+        """The same values for some rows only."""
         return replace(
             self,
             places=tuple(self.places[index] for index in chosen),
@@ -74,30 +73,30 @@ class Fields:
         )
 
     def find(self, name: str) -> str:
-        """Finds the full name of a field, which may be given without what stands before its point.
+        """Full name of a field, which may be given without the prefix before its last point.
 
         Raises:
-            DataError: There is no such field; the message lists those that there are.
+            DataError: There is no such field; the message lists the existing ones.
         """
-        known = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
-        if name in known:
+        names = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
+        if name in names:
             return name
-        ends = [word for word in known if word.endswith(f".{name}")]
-        if len(ends) == 1:
-            return ends[0]
-        if ends:
+        matches = [word for word in names if word.endswith(f".{name}")]
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
             raise DataError(
-                f"{self.name}: {name!r} may be {some_of(ends)}; the full name is needed.",
-                culprits=ends,
+                f"{self.name}: {name!r} may be {some_of(matches)}; the full name is needed.",
+                culprits=matches,
             )
         raise DataError(
             f"{self.name} has no column or key {name!r}; it has {self.listing()}.",
             culprits=[name],
-            next_step=did_you_mean(name, known),
+            next_step=did_you_mean(name, names),
         )
 
     def column(self, name: str) -> FloatArray:
-        """Takes a field's numbers, (n, k).
+        """The numbers of a field, (n, k).
 
         Raises:
             DataError: There is no such field, or it holds text.
@@ -108,7 +107,7 @@ class Fields:
         if full not in self.numbers:
             cells = zip(self.places, self.texts[full], strict=True)
             odd = ((place, word) for place, word in cells if word and not is_number(word))
-            # JSON has numbers in quotes as well.
+            # JSON may also have numbers in quotes.
             place, text = next(odd, (self.places[0], self.texts[full][0]))
             step = "Correct the cell, or leave the whole pose of that row empty."
             if _DECIMAL_COMMA.fullmatch(text):
@@ -123,7 +122,7 @@ class Fields:
         return self.numbers[full].reshape(len(self), -1)
 
     def listing(self) -> str:
-        """Words the fields with the numbers that each has a row."""
+        """Lists the fields with their numbers of values a row, for messages."""
         names = list(dict.fromkeys([*self.numbers, *self.texts]))
         words = [
             f"{name} ({int(np.prod(self.numbers[name].shape[1:]))})"
@@ -131,16 +130,16 @@ class Fields:
             else name
             for name in names
         ]
-        return some_of(words, _LISTED)
+        return some_of(words, _MOST_LISTED)
 
 
 def fields_of_table(table: TextTable) -> Fields:
-    """Takes the columns of a table; those in which every filled cell is a number become numbers.
+    """Reads the columns of a table; a column of numbers in all filled cells becomes numeric.
 
-    Matrices below or beside each other are a row each; so are two rows, of the robot and of the
-    camera, that come by turns.
+    Stacked or adjacent 4 x 4 matrices give a row each, and so do alternating rows of robot and
+    camera poses.
     """
-    if matrices := _stacked_matrices(table) or _rows_by_turns(table):
+    if matrices := _stacked_matrices(table) or _alternating_rows(table):
         return matrices
     columns = list(zip(*table.rows, strict=True))
     texts = dict(zip(table.columns, columns, strict=True))
@@ -154,7 +153,7 @@ def fields_of_table(table: TextTable) -> Fields:
 
 
 def _stacked_matrices(table: TextTable) -> Fields | None:
-    """Takes 4 x 4 matrices that stand below each other, or beside each other in four rows."""
+    """Reads 4 x 4 matrices stacked below each other, or side by side in four rows."""
     height, width = len(table.rows), len(table.columns)
     count = height * width // 16
     if table.has_header or count < 2 or 4 not in (height, width) or (height + width) % 4:
@@ -172,23 +171,23 @@ def _stacked_matrices(table: TextTable) -> Fields | None:
     return Fields(table.path.stem, table.path.parent, places, rows)
 
 
-def _rows_by_turns(table: TextTable) -> Fields | None:
-    """Takes rows that say in their first cell, by turns, which of two poses they hold."""
+def _alternating_rows(table: TextTable) -> Fields | None:
+    """Reads alternating rows whose first cell labels them as robot or camera."""
     labels = [row[0] for row in table.rows]
-    numbers = [row[1:] for row in table.rows]
-    both = labels[:2]
-    if len(set(both)) < 2 or len(labels) < 4 or labels != both * (len(labels) // 2):
+    cells = [row[1:] for row in table.rows]
+    pair = labels[:2]
+    if len(set(pair)) < 2 or len(labels) < 4 or labels != pair * (len(labels) // 2):
         return None
-    if is_number(both[0]) or not all(is_number(name) for row in numbers for name in row):
+    if is_number(pair[0]) or not all(is_number(name) for row in cells for name in row):
         return None
-    arrays = np.array(numbers, dtype=float)
-    found = {
-        next((name for name, known in _LABELS.items() if label.lower() in known), label): at
-        for at, label in enumerate(both)
+    arrays = np.array(cells, dtype=float)
+    offsets = {
+        next((name for name, words in _LABELS.items() if label.lower() in words), label): at
+        for at, label in enumerate(pair)
     }
-    named = {name: arrays[at::2] for name, at in found.items()}
+    poses = {name: arrays[at::2] for name, at in offsets.items()}
     places = tuple(table.place(at) for at in range(0, len(labels), 2))
-    return Fields(table.path.stem, table.path.parent, places, named)
+    return Fields(table.path.stem, table.path.parent, places, poses)
 
 
 def fields_of_records(
@@ -198,7 +197,7 @@ def fields_of_records(
     folder: Path,
     views: tuple[int, ...] = (),
 ) -> Fields:
-    """Takes the values of n records, as `flattened` gives them; one that rows lack is NaN there."""
+    """Fields of n records as `flattened` returns them; a value missing in a row is NaN."""
     numbers: dict[str, FloatArray] = {}
     texts: dict[str, tuple[str, ...]] = {}
     ragged: dict[str, str] = {}
@@ -233,13 +232,12 @@ def fields_of_records(
 
 
 def flattened(record: object, prefix: str = "") -> dict[str, object]:
-    """Joins the names of nested mappings by points; parsing has bounded their depth.
+    """Flattens nested mappings with names joined by points; the parser has bounded the depth.
 
-    Numbers called x, y, z, or x, y, z, w, are an array besides.
+    Numbers named x, y, z, or x, y, z, w, are also joined into an array.
 
     Returns:
-        Texts, arrays of few numbers, and lists that are no arrays; what is larger or null is left
-        out.
+        Texts, small arrays, and lists that are no arrays; large arrays and nulls are left out.
     """
     if isinstance(record, Mapping):
         flat: dict[str, object] = {}
@@ -259,7 +257,7 @@ def flattened(record: object, prefix: str = "") -> dict[str, object]:
 
 
 def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
-    """Takes arrays whose first axis counts the rows; others are left out.
+    """Fields of arrays whose first axis counts the rows; others are left out.
 
     Raises:
         DataError: There is no array with rows.
@@ -293,7 +291,7 @@ def fields_of_arrays(arrays: Mapping[str, Array], path: Path) -> Fields:
 
 
 def _cells(numbers: FloatArray) -> tuple[str, ...]:
-    """Writes (n,) numbers as the cells of a table, whole ones as counts are written."""
+    """Writes (n,) numbers as cells of a table; whole numbers without a decimal point."""
     return tuple(
         "" if np.isnan(number) else str(int(number)) if number % 1 == 0 else repr(number)
         for number in numbers.tolist()
@@ -301,20 +299,21 @@ def _cells(numbers: FloatArray) -> tuple[str, ...]:
 
 
 def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
-    """Tells what the columns of a table without a header are, by how many there are.
+    """Interprets the columns of a table without a header by their number.
 
     Returns:
-        The columns of `time`, `robot` and `camera`; empty where it has a header or another number.
+        The columns of `time`, `robot` and `camera`; all empty for a table with a header or another
+        number of columns.
     """
     names = [str(at) for at in range(1, len(fields.texts) + 1)]
     if not names or list(fields.texts) != names:
         return {"time": (), "robot": (), "camera": ()}
-    time, robot, camera = _UNNAMED.get(len(names), (0, 0, 0))
+    time, robot, camera = _LAYOUTS.get(len(names), (0, 0, 0))
     if _are_matrices(fields, names):
         robot = 12
     if len(names) == 7 and set(names) == set(fields.numbers):
         last = np.stack([fields.numbers[name] for name in names[3:]])
-        if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NO_QUATERNION).all():
+        if (np.abs(np.linalg.norm(last, axis=0) - 1.0) > _NORM_TOLERANCE).all():
             # A number or a time, and a position with three angles.
             time, robot = 1, 6
     pose = names[time : time + robot]
@@ -328,7 +327,7 @@ def unnamed_columns(fields: Fields) -> Mapping[str, tuple[str, ...]]:
 
 
 def _are_rotations_first(fields: Fields, names: Sequence[str]) -> bool:
-    """Whether the last three of six numbers are no angles, even in degrees; the first may be."""
+    """Whether the last three of six numbers are too large for angles, and the first three not."""
     if not set(names) <= set(fields.numbers):
         return False
     first, last = np.abs([fields.numbers[name] for name in names]).reshape(2, -1)
@@ -336,16 +335,16 @@ def _are_rotations_first(fields: Fields, names: Sequence[str]) -> bool:
 
 
 def _are_matrices(fields: Fields, names: Sequence[str]) -> bool:
-    """Whether twelve numbers are the upper three rows of matrices, and not two poses."""
+    """Whether twelve numbers are the upper three rows of matrices, not two poses."""
     if len(names) != 12 or set(names) != set(fields.numbers):
         return False
     numbers = np.stack([fields.numbers[name] for name in names], axis=1)
     rows = numbers.reshape(-1, 3, 4)[..., :3]
-    return bool((np.abs(np.linalg.norm(rows, axis=2) - 1.0) < _NO_QUATERNION).all())
+    return bool((np.abs(np.linalg.norm(rows, axis=2) - 1.0) < _NORM_TOLERANCE).all())
 
 
 def stamp_name(fields: Fields, taken: Collection[str]) -> str:
-    """Finds the field of the times, one number a row and none of those `taken`; else empty."""
+    """Finds the field of times, one number a row and not `taken`; else empty."""
     named = (
         name
         for name, numbers in fields.numbers.items()
@@ -355,7 +354,7 @@ def stamp_name(fields: Fields, taken: Collection[str]) -> str:
 
 
 def _unnamed_times(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
-    """The times in a table without a header, where the poses stand behind them."""
+    """Times in a table without a header, where the poses follow them."""
     unnamed = unnamed_columns(fields)
     if not set(unnamed["robot"]) <= set(taken):
         return ()
@@ -363,5 +362,5 @@ def _unnamed_times(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
 
 
 def _are_counts(numbers: FloatArray) -> bool:
-    """Whether numbers are those of rows, of which some may be left out, and no times."""
+    """Whether numbers count rows, possibly with gaps, rather than time."""
     return bool((numbers % 1 == 0).all() and numbers.max(initial=0.0) < _LARGEST_COUNT)

@@ -1,4 +1,4 @@
-"""Finding files: in natural order, by the number in their names, and images by their rows."""
+"""Finds files: in natural order, by the number in their names, and images by their rows."""
 
 import re
 from collections import Counter
@@ -10,23 +10,23 @@ from visioncal.core.files import is_inside, natural
 from visioncal.core.number_format import some_of
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-# Enough to recognise a text file.
+# Length that suffices to recognise a text file.
 _HEAD_BYTES = 16_384
 
 
 def number_in(name: str) -> int | None:
-    """Takes the last number in a name without its ending; None where there is none."""
+    """Last number in a file's name without its ending; None where there is none."""
     digits = re.findall(r"[0-9]+", Path(name).stem)
     return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
 
 
 def kind_of(path: Path) -> str:
-    """A file's name without the last number in it: what files of one kind have in common."""
+    """A file's name without its last number: equal for files of one series."""
     return re.sub(r"[0-9]+([^0-9]*)$", r"\1", path.stem).strip("_-. ") + path.suffix.lower()
 
 
 def listed(folder: Path) -> tuple[Path, ...]:
-    """Lists the files of a folder in natural order; none where it cannot be listed.
+    """Files of a folder in natural order; empty where it cannot be listed.
 
     Links that lead out of it are left out.
     """
@@ -39,25 +39,25 @@ def listed(folder: Path) -> tuple[Path, ...]:
 
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
-    """Lists the images of a folder in natural order."""
-    found = tuple(path for path in listed(folder) if is_image_name(path.name))
-    if not found:
-        is_there = folder.is_dir()
+    """Images of a folder in natural order."""
+    images = tuple(path for path in listed(folder) if is_image_name(path.name))
+    if not images:
+        is_folder = folder.is_dir()
         raise DataError(
             f"{folder} has no images (png, jpg, tif)."
-            if is_there
+            if is_folder
             else f"{folder} {'is no folder' if folder.exists() else 'does not exist'}; the folder "
             "of the images is needed.",
             culprits=[str(folder)],
             next_step="Name the folder of the images with --images."
-            if is_there
+            if is_folder
             else "Check the path and its spelling.",
         )
-    return found
+    return images
 
 
 def head(path: Path) -> str:
-    """Reads the beginning of a text file; empty where it is none."""
+    """The beginning of a text file; empty where it is not text."""
     try:
         with path.open("rb") as file:
             data = file.read(_HEAD_BYTES)
@@ -72,57 +72,57 @@ def images_named(
     """Finds the images that rows name.
 
     Args:
-        names: (n,) what each row says; None or empty in a row without an image.
+        names: (n,) image names; None or empty in a row without an image.
         base: What the names are relative to.
-        folder: Where the images lie now; they are matched by name, else by the number in it.
+        folder: Where the images are now; matched by name, else by the number in it.
 
     Returns:
-        (n,) paths; one that does not exist is where the source says that it should be.
+        (n,) paths; for a missing image the path that the source states.
 
     Raises:
-        DataError: A name leaves the folder, or is of no image.
+        DataError: A name leaves the folder, or is not an image's.
     """
     if folder is None:
-        found = [_beside(base, name) if name else None for name in names]
+        paths = [_beside(base, name) if name else None for name in names]
     else:
-        found = _found(names, folder)
-    for name, path in zip(names, found, strict=True):
+        paths = _images_by_name(names, folder)
+    for name, path in zip(names, paths, strict=True):
         if path is not None and not is_image_name(path.name):
             raise DataError(
                 f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif or bmp is needed.",
                 culprits=[str(name)[:80]],
                 next_step="Correct it, or name the column of the images with --image-column.",
             )
-    return tuple(found)
+    return tuple(paths)
 
 
-def _found(names: Sequence[str | None], folder: Path) -> list[Path | None]:
-    there = _images_in(folder)
-    by_name = {item.stem: item for item in there} | {item.name: item for item in there}
-    by_number = _unique_numbers(there)
-    wanted = [number_in(name) for name in names if name]
-    is_unique = len(set(wanted)) == len(wanted) and None not in wanted
-    found: list[Path | None] = []
+def _images_by_name(names: Sequence[str | None], folder: Path) -> list[Path | None]:
+    images = _images_in(folder)
+    by_name = {item.stem: item for item in images} | {item.name: item for item in images}
+    by_number = _unique_numbers(images)
+    numbers = [number_in(name) for name in names if name]
+    is_unique = len(set(numbers)) == len(numbers) and None not in numbers
+    paths: list[Path | None] = []
     for name in names:
         if not name:
-            found.append(None)
+            paths.append(None)
             continue
         plain = name.replace("\\", "/").rsplit("/", 1)[-1]
         number = number_in(plain)
         match = by_name.get(plain)
         if match is None and is_unique and number is not None:
             match = by_number.get(number)
-        found.append(match or below(folder, plain))
-    return found
+        paths.append(match or below(folder, plain))
+    return paths
 
 
 def is_image_name(name: str) -> bool:
-    """Tells whether a name ends as those of images do."""
+    """Whether a name has an image's ending."""
     return name.lower().endswith(IMAGE_ENDINGS)
 
 
 def _beside(base: Path, name: str) -> Path:
-    """Finds a named image where the name says, else in the folder `images` beside the source."""
+    """Path of a named image, as the name says or in the folder `images` beside the source."""
     path = below(base, name)
     inner = base / "images" / path.name
     return inner if not path.exists() and is_inside(inner, base) and inner.exists() else path
@@ -133,12 +133,8 @@ def _images_of(
 ) -> tuple[tuple[Path | None, ...], tuple[str, ...]]:
     """Pairs rows with the images of a folder, by number or in order.
 
-    Args:
-        folder: The folder.
-        views: (n,) the rows' numbers.
-        labels: (n,) the rows' places, for messages.
-        numbered: Whether these numbers stand in the source's names; else rows and images are paired
-            in natural order, and must be as many.
+    With `numbered` the rows' numbers are from the source's names; otherwise rows and images are
+    paired in natural order, and their counts must agree.
 
     Returns:
         (n,) paths, None in a row whose number no image has; and a note where order decides.
@@ -146,10 +142,10 @@ def _images_of(
     Raises:
         DataError: There are no images, several a pose, or not as many as rows.
     """
-    there = _images_in(folder)
-    by_number = _unique_numbers(there)
-    kinds = Counter(kind_of(path) for path in there if number_in(path.name) in set(views))
-    if numbered and kinds and len(by_number) < len(there):
+    images = _images_in(folder)
+    by_number = _unique_numbers(images)
+    kinds = Counter(kind_of(path) for path in images if number_in(path.name) in set(views))
+    if numbered and kinds and len(by_number) < len(images):
         usual = [name for name, count in kinds.items() if count == max(kinds.values())]
         if len(usual) > 1:
             raise DataError(
@@ -158,23 +154,23 @@ def _images_of(
                 culprits=usual,
                 next_step="Put those of one kind into a folder, and name it with --images.",
             )
-        there = tuple(path for path in there if kind_of(path) in usual)
-        by_number = _unique_numbers(there)
-    if numbered and len(by_number) == len(there) and by_number.keys() & set(views):
+        images = tuple(path for path in images if kind_of(path) in usual)
+        by_number = _unique_numbers(images)
+    if numbered and len(by_number) == len(images) and by_number.keys() & set(views):
         return tuple(by_number.get(view) for view in views), ()
-    if len(there) != len(views):
-        first, last = there[0].name, there[-1].name
+    if len(images) != len(views):
+        first, last = images[0].name, images[-1].name
         raise DataError(
-            f"{folder} has {len(there)} images ({first} ... {last}), but there are {len(views)} "
+            f"{folder} has {len(images)} images ({first} ... {last}), but there are {len(views)} "
             f"poses ({labels[0]} ... {labels[-1]}); one image a pose is needed.",
             culprits=[str(folder)],
             next_step="Name each row's image with --image-column, or remove what is over. Where "
             "that is not known, remove the last: visioncal doctor then says from where on rows and "
             "images are shifted.",
         )
-    return there, (
-        f"Rows and images are paired in order, {labels[0]} with {there[0].name}, {labels[-1]} with "
-        f"{there[-1].name}; --image-column names a column that names each row's image.",
+    return images, (
+        f"Rows and images are paired in order, {labels[0]} with {images[0].name}, {labels[-1]} "
+        f"with {images[-1].name}; --image-column names a column that names each row's image.",
     )
 
 
@@ -192,7 +188,7 @@ def images_beside(
         (n,) paths, None in a row whose number no image has; and a note where order decides.
 
     Raises:
-        DataError: `chosen` has no images, or they are not as many as the rows.
+        DataError: `chosen` has no images, or not as many as there are rows.
     """
     beside = any(is_image_name(path.name) for path in listed(folder))
     if chosen is None and not beside:
@@ -207,10 +203,10 @@ def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:
 
 
 def below(base: Path, name: str) -> Path:
-    """Finds the file that a document names, relative to the document's folder.
+    """Path of a file that a document names, relative to the document's folder.
 
     Raises:
-        DataError: The path leaves the folder, itself or by a link, or can be none.
+        DataError: The path is invalid, or leaves the folder, itself or by a link.
     """
     path = base / name.replace("\\", "/")
     if not is_inside(path, base):

@@ -1,4 +1,4 @@
-"""What someone else recorded, before anything is believed of it; and what a format of it is."""
+"""A foreign recording as its numbers are written, and the description of a foreign format."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -12,7 +12,7 @@ from visioncal.interchange.formats.import_options import ImportOptions
 
 @dataclass(frozen=True, eq=False)
 class ForeignSweep:
-    """Two streams of one motion, each with a clock of its own.
+    """Two streams of one motion, each with its own clock.
 
     Attributes:
         robot_s: (n,) times [s], ascending.
@@ -29,12 +29,7 @@ class ForeignSweep:
 
 @dataclass(frozen=True, eq=False)
 class FoundCorners:
-    """Corners of a target that another program has found in one image.
-
-    Attributes:
-        ids: (k,) their numbers on the target.
-        px: (k, 2) where they are [px].
-    """
+    """Corners found by another program in one image: (k,) ids on the target, (k, 2) pixels [px]."""
 
     ids: IntArray
     px: FloatArray
@@ -42,27 +37,26 @@ class FoundCorners:
 
 @dataclass(frozen=True, eq=False)
 class Foreign:
-    """A recording in somebody else's form: n rows, each what was seen from one pose.
+    """A recording in a foreign format: n rows, each an observation at one robot pose.
 
     Attributes:
-        name: Its name.
         robot: `base_from_flange` of each row.
-        camera: `cam_from_target` of each row; None where images stand for it.
+        camera: `cam_from_target` of each row; None where images are used instead.
         images: (n,) the image of each row; None in a row without one, empty where there are none.
-        corners: (n,) what another program found in each row's image; None in a row without, empty
-            where none did.
+        corners: (n,) corners found by another program in each row's image; None in a row without,
+            empty where there are none.
         joints_rad: (n, j) joint angles [rad], NaN in a row without; None where they were not
             recorded.
         stamps_s: (n,) times [s]; None where they were not recorded.
-        mount: How the camera is mounted, where the source says so.
+        mount: How the camera is mounted, where the source states it.
         target: The content of a target's `.toml`, where the source describes one.
         lens: The fields of `[camera]` in session.toml, where the source has intrinsics.
-        arm: The fields of `[robot]` in session.toml, where the user names one.
+        arm: The fields of `[robot]` in session.toml, where the user names a robot.
         views: (n,) the rows' numbers in the source; 0, 1, ... where empty.
-        sweep: Two streams with clocks of their own, of which the rows are a sample; None where the
+        sweep: Two streams with separate clocks, of which the rows are a sample; None where the
             source has one clock.
         columns: Further columns of views.csv with their (n,) cells.
-        notes: What was assumed or left aside, in sentences for the user.
+        notes: Assumptions and omissions, in sentences for the user.
     """
 
     name: str
@@ -83,7 +77,7 @@ class Foreign:
 
 
 def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
-    """Takes some rows of a recording, in the order that is given."""
+    """Some rows of a recording, in the given order."""
     count = len(foreign.robot)
     return replace(
         foreign,
@@ -102,14 +96,13 @@ def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
 
 @dataclass(frozen=True)
 class ForeignFormat:
-    """A form in which others store what they recorded; it is read and never written.
+    """A foreign format of recordings, which is read and never written.
 
     Attributes:
-        name: As the command line has it.
-        words: What it is, for messages.
-        recognises: Whether a path that exists looks like it; it never raises DataError.
-        read: Reads the recording at a path; how its poses are written is already taken as the
-            user says, so that whoever gets them need not ask.
+        name: Its name on the command line.
+        words: Its description, for messages.
+        recognises: Whether an existing path looks like this format; never raises DataError.
+        read: Reads the recording at a path, with the user's options for its poses already applied.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What the user says of somebody else's recording, beyond what the recording says itself."""
+"""The user's options for a foreign recording: what the recording does not state itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from visioncal.core.types import Mount
 
 @dataclass(frozen=True)
 class PoseImportOptions:
-    """Where poses stand and how they are written; what is None or empty is left to the source.
+    """Location and convention of poses; None or empty leaves it to the source.
 
     Attributes:
         names: Columns of a table, keys of JSON or arrays of an .npz: position first.
@@ -28,16 +28,16 @@ class PoseImportOptions:
 
     @property
     def is_scalar_first(self) -> bool:
-        """Whether the user says that quaternions begin with their scalar part."""
+        """Whether the stated form has quaternions with the scalar first."""
         maker = POSE_FORMS.get(self.form or "")
         return (self.form if maker is None else maker.rotation) == "quaternion-wxyz"
 
     def applied_to(self, poses: PoseNumbers) -> PoseNumbers:
-        """Reads poses as the user says; what the user does not say stays."""
+        """The poses with the user's options in place of the declared reading."""
         return poses.read_as(self.reading(poses.reading))
 
     def reading(self, declared: Reading) -> Reading:
-        """Changes a declared reading into what the user says.
+        """The declared reading with the user's options in its place.
 
         Raises:
             DataError: There is no such form or unit.
@@ -58,31 +58,28 @@ class PoseImportOptions:
         return reading
 
 
-def _check(what: str, name: str, known: Sequence[str]) -> None:
-    if name not in known:
+def _check(what: str, name: str, names: Sequence[str]) -> None:
+    if name not in names:
         raise DataError(
-            f"There is no {what} named {name!r}; the names are {some_of(known, 20)}.",
+            f"There is no {what} named {name!r}; the names are {some_of(names, 20)}.",
             culprits=[name],
-            next_step=did_you_mean(name, known),
+            next_step=did_you_mean(name, names),
         )
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Everything that the user says of a recording.
+    """All options for a foreign recording.
 
     Attributes:
         robot: Of the robot's poses, `base_from_flange`.
         camera: Of the measured poses of the target, `cam_from_target`.
         joints: Columns or keys of the joint angles.
-        joints_deg: Whether these are in degrees.
         image: The column or key that names each row's image.
         camera_file: A second file, which holds the camera's poses.
-        mount: How the camera is mounted.
-        target: A shipped name, the path of a `.toml`, or a description in one word.
+        target: A shipped name, the path of a `.toml`, or a one-word description.
         intrinsics: The path of a file with intrinsics, or `estimate`.
-        images: A folder with the images.
-        corners: A file with the corners that another program found in the images.
+        corners: A file with corners that another program found in the images.
         resolution: (width, height) [px].
         robot_model: A built-in robot's name, or the path of a .urdf or a DH .toml.
         tip: The frame that the poses are of.

@@ -1,4 +1,4 @@
-"""ROS-Industrial: industrial_calibration, and robot_cal_tools before it."""
+"""ROS-Industrial's industrial_calibration, and its predecessor robot_cal_tools."""
 
 import re
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 
-# Others keep the pose itself there.
+# Other formats have the pose itself under this key.
 _NAMED_POSE = re.compile(r"\bpose: *[\"']?[^\n\"'\[{,]+\.ya?ml\b", re.IGNORECASE)
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -38,8 +38,8 @@ def _kinematic_file(path: Path) -> Path | None:
 
 
 def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
-    """Reads cal_data.yaml with a pose file and an image a row."""
-    # The poses are of the robot's flange in its base; `static_camera` gives the mount.
+    """Reads cal_data.yaml with a pose file and an image in each row."""
+    # Poses are of the robot's flange in its base; `static_camera` gives the mount.
     file = _required(_hand_eye_file(path), path, "a cal_data.yaml with pose and image rows")
     document = mapping(read_yaml(file), str(file))
     rows = document.get("data")
@@ -52,7 +52,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
         if not isinstance(name, str):
             raise DataError(f"{file}: data, row {at} names no pose.", culprits=[str(file)])
         stored = below(file.parent, name)
-        poses.append(_pose_numbers_of(read_yaml(stored), str(stored)))
+        poses.append(_pose_numbers(read_yaml(stored), str(stored)))
         places.append(name)
         names.append(str(entry["image"]) if entry.get("image") else None)
     numbers = np.array(poses)
@@ -62,7 +62,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
             f"{file}: static_camera is {static!r}; true or false is needed.", culprits=[str(file)]
         )
     notes: list[str] = []
-    # What the user says stands in place of what the source does.
+    # The user's options replace what the source states.
     lens = None if requested.intrinsics else _lens(document, str(file), notes)
     target = None if requested.target else _target(document, notes)
     numbered = [number_in(place) for place in places]
@@ -81,7 +81,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
     )
 
 
-def _pose_numbers_of(value: object, where: str) -> list[float]:
+def _pose_numbers(value: object, where: str) -> list[float]:
     """Reads x, y, z, qx, qy, qz, qw [m]."""
     content = mapping(value, where)
     return [number(content.get(name), f"{where}: {name}") for name in _POSE]
@@ -118,22 +118,22 @@ def _target(document: Mapping[str, Any], notes: list[str]) -> dict[str, Any] | N
 
 
 def _dictionary(value: object, where: str) -> str:
-    """Names OpenCV's dictionary of a number."""
+    """Name of OpenCV's dictionary with a number."""
     if isinstance(value, str):
         return value
     wanted = _integer(value, where)
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
-    found = [name for name in names if getattr(cv2.aruco, name) == wanted]
-    if not found:
+    matching = [name for name in names if getattr(cv2.aruco, name) == wanted]
+    if not matching:
         raise DataError(f"{where} is {wanted}, which OpenCV does not have.", culprits=[where])
-    return found[0]
+    return matching[0]
 
 
 def _integer(value: object, where: str) -> int:
-    found = number(value, where)
-    if found % 1:
-        raise DataError(f"{where} is {found}; a whole number is needed.", culprits=[where])
-    return int(found)
+    parsed = number(value, where)
+    if parsed % 1:
+        raise DataError(f"{where} is {parsed}; a whole number is needed.", culprits=[where])
+    return int(parsed)
 
 
 def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
@@ -144,7 +144,7 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
     joints: dict[str, list[FloatArray]] = {"camera_joints": [], "target_joints": []}
     for name, row in document.items():
         entry = mapping(row, f"{file}: {name}")
-        poses.append(_pose_numbers_of(entry.get("pose"), f"{file}: {name}: pose"))
+        poses.append(_pose_numbers(entry.get("pose"), f"{file}: {name}: pose"))
         for chain, values in joints.items():
             values.append(as_numbers(entry.get(chain, []), f"{file}: {name}: {chain}").reshape(-1))
     moving = [name for name, values in joints.items() if any(len(row) for row in values)]

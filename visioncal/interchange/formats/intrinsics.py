@@ -1,4 +1,4 @@
-"""Intrinsics as others store them, turned into the fields of `[camera]` in session.toml."""
+"""Reads intrinsics in foreign formats as the fields of `[camera]` in session.toml."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,7 +42,7 @@ _DISTORTION_KEYS: tuple[str, ...] = (
     "D1",
 )
 _SIZE_KEYS = (("image_width", "image_height"), ("width", "height"), ("w", "h"))
-# Pixels are square to a millionth of their size, or the model is another.
+# Largest skew relative to the focal length; more is another camera model.
 _MOST_SKEW = 1e-6
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
 _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "brown", "none")
@@ -51,15 +51,15 @@ _BROWN = ("plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "br
 def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Reads the intrinsics of a camera.
 
-    Known are ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
+    Supports ROS camera_info (YAML), OpenCV's FileStorage (YAML, XML, JSON), Kalibr's camchain,
     ViSP's camera XML, ROS-Industrial's fx, fy, cx, cy, and .npz or JSON with a matrix under one of
     the usual names.
 
     Returns:
-        model, matrix, distortion, and resolution where the file has it; and what was assumed.
+        model, matrix, distortion, and resolution where the file has it; and notes on assumptions.
 
     Raises:
-        DataError: It is none of these, or a lens model that is not known here.
+        DataError: It is none of these, or has an unknown lens model.
     """
     if path.suffix.lower() == ".npz":
         return intrinsics_from(read_npz(path), str(path))
@@ -73,10 +73,10 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
 def intrinsics_from(
     content: Mapping[str, Any], where: str
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Takes the intrinsics out of a document, as `read_intrinsics` does out of a file.
+    """Reads the intrinsics from a document, as `read_intrinsics` does from a file.
 
     Raises:
-        DataError: There are none in it.
+        DataError: It has none.
     """
     if "cam0" in content:
         return _kalibr(mapping(content["cam0"], f"{where}: cam0"), f"{where}: cam0"), ()
@@ -108,7 +108,7 @@ def intrinsics_from(
 
 
 def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
-    """Takes nine numbers as fx, 0, cx; 0, fy, cy; 0, 0, 1: by rows or, as 0, 0, 1 shows, columns.
+    """Reads the nine numbers of a camera matrix, by rows or, as 0, 0, 1 shows, by columns.
 
     Open3D and MATLAB write columns.
     """
@@ -126,7 +126,7 @@ def _camera_matrix(numbers: FloatArray, where: str) -> FloatArray:
 
 
 def _array(value: object, where: str) -> FloatArray:
-    """Numbers, or the data of a ROS matrix."""
+    """Reads numbers, or the data of a ROS matrix."""
     if isinstance(value, Mapping):
         return as_numbers(value.get("data"), f"{where}: data")
     return as_numbers(value, where)
@@ -145,7 +145,7 @@ def _model(name: str, where: str) -> str:
 
 
 def _kalibr(content: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Kalibr's camchain (Kalibr wiki, "Yaml formats"): pinhole with radtan or equidistant."""
+    """Reads Kalibr's camchain (Kalibr wiki, "Yaml formats"): pinhole with radtan or equidistant."""
     if content.get("camera_model", "pinhole") != "pinhole":
         raise DataError(
             f"{where}: the camera model {str(content['camera_model'])[:40]!r} is not known; "
@@ -164,8 +164,8 @@ def _kalibr(content: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _visp(root: Element, where: str) -> dict[str, Any]:
-    """ViSP's camera XML (ViSP, vpCameraParameters)."""
-    # Its k_ud carries undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
+    """Reads ViSP's camera XML (ViSP, vpCameraParameters)."""
+    # Its k_ud maps undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
     camera = root.child("camera") or root
     models = [child for child in camera.children if child.tag == "model"]
     kinds = [(model.child("type") or model).text for model in models]
@@ -207,8 +207,7 @@ def _lens(
     if not np.isfinite(values).all() or beyond:
         what = f"{len(coefficients)} coefficients" if beyond else "a number that is not finite"
         raise DataError(
-            f"{where}: {what}; up to {count} of the {model} model are known here.",
-            culprits=[where],
+            f"{where}: {what}; up to {count} of the {model} model are known here.", culprits=[where]
         )
     padded = (coefficients + [0.0] * count)[:count]
     lens: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Poses, joints and images out of named fields."""
+"""Finds and reads poses and joint angles in named fields."""
 
 import re
 from collections import Counter, defaultdict
@@ -16,7 +16,7 @@ from visioncal.interchange.formats.import_options import PoseImportOptions
 from visioncal.interchange.formats.worded import ANGLE_UNITS, DEGREES, without_unit, worded_poses
 from visioncal.session.columns import SELECTORS, joint_columns
 
-# Names under which pose pairs are commonly stored, the most specific first.
+# Common names of pose fields, the most specific first.
 ROBOT_KEYS: tuple[tuple[str, ...], ...] = (
     ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
     ("effector_wrt_world",),
@@ -58,7 +58,7 @@ CAMERA_KEYS: tuple[tuple[str, ...], ...] = (
 )
 JOINT_KEYS: tuple[str, ...] = ("joint_pose", "joints", "joint_angles", "joint_positions", "q")
 
-# A turn, and what rounding adds; joints may count some turns.
+# Largest angle: a turn with rounding; joints may make several turns.
 _MOST_RAD = 2 * np.pi + 0.01
 _MOST_TURNS_RAD = 10 * 2 * np.pi
 
@@ -76,43 +76,44 @@ _ANGLES_NAME = re.compile(r"rpy|roll|euler")
 def known_names(
     fields: Fields, candidates: Sequence[tuple[str, ...]], taken: Collection[str]
 ) -> tuple[str, ...]:
-    """Finds the first of several sets of names that are all there and free, in any case of letters.
+    """Finds the first set of names whose fields all exist and are free, ignoring case and units.
 
-    Units behind names do not count.
-
-    What holds no numbers counts where its name is clear, so that it is refused by its place.
+    A text field counts only within a set of several names, so that a wrong cell is reported by its
+    place.
 
     Returns:
-        The fields' full names; empty where no set is whole.
+        The fields' full names; empty where no set is complete.
     """
-    # One number in a field called `robot` or `camera` says which of several it is.
+    # A single number in a field called `robot` or `camera` is a selector, not a pose.
     numbers = (
-        name for name, them in fields.numbers.items() if them.ndim > 1 or name not in SELECTORS
+        name for name, values in fields.numbers.items() if values.ndim > 1 or name not in SELECTORS
     )
-    holding = [*numbers, *fields.ragged]
-    worded = (name for name, cells in fields.texts.items() if any(cells) and name not in SELECTORS)
-    names = list(dict.fromkeys([*holding, *worded]))
-    whole = _sets_of_names(names, candidates, taken)
-    return next((pair for pair in whole if len(pair) > 1 or pair[0] in holding), ())
+    numeric = [*numbers, *fields.ragged]
+    textual = (name for name, cells in fields.texts.items() if any(cells) and name not in SELECTORS)
+    names = list(dict.fromkeys([*numeric, *textual]))
+    complete = _sets_of_names(names, candidates, taken)
+    return next(
+        (candidate for candidate in complete if len(candidate) > 1 or candidate[0] in numeric), ()
+    )
 
 
 def _sets_of_names(
     names: Sequence[str], candidates: Sequence[tuple[str, ...]], taken: Collection[str]
 ) -> Iterator[tuple[str, ...]]:
-    """Yields the full names of every candidate that is whole."""
-    free = [name for name in names if name not in taken]
-    endings = Counter(name.rsplit(".", 1)[-1] for name in free)
-    full = {end: name for name in free if endings[end := name.rsplit(".", 1)[-1]] == 1}
-    full |= {name: name for name in free}
-    # A name in the very letters of a candidate goes before one in other letters or with a unit.
+    """Yields the full names of every complete candidate."""
+    free_names = [name for name in names if name not in taken]
+    endings = Counter(name.rsplit(".", 1)[-1] for name in free_names)
+    full = {end: name for name in free_names if endings[end := name.rsplit(".", 1)[-1]] == 1}
+    full |= {name: name for name in free_names}
+    # An exact match of a name goes before one in another case or with a unit.
     plain = {name: without_unit(name)[0].lower() for name in full}
     counts = Counter(plain.values())
-    bare = {plain[word]: name for word, name in full.items() if counts[plain[word]] == 1}
-    full = bare | {word.lower(): name for word, name in full.items()} | full
-    for them in candidates:
-        found = tuple(full.get(name, full.get(name.lower(), "")) for name in them)
-        if all(found):
-            yield found
+    without_units = {plain[word]: name for word, name in full.items() if counts[plain[word]] == 1}
+    full = without_units | {word.lower(): name for word, name in full.items()} | full
+    for candidate in candidates:
+        matches = tuple(full.get(name, full.get(name.lower(), "")) for name in candidate)
+        if all(matches):
+            yield matches
 
 
 def pose_names(
@@ -126,16 +127,16 @@ def pose_names(
 
     Args:
         fields: The fields.
-        given: What the user names.
-        unnamed: What they are in a table without a header.
+        given: Names that the user gives.
+        unnamed: The pose columns of a table without a header.
         whose: `robot` or `camera`.
-        taken: Full names of those that hold something else.
+        taken: Full names of fields with another use.
 
     Returns:
-        Full names; empty where nothing says it.
+        Full names; empty where no fields are recognised.
 
     Raises:
-        DataError: The user names what is not there.
+        DataError: The user names a field that does not exist.
     """
     if given:
         return tuple(fields.find(name) for name in given)
@@ -148,37 +149,38 @@ def pose_names(
 def poses_from(
     fields: Fields, names: Sequence[str], requested: PoseImportOptions, whose: str
 ) -> tuple[PoseNumbers, tuple[str, ...]]:
-    """Takes poses out of fields.
+    """Reads poses from fields.
 
-    16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 its upper
-    three rows, or a position and a rotation by rows, whichever makes rotations; else three of
-    position and those of a rotation, in whichever order names such as rvec and tvec say it.
+    16 numbers are a matrix, by rows or by columns as its last row of 0, 0, 0, 1 shows; 12 are its
+    upper three rows, or a position and a rotation by rows, whichever gives rotations; otherwise a
+    position of three numbers and a rotation, ordered as names such as rvec and tvec show.
 
     Args:
         fields: The fields.
-        names: Which of them hold the poses.
-        requested: What the user says of them.
+        names: The fields that hold the poses.
+        requested: The user's options.
         whose: `robot` or `camera`, for messages.
 
     Returns:
-        The poses, and what was assumed of them.
+        The poses, and notes on assumptions.
 
     Raises:
-        DataError: There are no such fields, or their numbers make up no pose.
+        DataError: There are no such fields, or their numbers are no poses.
     """
     if whose == "robot" and fields.form:
-        requested = _with_own_form(fields, requested)
+        requested = _with_stated_form(fields, requested)
     if not requested.names and len(names) == 7 and requested.is_scalar_first:
-        # That is said of the columns as they stand, and these were found by their names.
-        written = {name: at for at, name in enumerate(fields.numbers)}
-        names = (*names[:3], *sorted(names[3:], key=lambda name: written.get(name, 0)))
+        # --form refers to the columns in their order in the file, and these were found by their
+        # names.
+        order = {name: at for at, name in enumerate(fields.numbers)}
+        names = (*names[:3], *sorted(names[3:], key=lambda name: order.get(name, 0)))
     blocks = [fields.column(name) for name in names]
     sizes = [block.shape[1] for block in blocks]
     places = fields.places
     if sum(sizes) in (12, 16) and 9 not in sizes:
         numbers = PoseNumbers(*_matrices(np.hstack(blocks)), Reading("matrix"), places)
         return _checked(requested.applied_to(numbers), requested, whose, ())
-    positions, rotations, turned = _split(blocks, names)
+    positions, rotations, rotation_names = _split(blocks, names)
     if rotations.shape[1] not in (3, 4, 9) or positions.shape[1] != 3:
         raise DataError(
             f"{fields.name}: {', '.join(names)} have {sum(sizes)} numbers; a pose has 16 or 12 "
@@ -188,7 +190,7 @@ def poses_from(
         )
     units = {without_unit(name)[1] for name in names}
     rotation, notes = _likely_rotation(
-        rotations.shape[1], turned, requested, whose, degrees=bool(units & {*DEGREES})
+        rotations.shape[1], rotation_names, requested, whose, degrees=bool(units & {*DEGREES})
     )
     numbers = PoseNumbers(positions, rotations, Reading(rotation), places)
     lengths = units - {"", *ANGLE_UNITS}
@@ -197,8 +199,8 @@ def poses_from(
     return _checked(requested.applied_to(numbers), requested, whose, notes)
 
 
-def _with_own_form(fields: Fields, requested: PoseImportOptions) -> PoseImportOptions:
-    """Reads the robot's poses in the form that their rows say."""
+def _with_stated_form(fields: Fields, requested: PoseImportOptions) -> PoseImportOptions:
+    """Options with the pose form that the rows themselves state."""
     if requested.form not in (None, fields.form):
         raise DataError(
             f"{fields.places[0]}: the pose is written as {POSE_FORMS[fields.form].words}, not as "
@@ -210,9 +212,9 @@ def _with_own_form(fields: Fields, requested: PoseImportOptions) -> PoseImportOp
 
 
 def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
-    """Finds the fields of joint angles: a list of them, or one a joint that counts from one."""
-    if whole := joint_columns(tuple(fields.numbers)):
-        return whole
+    """Finds the fields of joint angles: one list, or a field a joint numbered from one."""
+    if columns := joint_columns(tuple(fields.numbers)):
+        return columns
     if listed := known_names(fields, [(key,) for key in JOINT_KEYS], taken):
         return listed
     counted: dict[tuple[str, ...], dict[int, str]] = defaultdict(dict)
@@ -221,23 +223,24 @@ def joint_names(fields: Fields, taken: Collection[str]) -> tuple[str, ...]:
         is_whole = numbers.ndim == 1 and bool(np.isfinite(numbers).all())
         if match and is_whole and name not in taken:
             counted[match.group(1, 3)][int(match[2])] = name
-    for them in counted.values():
+    for by_number in counted.values():
         # Four numbers q1 ... may be a quaternion.
-        if len(them) >= _LEAST_JOINTS and [*them] == [*range(1, len(them) + 1)]:
-            return tuple(them.values())
+        if len(by_number) >= _LEAST_JOINTS and [*by_number] == [*range(1, len(by_number) + 1)]:
+            return tuple(by_number.values())
     return ()
 
 
 def joints_from(
     fields: Fields, names: Sequence[str], *, degrees: bool
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Takes joint angles out of fields, in degrees where they or their names say so.
+    """Reads joint angles from fields, in degrees where the options, the names or their size say so.
 
     Returns:
-        (n, j) angles [rad], and what was assumed of them.
+        (n, j) angles [rad], and notes on assumptions.
 
     Raises:
-        DataError: There are no such fields, a row lacks some, or they are no radians as named.
+        DataError: There are no such fields, a row lacks some, or they are too large for the radians
+            of their names.
     """
     joints = np.hstack([fields.column(name) for name in names])
     bad = ~np.isfinite(joints).all(axis=1)
@@ -262,29 +265,25 @@ def joints_from(
 def check_radians(
     poses: PoseNumbers, requested: PoseImportOptions, whose: str, *, guesses: bool = True
 ) -> None:
-    """Checks that angles of which nobody says what they are can be radians.
+    """Checks that angles of unstated unit can be radians.
 
-    Args:
-        poses: The poses.
-        requested: What the user says of them.
-        whose: `robot` or `camera`, for messages.
-        guesses: Whether the command can try other readings.
+    `guesses` says whether the command can try other readings, which the message then suggests.
 
     Raises:
-        DataError: They turn farther than once about.
+        DataError: An angle exceeds one turn.
     """
     there, rotation = poses.there, poses.reading.rotation
     radians = rotation == "rotation-vector" or rotation.endswith("-rad")
-    open_degrees = rotation == "rotation-vector-deg" and requested.form is None
-    if not (radians or open_degrees) or not there.any():
+    is_degrees = rotation == "rotation-vector-deg" and requested.form is None
+    if not (radians or is_degrees) or not there.any():
         return
     largest = np.abs(np.where(there[:, None], poses.rotations, 0.0)).max(axis=1)
     row = int(largest.argmax())
-    if open_degrees or largest[row] > _MOST_RAD:
-        found = "angles in degrees" if open_degrees else f"an angle of {largest[row]:.4g}"
+    if is_degrees or largest[row] > _MOST_RAD:
+        what = "angles in degrees" if is_degrees else f"an angle of {largest[row]:.4g}"
         raise DataError(
-            f"{poses.places[row]}: the {whose}'s rotation has {found}"
-            + ("" if open_degrees else ", too large for radians")
+            f"{poses.places[row]}: the {whose}'s rotation has {what}"
+            + ("" if is_degrees else ", too large for radians")
             + ("." if requested.form else ", and the source does not say what it is."),
             culprits=[poses.places[row]],
             next_step=f"Say --{whose}-form: kuka, or doosan, where the angles are A, B, C; fanuc "
@@ -294,10 +293,10 @@ def check_radians(
 
 
 def as_matrix(value: object, where: str) -> FloatArray:
-    """Reads the 16 numbers of a matrix: (4, 4).
+    """Reads the 16 numbers of a (4, 4) matrix.
 
     Raises:
-        DataError: They are not as many, or not finite.
+        DataError: Their number is another, or they are not finite.
     """
     numbers = as_numbers(value, where)
     if numbers.size != 16 or not np.isfinite(numbers).all():
@@ -309,7 +308,7 @@ def as_matrix(value: object, where: str) -> FloatArray:
 
 
 def matrix_numbers(matrices: FloatArray, places: Sequence[str], *, unit: str = "m") -> PoseNumbers:
-    """Takes (n, 4, 4) matrices as poses."""
+    """Poses of (n, 4, 4) matrices."""
     flat = matrices.reshape(len(matrices), 16)
     return PoseNumbers(*_matrices(flat), Reading("matrix", unit), tuple(places))
 
@@ -319,9 +318,12 @@ def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
     last = np.array([0.0, 0, 0, 1])
     if flat.shape[1] == 12:
         matrices = flat.reshape(-1, 3, 4)
-        behind = ROTATION_FORMS["matrix"].read(flat[:, 3:])
-        above = ROTATION_FORMS["matrix"].read(matrices[:, :, :3].reshape(-1, 9))
-        if np.isfinite(behind).all(axis=(1, 2)).sum() > np.isfinite(above).all(axis=(1, 2)).sum():
+        after_position = ROTATION_FORMS["matrix"].read(flat[:, 3:])
+        upper_rows = ROTATION_FORMS["matrix"].read(matrices[:, :, :3].reshape(-1, 9))
+        if (
+            np.isfinite(after_position).all(axis=(1, 2)).sum()
+            > np.isfinite(upper_rows).all(axis=(1, 2)).sum()
+        ):
             return flat[:, :3].copy(), flat[:, 3:].copy()
     else:
         square = flat.reshape(-1, 4, 4)
@@ -330,7 +332,8 @@ def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
         wrong = np.isfinite(matrices).all(axis=(1, 2)) & (
             np.abs(matrices[:, 3] - last).max(axis=1) > 1e-6
         )
-        # A matrix with another last row is no rigid transform: its rotation is refused as such.
+        # A matrix with another last row is no rigid transform: its zeroed rotation is refused
+        # later.
         matrices = np.where(wrong[:, None, None], 0.0, matrices)
     return matrices[:, :3, 3].copy(), matrices[:, :3, :3].reshape(-1, 9).copy()
 
@@ -338,7 +341,7 @@ def _matrices(flat: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _split(
     blocks: Sequence[FloatArray], names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-    """Tells position from rotation: (positions, rotations, the rotation's names)."""
+    """Separates position from rotation: (positions, rotations, the rotation's names)."""
     if len(blocks) == 2:
         first, second = blocks
         rotation_first = (
@@ -364,10 +367,10 @@ def _likely_rotation(
             if len(names) == 1
             else "".join(name[-1].lower() for name in names)
         )
-        # ABB counts q1 to q4 from the scalar on.
-        counted = [name[-2:].lower() for name in names] == ["q1", "q2", "q3", "q4"]
-        rotation = f"quaternion-{'wxyz' if counted or ends == 'wxyz' else 'xyzw'}"
-        if requested.form is not None or counted or ends in ("xyzw", "wxyz"):
+        # ABB numbers q1 to q4 from the scalar on.
+        is_abb = [name[-2:].lower() for name in names] == ["q1", "q2", "q3", "q4"]
+        rotation = f"quaternion-{'wxyz' if is_abb or ends == 'wxyz' else 'xyzw'}"
+        if requested.form is not None or is_abb or ends in ("xyzw", "wxyz"):
             return rotation, ()
         return rotation, (
             f"The {whose}'s quaternions are taken for x, y, z, w, as the source does not say; "
@@ -377,7 +380,7 @@ def _likely_rotation(
     if _ANGLES_NAME.search(joined):
         return f"euler-xyz-{'deg' if degrees else 'rad'}", ()
     if degrees:
-        # What they are besides is asked for, unless the user says it.
+        # Angle units are checked later, unless the user states them.
         return "rotation-vector-deg", ()
     if requested.form is None and "rvec" not in joined:
         return "rotation-vector", (

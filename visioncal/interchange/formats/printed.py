@@ -1,7 +1,7 @@
-"""Poses as programs print them, as pendants show them and as robots' programs have them.
+"""Reads poses printed by programs, shown by pendants, or taught in robot programs.
 
-Matrices of four lines each, under a line that says what they are; and translation [m] and
-quaternion x, y, z, w of ROS (tf_echo, tf2_echo).
+Printed poses are matrices of four lines each, below a heading; or ROS's translation [m] and
+quaternion x, y, z, w (tf_echo, tf2_echo).
 """
 
 import re
@@ -19,7 +19,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.interchange.formats.fields import Fields
 
-_BETWEEN = re.compile(r"[\s,;\[\]()]+")
+_SEPARATORS = re.compile(r"[\s,;\[\]()]+")
 _POSE = re.compile(
     r"- Translation: \[([^\[\]]*)\]\s+- Rotation: in Quaternion(?: \(xyzw\))? \[([^\[\]]*)\]"
 )
@@ -27,42 +27,42 @@ _POSE_NAMES = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 # Programs of FANUC, KUKA, ABB and Universal Robots.
 PROGRAMS = (".ls", ".dat", ".src", ".mod", ".modx", ".script", ".urscript")
-# Names under which poses are looked for, by how many numbers they have.
+# Field names of a pose by its number of values.
 _NAMES = {6: ("x", "y", "z", "rx", "ry", "rz"), 7: ("x", "y", "z", "q1", "q2", "q3", "q4")}
 _IMAGE = re.compile(r"[^\s,;\"']+\.(?:png|jpe?g|tiff?|bmp)(?![\w.])", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//", "!")
-_REMARKS = ("#", "!", ";", "&")
+_PROGRAM_COMMENTS = ("#", "!", ";", "&")
 _STATEMENT = re.compile(r"(?:[^\n{}]++|\{[^{}]*+\})++")
-# Poses of something else than the flange or the tool at a stop.
-_NO_STOP = re.compile(r"tooldata|wobjdata|set_tcp|TOOL_DATA|BASE_DATA|\bFRAME\b|offs\s*\(", re.I)
+# Poses other than of the flange or the tool at a stop.
+_NOT_A_STOP = re.compile(r"tooldata|wobjdata|set_tcp|TOOL_DATA|BASE_DATA|\bFRAME\b|offs\s*\(", re.I)
 
 
 def printed_fields(path: Path) -> Fields | None:
-    """Takes the 4 x 4 matrices of a text, those under one heading as one field.
+    """Reads the 4 x 4 matrices of a text, a field for each heading.
 
     Returns:
         The rows; None where the text has fewer than two matrices, or no heading.
 
     Raises:
-        DataError: Headings have different numbers of matrices under them.
+        DataError: The headings have different numbers of matrices.
     """
-    found: dict[str, list[tuple[int, list[list[float]]]]] = defaultdict(list)
-    heading, begins = "", 0
+    by_heading: dict[str, list[tuple[int, list[list[float]]]]] = defaultdict(list)
+    heading, first_line = "", 0
     rows: list[list[float]] = []
     for at, line in enumerate(read_plain_text(path).splitlines(), start=1):
-        words = [part for part in _BETWEEN.split(line) if part]
+        words = [part for part in _SEPARATORS.split(line) if part]
         if len(words) == 4 and all(map(is_number, words)):
-            begins = begins if rows else at
+            first_line = first_line if rows else at
             rows.append([float(word) for word in words])
         elif words:
-            heading, rows = _plain(line), []
+            heading, rows = _heading(line), []
         if len(rows) == 4:
             if rows[3] == [0.0, 0.0, 0.0, 1.0]:
-                found[heading].append((begins, rows))
+                by_heading[heading].append((first_line, rows))
             rows = []
-    if sum(map(len, found.values())) < 2 or not any(found):
+    if sum(map(len, by_heading.values())) < 2 or not any(by_heading):
         return None
-    counts = {name: len(them) for name, them in found.items()}
+    counts = {name: len(matrices) for name, matrices in by_heading.items()}
     if len(set(counts.values())) > 1:
         listed = some_of([f"{count} under {name!r}" for name, count in counts.items()])
         raise DataError(
@@ -70,23 +70,23 @@ def printed_fields(path: Path) -> Fields | None:
             culprits=[*counts],
             next_step="Remove those of views of which another is missing.",
         )
-    first = next(iter(found.values()))
+    first = next(iter(by_heading.values()))
     places = tuple(f"{path.name}, line {at}" for at, _ in first)
     numbers = {
-        name or "matrix": np.array([group for _, group in them]).reshape(-1, 16)
-        for name, them in found.items()
+        name or "matrix": np.array([matrix for _, matrix in matrices]).reshape(-1, 16)
+        for name, matrices in by_heading.items()
     }
     return Fields(path.stem, path.parent, places, numbers)
 
 
-def _plain(line: str) -> str:
-    """A heading without what differs from one to the next: `Pose 3:` is `Pose`."""
+def _heading(line: str) -> str:
+    """A heading without its numbering: `Pose 3:` is `Pose`."""
     words = re.findall(r"[^\W\d_]+(?:[^\W_]*[^\W\d_])?", line)
     return " ".join(words)[:80]
 
 
 def echoed_fields(path: Path) -> Fields | None:
-    """Takes every pose that was printed; once a second, as the times say, it is no stream.
+    """Reads every pose printed by tf_echo; their times, once a second, are ignored.
 
     Returns:
         The rows; None where the text has none.
@@ -113,10 +113,10 @@ def echoed_fields(path: Path) -> Fields | None:
 
 
 def pendant_fields(path: Path) -> Fields | None:
-    """Takes the lines of a text file that hold poses, each with its image where it names one.
+    """Reads lines with poses in a maker's notation, each with the name of its image if it has one.
 
     Returns:
-        The rows; None where the first lines hold no pose with a maker's marks.
+        The rows; None where neither of the first two lines holds such a pose.
 
     Raises:
         DataError: A line has no pose, or another maker's than the first.
@@ -126,13 +126,13 @@ def pendant_fields(path: Path) -> Fields | None:
         for at, line in enumerate(read_plain_text(path).splitlines(), start=1)
         if line.strip() and not line.strip().startswith(_COMMENTS)
     ]
-    # A header may stand first.
+    # The first line may be a header.
     first = next((at for at, (_, line) in enumerate(lines[:2]) if is_marked_pose(line)), None)
     return None if first is None else _fields_of_lines(path, lines[first:])
 
 
 def program_fields(path: Path) -> Fields:
-    """Takes the taught poses of a robot's program; tools, bases and joints of it are left aside.
+    """Reads the taught poses of a robot program; its tools, bases and joint targets are skipped.
 
     Raises:
         DataError: There are none, or they are in several forms.
@@ -142,7 +142,8 @@ def program_fields(path: Path) -> Fields:
     lines = [
         (text.count("\n", 0, match.start()) + 1, match[0].replace("\n", " "))
         for match in _STATEMENT.finditer(text)
-        if not match[0].lstrip().startswith(_REMARKS) and _NO_STOP.search(match[0]) is None
+        if not match[0].lstrip().startswith(_PROGRAM_COMMENTS)
+        and _NOT_A_STOP.search(match[0]) is None
     ]
     poses = [line for line in lines if is_marked_pose(line[1])]
     if not poses:
@@ -153,7 +154,7 @@ def program_fields(path: Path) -> Fields:
 def _fields_of_lines(path: Path, lines: Sequence[tuple[int, str]]) -> Fields:
     places = tuple(f"{path.name}, line {at}" for at, _ in lines)
     texts = [line for _, line in lines]
-    images = tuple(found[0] if (found := _IMAGE.search(text)) else "" for text in texts)
+    images = tuple(match[0] if (match := _IMAGE.search(text)) else "" for text in texts)
     poses = [
         read_pose(_IMAGE.sub(" ", text), place) for text, place in zip(texts, places, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""The formats that are known, and the way from one to another."""
+"""All foreign formats, and the conversion of sessions and foreign recordings."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +24,7 @@ from visioncal.interchange.formats.yaml_folders import VISP, ZIVID
 from visioncal.session import Session
 from visioncal.session.selecting import check_one_of_each
 
-# The first that recognises a path reads it: those that look for less come last.
+# The first that recognises a path reads it, so the least specific come last.
 FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
     HAND_EYE,
     KINEMATICS,
@@ -38,7 +38,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
 
 _DEFAULTS = ImportOptions()
 
-# Tries other readings of the poses, and settles which is right.
+# Tries other readings of the poses, and selects one.
 Choose: TypeAlias = Callable[[InDoubt | Foreign], Candidate]
 
 
@@ -54,27 +54,27 @@ def convert(
     mirrors_poses: bool = False,
     exchange: tuple[int, int] | None = None,
 ) -> Session:
-    """Writes a session, or somebody else's recording, as a session's folder or as a recording.
+    """Writes a session or a foreign recording as a session's folder or as a recording.
 
-    A session goes from one form of ours to another without loss.
+    Conversion between our own formats is lossless.
 
     Args:
         source: The session, as a folder or an .rrd, or a recording in any of `FOREIGN_FORMATS`.
-        dest: Where to; its suffix says in which form, and none of theirs means a folder.
-        requested: What is to be known of somebody else's recording beyond what it says.
-        form: The name of its format, where it is not to be recognised.
-        force: Whether a file that is there may be replaced; a folder never is.
-        choose: Called, where it is in doubt how the poses are meant, with what was read; what it
-            answers is what is written.
-        mirrors_poses: Whether that may mirror the robot's poses.
-        exchange: Two views whose images, corners and readings are to be exchanged.
+        dest: Destination; its suffix selects the format, and any other suffix means a folder.
+        requested: Options for a foreign recording.
+        form: The name of its format; None to recognise it.
+        force: Whether an existing file may be replaced; a folder never is.
+        choose: Called with what was read where the convention of the poses is in doubt; returns the
+            reading to apply.
+        mirrors_poses: Whether that reading may mirror the robot's poses.
+        exchange: Two views whose images, corners and readings are exchanged.
 
     Returns:
         The session.
 
     Raises:
-        DataError: `source` is neither, `requested` is not for it, `dest` is taken, cannot be
-            written or, read again, is another session.
+        DataError: `source` is neither, `requested` does not apply to it, `dest` exists, cannot be
+            written, or reads back differently.
     """
     source, dest = Path(source), Path(dest)
     _check_dest(source, dest, force=force)
@@ -109,26 +109,23 @@ def convert(
 
 
 def read_foreign(source: Path, requested: ImportOptions, form: str | None = None) -> Foreign:
-    """Reads somebody else's recording, as the user says that it is to be read.
+    """Reads a foreign recording with the user's options applied.
 
-    Args:
-        source: A file or folder in any of `FOREIGN_FORMATS`.
-        requested: What the user says of it.
-        form: The name of its format; None to recognise it.
+    Its format is recognised unless `form` names it.
 
     Raises:
-        DataError: It is of no known format, or something in it is wrong.
+        DataError: Its format is unknown, or something in it is wrong.
     """
-    # Two files are two tables, whatever the first of them looks like.
+    # With a second file, both are tables, whatever the first looks like.
     form = form or (TABLE.name if requested.camera_file is not None else None)
     return wished(_foreign_format(source, form).read(source, requested), requested)
 
 
 def write_session(session: Session, dest: Path) -> None:
-    """Writes a session in the form that the suffix of `dest` names, and reads it again.
+    """Writes a session in the format of the suffix of `dest`, and checks that it reads back.
 
     Raises:
-        DataError: There is nothing in the session, `dest` cannot be written, or does not hold it.
+        DataError: The session is empty, `dest` cannot be written, or reads back differently.
     """
     if not session.views and not session.streams:
         raise DataError(
@@ -137,7 +134,7 @@ def write_session(session: Session, dest: Path) -> None:
             next_step="Nothing was written; record it again.",
         )
     if _is_recording(dest):
-        # The codec takes half a second to import, which help need not wait for.
+        # The codec takes half a second to import, which --help need not wait for.
         from visioncal.present.recording import write_recording
         from visioncal.present.viewer import blueprint
 
@@ -157,8 +154,8 @@ def _is_recording(path: Path) -> bool:
 
 
 def _is_session(path: Path) -> bool:
-    """Whether a path is one of ours."""
-    # A result is no session either, but what it is and where its session lies is told on reading.
+    """Whether a path is a session or a result."""
+    # Loading a result reports what it is and where its session is.
     is_result = path.name == "calibration.json" or (path / "recording.rrd").is_file()
     is_folder = is_result or (path / "session.toml").is_file()
     return is_folder or (path.is_file() and _is_recording(path))
@@ -181,7 +178,7 @@ def _check_source(source: Path) -> None:
 
 def _check_dest(source: Path, dest: Path, *, force: bool) -> None:
     is_folder = not _is_recording(dest)
-    # An empty folder is free for a session's folder, which looks for itself.
+    # An empty folder is checked by the session's writer.
     if not (is_folder and dest.is_dir()):
         same = source.exists() and dest.exists() and dest.samefile(source)
         check_free(dest, force=force, replaceable=not is_folder and not same)
@@ -196,15 +193,15 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
             culprits=[form],
             next_step=did_you_mean(form, names),
         )
-    for known in FOREIGN_FORMATS:
-        if known.name == form or (form is None and known.recognises(source)):
-            return known
-    own = ("a session's folder", "an .rrd recording")
-    words = "; ".join([*own, *(foreign_format.words for foreign_format in FOREIGN_FORMATS)])
-    inside = ", ".join(path.name for path in listed(source)[:8]) if source.is_dir() else ""
+    for candidate in FOREIGN_FORMATS:
+        if candidate.name == form or (form is None and candidate.recognises(source)):
+            return candidate
+    own_formats = ("a session's folder", "an .rrd recording")
+    words = "; ".join([*own_formats, *(foreign_format.words for foreign_format in FOREIGN_FORMATS)])
+    contents = ", ".join(path.name for path in listed(source)[:8]) if source.is_dir() else ""
     raise DataError(
         f"{source} is no session and in no format that is known: {words}."
-        + (f" It holds {inside}." if inside else ""),
+        + (f" It holds {contents}." if contents else ""),
         culprits=[str(source)],
         next_step="Write the poses into a CSV with a header, a row a view.",
     )

@@ -1,4 +1,4 @@
-"""Other readings of a recording's poses: which is right, and the recording read that way."""
+"""Finds another reading of a recording's poses, and applies it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,28 +38,28 @@ from visioncal.session.corners import CornerTable
 from visioncal.session.table import TextRow, parse_csv
 from visioncal.vision.targets import LARGEST_M
 
-# Distances between consecutive rows of one log go up and down together.
-_FEWEST_STEPS, _SAME_LOG = 4, 0.9
-# No printed square is larger.
+# Least number and correlation of pose steps by which joints and poses are of one log.
+_FEWEST_STEPS, _LEAST_CORRELATION = 4, 0.9
+# Largest size of a printed square.
 _LARGEST_MM = 1e3 * LARGEST_M
 # Rotations with larger numbers are in degrees [rad].
 _LARGEST_RAD = 7.0
-_NO_TURN = ("0.0", "0.0", "0.0", "1.0")
-# In which a board's size is written that is too large for metres; the likeliest first.
+_IDENTITY = ("0.0", "0.0", "0.0", "1.0")
+# Units of a board's size that is too large for metres, the most likely first.
 _BOARD_UNITS = ("mm", "cm", "inch")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
 def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Guess:
-    """Tries every plausible reading of somebody else's poses, and both mounts where none is known.
+    """Tries every plausible reading of a foreign recording's poses, and both mounts if needed.
 
     Raises:
-        DataError: There is nothing to read, the target is in no view, or nothing shows the mount.
+        DataError: There are no poses, no view shows the target, or nothing determines the mount.
         DegenerateError: Too few views have both poses.
-        ConvergenceError: The intrinsics do not come to rest.
+        ConvergenceError: The intrinsics do not converge.
     """
     foreign = spoken(foreign)
-    # The mount has no part in what is taken from the session here.
+    # The mount does not affect what is read from the session here.
     session = assemble(foreign, mount=MOUNTS[0])
     chain = chain_poses(session)
     camera = foreign.camera
@@ -75,47 +75,42 @@ def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Gues
 
 
 def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = False) -> Foreign:
-    """Reads a recording as a candidate has it: poses, pairing, mount and the size of the board.
-
-    Args:
-        foreign: The recording.
-        candidate: How its poses are meant.
-        mirrors_poses: Whether the robot's poses may be mirrored.
+    """Applies a candidate reading to a recording: poses, pairing, mount and the size of the board.
 
     Raises:
-        DataError: It reads the robot's poses otherwise, and there are joint angles in their place;
-            or it mirrors them, unasked.
+        DataError: It changes the robot's poses where only joint angles are recorded, or mirrors
+            them without permission.
     """
     if _mirrors(candidate) and not mirrors_poses:
         raise _not_mirrored(candidate)
-    foreign, notes, taken = spoken(foreign), _note(candidate), candidate.hypothesis
+    foreign, notes, reading = spoken(foreign), _change_notes(candidate), candidate.hypothesis
     if foreign.mount is None:
-        notes = (*notes, f"The mount is taken for {taken.mount}.")
+        notes = (*notes, f"The mount is taken for {reading.mount}.")
     robot, camera, joints = foreign.robot, foreign.camera, foreign.joints_rad
     _check_applies(candidate, robot)
     if joints is not None:
-        chain = chain_poses(assemble(foreign, mount=taken.mount))
-        if _go_together(chain, robot):
-            order = taken.rows(len(joints))
+        chain = chain_poses(assemble(foreign, mount=reading.mount))
+        if _is_one_log(chain, robot):
+            order = reading.rows(len(joints))
             joints = np.where((order >= 0)[:, None], joints[order], np.nan)
     target, sweep = foreign.target, foreign.sweep
     if sweep is not None:
-        corrected = taken.robot.corrected(sweep.robot), taken.camera.corrected(sweep.camera)
+        corrected = reading.robot.corrected(sweep.robot), reading.camera.corrected(sweep.camera)
         sweep = replace(sweep, robot=corrected[0], camera=corrected[1])
     return replace(
         foreign,
         sweep=sweep,
-        robot=taken.robot_numbers(robot) if robot.there.any() else robot,
-        camera=None if camera is None else taken.camera_numbers(camera),
+        robot=reading.robot_numbers(robot) if robot.there.any() else robot,
+        camera=None if camera is None else reading.camera_numbers(camera),
         joints_rad=joints,
-        mount=taken.mount,
+        mount=reading.mount,
         target=None if target is None else _scaled(target, candidate.board_scale),
         notes=(*(note for note in foreign.notes if not _is_overruled(note, candidate)), *notes),
     )
 
 
 def _is_overruled(note: str, candidate: Candidate) -> bool:
-    """Whether a note says what was assumed of something that is now read otherwise."""
+    """Whether a note states an assumption that the candidate changes."""
     if " taken for " not in note:
         return False
     start = note.replace("quaternions", "rotations").lower()
@@ -126,11 +121,11 @@ def _is_overruled(note: str, candidate: Candidate) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class InDoubt:
-    """A session that is to be read anew.
+    """A session whose poses may be in another convention.
 
     Attributes:
-        session: It, with any rotations where its own are of no form that sessions have.
-        robot: The numbers of its robot's poses as they are written; None for those that it has.
+        session: The session, with identity rotations where its own are in an unsupported form.
+        robot: The robot's poses as they are written; None for those of the session.
     """
 
     session: Session
@@ -138,92 +133,96 @@ class InDoubt:
 
 
 def load_in_doubt(path: Path) -> InDoubt:
-    """Loads a session that is to be read anew, even where it cannot be read as it stands.
+    """Loads a session for rereading, even where its poses or its board's size are invalid.
 
-    A board larger than any is taken for the unit with which the chain closes, else for millimetres;
-    positions and rotations may be in other columns, or of another form, than those of sessions.
+    A board too large for metres is read in the unit with which the chain closes, else in
+    millimetres; positions and rotations may be in columns or forms that sessions do not have.
 
     Raises:
         DataError: It is no session.
     """
-    table = _otherwise_written(path) if path.is_dir() else None
+    table = _other_columns(path) if path.is_dir() else None
     plain, robot = (None, None) if table is None else (table.plain, table.robot)
     file = path / "session.toml"
     name = read_toml(file, file.name).get("target") if file.is_file() else None
-    stated = {}
+    stated_target = {}
     if isinstance(name, str) and name.endswith(".toml"):
-        stated = read_toml(path / name, name)
-    sides = (stated.get(name) for name in ("square_m", "size_m"))
-    numbers = (side for side in sides if isinstance(side, int | float))
+        stated_target = read_toml(path / name, name)
+    lengths = (stated_target.get(name) for name in ("square_m", "size_m"))
+    numbers = (side for side in lengths if isinstance(side, int | float))
     side = next((number for number in numbers if LARGEST_M < number < _LARGEST_MM), None)
     if side is None:
         return InDoubt(Session.load(path, table=plain), robot)
-    ways = {}
+    by_unit = {}
     for unit in _BOARD_UNITS:
         if UNITS_M[unit] * side <= LARGEST_M:
-            target = _scaled(stated, UNITS_M[unit])
-            ways[unit] = Session.load(path, target_document=target, table=plain)
-    scores = {unit: _closing_score(way, robot) for unit, way in ways.items()}
+            target = _scaled(stated_target, UNITS_M[unit])
+            by_unit[unit] = Session.load(path, target_document=target, table=plain)
+    scores = {unit: _closing_score(session, robot) for unit, session in by_unit.items()}
     unit = min(scores, key=lambda index: scores[index])
     note = f"{name} cannot be in metres: {side:g} is read as {side:g} {unit}."
-    return InDoubt(replace(ways[unit], warnings=(note, *ways[unit].warnings)), robot)
+    return InDoubt(replace(by_unit[unit], warnings=(note, *by_unit[unit].warnings)), robot)
 
 
 def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
-    """How well the chain closes as declared; infinite where it does not."""
+    """Score of the chain's closure as declared; infinite where it does not close."""
     try:
         declared = guess_session(session, robot).declared
     except VisioncalError:
-        # The reading that is then tried says why.
+        # The candidate reading that is then tried reports the error.
         return np.inf
     return declared.score if declared.closes else np.inf
 
 
 @dataclass(frozen=True, eq=False)
 class _PoseTable:
-    """A views.csv whose poses are written otherwise than sessions have them.
+    """A views.csv whose poses are in columns or forms that sessions do not have.
 
     Attributes:
-        plain: Its columns and rows, with positions as they are and the rotation of no turn.
-        robot: What it says of the poses.
+        plain: Its columns and rows, with the same positions and identity rotations.
+        robot: The poses as they are written.
     """
 
     plain: tuple[tuple[str, ...], tuple[TextRow, ...]]
     robot: PoseNumbers
 
 
-def _otherwise_written(folder: Path) -> _PoseTable | None:
+def _other_columns(folder: Path) -> _PoseTable | None:
     """Reads positions and rotations of other columns or forms; None where there are none."""
     if not (folder / "views.csv").is_file():
         return None
     columns, rows = parse_csv(read_text_inside(folder, "views.csv"), "views.csv")
-    places = position_columns(columns) or POSITION
-    spelt = {name.lower(): name for name in columns}
-    others = (
-        tuple(spelt[name] for name in names) for names in ROTATIONS if spelt.keys() >= set(names)
+    position_names = position_columns(columns) or POSITION
+    exact_names = {name.lower(): name for name in columns}
+    complete = (
+        tuple(exact_names[name] for name in names)
+        for names in ROTATIONS
+        if exact_names.keys() >= set(names)
     )
-    turns = QUATERNION if set(QUATERNION) <= set(columns) else next(others, ())
-    if not turns or not {*places} <= {*columns}:
+    rotation_names = QUATERNION if set(QUATERNION) <= set(columns) else next(complete, ())
+    if not rotation_names or not {*position_names} <= {*columns}:
         return None
     cells = [dict(zip(columns, row.cells, strict=False)) for row in rows]
-    numbers = [[_number(row.get(name, "")) for name in (*places, *turns)] for row in cells]
-    values = np.array(numbers).reshape(-1, len(places) + len(turns))
+    numbers = [
+        [_number(row.get(name, "")) for name in (*position_names, *rotation_names)] for row in cells
+    ]
+    values = np.array(numbers).reshape(-1, len(position_names) + len(rotation_names))
     positions, rotations = values[:, :3], values[:, 3:]
-    if turns == QUATERNION:
+    if rotation_names == QUATERNION:
         if not np.nan_to_num(rotations[:, 3]).any():
             rotations = rotations[:, :3]
-        elif places == POSITION:
+        elif position_names == POSITION:
             return None
     form = "quaternion-xyzw"
     if rotations.shape[1] == 3:
         largest = float(np.nanmax(np.abs(rotations), initial=0.0))
         form = "euler-xyz-deg" if largest > _LARGEST_RAD else "rotation-vector"
-    kept = [name for name in columns if name not in {*places, *turns}]
+    kept = [name for name in columns if name not in {*position_names, *rotation_names}]
     plain = []
-    for row, mine, position in zip(rows, cells, positions, strict=True):
-        is_there = np.isfinite(position).all()
-        pose = [*map(repr, position.tolist()), *_NO_TURN] if is_there else [""] * len(POSE)
-        plain.append(replace(row, cells=(*(mine.get(name, "") for name in kept), *pose)))
+    for row, row_cells, position in zip(rows, cells, positions, strict=True):
+        has_position = np.isfinite(position).all()
+        pose = [*map(repr, position.tolist()), *_IDENTITY] if has_position else [""] * len(POSE)
+        plain.append(replace(row, cells=(*(row_cells.get(name, "") for name in kept), *pose)))
     robot = PoseNumbers(positions, rotations, Reading(form), tuple(row.where for row in rows))
     return _PoseTable(((*kept, *POSE), tuple(plain)), robot)
 
@@ -239,42 +238,37 @@ def reread_session(
     *,
     mirrors_poses: bool = False,
 ) -> Session:
-    """Reads a session's poses as a candidate has it; everything else stays as it is.
+    """Applies a candidate reading to a session's poses; everything else stays the same.
 
-    Of a mirror, corners.csv is turned back where it shows the board from behind. The session says
-    what was changed.
-
-    Args:
-        session: The session.
-        candidate: How its poses are meant.
-        robot: The numbers of its robot's poses as they are written; left out, those that it has.
-        mirrors_poses: Whether the robot's poses may be mirrored.
+    `robot` has the robot's poses as they are written; None for the session's own. For a mirror,
+    corners.csv is mirrored back where it shows the board from behind. The session notes the changes
+    in `corrected`.
 
     Raises:
-        DataError: The session that comes out is wrong; or as `reread`.
+        DataError: The resulting session is invalid; or as `reread`.
     """
     corners = session.corner_table
-    changed: tuple[str, ...] = ()
+    changes: tuple[str, ...] = ()
     if _mirrors(candidate) and not mirrors_poses:
         if corners is None or session.resolution is None or not session_is_mirrored(session):
             raise _not_mirrored(candidate)
-        corners, changed, candidate = _turned_back(corners, session.resolution[0], candidate)
+        corners, changes, candidate = _mirrored_back(corners, session.resolution[0], candidate)
     cells = [{name: view.cell(name) for name in session.columns} for view in session.views]
     camera = numbers_in(session, MEASURED_CAM_POSE)
     robot = numbers_in(session, POSE) if robot is None else robot
-    taken = candidate.hypothesis
+    reading = candidate.hypothesis
     _check_applies(candidate, robot)
-    if _go_together(chain_poses(session), robot):
-        _reorder(cells, taken.rows(len(cells)), joint_columns(session.columns))
+    if _is_one_log(chain_poses(session), robot):
+        _reorder(cells, reading.rows(len(cells)), joint_columns(session.columns))
     if robot.there.any():
-        _replace(cells, pose_cells(taken.robot_numbers(robot), POSE), POSE)
+        _replace_cells(cells, pose_cells(reading.robot_numbers(robot), POSE), POSE)
     if camera.there.any():
-        corrected = pose_cells(taken.camera_numbers(camera), MEASURED_CAM_POSE)
-        _replace(cells, corrected, MEASURED_CAM_POSE)
-    changed = (*changed, *_note(candidate))
-    document = {**session.document, "mount": taken.mount}
-    if changed:
-        document["corrected"] = [*session.declaration.corrected, *changed]
+        corrected = pose_cells(reading.camera_numbers(camera), MEASURED_CAM_POSE)
+        _replace_cells(cells, corrected, MEASURED_CAM_POSE)
+    changes = (*changes, *_change_notes(candidate))
+    document = {**session.document, "mount": reading.mount}
+    if changes:
+        document["corrected"] = [*session.declaration.corrected, *changes]
     target = session.target_document
     if target is not None and candidate.board_scale != 1.0 and not session.targets:
         target = _scaled(target, candidate.board_scale)
@@ -288,14 +282,14 @@ def reread_session(
         robot_document=session.robot_document,
         corners=corners,
     ).with_streams(
-        {name: _reread_stream(stream, taken) for name, stream in session.streams.items()}
+        {name: _reread_stream(stream, reading) for name, stream in session.streams.items()}
     )
-    said = dict.fromkeys((*changed, *session.warnings, *reread.warnings))
-    return replace(reread, warnings=tuple(said))
+    notes = dict.fromkeys((*changes, *session.warnings, *reread.warnings))
+    return replace(reread, warnings=tuple(notes))
 
 
-def _reread_stream(stream: Stream, taken: Hypothesis) -> Stream:
-    """Reads the poses of a stream as they are read in views."""
+def _reread_stream(stream: Stream, reading: Hypothesis) -> Stream:
+    """Applies a reading to the poses of a stream."""
     if any(name not in stream for name in POSE):
         return stream
     numbers = np.stack([stream[name] for name in POSE], axis=1)
@@ -303,7 +297,7 @@ def _reread_stream(stream: Stream, taken: Hypothesis) -> Stream:
     poses = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
     values = stream.values.copy()
     columns = [stream.columns.index(name) for name in POSE]
-    rows = pose_cells(taken.robot.corrected(poses), POSE)
+    rows = pose_cells(reading.robot.corrected(poses), POSE)
     values[:, columns] = [[float(row.get(name, "nan")) for name in POSE] for row in rows]
     values.setflags(write=False)
     return replace(stream, values=values)
@@ -314,7 +308,7 @@ def _mirrors(candidate: Candidate) -> bool:
 
 
 def _not_mirrored(candidate: Candidate) -> DataError:
-    """Says that poses are not mirrored unasked: those of mirrored images are right."""
+    """Error of a mirror without permission: with mirrored images, the poses are right."""
     return DataError(
         "Nothing was written: mirrored images are the usual cause, and then the robot's poses are "
         "right.",
@@ -324,10 +318,10 @@ def _not_mirrored(candidate: Candidate) -> DataError:
     )
 
 
-def _turned_back(
+def _mirrored_back(
     corners: CornerTable, width: int, candidate: Candidate
 ) -> tuple[CornerTable, tuple[str, ...], Candidate]:
-    """Mirrors corners back, with the words for it and a candidate that leaves the poses alone."""
+    """Mirrored corners, the note for it, and the candidate without its mirror of the poses."""
     px = corners.px.copy()
     px[:, 0] = width - 1 - px[:, 0]
     words = (
@@ -335,24 +329,26 @@ def _turned_back(
         "poses are not mirrored. Where it was v_px that counted from the wrong side, mirror v_px "
         "instead: the camera's frame is turned by 180 deg about its z else."
     )
-    tried = candidate.hypothesis
-    tried = replace(tried, robot=replace(tried.robot, signs=""))
-    others = tuple(difference for difference in candidate.differences if difference != MIRROR_WORDS)
+    reading = candidate.hypothesis
+    reading = replace(reading, robot=replace(reading.robot, signs=""))
+    differences = tuple(
+        difference for difference in candidate.differences if difference != MIRROR_WORDS
+    )
     return (
         replace(corners, px=px),
         (words,),
-        replace(candidate, hypothesis=tried, differences=others),
+        replace(candidate, hypothesis=reading, differences=differences),
     )
 
 
-def _note(candidate: Candidate) -> tuple[str, ...]:
+def _change_notes(candidate: Candidate) -> tuple[str, ...]:
     if not candidate.changes:
         return ()
     return (f"The poses are read otherwise than declared: {candidate.words}.",)
 
 
 def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
-    """Joint angles can change rows with their views, and nothing else."""
+    """Refuses another reading of poses where only joint angles are recorded."""
     if not robot.there.any() and candidate.hypothesis.robot != candidate.declared.robot:
         raise DataError(
             f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
@@ -362,20 +358,20 @@ def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
         )
 
 
-def _go_together(chain: FloatArray | None, robot: PoseNumbers) -> bool:
-    """Whether each row's joint angles are of its pose: they then change rows with it."""
-    # Without a model of the robot this stays open, and one log is the likelier.
+def _is_one_log(chain: FloatArray | None, robot: PoseNumbers) -> bool:
+    """Whether joint angles and poses of a row belong together, and are reordered together."""
+    # Without a robot model this cannot be checked, and one log is more likely.
     if chain is None or not robot.there.any():
         return True
-    # Other units or frames move all rows alike: what differs from row to row shows it.
+    # Other units or frames change all rows alike, so the steps between rows are compared.
     steps = [
-        np.linalg.norm(np.diff(array, axis=0), axis=1)
-        for array in (chain[:, :3, 3], robot.positions)
+        np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        for positions in (chain[:, :3, 3], robot.positions)
     ]
-    both = np.isfinite(steps).all(axis=0)
-    if both.sum() < _FEWEST_STEPS:
+    finite = np.isfinite(steps).all(axis=0)
+    if finite.sum() < _FEWEST_STEPS:
         return True
-    return bool(np.corrcoef(steps[0][both], steps[1][both])[0, 1] > _SAME_LOG)
+    return bool(np.corrcoef(steps[0][finite], steps[1][finite])[0, 1] > _LEAST_CORRELATION)
 
 
 def _reorder(rows: Sequence[dict[str, str]], order: IntArray, names: Sequence[str]) -> None:
@@ -384,11 +380,11 @@ def _reorder(rows: Sequence[dict[str, str]], order: IntArray, names: Sequence[st
         row.update(before[at] if at >= 0 else dict.fromkeys(names, ""))
 
 
-def _replace(
+def _replace_cells(
     rows: Sequence[dict[str, str]], cells: Sequence[Mapping[str, str]], names: Sequence[str]
 ) -> None:
-    for row, own in zip(rows, cells, strict=True):
-        row.update({name: own.get(name, "") for name in names})
+    for row, new_cells in zip(rows, cells, strict=True):
+        row.update({name: new_cells.get(name, "") for name in names})
 
 
 def _scaled(target: Mapping[str, Any], factor: float) -> Mapping[str, Any]:

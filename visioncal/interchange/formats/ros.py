@@ -1,4 +1,4 @@
-"""ROS: the samples of easy_handeye2 and of MoveIt."""
+"""Samples of ROS's easy_handeye2 and of MoveIt."""
 
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def _is_moveit(path: Path) -> bool:
 
 def _read_moveit(path: Path, requested: ImportOptions) -> Foreign:
     """Reads MoveIt's samples: the effector in the world, the object in the sensor, as matrices."""
-    # Either a list of mappings, as its panel saves them, or of pairs, as its tests keep them.
+    # A list of mappings, as its panel saves them, or of pairs, as its tests have them.
     document = read_json(path) if path.suffix.lower() == ".json" else read_yaml(path)
     robot, camera, places = [], [], []
     for at, sample in enumerate(_rows(document, str(path))):

@@ -1,4 +1,4 @@
-"""Two streams of poses with clocks of their own: their times, and moments that both have seen."""
+"""Pairs two pose streams with separate clocks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,20 +17,21 @@ from visioncal.estimation.clock_correlation import (
 )
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
 
-# Less in common determines no offset; more is a recording of work, not of a calibration.
+# Limits of the overlap [s]: a shorter one determines no offset, a longer one is no calibration
+# motion.
 _SHORTEST_S, _LONGEST_S = 2.0, 3600.0
-# Epochs of our days count 1e9 seconds: (larger than, seconds).
+# Present epochs are about 1e9 s: (larger than, seconds a unit).
 _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
 @dataclass(frozen=True, eq=False)
 class Paired:
-    """Slow moments that two streams have in common: a fair sample of them.
+    """A sample of slow, distinct poses from the overlap of two streams.
 
     Attributes:
-        rows: (m,) the camera's samples that were chosen.
-        base_from_flange: (m, 4, 4) the robot's poses at those moments [m].
-        match: How the clocks go together, to a fraction of a frame.
+        rows: (m,) the chosen samples of the camera.
+        base_from_flange: (m, 4, 4) the robot's poses at these times [m].
+        match: Coarse clock offset, to a fraction of a frame.
     """
 
     rows: IntArray
@@ -39,7 +40,7 @@ class Paired:
 
 
 def seconds(stamps: FloatArray, places: Sequence[str]) -> FloatArray:
-    """Reads stamps as seconds; those of an epoch may be in milli-, micro- or nanoseconds.
+    """Converts stamps to seconds; those of an epoch may be in milli-, micro- or nanoseconds.
 
     Raises:
         DataError: A stamp is missing, or they do not increase.
@@ -47,9 +48,9 @@ def seconds(stamps: FloatArray, places: Sequence[str]) -> FloatArray:
     if not np.isfinite(stamps).all():
         place = places[int(np.argmin(np.isfinite(stamps)))]
         raise DataError(f"{place}: the time is missing.", culprits=[place])
-    falls = np.diff(stamps) <= 0
-    if falls.any():
-        place = places[int(np.argmax(falls)) + 1]
+    not_increasing = np.diff(stamps) <= 0
+    if not_increasing.any():
+        place = places[int(np.argmax(not_increasing)) + 1]
         raise DataError(
             f"{place}: the time does not increase from the row before.",
             culprits=[place],
@@ -59,16 +60,16 @@ def seconds(stamps: FloatArray, places: Sequence[str]) -> FloatArray:
 
 
 def in_seconds(stamps: FloatArray) -> FloatArray:
-    """Reads stamps as seconds; an epoch's size shows milli-, micro- or nanoseconds."""
-    known = np.abs(stamps[np.isfinite(stamps)])
-    largest = float(known.max()) if len(known) else 0.0
-    return stamps * next((value for limit, value in _EPOCHS if largest > limit), 1.0)
+    """Converts stamps to seconds; the size of an epoch shows milli-, micro- or nanoseconds."""
+    sizes = np.abs(stamps[np.isfinite(stamps)])
+    largest = float(sizes.max()) if len(sizes) else 0.0
+    return stamps * next((unit_s for limit, unit_s in _EPOCHS if largest > limit), 1.0)
 
 
 def pair_streams(
     robot_s: FloatArray, robot: FloatArray, camera_s: FloatArray, camera: FloatArray
 ) -> Paired:
-    """Finds about how the clocks go together, and moments at which the robot is slow.
+    """Estimates a coarse clock offset, and selects times at which the robot is slow.
 
     Args:
         robot_s: (n,) times [s], increasing.
@@ -77,13 +78,13 @@ def pair_streams(
         camera: (k, 4, 4) `cam_from_target`, or the inverse [m].
 
     Raises:
-        DataError: The streams have too little time in common, or their motions do not agree.
+        DataError: The streams overlap too little, or their motions do not agree.
     """
     _check_common(robot_s, camera_s)
     flange = Trajectory(robot_s, robot)
     match = _match(flange, ImageTimes("eye-in-hand", camera_s, camera))
-    at_s = camera_s - match.offset_s
-    rows = np.flatnonzero(flange.covers(at_s))
+    robot_clock_s = camera_s - match.offset_s
+    rows = np.flatnonzero(flange.covers(robot_clock_s))
     if len(rows) < 3:
         raise DataError(
             f"The robot's poses cover {len(rows)} samples of the camera's; 3 or more are "
@@ -92,8 +93,8 @@ def pair_streams(
             culprits=["robot", "camera"],
             next_step="Log the robot's pose ten times a second or more.",
         )
-    poses = flange.at(at_s[rows])
-    chosen = slow_and_new(poses, flange.speeds(at_s[rows]))
+    poses = flange.at(robot_clock_s[rows])
+    chosen = slow_and_new(poses, flange.speeds(robot_clock_s[rows]))
     return Paired(rows[chosen], poses[chosen], match)
 
 
@@ -118,7 +119,7 @@ def _check_common(robot_s: FloatArray, camera_s: FloatArray) -> None:
 def _match(flange: Trajectory, frames: ImageTimes) -> Match:
     best = next(iter(turning_matches(flange, frames)), Match(0.0, np.inf, 0.0))
     if flange.step_s >= LONGEST_GAP_S:
-        # Nothing can be compared; whoever looks for covered samples says so.
+        # Too sparse to compare; the caller reports the uncovered samples.
         return best
     if best.correlation < LEAST_CORRELATION:
         raise DataError(

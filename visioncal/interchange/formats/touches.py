@@ -1,4 +1,4 @@
-"""Files of touches and of CAD points: tables in any form that `convert` reads."""
+"""Reads touches and CAD points from tables in any form that `convert` reads."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,12 +27,12 @@ def read_touches(
     """Reads touches.
 
     Args:
-        path: A table with the columns of views.csv, `kind` and `point`; of these, only the pose or
-            the joints have to be there. Or a session, whose rows have them.
-        requested: How poses and joints are written, where the columns do not say.
-        robot: Which robot of a whole cell is meant, where a session or a column `robot` has more.
-        positions: Whether positions will do where the table has no rotations: x_m, y_m, z_m, or
-            x, y, z with the unit given.
+        path: A table with the columns of views.csv, `kind` and `point`, of which only the pose or
+            the joints are required; or a session, whose rows have them.
+        requested: Convention of poses and joints, where the columns do not show it.
+        robot: Which robot of a cell is meant, where a session or a column `robot` has several.
+        positions: Whether a table without rotations is accepted: x_m, y_m, z_m, or x, y, z with the
+            unit given.
 
     Raises:
         DataError: It cannot be read, or a row is no pose.
@@ -58,10 +58,7 @@ def read_touches(
 
 
 def robots_of(path: Path) -> tuple[str, ...]:
-    """The robots that touches name, in their order; none where they name none.
-
-    Args:
-        path: As for `read_touches`.
+    """Names of the robots in a table or session of touches, in their order; may be empty.
 
     Raises:
         DataError: It cannot be read.
@@ -72,25 +69,25 @@ def robots_of(path: Path) -> tuple[str, ...]:
 
 
 def _of_robot(fields: Fields, robot: str | None) -> Fields:
-    """The rows of one robot, where a column names it."""
-    named = fields.texts.get("robot", ())
-    known = list(dict.fromkeys(named))
-    if len(known) < 2:
+    """The rows of one robot, where a column names robots."""
+    robots = fields.texts.get("robot", ())
+    names = list(dict.fromkeys(robots))
+    if len(names) < 2:
         return fields
     if robot is None:
         raise DataError(
-            f"{fields.name} has touches of several robots ({some_of(known)}), and which is meant "
+            f"{fields.name} has touches of several robots ({some_of(names)}), and which is meant "
             "is not said.",
             culprits=["--robot"],
-            next_step=f"Name one: --robot {known[0]}.",
+            next_step=f"Name one: --robot {names[0]}.",
         )
-    if robot not in known:
+    if robot not in names:
         raise DataError(
-            f"{fields.name} has no touches of robot {robot!r}: its robots are {some_of(known)}.",
+            f"{fields.name} has no touches of robot {robot!r}: its robots are {some_of(names)}.",
             culprits=["--robot"],
-            next_step=did_you_mean(robot, known),
+            next_step=did_you_mean(robot, names),
         )
-    return fields.rows([at for at, name in enumerate(named) if name == robot])
+    return fields.rows([at for at, name in enumerate(robots) if name == robot])
 
 
 def _rows_of(
@@ -99,20 +96,20 @@ def _rows_of(
     count = len(fields)
     numbers = fields.views or view_numbers(fields) or tuple(range(count))
     texts = {name.lower(): cells for name, cells in fields.texts.items()}
-    nothing = ("",) * count
+    empty = ("",) * count
     return TouchRows(
         path.name,
         tuple(map(str, numbers)),
         fields.places,
         poses,
         joints_rad,
-        texts.get("kind", nothing),
-        texts.get("point", nothing),
+        texts.get("kind", empty),
+        texts.get("point", empty),
     )
 
 
 def _positions_alone(fields: Fields, requested: PoseImportOptions) -> FloatArray:
-    """Poses (n, 4, 4) without rotations."""
+    """Poses (n, 4, 4) with NaN rotations [m]."""
     form = POSE_FORMS.get(requested.form or "")
     unit = requested.unit or (form.unit if form else None)
     poses = np.full((len(fields), 4, 4), np.nan)
@@ -125,12 +122,12 @@ def read_nominal(path: Path, unit: str | None = None) -> NominalPoints:
 
     Args:
         path: A table with a column `point` (or name) and x_m, y_m, z_m, or the same in another unit
-            of `UNITS_M`, or x, y, z with the unit given. A column sigma_m (sigma_mm ...) may say
-            how well each is known.
-        unit: What x, y, z are in.
+            of `UNITS_M`, or x, y, z with the unit given. An optional column sigma_m (sigma_mm ...)
+            has each point's standard deviation.
+        unit: The unit of x, y, z.
 
     Raises:
-        DataError: Columns are missing, a name stands there twice, or a cell is no number.
+        DataError: Columns are missing, a name occurs twice, or a cell is no number.
     """
     fields = read_fields(path)
     if "qw" in fields.numbers:
@@ -173,7 +170,7 @@ def _names(fields: Fields) -> tuple[str, ...]:
 
 
 def _sigmas(fields: Fields, length_m: float) -> FloatArray:
-    """How well each point is known (n,) [m]; zero where the table does not say."""
+    """Standard deviation of each point (n,) [m]; zero where the table has none."""
     units = {f"sigma_{name}": length for name, length in UNITS_M.items()} | {"sigma": length_m}
     column = next((unit for unit in units if unit in fields.numbers), None)
     if column is None:
@@ -186,7 +183,7 @@ def _sigmas(fields: Fields, length_m: float) -> FloatArray:
 
 
 def _axes(
-    fields: Fields, unit: str | None, option: str, named: Sequence[str] = ()
+    fields: Fields, unit: str | None, option: str, given: Sequence[str] = ()
 ) -> tuple[tuple[str, ...], float]:
     """Finds the columns of x, y, z, and the length of their unit [m]."""
     if unit is not None and unit not in UNITS_M:
@@ -194,14 +191,14 @@ def _axes(
             f"There is no unit of length named {unit!r}; the names are {some_of(list(UNITS_M))}.",
             culprits=[unit],
         )
-    known = {text.lower(): text for text in (*fields.texts, *fields.numbers)}
+    columns = {text.lower(): text for text in (*fields.texts, *fields.numbers)}
     for name, length in UNITS_M.items():
-        wanted = named or [f"{axis}_{name}" for axis in "xyz"]
-        if all(word.lower() in known and word.endswith(f"_{name}") for word in wanted):
-            # Who names a unit has seen that the columns' names are wrong.
-            return tuple(known[name.lower()] for name in wanted), UNITS_M[unit] if unit else length
-    plain = tuple(named) or tuple(known.get(axis, "") for axis in "xyz")
-    if not all(plain):
+        names = given or [f"{axis}_{name}" for axis in "xyz"]
+        if all(column.lower() in columns and column.endswith(f"_{name}") for column in names):
+            # An explicit unit overrides those in the columns' names.
+            return tuple(columns[name.lower()] for name in names), UNITS_M[unit] if unit else length
+    unitless = tuple(given) or tuple(columns.get(axis, "") for axis in "xyz")
+    if not all(unitless):
         raise DataError(
             f"{fields.name}: columns x_mm, y_mm, z_mm or x_m, y_m, z_m are needed; there are "
             f"{fields.listing()}.",
@@ -209,19 +206,19 @@ def _axes(
         )
     if unit is None:
         raise DataError(
-            f"{fields.name}: {', '.join(plain)} are in no unit that is named.",
+            f"{fields.name}: {', '.join(unitless)} are in no unit that is named.",
             culprits=[fields.name],
             next_step=f"Name the columns x_mm, y_mm, z_mm, or say {option} mm.",
         )
-    return plain, UNITS_M[unit]
+    return unitless, UNITS_M[unit]
 
 
 def _has_axes(fields: Fields) -> bool:
-    known = {number.lower() for number in fields.numbers}
+    names = {number.lower() for number in fields.numbers}
     suffixes = ("", *(f"_{unit}" for unit in UNITS_M))
-    return any(all(f"{axis}{suffix}" in known for axis in "xyz") for suffix in suffixes)
+    return any(all(f"{axis}{suffix}" in names for axis in "xyz") for suffix in suffixes)
 
 
 def _coordinates(fields: Fields, columns: Sequence[str], length_m: float) -> FloatArray:
-    """Takes three columns in a unit of some length: (n, 3) [m]; NaN where a cell is empty."""
+    """Reads three columns in a unit of given length: (n, 3) [m]; NaN where a cell is empty."""
     return length_m * np.column_stack([fields.column(column)[:, 0] for column in columns])

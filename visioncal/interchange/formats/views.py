@@ -1,6 +1,6 @@
-"""Folders with a file a view, or several kinds of file a view.
+"""Folders with one file a view, or several kinds of file a view.
 
-Among them poses that HALCON has written: `f 0`, `r` with a rotation, `t` with a place [m].
+Among them HALCON's poses: `f 0`, `r` with a rotation, `t` with a translation [m].
 """
 
 import re
@@ -24,10 +24,10 @@ from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
 from visioncal.interchange.formats.import_options import ImportOptions
 
 _LINE = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
-# How the rotation is written, by the code of the representation (create_pose): turns about x, y, z
-# in the order of the letters' turns, or a vector as long as the tangent of half the angle.
+# Rotation forms by the code of the representation (create_pose): angles about x, y, z in the
+# letters' order, or the Rodrigues vector of length tan(angle / 2).
 _EULER = {0: "XYZ", 2: "xyz"}
-_RODRIGUEZ = 4
+_RODRIGUES = 4
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def _families(folder: Path) -> tuple[_Family, ...]:
 
 
 def _view_folder(path: Path) -> Path | None:
-    """The folder with a file a view: the one named, or `poses` in it."""
+    """The folder with one file a view: the named one, or `poses` in it."""
     if not path.is_dir():
         return None
     inner = path / "poses"
@@ -64,7 +64,7 @@ def _view_folder(path: Path) -> Path | None:
 
 
 def _read_views(path: Path, requested: ImportOptions) -> Foreign:
-    """Reads a folder with a file a view, or several kinds of file a view."""
+    """Reads a folder with one file a view, or several kinds of file a view."""
     folder = _view_folder(path)
     if folder is None:
         raise DataError(f"{path} has no files like pose_01.json.", culprits=[str(path)])
@@ -76,17 +76,17 @@ def _read_views(path: Path, requested: ImportOptions) -> Foreign:
         for at, view in enumerate(views):
             if view in family.files:
                 for key, value in _record(family.files[view]).items():
-                    own = family.name if key == "matrix" else f"{prefix}{key}"
-                    records[at][own or "matrix"] = value
+                    key_name = family.name if key == "matrix" else f"{prefix}{key}"
+                    records[at][key_name or "matrix"] = value
     places = [
         " and ".join(family.files[view].name for family in families if view in family.files)
         for view in views
     ]
     name = (path if folder == path else folder.parent).resolve().name
     fields = fields_of_records(records, places, name, folder, tuple(views))
-    around = (file for file in (folder, path, path / "images") if is_inside(file, path))
+    folders = (file for file in (folder, path, path / "images") if is_inside(file, path))
     images = next(
-        (file for file in around if any(is_image_name(at.name) for at in listed(file))), None
+        (file for file in folders if any(is_image_name(at.name) for at in listed(file))), None
     )
     return foreign_from(fields, requested, images=images)
 
@@ -128,24 +128,24 @@ VIEWS = ForeignFormat(
 
 
 def _halcon_pose(path: Path) -> FloatArray | None:
-    """Reads the (4, 4) pose of one file."""
+    """Reads one file's (4, 4) pose [m]."""
     lines = {match[1]: match[2].split() for match in _LINE.finditer(read_plain_text(path))}
     if lines.keys() != {"f", "r", "t"}:
         return None
     counts = {name: len(words) for name, words in lines.items()}
     if counts != {"f": 1, "r": 3, "t": 3} or not all(
-        is_number(name) for them in lines.values() for name in them
+        is_number(name) for values in lines.values() for name in values
     ):
         raise DataError(f"{path}: f, r and t hold 1, 3 and 3 numbers.", culprits=[str(path)])
     (code,), turns, position = (np.array(lines[name], dtype=float) for name in "frt")
-    if code == _RODRIGUEZ:
+    if code == _RODRIGUES:
         half = np.arctan(np.linalg.norm(turns))
         rotation = Rotation.from_rotvec(2.0 * half * turns / max(float(np.tan(half)), 1e-300))
     elif code in _EULER:
         rotation = Rotation.from_euler(_EULER[int(code)], turns, degrees=True)
     else:
         raise DataError(
-            f"{path}: the pose is of type {code:g}; {_RODRIGUEZ} and {[*_EULER]} are read.",
+            f"{path}: the pose is of type {code:g}; {_RODRIGUES} and {[*_EULER]} are read.",
             culprits=[str(path)],
             next_step="Write it with convert_pose_type as 'Rp+T', 'gba', 'point'.",
         )

@@ -1,4 +1,4 @@
-"""Folders with a YAML a pose: ViSP's, with a camera XML, and Zivid's, a 4 x 4 matrix in mm each."""
+"""Folders with one YAML a pose: ViSP's with a camera XML, and Zivid's with 4 x 4 matrices [mm]."""
 
 import re
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 # `franka_pose_rPe_3.yaml`: the end effector in the robot's reference frame; `pose_cPo_3.yaml`: the
 # object in the camera.
 _POSE_NAME = re.compile(r".*pose_[a-z]Pe_[0-9]+\.ya?ml", re.IGNORECASE)
-_SEEN_NAME = re.compile(r".*pose_cPo_[0-9]+\.ya?ml", re.IGNORECASE)
+_CAMERA_POSE_NAME = re.compile(r".*pose_cPo_[0-9]+\.ya?ml", re.IGNORECASE)
 _ZIVID_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
 
 
@@ -75,30 +75,30 @@ def _pose_files(path: Path, name: re.Pattern[str] = _POSE_NAME) -> tuple[Path, .
 
 def _read(path: Path, requested: ImportOptions) -> Foreign:
     """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
-    # Poses of the object in the camera are taken where there are no images.
+    # Poses of the object in the camera are used only where there are no images.
     files = _pose_files(path)
     if not files:
         raise DataError(f"{path} has no files like franka_pose_rPe_1.yaml.", culprits=[str(path)])
     views = tuple(number_in(file.name) or 0 for file in files)
     places = tuple(file.name for file in files)
     notes: list[str] = []
-    images, paired = images_beside(path, requested.images, views, places, numbered=True)
-    seen = (
+    images, image_notes = images_beside(path, requested.images, views, places, numbered=True)
+    camera_files = (
         {}
         if any(images)
-        else {number_in(file.name): file for file in _pose_files(path, _SEEN_NAME)}
+        else {number_in(file.name): file for file in _pose_files(path, _CAMERA_POSE_NAME)}
     )
-    camera = requested.camera.applied_to(_poses([seen.get(view) for view in views], places))
+    camera = requested.camera.applied_to(_poses([camera_files.get(view) for view in views], places))
     return Foreign(
         name=path.resolve().name,
         robot=requested.robot.applied_to(_poses(files, places)),
-        camera=camera if seen else None,
+        camera=camera if camera_files else None,
         images=images,
         mount=_mount(path, notes),
         target=None if requested.target else _target(path, notes),
         lens=_lens(path, notes),
         views=views,
-        notes=(*notes, *paired),
+        notes=(*notes, *image_notes),
     )
 
 
@@ -115,15 +115,14 @@ def _pose(path: Path) -> list[float]:
             f"{path}: data holds {len(flat)} numbers; tx, ty, tz and theta-u are needed.",
             culprits=[str(path)],
         )
-    return [float(float64) for float64 in flat]
+    return [float(value) for value in flat]
 
 
 def _mount(path: Path, notes: list[str]) -> Mount | None:
-    name = path.resolve().name
-    found = next((mount for mount in MOUNTS if mount in name), None)
-    if found is not None:
-        notes.append(f"The mount is taken from the folder's name: {found}.")
-    return found
+    stated = next((mount for mount in MOUNTS if mount in path.resolve().name), None)
+    if stated is not None:
+        notes.append(f"The mount is taken from the folder's name: {stated}.")
+    return stated
 
 
 def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
@@ -136,7 +135,7 @@ def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
 
 
 def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
-    """Reads the target from the note that lies with the images, where it says enough."""
+    """Reads the target from a note beside the images, where that is complete."""
     for file in listed(path):
         if not file.name.endswith("-data.txt"):
             continue
