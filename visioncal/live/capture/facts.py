@@ -1,4 +1,4 @@
-"""What is written of a live cell: the session's own facts, and the rows of its views."""
+"""Session files of a live cell: constant facts, and the rows of its views."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ _TARGET_FILE = "target.toml"
 
 @dataclass(frozen=True, eq=False)
 class CaptureFacts:
-    """What does not change from view to view.
+    """Facts of a recording that are the same for all views.
 
     Attributes:
         name: The session's name.
-        mount: Where the camera is.
+        mount: Where the camera is mounted.
         target: The board.
         robot: The arm's model; None where it is not known.
-        arm: What the arm calls itself.
-        camera: What the camera calls itself.
+        arm: The name that the arm reports.
+        camera: The name that the camera reports.
         resolution: (width, height) of its pictures [px].
-        lens: The intrinsics that it reports, to be refined; None to have them estimated.
-        settings: What it is set to.
-        plan: The digest of the plan that is driven; empty for none.
+        lens: Intrinsics that it reports, to be refined; None to have them estimated.
+        settings: The camera's settings.
+        plan: Digest of the plan that is driven; empty for none.
     """
 
     name: str
@@ -47,7 +47,7 @@ class CaptureFacts:
     plan: str
 
     def texts(self) -> dict[str, str]:
-        """The files of the session besides its views, by name; session.toml is the last."""
+        """Files of the session besides its views, by name; session.toml is the last."""
         texts: dict[str, str] = {}
         document: dict[str, Any] = {"schema": 1, "name": self.name, "mount": self.mount}
         document["target"] = _shipped_target(self.target)
@@ -58,14 +58,14 @@ class CaptureFacts:
         if self.robot is not None:
             model = _shipped_robot(self.robot)
             if not model:
-                model, text = _placed(self.robot)
+                model, text = _robot_file(self.robot)
                 texts[model] = text
             document["robot"] = {"model": model, "tip": self.robot.tip}
         texts["session.toml"] = tomli_w.dumps(document)
         return texts
 
     def provenance(self) -> dict[str, Any]:
-        """What a recording must have in common with the one that it goes on with, for people."""
+        """Facts that a resumed recording must share with its beginning."""
         return {
             "arm": self.arm,
             "camera": self.camera,
@@ -88,14 +88,14 @@ class CaptureFacts:
 def view_of(
     number: int, image: str, taken: TakenView, facts: CaptureFacts, unix_offset_s: float
 ) -> View:
-    """Writes a view as a row of views.csv.
+    """Builds the row of views.csv for a view.
 
     Args:
-        number: Its number.
-        image: The path of its image.
-        taken: What was taken.
-        facts: What does not change.
-        unix_offset_s: What makes the host's monotonic clock UNIX time [s].
+        number: Number of the view.
+        image: Path of its image.
+        taken: The view.
+        facts: Facts of the recording.
+        unix_offset_s: Offset from the host's monotonic clock to UNIX time [s].
     """
     state, frame = taken.state, taken.frame
     numbers = {
@@ -120,7 +120,7 @@ def view_of(
 
 
 def state_of(view: View) -> ArmState | None:
-    """The joints and the pose of a row; None where it has no pose."""
+    """Joints and pose of a row; None where it has no pose."""
     pose = view.base_from_flange()
     if pose is None:
         return None
@@ -128,7 +128,7 @@ def state_of(view: View) -> ArmState | None:
 
 
 def _texts(taken: TakenView, state: ArmState, facts: CaptureFacts) -> dict[str, str]:
-    """Columns that calibration passes through: what the devices said of themselves."""
+    """Columns that calibration passes through: what the devices report."""
     texts = {
         "safety": state.safety,
         "blur_px": f"{taken.corners.blur_px:.2f}",
@@ -144,14 +144,14 @@ def _texts(taken: TakenView, state: ArmState, facts: CaptureFacts) -> dict[str, 
 
 
 def _shipped_target(target: Target) -> str:
-    """The name of a board that comes with visioncal; empty for another."""
+    """Name of a board that comes with visioncal; empty for another."""
     if target.name in target_names() and load_target(target.name) == target:
         return target.name
     return ""
 
 
 def _shipped_robot(robot: Robot) -> str:
-    """The name of an arm that comes with visioncal; empty for another."""
+    """Name of an arm that comes with visioncal; empty for another."""
     for name in robot_names():
         shipped = load_robot(name)
         if shipped.name == robot.name and dict(shipped.document) == dict(robot.document):
@@ -159,7 +159,7 @@ def _shipped_robot(robot: Robot) -> str:
     return ""
 
 
-def _placed(robot: Robot) -> tuple[str, str]:
-    """An arm of one's own as a file: its name and content."""
-    named = "robot.json" if "kind" in robot.document else ""
-    return robot_file(robot.document, named)
+def _robot_file(robot: Robot) -> tuple[str, str]:
+    """Name and content of the file for an arm that does not come with visioncal."""
+    name = "robot.json" if "kind" in robot.document else ""
+    return robot_file(robot.document, name)

@@ -108,9 +108,7 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
     inverse = 1.0 / world.units
     inverse[12 : 12 + world.lens_board_count] = 0.0
     objective = (
-        np.diag(inverse**2) / (size - world.lens_board_count)
-        if criterion == "A"
-        else world.objective
+        np.diag(inverse**2) / (size - world.lens_board_count) if criterion == "A" else world.counted
     )
 
     def variance(square: FloatArray) -> Variance:

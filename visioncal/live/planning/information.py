@@ -103,7 +103,7 @@ class World:
         factors: (k, 6, p) whitened Jacobian F of each stop; F^T F is its information.
         prior: (p, p) prior information.
         recorded: (p, p) information of the recorded stops.
-        objective: (p, p) weight W such that trace(W C) is the variance to be minimised with a
+        counted: (p, p) weight W such that trace(W C) is the variance to be minimised with a
             covariance C: of a position, as a mean over where it matters [m^2].
         place: (p, p) the same for the position whose accuracy is reported [m^2].
         turn: (p, p) the same for the rotation [rad^2].
@@ -119,7 +119,7 @@ class World:
     factors: FloatArray
     prior: FloatArray
     recorded: FloatArray
-    objective: FloatArray
+    counted: FloatArray
     place: FloatArray
     turn: FloatArray
     units: FloatArray
@@ -137,7 +137,7 @@ class World:
             self.factors[:, :, kept],
             self.prior[block],
             self.recorded[block],
-            self.objective[block],
+            self.counted[block],
             self.place[block],
             self.turn[block],
             self.units[kept],
