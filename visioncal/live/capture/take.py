@@ -54,13 +54,13 @@ class Settled:
 
 def _capture_still(cell: LiveCell) -> StillFrame:
     """Takes a frame, with the states of the arm around its exposure."""
-    asked_s = cell.clock.now()
+    asked = cell.clock.now()
     before = cell.state()
     frame = cell.camera.frame()
     after = cell.state()
-    if frame.stamp_s < asked_s - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
+    if frame.stamp_s < asked - _EARLY_S or frame.stamp_s > cell.clock.now() + _EARLY_S:
         raise DriverError(
-            f"{cell.camera.name}: its picture is stamped {frame.stamp_s - asked_s:+.3f} s from when "
+            f"{cell.camera.name}: its picture is stamped {frame.stamp_s - asked:+.3f} s from when "
             "it was asked for; a picture exposed after that is needed.",
             culprits=[cell.camera.name],
             next_step="The camera hands out old pictures, or its clock is not the host's.",
