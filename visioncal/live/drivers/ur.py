@@ -35,9 +35,9 @@ _CLOSE_S = 0.9
 # Timeout of a last stop command to a controller that sends no more states [s].
 _LAST_STOP_S = 0.3
 # The controller ends its program, and stops the arm, where this computer is silent for 1 s.
-_WATCHDOG_HZ, _WATCHDOG_S = 1.0, 0.1
+_LEAST_HZ, _KICK_S = 1.0, 0.1
 # Timeout of the start of an asynchronous motion [s].
-_MOTION_START_S = 0.5
+_BEGIN_S = 0.5
 # Deceleration of `halt`: a joint at 1 rad/s stops within a quarter of a second.
 _BRAKE_RAD_S2 = 4.0
 _STILL_RAD_S = 1e-3
@@ -165,15 +165,15 @@ class UrArm:
             self._moves_before = None
             raise self._explained_error(
                 "ended its program during a motion, as it does where this computer is silent for "
-                f"{1.0 / _WATCHDOG_HZ:.0f} s"
+                f"{1.0 / _LEAST_HZ:.0f} s"
             )
         progress = self._control.getAsyncOperationProgressEx()
         if progress.isAsyncOperationRunning():
             return True
         if progress.changeCount() == self._moves_before:
-            if self._motion_timer.read() < _MOTION_START_S:
+            if self._motion_timer.read() < _BEGIN_S:
                 return True
-            raise self._explained_error(f"did not begin a motion within {_MOTION_START_S} s")
+            raise self._explained_error(f"did not begin a motion within {_BEGIN_S} s")
         self._moves_before = None
         return False
 
@@ -219,7 +219,7 @@ class UrArm:
             self._control = library.RTDEControlInterface(self._host, _RATE_HZ)
         except RuntimeError as error:
             raise self._explained_error(f"does not take the control script: {error}") from error
-        self._line = Line(self._name, self._kick_watchdog, _WATCHDOG_S)
+        self._line = Line(self._name, self._kick_watchdog, _KICK_S)
         offset = self._line.call(
             self._control.getTCPOffset, limit_s=_CALL_S, what="report its tool offset"
         )
@@ -229,7 +229,7 @@ class UrArm:
     def _enable_watchdog(self, line: Line) -> None:
         """Makes the controller stop the arm if this computer falls silent."""
         line.call(
-            lambda: self._control.setWatchdog(_WATCHDOG_HZ),
+            lambda: self._control.setWatchdog(_LEAST_HZ),
             limit_s=_CALL_S,
             what="set its watchdog",
         )

@@ -26,7 +26,7 @@ _HEADER = struct.Struct(">HB")
 _PROTOCOL, _OUTPUTS, _START, _DATA = b"VOSU"
 # Primary interface: the read-only port is open where the other may not be.
 _PORTS = (30011, 30001)
-_STATES_S = 1.0
+_WAIT_S = 1.0
 _PRIMARY_HEADER = struct.Struct(">IB")
 _ROBOT_STATE, _CARTESIAN = 16, 4
 _TOOL = struct.Struct(">6d6d")
@@ -228,7 +228,7 @@ def _package(host: str, kind: int, size: int, what: str) -> bytes:
 
 def _packages(host: str) -> Iterator[tuple[int, bytes]]:
     """Packages of all robot states that arrive within the timeout."""
-    ends_s = time.monotonic() + _STATES_S
+    ends_s = time.monotonic() + _WAIT_S
     try:
         link = connect(host, _PORTS[0], "the primary interface")
     except DriverError:
