@@ -60,17 +60,10 @@ def watched(
     state: Callable[[], object],
     glance: Callable[[], None] = lambda: None,
 ) -> None:
-    """Waits until a started arm has stopped.
-
-    Args:
-        arm: The arm.
-        expected_s: Expected duration of its motion [s].
-        clock: The clock.
-        state: Reads the arm's state; raises where it is stopped or lost.
-        glance: Called periodically while it moves.
+    """Waits until a started arm has stopped; `glance` is called periodically.
 
     Raises:
-        DriverError: It takes too long; or from `state` or `glance`.
+        DriverError: The motion takes much longer than expected [s]; or from `state` or `glance`.
     """
     start = last_glance = clock.now()
     while True:
@@ -102,17 +95,10 @@ def drive(
     *,
     look: Callable[[], None],
 ) -> None:
-    """Drives through postures and waits until the arm has arrived at the last.
+    """Drives through postures (n,) [rad] and waits until the arm has arrived at the last.
 
-    The arm's state is monitored throughout. An exception leaves the arm moving; `LiveCell.halting`
-    around the recording stops it.
-
-    Args:
-        cell: The devices.
-        arm: Its arm.
-        postures: (n,) joint angles each [rad].
-        options: Speed and acceleration.
-        look: Called periodically during the motion; raises where the recording cannot go on.
+    The arm's state is monitored throughout, and `look` is called periodically. An exception leaves
+    the arm moving; `LiveCell.halting` around the recording stops it.
 
     Raises:
         DriverError: The arm was stopped, its connection is lost, it takes too long, or it did not

@@ -58,7 +58,8 @@ class CaptureFacts:
         if self.robot is not None:
             model = _shipped_robot(self.robot)
             if not model:
-                model, text = _robot_file(self.robot)
+                named = "robot.json" if "kind" in self.robot.document else ""
+                model, text = robot_file(self.robot.document, named)
                 texts[model] = text
             document["robot"] = {"model": model, "tip": self.robot.tip}
         texts["session.toml"] = tomli_w.dumps(document)
@@ -88,15 +89,7 @@ class CaptureFacts:
 def view_of(
     number: int, image: str, taken: TakenView, facts: CaptureFacts, unix_offset_s: float
 ) -> View:
-    """Builds the row of views.csv for a view.
-
-    Args:
-        number: Number of the view.
-        image: Path of its image.
-        taken: The view.
-        facts: Facts of the recording.
-        unix_offset_s: Offset from the host's monotonic clock to UNIX time [s].
-    """
+    """Builds the row of views.csv for a view; the offset is from monotonic to UNIX time [s]."""
     state, frame = taken.state, taken.frame
     numbers = {
         "stamp_s": round(frame.stamp_s + unix_offset_s, 6),
@@ -157,9 +150,3 @@ def _shipped_robot(robot: Robot) -> str:
         if shipped.name == robot.name and dict(shipped.document) == dict(robot.document):
             return name
     return ""
-
-
-def _robot_file(robot: Robot) -> tuple[str, str]:
-    """Name and content of the file for an arm that does not come with visioncal."""
-    name = "robot.json" if "kind" in robot.document else ""
-    return robot_file(robot.document, name)

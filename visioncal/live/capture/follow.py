@@ -45,21 +45,15 @@ class HeldArm:
 
 
 def follow(capture: Capture, count: int) -> list[CaptureEvent]:
-    """Takes a view whenever a guided arm rests at a new pose.
-
-    Args:
-        capture: The recording.
-        count: Number of views; 0 until Ctrl-C.
-
-    Returns:
-        The result of each rest.
+    """Takes `count` views (0: until Ctrl-C), one whenever a guided arm rests at a new pose.
 
     Raises:
         DriverError: A device failed, or the arm is stopped.
         DataError: A view cannot be written, or too many rests in a row gave none.
     """
     capture.catch_up()
-    visited = _recorded_poses(capture)
+    poses = [view.base_from_flange() for view in capture.journal.views]
+    visited = [np.asarray(pose.as_matrix()) for pose in poses if pose is not None]
     with closed_cleanly(capture.cell, capture.journal, capture.options):
         try:
             while not count or len(capture.journal.views) < count:
@@ -94,9 +88,6 @@ def ask_and_take(
         ask: Asks a question and returns the line that was typed; None where the poses are read from
             a file.
 
-    Returns:
-        The result of each.
-
     Raises:
         DriverError: The camera failed, or Ctrl-C was pressed.
         DataError: A view cannot be written, or too many in a row gave none.
@@ -108,9 +99,7 @@ def ask_and_take(
             number = _next_number(capture)
             wish = capture.coach.advice()
             hint = f" ({wish})" if wish else ""
-            if ask is not None and _wants_to_end(
-                ask, f"View {number}{hint}: Enter takes it, q ends: "
-            ):
+            if ask is not None and _ends(ask, f"View {number}{hint}: Enter takes it, q ends: "):
                 break
             try:
                 held = HeldArm(arm.name, arm.state(), clock)
@@ -122,7 +111,7 @@ def ask_and_take(
     return capture.steps
 
 
-def _wants_to_end(ask: Callable[[str], str], question: str) -> bool:
+def _ends(ask: Callable[[str], str], question: str) -> bool:
     try:
         return ask(question).strip().lower() == "q"
     except EOFError:
@@ -151,11 +140,6 @@ def _is_new(state: ArmState, visited: Sequence[FloatArray]) -> bool:
         if mm < _NEW_MM and deg < _NEW_DEG:
             return False
     return True
-
-
-def _recorded_poses(capture: Capture) -> list[FloatArray]:
-    poses = [view.base_from_flange() for view in capture.journal.views]
-    return [np.asarray(pose.as_matrix()) for pose in poses if pose is not None]
 
 
 def _next_number(capture: Capture) -> int:

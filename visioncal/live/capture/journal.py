@@ -53,10 +53,10 @@ class Journal:
     def begin(
         cls, folder: Path, facts: CaptureFacts, unix_offset_s: float, views: int
     ) -> "Journal":
-        """Begins a session.
+        """Begins a session in a new or empty folder.
 
         Args:
-            folder: Its folder, which must be new or empty.
+            folder: The folder.
             facts: Facts of the recording.
             unix_offset_s: Offset from the host's monotonic clock to UNIX time [s].
             views: Number of views to come; 0 where it is not known.
@@ -90,15 +90,9 @@ class Journal:
     def resume(
         cls, folder: Path, facts: CaptureFacts, unix_offset_s: float, views: int
     ) -> "Journal":
-        """Resumes a session, or begins it where nothing was recorded yet.
+        """Resumes a session, or begins it where nothing was recorded; arguments are as for `begin`.
 
         Partly written files of a killed process are removed.
-
-        Args:
-            folder: The session's folder.
-            facts: Facts of the recording; the same as before.
-            unix_offset_s: Offset from the host's monotonic clock to UNIX time [s].
-            views: Number of views in all; 0 where it is not known.
 
         Raises:
             DataError: The folder holds another recording, or something else.

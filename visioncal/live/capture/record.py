@@ -51,13 +51,7 @@ class Departure:
 def departure(
     cell: LiveCell, plan: PlanFile, done: Sequence[int], options: CaptureOptions
 ) -> Departure:
-    """Checks and summarises what is to be driven; nothing moves.
-
-    Args:
-        cell: The devices.
-        plan: The stops.
-        done: Views that are on the disk.
-        options: Speed and acceleration.
+    """Checks and summarises what is to be driven, without the views `done`; nothing moves.
 
     Raises:
         DriverError: The arm does not report its joints, or is stopped.
@@ -84,21 +78,10 @@ def record(
     *,
     lens: Camera | None = None,
 ) -> list[CaptureEvent]:
-    """Records the stops of a plan that have no view yet.
+    """Records the stops of a plan that have no view yet, and returns their results.
 
-    However it ends, the arm is halted and every reported view is on the disk.
-
-    Args:
-        cell: The devices; its arm can be driven.
-        plan: The stops.
-        journal: Storage of the views.
-        options: How views are taken.
-        watchers: Observers.
-        lens: Intrinsics that the camera reports; None for those of the plan, which are good enough
-            for tilts and distances.
-
-    Returns:
-        The result of each stop.
+    However it ends, the arm is halted and every reported view is on the disk. Without the
+    intrinsics of the camera, those of the plan are good enough for tilts and distances.
 
     Raises:
         DriverError: A device failed, the arm was stopped, or Ctrl-C was pressed.
@@ -142,11 +125,6 @@ def record(
 @contextmanager
 def closed_cleanly(cell: LiveCell, journal: Journal, options: CaptureOptions) -> Iterator[None]:
     """Halts the arm if a recording fails, and adds what is on the disk to the error.
-
-    Args:
-        cell: The arm and the camera.
-        journal: Storage of the views.
-        options: How views are taken.
 
     Raises:
         DriverError: A device failed, or Ctrl-C was pressed.
@@ -212,14 +190,7 @@ class CheckedPaths:
     plan: PlanFile
 
     def to(self, stop: Stop, q: FloatArray) -> tuple[FloatArray, ...]:
-        """Finds the path to a stop.
-
-        Args:
-            stop: A stop of the plan.
-            q: (n,) present joint angles [rad].
-
-        Returns:
-            The postures (n,) to drive through, the last of which is the stop's.
+        """Finds the postures (n,) to drive through from joints (n,) to a stop of the plan [rad].
 
         Raises:
             DataError: No path clear of everything declared was found, or the arm is too near to

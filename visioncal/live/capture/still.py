@@ -76,15 +76,9 @@ def why_image_moves(first: Image, latest: Image, still: Stillness) -> tuple[str,
 
 
 def image_motion_px(first: Image, latest: Image) -> float:
-    """Measures image motion by tracking feature points (Lucas and Kanade 1981).
+    """Median motion of feature points between grey images (h, w) [px] (Lucas and Kanade 1981).
 
-    Args:
-        first: (h, w) grey image.
-        latest: (h, w) a later one.
-
-    Returns:
-        Median shift of the points [px]; zero without features, infinite where most points are
-        lost.
+    It is zero without features, and infinite where most points are lost.
     """
     low, high = np.percentile(first[::4, ::4], [1, 99])
     if high - low < _CONTRAST:
@@ -92,11 +86,11 @@ def image_motion_px(first: Image, latest: Image) -> float:
     points = cv2.goodFeaturesToTrack(first, _POINTS, 0.05, _WINDOW_PX)
     if points is None or len(points) < _FEWEST:
         return 0.0
-    tracked, status, error = cv2.calcOpticalFlowPyrLK(
+    moved, status, error = cv2.calcOpticalFlowPyrLK(
         first, latest, points, np.empty_like(points), winSize=(_WINDOW_PX, _WINDOW_PX)
     )
     kept = (status[:, 0] == 1) & (error[:, 0] < _GREY_DIFFERENCE)
     if kept.mean() < _FOUND_SHARE:
         return float("inf")
-    shifts: FloatArray = np.asarray((tracked - points)[kept, 0], dtype=float)
+    shifts: FloatArray = np.asarray((moved - points)[kept, 0], dtype=float)
     return float(np.median(np.linalg.norm(shifts, axis=1)))

@@ -109,13 +109,6 @@ def take(
     In all frames image and arm must be where they were when the rest began; otherwise the frames
     are discarded, and the next rest is waited for.
 
-    Args:
-        cell: The devices.
-        settled: The rest.
-        target: The board to detect.
-        view: Number of the view.
-        options: Number of frames, and which is kept.
-
     Raises:
         DriverError: A device fails, or the arm is stopped.
     """

@@ -40,11 +40,7 @@ def refuse_without(needed: str, extras: Mapping[str, str]) -> None:
 
 
 def client_library(module: str, extra: str) -> ModuleType:
-    """Imports a client library.
-
-    Args:
-        module: The module's name.
-        extra: The extra that brings it.
+    """Imports a client library that an extra brings.
 
     Raises:
         DriverError: It is not installed, with the command that installs it.

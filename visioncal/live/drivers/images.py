@@ -20,11 +20,8 @@ class FolderCamera:
     It replaces a camera that another program triggers: the files are listed on opening, read in
     grey, and each is stamped when it is requested.
 
-    Args:
-        folder: The folder.
-
     Raises:
-        DataError: It is missing or holds no images, or the first cannot be read.
+        DataError: The folder is missing or holds no images, or the first cannot be read.
     """
 
     # A folder has no intrinsics.

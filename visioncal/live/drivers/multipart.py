@@ -34,8 +34,7 @@ def without_password(url: str) -> str:
 def open_multipart(url: str) -> "MultipartPictures | None":
     """Opens a stream of JPEG files; None where the URL answers with something else.
 
-    Args:
-        url: Of http or https, with user and password where the camera requires them.
+    User and password are part of the URL where the camera requires them.
 
     Raises:
         DriverError: It does not answer, or refuses.

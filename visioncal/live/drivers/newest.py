@@ -74,12 +74,7 @@ class _PictureRequest(Generic[T]):
 
 
 class Newest(Generic[T]):
-    """Newest picture of a source that a thread reads continuously.
-
-    Args:
-        source: The source; closed by the thread at its end.
-        name: Name of the camera in messages.
-    """
+    """Newest picture of a source that a thread reads continuously, and closes at its end."""
 
     def __init__(self, source: Source[T], name: str) -> None:
         self._source, self._name = source, name
@@ -98,11 +93,9 @@ class Newest(Generic[T]):
         return self._wait_for(self._first, timeout_s)
 
     def after(self, moment_s: float, timeout_s: float) -> tuple[Arrival, T]:
-        """Waits for a picture whose exposure began after a moment.
+        """Waits for a picture whose exposure began after a moment on the monotonic clock [s].
 
-        Args:
-            moment_s: The moment, on the host's monotonic clock [s].
-            timeout_s: Least timeout [s]; that of a slow camera is longer.
+        The timeout [s] of a slow camera is longer.
 
         Raises:
             DriverError: None came in time, or the source has ended.

@@ -13,9 +13,6 @@ class Stopwatch:
 
     It is read repeatedly while waiting for a device. When a virtual machine pauses or a computer
     swaps, all devices seem late at once, though none was silent.
-
-    Args:
-        now: The clock [s].
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:

@@ -339,10 +339,7 @@ def _matrix(pose: list[float]) -> FloatArray:
 
 
 class UrMotion:
-    """Joint states of a UR that another program moves.
-
-    Args:
-        host: The controller's address.
+    """Joint states of the UR at a host, which another program moves.
 
     Raises:
         DriverError: The client library is missing, or the host is unreachable or no UR.

@@ -21,13 +21,7 @@ _GLANCE_S = 0.05
 
 
 class Line:
-    """Worker thread that runs calls in order, and a periodic task while there are none.
-
-    Args:
-        name: Name of the device in messages.
-        idle: The periodic task.
-        every_s: Its period [s].
-    """
+    """Worker thread that runs calls in order, and a periodic task [s] while there are none."""
 
     def __init__(self, name: str, idle: Callable[[], None], every_s: float) -> None:
         self._name = name
@@ -37,12 +31,7 @@ class Line:
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def call(self, work: Callable[[], T], *, limit_s: float, what: str) -> T:
-        """Runs a call in the thread.
-
-        Args:
-            work: The call.
-            limit_s: Timeout [s].
-            what: What it does, for messages.
+        """Runs a call in the thread, with a timeout [s]; `what` it does is for messages.
 
         Raises:
             DriverError: It threw, or did not return in time.

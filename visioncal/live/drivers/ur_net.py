@@ -64,12 +64,7 @@ def resolve(host: str) -> str:
 
 
 def connect(host: str, port: int, what: str) -> socket.socket:
-    """Opens a connection.
-
-    Args:
-        host: The controller's address.
-        port: Its port.
-        what: Name of the server, for messages.
+    """Opens a connection to a port of a controller; `what` listens there is for messages.
 
     Raises:
         DriverError: The host cannot be reached, or does not listen there.
@@ -97,12 +92,7 @@ def connect(host: str, port: int, what: str) -> socket.socket:
 
 
 class Dashboard:
-    """Client of the controller's dashboard server, which takes commands as lines of text.
-
-    Args:
-        host: The controller's address.
-        answer_s: Timeout of an answer [s].
-    """
+    """Client of a controller's dashboard server, which takes commands as lines of text."""
 
     def __init__(self, host: str, answer_s: float = _ANSWER_S) -> None:
         self._label = f"{host}:{DASHBOARD_PORT}"

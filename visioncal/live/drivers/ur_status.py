@@ -120,8 +120,8 @@ def read_condition(host: str) -> Condition:
         version = _read_version(host, dashboard.ask("PolyscopeVersion"))
         model = dashboard.ask("get robot model")
         mode = dashboard.ask("robotmode").rpartition(":")[2].strip()
-        question = "safetystatus" if version >= (5, 4, 0) else "safetymode"
-        safety = dashboard.ask(question).rpartition(":")[2].strip()
+        query = "safetystatus" if version >= (5, 4, 0) else "safetymode"
+        safety = dashboard.ask(query).rpartition(":")[2].strip()
         remote = (
             version < _REPORTS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
         )

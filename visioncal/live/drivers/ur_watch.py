@@ -38,7 +38,7 @@ _DELAYS_S = 10.0
 
 
 class StateStream:
-    """States in the order of arrival.
+    """States of a controller in the order of arrival.
 
     Args:
         library: The module `rtde_receive`.

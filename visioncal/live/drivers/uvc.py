@@ -254,12 +254,7 @@ class GrabbedPictures:
 
 
 class FilePictures:
-    """All pictures of a video file in order, each stamped when it is requested.
-
-    Args:
-        capture: The opened capture.
-        name: Name of the file in messages.
-    """
+    """All pictures of a video file in order, each stamped when it is requested."""
 
     def __init__(self, capture: cv2.VideoCapture, name: str) -> None:
         self._capture, self._name = capture, name

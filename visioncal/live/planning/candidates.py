@@ -143,11 +143,8 @@ class _CandidateSearch:
 
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough stops, or it is clear that there are not."""
-        draw = (
-            self._from_views
-            if self._cell.robot.joint_count >= _FULL_JOINTS
-            else self._from_postures
-        )
+        in_views = self._cell.robot.joint_count >= _FULL_JOINTS
+        draw = self._from_views if in_views else self._from_postures
         for self._least_share in _SHARES:
             for draws in range(_DRAWS):
                 poor = len(self.kept) < _NEXT_TO_NONE * self._count
@@ -170,7 +167,7 @@ class _CandidateSearch:
             self._distances_narrowed = True
 
     def error(self) -> DataError:
-        """The error that too few were found."""
+        """Error of a search with too few stops."""
         error, cell = self.losses.error(len(self.kept), self._count), self._cell
         if (
             cell.mount == "eye-in-hand"
@@ -330,21 +327,18 @@ class Losses:
         """Number of tries that were rejected, by limit, the most frequent first."""
         counts = Counter(self.named)
         for limit, times in self.lost.items():
-            named = sum(
-                number for name, number in self.named.items() if name.startswith(f"{limit} (")
-            )
+            start = f"{limit} ("
+            named = sum(self.named[name] for name in self.named if name.startswith(start))
             counts[limit] += times - named
         return {limit: times for limit, times in counts.most_common() if times > 0}
 
     def worst(self) -> str:
         """The limit that lets the smallest share through."""
-        shares = {
-            limit: 1.0 - self.lost[limit] / tried for limit, tried in self.tried.items() if tried
-        }
-        return min(shares, key=lambda limit: shares[limit])
+        tried = {limit: times for limit, times in self.tried.items() if times}
+        return min(tried, key=lambda limit: 1.0 - self.lost[limit] / tried[limit])
 
     def error(self, found: int, wished: int) -> DataError:
-        """The error of a search that found too few."""
+        """Error of a search with too few stops."""
         worst = self.worst()
         own = {
             name: count for name, count in self.counts().items() if name.startswith(f"{worst} (")

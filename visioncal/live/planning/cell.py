@@ -157,14 +157,7 @@ class PlanCell:
                 )
 
     def cam_from_target(self, q: FloatArray) -> FloatArray:
-        """Predicts the board's pose in the camera, if the guesses are right.
-
-        Args:
-            q: (k, n) joint angles [rad].
-
-        Returns:
-            (k, 4, 4) `cam_from_target` [m].
-        """
+        """Predicts (k, 4, 4) `cam_from_target` [m] at (k, n) joint angles [rad] by the guesses."""
         return self.seen_from(self.robot.base_from_flange(q))
 
     def seen_from(self, base_from_flange: FloatArray) -> FloatArray:
@@ -180,15 +173,7 @@ class PlanCell:
         return np.asarray(self.x @ cam_from_target @ invert(self.z))
 
     def guesses(self, count: int, seed: int) -> tuple["PlanCell", ...]:
-        """Draws cells from the uncertainty of both edges.
-
-        Args:
-            count: Number of cells.
-            seed: Random seed; the same seed gives the same cells.
-
-        Returns:
-            Cells whose `x` and `z` are perturbed on the right by normal twists.
-        """
+        """Draws cells from the uncertainty of both edges, perturbed on the right."""
         rng = np.random.default_rng(seed)
         draws = rng.standard_normal((count, 12))
         if self.covariance is None:
@@ -225,14 +210,8 @@ def cell_of_calibration(
     """Takes a calibrated cell as the guess for another calibration of it.
 
     The edges' sigmas are those of the result, but at least a millimetre or two: the reason for
-    another calibration may be that somebody touched the camera or the board.
-
-    Args:
-        calibration: The result; its arm is used as calibrated.
-        target: The board, which a calibration does not keep.
-        limits: Limits of the stops.
-        boxes: Obstacles.
-        robot: The arm, where the calibration has none.
+    another calibration may be that somebody touched the camera or the board. The robot is used
+    where the calibration has none.
 
     Raises:
         DataError: The calibration has no robot or no camera.

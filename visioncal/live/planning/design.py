@@ -106,10 +106,10 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
     share = values[values > _NULL]
     # Lens and board are nuisance parameters.
     inverse = 1.0 / world.units
-    inverse[12 : 12 + world.lens_board_count] = 0.0
-    objective = (
-        np.diag(inverse**2) / (size - world.lens_board_count) if criterion == "A" else world.counted
-    )
+    inverse[12 : 12 + world.shared_count] = 0.0
+    counted = world.counted
+    if criterion == "A":
+        counted = np.diag(inverse**2) / (size - world.shared_count)
 
     def variance(square: FloatArray) -> Variance:
         transformed = unwhitened.T @ square @ unwhitened
@@ -122,7 +122,7 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
     return Reduced(
         factors @ basis,
         np.eye(len(share)) + basis.T @ recorded @ basis,
-        variance(objective),
+        variance(counted),
         variance(world.place),
         variance(world.turn),
         np.eye(len(share))[:, share > _LEAST_SHARE**2 * share.max(initial=0.0)],
@@ -165,7 +165,7 @@ class Selection:
         return cls(problem, criterion, (), tuple(starts), tuple(gradients))
 
     @cached_property
-    def noise_covariances(self) -> tuple[FloatArray, ...]:
+    def covariances(self) -> tuple[FloatArray, ...]:
         """Covariance (r, r) of noise alone, by world."""
         return tuple(np.asarray(np.linalg.inv(array), dtype=float) for array in self.information)
 
@@ -209,20 +209,14 @@ class Selection:
         if self.criterion in ("I", "A"):
             return world.objective.of(covariance)
         if self.criterion == "E":
-            return float(
-                np.linalg.eigvalsh(_extreme_covariance(world, covariance)).max(initial=0.0)
-            )
+            extremes = np.linalg.eigvalsh(_extreme_covariance(world, covariance))
+            return float(extremes.max(initial=0.0))
         return float(np.exp(np.linalg.slogdet(covariance)[1] / max(len(covariance), 1)))
 
     def _worlds(self) -> Iterator[tuple[Reduced, FloatArray]]:
-        noise = self.noise_covariances
-        biases = (
-            covariance @ gradient
-            for covariance, gradient in zip(noise, self.gradients, strict=True)
-        )
-        totals = (
-            covariance + bias @ bias.T for covariance, bias in zip(noise, biases, strict=True)
-        )
+        pairs = zip(self.covariances, self.gradients, strict=True)
+        biased = ((covariance, covariance @ gradient) for covariance, gradient in pairs)
+        totals = (covariance + bias @ bias.T for covariance, bias in biased)
         return zip(self.problem, totals, strict=True)
 
     @property
@@ -262,7 +256,7 @@ class Selection:
         gains: FloatArray = np.mean(
             [
                 self._gains(*pair, rows, sign)
-                for pair in zip(self.problem, self.noise_covariances, strict=True)
+                for pair in zip(self.problem, self.covariances, strict=True)
             ],
             axis=0,
         )
@@ -342,17 +336,11 @@ def chosen(
     criterion: Criterion = "I",
     wish: Wish | None = None,
 ) -> Design:
-    """Chooses the most informative stops to add to the recorded ones.
+    """Chooses at most `count` of the candidates to add to the recorded stops, the most informative.
 
     Stops are added greedily until there are enough, or the predicted accuracy meets the wish; then
     the best unused candidate replaces the least informative stop while that gains (Mitchell 1974,
     DETMAX, with excursions of one).
-
-    Args:
-        worlds: The candidates' information, in each of the possible cells.
-        count: Most stops to choose.
-        criterion: The criterion.
-        wish: Accuracy at which fewer stops are enough.
 
     Raises:
         DataError: The criterion is not known, or there are fewer candidates than stops.
@@ -375,13 +363,7 @@ def chosen(
 
 
 def shortfall(design: Design, wish: Wish, count: int) -> str:
-    """Explains why a wish is not met and what to do; empty where it is met.
-
-    Args:
-        design: The chosen stops.
-        wish: The wished accuracy.
-        count: Most stops that were allowed.
-    """
+    """Explains why at most `count` stops do not meet a wish, and a remedy; empty if they do."""
     if design.met is not False:
         return ""
     given = f"{len(design.rows)} stops give {_accuracy_words(design.predicted, wish)}"

@@ -123,14 +123,14 @@ class World:
     place: FloatArray
     turn: FloatArray
     units: FloatArray
-    lens_board_count: int
+    shared_count: int
     unestimated: FloatArray
     gradient: FloatArray
     held: int
 
     def with_known_lens_board(self) -> "World":
         """Returns the same world with lens and board known exactly."""
-        kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.lens_board_count))
+        kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.shared_count))
         block = np.ix_(kept, kept)
         of_arm = slice(self.gradient.shape[1] - self.held)
         return World(
@@ -170,14 +170,9 @@ def worlds_of(
     recorded: RecordedStops | None = None,
     workspace: Box | None = None,
 ) -> tuple[World, ...]:
-    """Predicts the information of candidates in each of some possible cells.
+    """Predicts the information of candidates with joints (k, n) [rad] in each possible cell.
 
-    Args:
-        cells: The guessed cell, and draws from its uncertainty.
-        purpose: The stops' purpose.
-        q: (k, n) joint angles of the candidates [rad].
-        recorded: Stops that were recorded already.
-        workspace: Region in which the arm's accuracy counts; None for all of its reach.
+    The arm's accuracy counts within the workspace, or all of its reach for None.
 
     Raises:
         DataError: The workspace holds no posture, or joint angles of recorded stops are needed and
@@ -190,18 +185,11 @@ def worlds_of(
 def stop_factors(
     cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None = None
 ) -> FloatArray:
-    """Whitened Jacobian of stops; F^T F is the information of each.
+    """Whitened Jacobian F (k, 6, p + a) of stops with joints (k, n) [rad]; F^T F is information.
 
-    Args:
-        cell: The cell, as guessed.
-        purpose: Defines the unknowns.
-        q: (k, n) joint angles [rad].
-        recorded: Source of lens and board; None for the stated ones, with the stated uncertainty of
-            the board's size.
-
-    Returns:
-        (k, 6, p + a); zero where the board is not seen. Errors of the arm that a fit treats as
-        noise come last.
+    It is zero where the board is not seen. Errors of the arm that a fit treats as noise come last.
+    Lens and board are those of the recorded stops; without any, the stated ones, with the stated
+    uncertainty of the board's size.
     """
     free = stated(cell) if recorded is None else recorded.free
     poses = cell.cam_from_target(q)
@@ -284,7 +272,7 @@ def _world(
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded)
-    lens_board_count, sigma, arm = (
+    shared_count, sigma, arm = (
         len(shared),
         _arm_sigma(purpose),
         _arm_size(cell.robot, purpose, recorded),
@@ -300,48 +288,42 @@ def _world(
     size, every = len(prior), factors.shape[2]
     known = np.zeros((every, every))
     if recorded is not None:
-        known = _recorded_stops_information(cell, purpose, recorded)
+        known = _recorded_information(cell, purpose, recorded)
     scale = np.ones(every)
     scale[:size] = inflation**-0.5
     factors, known = scale * factors, np.outer(scale, scale) * known
-    of_looks = np.sqrt(np.diag(covariance_from(shared))) if lens_board_count else np.zeros(0)
+    of_looks = np.sqrt(np.diag(covariance_from(shared))) if shared_count else np.zeros(0)
     units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
     if purpose.judged == "sight":
         weights = _sight_weights(cell, arm, q)
     else:
         weights = _workspace_weights(cell, purpose, workspace)
-    objective, position, rotation = (
-        _with_shared_columns(array, lens_board_count) for array in weights
-    )
-    unestimated, unestimated_gradient, held = factors[:, :, size:], known[:size, size:], 0
+    counted, place, turn = (_padded(array, shared_count) for array in weights)
+    misfit, gradient, held = factors[:, :, size:], known[:size, size:], 0
     if recorded is not None and not purpose.blocks:
-        edge_error_root, held = recorded.edge_error_root, recorded.held.shape[1]
+        error_root, held = recorded.edge_error_root, recorded.held.shape[1]
         pull = np.zeros((size, held))
         pull[12 : 12 + len(recorded.held)] = -recorded.held / inflation
-        further = (prior + known[:size, :size])[:, :12] @ edge_error_root
-        unestimated_gradient = np.hstack([unestimated_gradient, further, pull])
+        further = (prior + known[:size, :size])[:, :12] @ error_root
+        gradient = np.hstack([gradient, further, pull])
         still = np.zeros((*factors.shape[:2], held))
-        unestimated = np.concatenate(
-            [unestimated, factors[:, :, :12] @ edge_error_root, still], axis=2
-        )
+        misfit = np.concatenate([misfit, factors[:, :, :12] @ error_root, still], axis=2)
     return World(
         factors[:, :, :size],
         prior,
         known[:size, :size],
-        objective,
-        position,
-        rotation,
+        counted,
+        place,
+        turn,
         units,
-        lens_board_count,
-        unestimated,
-        unestimated_gradient,
+        shared_count,
+        misfit,
+        gradient,
         held,
     )
 
 
-def _recorded_stops_information(
-    cell: PlanCell, purpose: Purpose, recorded: RecordedStops
-) -> FloatArray:
+def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedStops) -> FloatArray:
     """Information (p + a, p + a) of recorded stops and hand measurements, without priors."""
     q = recorded.q
     if q is None and purpose.blocks:
@@ -503,10 +485,10 @@ def _mean_square(jacobian: FloatArray) -> FloatArray:
     return np.asarray(rows.T @ rows / len(jacobian))
 
 
-def _with_shared_columns(square: FloatArray, lens_board_count: int) -> FloatArray:
+def _padded(square: FloatArray, shared_count: int) -> FloatArray:
     """Inserts rows and columns of zeros for lens and board after those of the edges."""
-    size = len(square) + lens_board_count
+    size = len(square) + shared_count
     wide = np.zeros((size, size))
-    rows = np.concatenate([np.arange(12), np.arange(12 + lens_board_count, size)])
+    rows = np.concatenate([np.arange(12), np.arange(12 + shared_count, size)])
     wide[np.ix_(rows, rows)] = square
     return wide

@@ -106,13 +106,7 @@ class NeedPlanned:
 
 
 def need_planned(picking: Picking, rows: IntArray, count: int) -> NeedPlanned:
-    """Predicts picks after a plan, and states what limits them.
-
-    Args:
-        picking: The candidates.
-        rows: (m,) the chosen ones.
-        count: Most stops that were allowed.
-    """
+    """Predicts picks after a plan of at most `count` stops (m,), and states what limits them."""
     every, least = np.arange(len(picking.q)), NeedLimits.probability[0]
     probability, best = picking.chance(rows), picking.chance(every)
     words = ""
@@ -158,25 +152,20 @@ def check_need(need: Need, judged: str) -> None:
 def _pick_covariances(
     cell: PlanCell, covariance: FloatArray, noise: FloatArray, q: FloatArray
 ) -> FloatArray:
-    """Covariances (k, 6, 6) of picks of objects at the target's poses seen from some postures.
+    """Covariances (k, 6, 6) of picks of objects at the target's poses from (k, n) postures [rad].
 
-    All in the axes of what carries the camera: the flange, or the base.
-
-    Args:
-        cell: The cell.
-        covariance: (6, 6) of the camera's pose, a right perturbation.
-        noise: (6,) variances of the flange.
-        q: (k, n) the postures [rad].
+    All are in the axes of what carries the camera: the flange, or the base. The covariance (6, 6)
+    is that of the camera's pose, a right perturbation; the noise (6,) is variances of the flange.
     """
     middle = corner_positions(cell.target).mean(axis=0)
     seen = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
     turn = cell.x[:3, :3]
-    camera_jacobian = _point_jacobians(seen)
-    camera_jacobian[:, :3], camera_jacobian[:, 3:] = (
-        turn @ camera_jacobian[:, :3],
-        turn @ camera_jacobian[:, 3:],
+    jacobian = _point_jacobians(seen)
+    jacobian[:, :3], jacobian[:, 3:] = (
+        turn @ jacobian[:, :3],
+        turn @ jacobian[:, 3:],
     )
-    covariances = camera_jacobian @ covariance @ np.swapaxes(camera_jacobian, 1, 2) + np.diag(noise)
+    covariances = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + np.diag(noise)
     if cell.mount == "eye-in-hand":
         flange_jacobian = _point_jacobians(seen @ turn.T + cell.x[:3, 3])
         covariances = covariances + (flange_jacobian * noise) @ np.swapaxes(flange_jacobian, 1, 2)

@@ -37,11 +37,7 @@ class Detours:
         self._failed_searches = 0
 
     def path(self, start: FloatArray, end: FloatArray) -> FloatArray | int:
-        """Finds a path: straight in joint space, or around obstacles.
-
-        Args:
-            start: (n,) joint angles [rad].
-            end: (n,) joint angles [rad].
+        """Finds a path between joint angles (n,) [rad]: straight in joint space, or a detour.
 
         Returns:
             Via postures (j, n), without the ends; or, where no path was found, the index in
@@ -50,15 +46,13 @@ class Detours:
         blocked = self._collisions.on_the_way(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
-        found = (
-            self._bidirectional_search(start, end) if self._failed_searches < _MOST_FAILED else None
-        )
+        found = self._rrt_connect(start, end) if self._failed_searches < _MOST_FAILED else None
         if found is None:
             self._failed_searches += 1
             return blocked
         return self._shortcut(found)[1:-1]
 
-    def _bidirectional_search(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
+    def _rrt_connect(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
         """RRT-Connect: two trees grow towards draws and each other (Kuffner and LaValle 2000).
 
         Returns:
@@ -84,13 +78,13 @@ class Detours:
         place, new = tree.nearest(goal), None
         for _ in range(steps):
             difference = goal - tree.postures[place]
-            remaining = float(np.linalg.norm(difference))
-            if remaining == 0.0:
+            distance = float(np.linalg.norm(difference))
+            if distance == 0.0:
                 return place
             posture = (
                 goal
-                if remaining <= _STEP_RAD
-                else tree.postures[place] + difference * (_STEP_RAD / remaining)
+                if distance <= _STEP_RAD
+                else tree.postures[place] + difference * (_STEP_RAD / distance)
             )
             if self._collisions.on_the_way(tree.postures[place], posture) >= 0:
                 break
@@ -220,11 +214,9 @@ class _Tour:
         """Inserts stops in an order, and tries those again that were not reached at first."""
         postponed = [row for row in order if not self._insert(row, len(self.order))]
         for row in postponed:
-            distance = [
-                float(np.linalg.norm(self._q[index] - self._q[row])) for index in self.order
-            ]
+            apart = [float(np.linalg.norm(self._q[index] - self._q[row])) for index in self.order]
             # After its nearest neighbours, or before them.
-            places = [place + after for place in np.argsort(distance)[:_PLACES] for after in (1, 0)]
+            places = [place + after for place in np.argsort(apart)[:_PLACES] for after in (1, 0)]
             any(self._insert(row, int(place)) for place in dict.fromkeys(places))
 
     def route(self, collisions: Collisions) -> Route:

@@ -153,7 +153,7 @@ def make_plan(
     Raises:
         DataError: The cell allows too few stops, or none has a safe path to another.
     """
-    progress = progress or _silent
+    progress = progress or (lambda *_: None)
     if request.need is not None:
         check_need(request.need, request.purpose.judged)
     # A recorded cell may allow few stops, such as one with a fixed camera; these are added.
@@ -250,21 +250,18 @@ class _Planning:
 
     def _nearer_to_lost(self, remaining: IntArray, lost: IntArray, reached: IntArray) -> IntArray:
         """Remaining candidates whose joints are nearer to lost stops than to any reached one."""
+        q = self.found.q
         to_lost, to_reached = (
-            np.linalg.norm(self.found.q[remaining][:, None] - self.found.q[rows], axis=2).min(
-                axis=1
-            )
+            np.linalg.norm(q[remaining][:, None] - q[rows], axis=2).min(axis=1)
             for rows in (lost, reached)
         )
         return np.asarray(remaining[to_lost < to_reached])
 
-    def _smallest_design(self, remaining: IntArray) -> Design:
+    def _smallest_design(self, rows: IntArray) -> Design:
         """Design with the fewest stops that meet wish and need, or as many as are allowed."""
         request, needed_stops = self.request, CalibrationLimits.stops[0]
         worlds = tuple(
-            replace(
-                world, factors=world.factors[remaining], unestimated=world.unestimated[remaining]
-            )
+            replace(world, factors=world.factors[rows], unestimated=world.unestimated[rows])
             for world in self.worlds
         )
 
@@ -275,7 +272,7 @@ class _Planning:
         if not len(design.rows):
             raise _wish_met_error(design)
         if request.need is not None:
-            picking = Picking(self.cells, worlds, self.found.q[remaining], request.need)
+            picking = Picking(self.cells, worlds, self.found.q[rows], request.need)
             fewest, share = picking.fewest(design.rows), picking.share_of(design.rows)
             if fewest == 0 and self.recorded >= needed_stops:
                 raise _need_met_error(request.need, picking.chance(design.rows[:0]))
@@ -289,7 +286,7 @@ class _Planning:
                 if enough and picking.chance(smaller.rows) >= share:
                     design = smaller
                     break
-        return replace(design, rows=remaining[design.rows])
+        return replace(design, rows=rows[design.rows])
 
     def stops(self, design: Design, route: Route) -> tuple[PlannedStop, ...]:
         """The stops in driving order."""
@@ -347,10 +344,6 @@ def _wish_met_error(design: Design) -> DataError:
     )
 
 
-def _silent(_: str, __: int, ___: int) -> None:
-    """Reports no progress."""
-
-
 def helps(
     cell: PlanCell,
     purpose: Purpose,
@@ -361,16 +354,10 @@ def helps(
     *,
     begun: Begun | None = None,
 ) -> Iterator[str]:
-    """States what each chosen stop contributes, given those before it.
+    """States what each chosen stop contributes, given those before it and the recorded ones.
 
-    Args:
-        cell: The cell, as guessed.
-        purpose: Purpose of the stops.
-        q: (k, n) joint angles of the candidates [rad].
-        world: The candidates' information if the guesses are right.
-        design: The chosen candidates.
-        names: Names of the chosen stops, in their order.
-        begun: Session to which the stops are added; None for none.
+    The candidates have joints (k, n) [rad] and their information in `world` if the guesses are
+    right; `names` are those of the chosen ones, in their order.
     """
     earlier_poses, earlier_names = np.zeros((0, 4, 4)), []
     if begun is not None:
@@ -447,10 +434,8 @@ def _edge_effect_words(before: FloatArray, after: FloatArray) -> str:
     component = int(np.argmax(drops))
     axis = ("the image's x", "the image's y", "the optical axis")[component % 3]
     words = f"the error {'about' if component < 3 else 'along'} {axis}"
-    sigma_before, sigma_after = (
-        float(np.sqrt(array[component, component])) for array in (before, after)
-    )
-    return _change_words(words, sigma_before, sigma_after, is_rotation=component < 3)
+    sigma_was, sigma_is = (float(np.sqrt(array[component, component])) for array in (before, after))
+    return _change_words(words, sigma_was, sigma_is, is_rotation=component < 3)
 
 
 def _change_words(what: str, before: float, after: float, *, is_rotation: bool) -> str:

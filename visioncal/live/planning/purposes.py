@@ -64,14 +64,10 @@ PURPOSES: Mapping[str, Purpose] = MappingProxyType(
 
 
 def purpose_of(name: str, culprit: str = "purpose") -> Purpose:
-    """Finds a purpose.
-
-    Args:
-        name: Its name.
-        culprit: Where it was named, for the error.
+    """Finds a purpose by its name.
 
     Raises:
-        DataError: There is no purpose of that name.
+        DataError: There is no purpose of that name; the culprit is where it was given.
     """
     if name not in PURPOSES:
         raise DataError(

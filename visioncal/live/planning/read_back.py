@@ -65,10 +65,7 @@ class PlanFile:
 
 
 def read_plan(path: Path | str) -> PlanFile:
-    """Reads a plan.
-
-    Args:
-        path: The plan.json, or its folder.
+    """Reads a plan from its plan.json, or from the folder of it.
 
     Raises:
         DataError: There is none, or it is not a valid plan.

@@ -259,23 +259,23 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
         raise _too_vague_error(run, len(views))
     shown = [run.poses[view].board for view in views]
     board = max(dict.fromkeys(shown), key=shown.count)
-    views_of_board = [view for view in sorted(views) if run.poses[view].board == board]
-    observed = replace(observed, boards=(board,), used=tuple(views_of_board))
+    chosen = [view for view in sorted(views) if run.poses[view].board == board]
+    observed = replace(observed, boards=(board,), used=tuple(chosen))
     observed = replace(observed, frames=observed.framed(np.stack([guess.x, guess.z])))
-    robot = robot_part(observed.arm_at(views_of_board).poses, run.session.mount)
+    robot = robot_part(observed.arm_at(chosen).poses, run.session.mount)
     target = tuple(run.session.boards.values())[board]
     poses = [
         choose_by(run.poses[index], pose, target)
-        for index, pose in zip(views_of_board, invert(robot @ guess.x) @ guess.z, strict=True)
+        for index, pose in zip(chosen, invert(robot @ guess.x) @ guess.z, strict=True)
     ]
     ((frame, scene),) = run.scenes.items()
     problem, alone = (
-        observed.posed(poses).problem(views_of_board),
-        np.ones(len(views_of_board), dtype=bool),
+        observed.posed(poses).problem(chosen),
+        np.ones(len(chosen), dtype=bool),
     )
-    looks = FramesSide(problem, alone, views_of_board, {}).looks({frame: scene}, {frame: poses})
+    looks = FramesSide(problem, alone, chosen, {}).looks({frame: scene}, {frame: poses})
     observed = replace(observed, free=free_of(looks.seen(looks.first))).posed(poses)
-    problem = observed.problem(views_of_board).merged()
+    problem = observed.problem(chosen).merged()
     return _RecordedStart(
         problem,
         problem.start(observed.frames),
@@ -283,7 +283,7 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
         observed.free or free_of(looks.seen(looks.first)),
         observed.arm_at_stops,
         board,
-        tuple(observed.first_of_stops(views_of_board)),
+        tuple(observed.first_of_stops(chosen)),
     )
 
 

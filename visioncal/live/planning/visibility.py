@@ -47,12 +47,7 @@ class Window:
     """
 
     def __init__(self, camera: Camera, edge_px: float) -> None:
-        """Prepares the planes.
-
-        Args:
-            camera: The intrinsics.
-            edge_px: How far points stay from the image's edge [px].
-        """
+        """Prepares the planes for points that stay `edge_px` from the image's edge [px]."""
         self._camera, self._edge_px = camera, edge_px
         border = _border_tangents(camera, 0.0, _RAYS)
         # Beyond these tangents a lens model may fold back into the image.
@@ -187,14 +182,10 @@ class CameraAim:
         return self.window.holds(apply(cam_from_target, self.outline))
 
     def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
-        """Share of the uncertain cell's draws in which poses show the whole print.
+        """Share (k,) of the uncertain cell's draws that show the whole print at poses (k, 4, 4).
 
-        Args:
-            base_from_flange: (k, 4, 4) the poses [m].
-            wanted: Poses that cannot reach this share any more are not evaluated further.
-
-        Returns:
-            (k,) shares; a lower bound where the wanted one is not reached.
+        Poses that cannot reach the wanted share any more are not evaluated further: theirs is a
+        lower bound.
         """
         seen = np.zeros(len(base_from_flange))
         checked, possible = 0, np.arange(len(base_from_flange))
@@ -322,14 +313,7 @@ class Shade:
         return cls(cell, points, tuple(parts))
 
     def behind_boxes(self, base_from_flange: FloatArray) -> IntArray:
-        """Finds boxes in the lines of sight.
-
-        Args:
-            base_from_flange: (k, 4, 4) poses [m].
-
-        Returns:
-            (k,) index of a box that hides a part of the print; -1 where there is none.
-        """
+        """Index (k,) of a box that hides part of the print at flange poses (k, 4, 4); else -1."""
         starts, ends = self._sight_lines(base_from_flange)
         blocking = np.full(len(base_from_flange), -1, dtype=np.int64)
         for index, box in enumerate(self.cell.boxes):
@@ -337,14 +321,7 @@ class Shade:
         return blocking
 
     def behind_arm(self, q: FloatArray) -> IntArray:
-        """Finds the arm itself in the lines of sight.
-
-        Args:
-            q: (k, n) joint angles [rad].
-
-        Returns:
-            (k,) index in `parts` of one that hides a part of the print; -1 where there is none.
-        """
+        """Index (k,) in `parts` that hides part of the print at joints (k, n) [rad]; else -1."""
         chain = self.cell.robot.chain
         frames = chain_frames(chain, chain.effective(q))
         starts, ends = self._sight_lines(frames[:, -1])

@@ -48,12 +48,7 @@ def image_of(stop: PlannedStop) -> str:
 
 
 def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
-    """Builds the content of plan.json; what does not apply is absent.
-
-    Args:
-        plan: The plan.
-        source: Where the cell comes from, for the reader.
-    """
+    """Builds the content of plan.json; `source` tells the reader where the cell comes from."""
     request, design = plan.request, plan.design
     inputs: dict[str, Any] = {
         "cell": _cell_document(plan.cell),

@@ -72,7 +72,9 @@ class Bench:
         self.controller: SimulatedController = spawn(_options_at(cell, start_q))
         # The camera asks from the pipeline's thread, and needs a connection of its own.
         self._truth = TruthClient(self.controller.host)
-        self.camera = RehearsalCamera(cell.truth, self._true_joints, pace=_PACE)
+        self.camera = RehearsalCamera(
+            cell.truth, lambda at_s: self._truth.state(at_s.tolist()).q, pace=_PACE
+        )
         self.through_depthai = _has_depthai()
 
     @contextmanager
@@ -96,9 +98,6 @@ class Bench:
         """Ends the controller."""
         self._truth.close()
         self.controller.close()
-
-    def _true_joints(self, at_s: FloatArray) -> FloatArray:
-        return self._truth.state(at_s.tolist()).q
 
     def _open_camera(self) -> CameraDevice:
         if not self.through_depthai:

@@ -60,18 +60,18 @@ def rehearsed_cell(options: RehearsalOptions) -> RehearsedCell:
     Raises:
         DataError: The arm is unknown, or cannot have the board in view.
     """
-    simulated = CellOptions(
+    wanted = CellOptions(
         robot=options.robot,
         mount=options.mount,
         views=1,
         cut_views=0.0,
         seed=options.seed,
     )
-    cell = simulate(simulated)
+    cell = simulate(wanted)
     controller = ControllerOptions(robot=options.robot, seed=options.seed, errors=_WORN)
     robot = replace(cell.robot, true_arm=true_arm(controller))
     truth = replace(cell, robots={"": robot})
-    return RehearsedCell(truth, controller, _user_description(truth, simulated))
+    return RehearsedCell(truth, controller, _user_description(truth, wanted))
 
 
 def _user_description(truth: SimulatedCell, options: CellOptions) -> PlanCell:

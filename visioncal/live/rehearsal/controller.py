@@ -60,11 +60,7 @@ class SimulatedController:
 
 
 def spawn(options: ControllerOptions | None = None, host: str | None = None) -> SimulatedController:
-    """Starts a simulated controller.
-
-    Args:
-        options: Its options; None for the defaults.
-        host: A loopback address, such as `127.0.0.2`; None for a free one.
+    """Starts a simulated controller at a loopback address such as `127.0.0.2`; None for any free.
 
     Raises:
         DriverError: It does not start, for example because a port is taken.

@@ -234,26 +234,21 @@ def posture(machine: Machine, pose: FloatArray, near: FloatArray) -> FloatArray 
 def postures_to(
     machine: Machine, pose: FloatArray, start: FloatArray
 ) -> tuple[list[FloatArray], float]:
-    """Postures along a straight line of the tool, and its length.
-
-    Args:
-        machine: The arm.
-        pose: (6,) end of the line.
-        start: (n,) posture at its start [rad].
+    """Postures along a straight line of the tool from a posture (n,) [rad] to a pose (6,).
 
     Returns:
         The postures, none where the line leaves the reach, and the length [m]; of a pure rotation
         its angle [rad].
     """
-    start_pose = tool_pose(machine, start)
-    rotations = Rotation.from_rotvec([start_pose[3:], pose[3:]])
-    distance = float(np.linalg.norm(pose[:3] - start_pose[:3])) or float(
+    begin = tool_pose(machine, start)
+    rotations = Rotation.from_rotvec([begin[3:], pose[3:]])
+    distance = float(np.linalg.norm(pose[:3] - begin[:3])) or float(
         (rotations[0].inv() * rotations[1]).magnitude()
     )
     knots = [start]
     interpolated = Slerp([0.0, 1.0], rotations)
     for share in np.linspace(0.0, 1.0, _KNOTS)[1:]:
-        position = start_pose[:3] + share * (pose[:3] - start_pose[:3])
+        position = begin[:3] + share * (pose[:3] - begin[:3])
         next_knot = posture(
             machine, np.concatenate([position, interpolated(share).as_rotvec()]), knots[-1]
         )

@@ -72,7 +72,7 @@ class Profile:
             return 0.5 * self.acceleration * elapsed_s**2, self.acceleration * elapsed_s
         if remaining_s < ramp:
             return (
-                self.distance - 0.5 * self.acceleration * remaining_s** 2,
+                self.distance - 0.5 * self.acceleration * remaining_s**2,
                 self.acceleration * remaining_s,
             )
         return self.peak * (elapsed_s - 0.5 * ramp), self.peak
@@ -104,20 +104,14 @@ class Way:
         place, speed = self.profile.at(max(0.0, elapsed_s))
         after = int(np.clip(np.searchsorted(self.distances, place), 1, len(self.distances) - 1))
         span = self.distances[after] - self.distances[after - 1]
-        direction = (self.knots[after] - self.knots[after - 1]) / span
-        return self.knots[after - 1] + direction * (
-            place - self.distances[after - 1]
-        ), direction * speed
+        slope = (self.knots[after] - self.knots[after - 1]) / span
+        return self.knots[after - 1] + slope * (place - self.distances[after - 1]), slope * speed
 
 
 def joint_way(start: FloatArray, goal: FloatArray, *, speed: float, acceleration: float) -> Way:
-    """Straight path of all joints between two postures.
+    """Straight path of all joints between postures (n,) [rad].
 
-    Args:
-        start: (n,) start [rad].
-        goal: (n,) goal [rad].
-        speed: Speed of the joint that travels farthest [rad/s].
-        acceleration: Its acceleration [rad/s^2].
+    Speed [rad/s] and acceleration [rad/s^2] are of the joint that travels farthest.
     """
     distance = float(np.abs(goal - start).max())
     return Way(
@@ -130,14 +124,7 @@ def joint_way(start: FloatArray, goal: FloatArray, *, speed: float, acceleration
 def sampled_way(
     knots: Sequence[FloatArray], distance: float, *, speed: float, acceleration: float
 ) -> Way:
-    """Path through evenly spaced postures, as along a straight line of the tool.
-
-    Args:
-        knots: Postures, (n,) each [rad].
-        distance: Length of the path [m].
-        speed: Speed limit [m/s].
-        acceleration: Acceleration [m/s^2].
-    """
+    """Path of a length [m] through evenly spaced postures (n,) [rad], at most at a speed [m/s]."""
     distances = np.linspace(0.0, distance, len(knots))
     return Way(np.array(knots), distances, Profile(distance, speed, acceleration))
 

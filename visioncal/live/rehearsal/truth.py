@@ -142,15 +142,9 @@ class TruthClient:
             self._ask({"fault": fault})
 
     def guide(self, q: FloatArray, *, speed: float, acceleration: float) -> float:
-        """Moves the arm to a posture as if guided by hand.
+        """Moves the arm to a posture (n,) [rad] as if by hand, and returns the time of arrival [s].
 
-        Args:
-            q: (n,) the posture [rad].
-            speed: Speed of the joint that travels farthest [rad/s].
-            acceleration: Its acceleration [rad/s^2].
-
-        Returns:
-            Time of arrival on the monotonic clock [s].
+        Speed [rad/s] and acceleration [rad/s^2] are of the joint that travels farthest.
         """
         request = {"guide": q.tolist(), "speed": speed, "acceleration": acceleration}
         return float(self._ask(request)["ends"])

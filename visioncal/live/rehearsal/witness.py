@@ -73,13 +73,9 @@ class Pace:
 def pace_of(
     steps: Sequence[CaptureEvent], plan: PlanFile, start_q: FloatArray, options: CaptureOptions
 ) -> Pace:
-    """Splits the duration of a recording into motion, settling and the rest.
+    """Splits the duration of a recording from joints (n,) [rad] into motion, settling and the rest.
 
-    Args:
-        steps: Results of a plan's stops from the first on, in order.
-        plan: The stops.
-        start_q: (n,) joint angles at the start [rad].
-        options: Speed and acceleration.
+    The results are those of the plan's stops from the first on, in order.
     """
     q, motions = start_q, []
     for _, stop in zip(steps, plan.stops, strict=False):
@@ -119,16 +115,11 @@ class EdgeCheck:
 
 
 def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> EdgeCheck:
-    """Tests the errors of all edges against their joint covariance.
-
-    Args:
-        calibration: The result.
-        transforms: (4, 4) true edges by name.
-    """
-    errors = np.concatenate(
+    """Tests the errors of all edges against true ones (4, 4) by name, with the joint covariance."""
+    twists = np.concatenate(
         [log(invert(transforms[name]) @ edge.matrix) for name, edge in calibration.edges.items()]
     )
-    squared = float(errors @ np.linalg.solve(calibration.joint_covariance, errors))
+    squared = float(twists @ np.linalg.solve(calibration.joint_covariance, twists))
     return EdgeCheck(
-        squared, errors.size, _SIGMA_FACTOR**2 * float(chi2_limit(_CHANCE, errors.size))
+        squared, twists.size, _SIGMA_FACTOR**2 * float(chi2_limit(_CHANCE, twists.size))
     )
