@@ -29,7 +29,6 @@ class Coach:
     """Coverage of a recording by its views.
 
     Attributes:
-        target: The board.
         resolution: (width, height) of the images [px].
         camera: Intrinsics for tilt and distance; None where they are not known.
     """

@@ -42,7 +42,6 @@ class CaptureEvent:
         covered: Coverage so far, in words.
         accuracy: Accuracy predicted so far; None while there is no prediction.
         advice: What comes next, in words.
-        times: Duration.
     """
 
     view: int
@@ -67,15 +66,9 @@ class Capture:
     """A recording in progress.
 
     Attributes:
-        cell: The devices.
-        target: The board to detect.
-        journal: Storage of the views.
-        options: How views are taken.
         agreement: Consistency check of joints and pose.
         coach: Coverage, and advice for the next view.
         prediction: Predicted accuracy.
-        watchers: Observers.
-        steps: Results of the stops so far.
     """
 
     cell: LiveCell

@@ -23,15 +23,11 @@ class CaptureFacts:
     """Facts of a recording that are the same for all views.
 
     Attributes:
-        name: The session's name.
-        mount: Where the camera is mounted.
-        target: The board.
         robot: The arm's model; None where it is not known.
         arm: The name that the arm reports.
         camera: The name that the camera reports.
         resolution: (width, height) of its pictures [px].
         lens: Intrinsics that it reports, to be refined; None to have them estimated.
-        settings: The camera's settings.
         plan: Digest of the plan that is driven; empty for none.
     """
 

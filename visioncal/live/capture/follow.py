@@ -27,7 +27,6 @@ class HeldArm:
     """An arm that stays at a given pose.
 
     Attributes:
-        name: Its name in messages.
         reported: Its state when it was read.
         clock: Clock of the state's stamps.
     """

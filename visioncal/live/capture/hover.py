@@ -30,8 +30,7 @@ class Hovering:
     """Driven arm, and the plane that its tip stays above.
 
     Attributes:
-        arm: The arm.
-        robot: Its model, as in its controller.
+        robot: Model of the arm, as in its controller.
         tip_m: (3,) the tip in the flange frame [m].
         point_m: (3,) a point of the plane, in the base [m].
         normal: (3,) normal of the plane, in the base, into what is touched.

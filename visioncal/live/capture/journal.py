@@ -36,10 +36,6 @@ class Journal:
     The table of views is replaced atomically for each view, after its image is on the disk: at any
     moment the folder holds a session of all acknowledged views, or, before the first, none. If the
     process is killed, at most the view that is being written is lost.
-
-    Attributes:
-        folder: The session's folder.
-        views: The views that are on the disk.
     """
 
     def __init__(self, folder: Path, facts: CaptureFacts, unix_offset_s: float) -> None:

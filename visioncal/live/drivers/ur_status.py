@@ -53,7 +53,6 @@ class Condition:
     """The dashboard's answers.
 
     Attributes:
-        host: The controller's address.
         version: PolyScope's version: major, minor, bug fix.
         model: The arm's name, such as `UR10e`.
         mode: The robot's mode, such as `RUNNING`.

@@ -38,7 +38,6 @@ class Box:
     """A box-shaped obstacle.
 
     Attributes:
-        name: Its name in messages.
         base_from_box: (4, 4) frame at its centre [m].
         size_m: (3,) full lengths along that frame's axes [m].
     """
@@ -106,18 +105,12 @@ class PlanCell:
     """A cell to plan for: its parts, rough guesses of the unknown edges, and limits.
 
     Attributes:
-        mount: Where the camera is mounted.
-        robot: The arm.
-        camera: The intrinsics.
-        target: The board.
         x: (4, 4) guess of `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
         z: (4, 4) guess of `base_from_target` (eye-in-hand) or `flange_from_target` (eye-to-hand).
         sigma_rad: Standard deviation of both rotations, per axis [rad].
         sigma_m: The same for their translations [m].
         noise: Noise of the robot's poses.
         pixel_px: Noise of a corner, per axis [px].
-        limits: Limits of the stops and of the paths between them.
-        boxes: Obstacles.
         covariance: (12, 12) joint covariance of both edges (rotation, translation; right
             perturbations), where recorded stops determine it; both sigmas are then typical of it.
             None where the sigmas are all that is known.

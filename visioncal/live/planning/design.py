@@ -144,8 +144,6 @@ class Selection:
     """Chosen candidates, and their information in each world.
 
     Attributes:
-        problem: The worlds.
-        criterion: The criterion.
         rows: The chosen candidates.
         information: (r, r) by world.
         gradients: (r, a) by world, the gradient's Jacobian in parameters that a fit does not
@@ -300,7 +298,6 @@ class Design:
 
     Attributes:
         rows: (n,) chosen candidates, the most informative first.
-        criterion: The criterion.
         value: The criterion at these stops: a sigma [mm] for I, else in its own units.
         history: Accuracy predicted without any of them, and after each in the order of `rows`.
         best: Accuracy with all candidates.

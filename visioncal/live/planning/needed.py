@@ -86,7 +86,6 @@ class NeedPlanned:
     """Predicted probability that picks land within tolerance.
 
     Attributes:
-        need: The tolerance.
         before: Probability without the planned stops.
         probability: The same with them.
         best: The same with all candidates.

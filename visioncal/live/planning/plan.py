@@ -45,16 +45,12 @@ class PlanRequest:
     """Request for a plan.
 
     Attributes:
-        purpose: Purpose of the stops.
         count: Most stops.
-        criterion: Design criterion.
         wish: Accuracy at which fewer stops are enough; None for none.
         need: Tolerance of picks at which fewer are enough; None for none.
-        candidates: Number of candidates.
         workspace: Region in which the arm's accuracy counts; None for all of its reach.
         start_q: (n,) present joint angles of the arm [rad]; None where they are not known, and the
             path to the first stop is not checked.
-        seed: Random seed.
     """
 
     purpose: Purpose
@@ -102,9 +98,6 @@ class Plan:
     """A plan.
 
     Attributes:
-        cell: The cell.
-        request: The request.
-        stops: The stops in driving order.
         design: The chosen candidates and the accuracy predicted with them.
         length_rad: Length of the path, as the sum of its segments' norms [rad].
         begun: The session to which the stops are added; None for none.
@@ -201,7 +194,6 @@ class _Planning:
 
     Attributes:
         cells: The guessed cell, and draws from its uncertainty.
-        request: The request.
         found: The candidates.
         worlds: Their information in each of the cells.
         begun: Session to which the stops are added; None for none.

@@ -49,8 +49,6 @@ class PlanFile:
     """A plan read from its file.
 
     Attributes:
-        cell: The cell.
-        purpose: Purpose of the stops.
         stops: In driving order.
         start_q: (n,) joint angles before the first stop [rad]; None where they were not stated, and
             the path to the first stop was not checked.

@@ -196,10 +196,8 @@ class _RecordedStart:
 
     Attributes:
         problem: The s stops, without errors of the arm; the planned board comes first.
-        state: Start of the iteration.
         noise: Noise of the robot at the stops.
         free: Free parameters of lens and boards.
-        arm: The robot's arm at the stops.
         board: Index of the planned board: the one in the most views.
         views: (s,) first view of each stop.
     """

@@ -114,7 +114,6 @@ class CameraAim:
     """Views of a board by a camera.
 
     Attributes:
-        cell: The cell, as guessed.
         distance_m: Least and greatest distance between camera and board centre [m].
         outline: (p, 3) points around the print, its corners first, in the target frame [m].
         centre: (3,) centre of the print [m].
@@ -296,7 +295,6 @@ class Shade:
     """Occlusion of the lines of sight from the camera to points of the print.
 
     Attributes:
-        cell: The cell, as guessed.
         points: (p, 3) the points of the print, in the target frame [m].
         parts: The arm's bodies, without those on the last link: they carry camera or board, and do
             not move relative to it.

@@ -56,8 +56,6 @@ class Bench:
     """A running simulated cell: its controller is another process, its camera renders the truth.
 
     Attributes:
-        cell: The simulated cell.
-        controller: The controller's process.
         camera: The camera that observes the true arm.
         through_depthai: Whether its pictures go through depthai's pipeline.
     """

@@ -28,9 +28,6 @@ class RehearsalOptions:
 
     Attributes:
         robot: `ur3e`, `ur5e` or `ur10e`.
-        mount: Where the camera is mounted.
-        stops: Number of planned stops.
-        seed: Random seed.
     """
 
     robot: str = "ur5e"

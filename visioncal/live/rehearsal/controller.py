@@ -39,8 +39,6 @@ class SimulatedController:
 
     Attributes:
         host: The loopback address that it listens on.
-        process: The process.
-        truth: Its truth channel.
     """
 
     host: str

@@ -32,7 +32,6 @@ class ControllerOptions:
 
     Attributes:
         robot: `ur3e`, `ur5e` or `ur10e`.
-        seed: Random seed.
         errors: Errors of the true arm relative to its controller's model.
         q: Joint angles at the start [rad].
         tcp: Tool offset that is set: x, y, z [m] and a rotation vector [rad].
@@ -41,7 +40,6 @@ class ControllerOptions:
         repeatability_rad: Sigma of a joint's error relative to its encoder, drawn anew for each
             motion [rad].
         polyscope: The dashboard's version string.
-        remote: Whether remote control is on.
         safety: `normal`, `protective-stop` or `emergency-stop`, at the start.
         mode: The robot's mode at the start, as on the dashboard: `RUNNING`, `POWER_OFF`.
         rate_hz: States per second.
@@ -101,14 +99,11 @@ class Machine:
     """The arm. Times are of the host's monotonic clock [s].
 
     Attributes:
-        believed: The controller's model of the arm.
-        true: The true arm.
         tcp: (6,) tool offset: x, y, z [m] and a rotation vector [rad].
         payload_kg: Payload [kg].
         payload_m: (3,) its centre of mass [m].
         safety: `normal`, `protective-stop` or `emergency-stop`.
         mode: The robot's mode, as on the dashboard.
-        remote: Whether remote control is on.
         program: State of the control script.
         polyscope: The dashboard's version string.
     """

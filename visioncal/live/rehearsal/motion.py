@@ -85,7 +85,6 @@ class Way:
     Attributes:
         knots: (k, n) postures, from the first to the last [rad].
         distances: (k,) distance along the path of each, from 0 to the profile's distance.
-        profile: Speed profile.
     """
 
     knots: FloatArray

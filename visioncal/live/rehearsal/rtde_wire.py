@@ -51,8 +51,6 @@ class Recipe:
 
     Attributes:
         number: Number of the recipe, the first byte of its frames.
-        names: The variables.
-        types: Their types.
     """
 
     number: int

@@ -37,8 +37,6 @@ class Moment:
     """The machine at one moment.
 
     Attributes:
-        machine: The arm.
-        registers: The script's registers.
         now_s: The moment, on the monotonic clock [s].
         up_s: Uptime of the controller [s].
     """

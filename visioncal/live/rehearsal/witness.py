@@ -30,7 +30,6 @@ class Witness:
     """Watcher that compares recorded poses with the true ones at the middle of each exposure.
 
     Attributes:
-        bench: The simulated cell.
         away_mm: Distance of the true flange from that of the true arm at the recorded joints, for
             each view: residual motion and repeatability [mm].
     """
@@ -54,7 +53,6 @@ class Pace:
     """Mean durations of the views of a recording [s].
 
     Attributes:
-        views: Number of views.
         motion_s: Motion, by speed and acceleration.
         driving_s: Overhead of starting and ending each part of the path.
         settling_s: Settling of arm and image.
