@@ -85,9 +85,9 @@ class Capture:
         """Takes the views on the disk into account."""
         for view in self.journal.views:
             image = decode_image(self.journal.image(view))
-            found = None if isinstance(image, str) else look_for(image, self.target, view.number)
-            if found is not None and isinstance(found[0], Corners):
-                self.coach.add(found[0])
+            detected = None if isinstance(image, str) else look_for(image, self.target, view.number)
+            if detected is not None and isinstance(detected[0], Corners):
+                self.coach.add(detected[0])
             state = state_of(view)
             if state is not None:
                 self.agreement.why_not(state)

@@ -89,8 +89,8 @@ def image_motion_px(first: Image, latest: Image) -> float:
     moved, status, error = cv2.calcOpticalFlowPyrLK(
         first, latest, points, np.empty_like(points), winSize=(_WINDOW_PX, _WINDOW_PX)
     )
-    kept = (status[:, 0] == 1) & (error[:, 0] < _GREY_DIFFERENCE)
-    if kept.mean() < _FOUND_SHARE:
+    matched = (status[:, 0] == 1) & (error[:, 0] < _GREY_DIFFERENCE)
+    if matched.mean() < _FOUND_SHARE:
         return float("inf")
-    shifts: FloatArray = np.asarray((moved - points)[kept, 0], dtype=float)
+    shifts: FloatArray = np.asarray((moved - points)[matched, 0], dtype=float)
     return float(np.median(np.linalg.norm(shifts, axis=1)))

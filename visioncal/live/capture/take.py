@@ -157,11 +157,11 @@ def _select_frame(
     return first if sharpest == 0 else _detect(frames[sharpest], target, view, motion_px)
 
 
-def _detect(kept: StillFrame, target: Target, view: int, motion_px: float) -> TakenView | Missed:
-    corners, _ = look_for(grey(kept.frame.image), target, view)
+def _detect(still: StillFrame, target: Target, view: int, motion_px: float) -> TakenView | Missed:
+    corners, _ = look_for(grey(still.frame.image), target, view)
     if isinstance(corners, Rejection):
         return Missed(corners.reason)
-    return TakenView(kept.frame, kept.state, corners, motion_px)
+    return TakenView(still.frame, still.state, corners, motion_px)
 
 
 def _mean_frame(frames: Sequence[StillFrame]) -> StillFrame:

@@ -26,9 +26,9 @@ _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 def without_password(url: str) -> str:
     """A URL without user and password, to be shown and stored."""
-    scheme, found, rest = url.partition("://")
+    scheme, separator, rest = url.partition("://")
     authority, slash, path = rest.partition("/")
-    return f"{scheme}{found}{authority.rpartition('@')[2]}{slash}{path}" if found else url
+    return f"{scheme}{separator}{authority.rpartition('@')[2]}{slash}{path}" if separator else url
 
 
 def open_multipart(url: str) -> "MultipartPictures | None":
@@ -178,8 +178,8 @@ class MultipartPictures:
         size, has_headers = None, False
         for _ in range(_MAX_HEADER_LINES):
             line = self._read_line().strip()
-            name, found, value = line.partition(b":")
-            if found:
+            name, separator, value = line.partition(b":")
+            if separator:
                 has_headers = True
                 if name.strip().lower() == b"content-length":
                     size = int(value)

@@ -151,9 +151,9 @@ class Newest(Generic[T]):
                 request.too_old += 1
                 return
         # Not under the lock: it may take long, and a waiting caller must be able to time out.
-        taken = self._source.take()
+        picture = self._source.take()
         with self._news:
-            request.answer = (arrival, taken)
+            request.answer = (arrival, picture)
             if self._request is request:
                 self._request = None
             self._news.notify_all()

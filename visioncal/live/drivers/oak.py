@@ -70,8 +70,8 @@ class OakCamera:
             )
             closing.callback(self._end.close)
             held = self._hold_settings(dai, requested, sensor, control)
-            self.factory, known = self._intrinsics(calibration, sensor)
-            self.settings = MappingProxyType({"rate_hz": rate_hz, **known, **held})
+            self.factory, provenance = self._intrinsics(calibration, sensor)
+            self.settings = MappingProxyType({"rate_hz": rate_hz, **provenance, **held})
             self._closing = closing.pop_all()
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
@@ -148,8 +148,8 @@ class OakCamera:
         except DriverError as error:
             return None, {"factory_intrinsics": f"not used: {error.message}"}
         focus = _calibrated_focus(calibration, sensor)
-        at = "" if focus is None else f", for focus {focus}"
-        return camera, {"factory_intrinsics": f"read from the device{at}"}
+        suffix = "" if focus is None else f", for focus {focus}"
+        return camera, {"factory_intrinsics": f"read from the device{suffix}"}
 
 
 def _options(more: Mapping[str, str]) -> tuple[str, float]:

@@ -137,8 +137,8 @@ def safety_of(bits: int) -> Safety:
 
 
 def _read_version(host: str, text: str) -> tuple[int, int, int]:
-    found = _VERSION.search(text)
-    version = tuple(map(int, found.groups())) if found else ()
+    match = _VERSION.search(text)
+    version = tuple(map(int, match.groups())) if match else ()
     if len(version) != 3:
         raise DriverError(
             f"The controller at {host} answers {text[:60]!r} when asked for its version; four "

@@ -126,8 +126,8 @@ def _scheme(source: int | str) -> str:
     """Scheme of a URL; empty for anything else, such as a GStreamer pipeline that contains one."""
     if isinstance(source, int) or "!" in source.partition("://")[0]:
         return ""
-    scheme, found, _ = source.partition("://")
-    return scheme.lower() if found else ""
+    scheme, separator, _ = source.partition("://")
+    return scheme.lower() if separator else ""
 
 
 def _open_jpeg_stream(source: int | str, requested: DeviceSetup) -> MultipartPictures | None:

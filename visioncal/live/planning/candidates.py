@@ -206,9 +206,9 @@ class _CandidateSearch:
         self._unreached += list(flange[~within][: _RETRIED - len(self._unreached)])
         flange = flange[passed(REACH, within)]
         share = sight.share(flange, self._least_share)
-        sure = passed(GUESS, share >= self._least_share)
+        likely = passed(GUESS, share >= self._least_share)
         # No more than are still needed are solved.
-        few = np.flatnonzero(sure)[: 3 * (self._count - len(self.kept)) + 50]
+        few = np.flatnonzero(likely)[: 3 * (self._count - len(self.kept)) + 50]
         flange, starts, share = flange[few], starts[few], share[few]
         positions, reached = self._inverse.from_starts(flange, starts)
         self.losses.lost[REACH] += int(np.sum(~reached))
@@ -234,8 +234,8 @@ class _CandidateSearch:
         q, flange = q[kept], flange[kept]
         kept = self._not_behind_boxes(self._shade.behind_boxes(flange))
         q, share = q[kept], sight.share(flange[kept], self._least_share)
-        sure = self.losses.passed(GUESS, share >= self._least_share)
-        return q[sure], share[sure]
+        likely = self.losses.passed(GUESS, share >= self._least_share)
+        return q[likely], share[likely]
 
     def _not_behind_boxes(self, behind: IntArray) -> Mask:
         """Mask of lines of sight that no box (k,) blocks; counts and names those that do."""
@@ -340,16 +340,16 @@ class Losses:
     def error(self, found: int, wished: int) -> DataError:
         """Error of a search with too few stops."""
         worst = self.worst()
-        own = {
+        named = {
             name: count for name, count in self.counts().items() if name.startswith(f"{worst} (")
         }
-        culprit = max(own, key=lambda name: own[name], default=worst)
+        culprit = max(named, key=lambda name: named[name], default=worst)
         tried = max(self.tried.values())
-        lost = some_of([f"{times} to {what}" for what, times in self.counts().items()], _NAMED)
+        losses = some_of([f"{times} to {what}" for what, times in self.counts().items()], _NAMED)
         share = 100.0 * self.lost[worst] / self.tried[worst]
         return DataError(
             f"plan: {found} of {wished} possible stops were found in {tried} tries. Lost were "
-            f"{lost}. Most in the way is {culprit}: {worst} kept out {share:.1f} % of the "
+            f"{losses}. Most in the way is {culprit}: {worst} kept out {share:.1f} % of the "
             f"{self.tried[worst]} that came so far.",
             culprits=[culprit],
             next_step=_ADVICE[worst],

@@ -247,11 +247,10 @@ def cell_of_calibration(
 
 
 def _noise(calibration: Calibration) -> tuple[Noise, float]:
-    found = calibration.noise
     noise = robot_noise(calibration)
     # Few stops may underestimate the noise by chance.
     floored = np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots)
-    return replace(noise, robots=floored), found.get("pixel_px", TYPICAL_PX)
+    return replace(noise, robots=floored), calibration.noise.get("pixel_px", TYPICAL_PX)
 
 
 def collisions_of(cell: PlanCell) -> Collisions:

@@ -135,8 +135,8 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
 def _square_root(square: FloatArray) -> FloatArray:
     """Root R (s, r) of a non-negative (r, r): R^T R is the matrix."""
     values, vectors = np.linalg.eigh(square)
-    kept = values > _NULL**2 * values.max(initial=0.0)
-    return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T)
+    positive = values > _NULL**2 * values.max(initial=0.0)
+    return np.asarray((vectors[:, positive] * np.sqrt(values[positive])).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +183,8 @@ class Selection:
     @property
     def left(self) -> list[int]:
         """Candidates that are not chosen."""
-        taken = set(self.rows)
-        return [index for index in range(len(self.problem[0].factors)) if index not in taken]
+        chosen_rows = set(self.rows)
+        return [index for index in range(len(self.problem[0].factors)) if index not in chosen_rows]
 
     def _changed(self, rows: tuple[int, ...], by: list[int], sign: float) -> "Selection":
         added = [(item.factors[by], item.unestimated[by]) for item in self.problem]
@@ -353,10 +353,10 @@ def chosen(
             state = _without_needless(state, wish)
         rows = _ranked(state)
         history, best = _history(worlds, rows)
-        sure = _all_of([world.with_known_lens_board() for world in worlds]).accuracy
-        exact = _all_of([world.without_unestimated_arm() for world in worlds]).accuracy
+        known_lens_board = _all_of([world.with_known_lens_board() for world in worlds]).accuracy
+        exact_arm = _all_of([world.without_unestimated_arm() for world in worlds]).accuracy
     met = None if wish is None else history[-1].meets(wish)
-    return Design(rows, criterion, state.figure, history, best, sure, exact, met)
+    return Design(rows, criterion, state.figure, history, best, known_lens_board, exact_arm, met)
 
 
 def shortfall(design: Design, wish: Wish, count: int) -> str:

@@ -194,15 +194,17 @@ def stop_factors(
     free = stated(cell) if recorded is None else recorded.free
     poses = cell.cam_from_target(q)
     stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
-    known = free.information if recorded is None else recorded.shared
+    information = free.information if recorded is None else recorded.shared
     # The other shared parameters do not affect a stop at which the arm stands still.
-    others = np.zeros((int(seen.sum()), 6, len(known) - len(free.columns)))
-    factors = np.zeros((len(q), 6, 12 + len(known) + _arm_size(cell.robot, purpose, recorded)))
+    others = np.zeros((int(seen.sum()), 6, len(information) - len(free.columns)))
+    factors = np.zeros(
+        (len(q), 6, 12 + len(information) + _arm_size(cell.robot, purpose, recorded))
+    )
     if seen.any():
         compressed = compress(stack, free.basis, free.appearance, poses[seen])
         flange = cell.robot.base_from_flange(q[seen])
         jacobian = np.concatenate([compressed.by_shared[:, :, free.columns], others], axis=2)
-        prior = Knowledge(known, np.zeros(len(known)))
+        prior = Knowledge(information, np.zeros(len(information)))
         problem = chain(
             cell.mount,
             flange,
@@ -272,11 +274,8 @@ def _world(
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded)
-    shared_count, sigma, arm = (
-        len(shared),
-        _arm_sigma(purpose),
-        _arm_size(cell.robot, purpose, recorded),
-    )
+    shared_count, sigma = len(shared), _arm_sigma(purpose)
+    arm = _arm_size(cell.robot, purpose, recorded)
     inflation = 1.0
     if recorded is not None and not purpose.blocks:
         inflation = recorded.inflation
@@ -285,33 +284,33 @@ def _world(
             arm *= recorded.arm.is_estimated
     weak = np.full(12, max(WEAK_SIGMA, cell.sigma_rad, cell.sigma_m) ** -2.0)
     prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm)) / inflation
-    size, every = len(prior), factors.shape[2]
-    known = np.zeros((every, every))
+    size, all_columns = len(prior), factors.shape[2]
+    recorded_information = np.zeros((all_columns, all_columns))
     if recorded is not None:
-        known = _recorded_information(cell, purpose, recorded)
-    scale = np.ones(every)
+        recorded_information = _recorded_information(cell, purpose, recorded)
+    scale = np.ones(all_columns)
     scale[:size] = inflation**-0.5
-    factors, known = scale * factors, np.outer(scale, scale) * known
-    of_looks = np.sqrt(np.diag(covariance_from(shared))) if shared_count else np.zeros(0)
-    units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
+    factors, recorded_information = scale * factors, np.outer(scale, scale) * recorded_information
+    shared_sigmas = np.sqrt(np.diag(covariance_from(shared))) if shared_count else np.zeros(0)
+    units = np.concatenate([_EDGE_UNITS, shared_sigmas, np.full(arm, sigma)])
     if purpose.judged == "sight":
         weights = _sight_weights(cell, arm, q)
     else:
         weights = _workspace_weights(cell, purpose, workspace)
     counted, place, turn = (_padded(array, shared_count) for array in weights)
-    misfit, gradient, held = factors[:, :, size:], known[:size, size:], 0
+    misfit, gradient, held = factors[:, :, size:], recorded_information[:size, size:], 0
     if recorded is not None and not purpose.blocks:
         error_root, held = recorded.edge_error_root, recorded.held.shape[1]
-        pull = np.zeros((size, held))
-        pull[12 : 12 + len(recorded.held)] = -recorded.held / inflation
-        further = (prior + known[:size, :size])[:, :12] @ error_root
-        gradient = np.hstack([gradient, further, pull])
-        still = np.zeros((*factors.shape[:2], held))
-        misfit = np.concatenate([misfit, factors[:, :, :12] @ error_root, still], axis=2)
+        held_gradient = np.zeros((size, held))
+        held_gradient[12 : 12 + len(recorded.held)] = -recorded.held / inflation
+        edge_gradient = (prior + recorded_information[:size, :size])[:, :12] @ error_root
+        gradient = np.hstack([gradient, edge_gradient, held_gradient])
+        zeros = np.zeros((*factors.shape[:2], held))
+        misfit = np.concatenate([misfit, factors[:, :, :12] @ error_root, zeros], axis=2)
     return World(
         factors[:, :, :size],
         prior,
-        known[:size, :size],
+        recorded_information[:size, :size],
         counted,
         place,
         turn,
@@ -405,19 +404,19 @@ def _predicted_corners(
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
     in_part = cell.target.kind in FOUND_IN_PART or cell.target.point_tags
     fewest = min(_FEWEST_CORNERS, len(positions)) if in_part else len(positions)
-    seen = visible.sum(axis=1) >= fewest
-    view, corner = np.nonzero(visible[seen])
-    counts = visible[seen].sum(axis=1)
+    shows = visible.sum(axis=1) >= fewest
+    view, corner = np.nonzero(visible[shows])
+    counts = visible[shows].sum(axis=1)
     stack = CornerStack(
-        tuple(np.flatnonzero(seen).tolist()),
+        tuple(np.flatnonzero(shows).tolist()),
         (0.0,) * len(counts),
         np.cumsum(counts) - counts,
         view,
         first_corner + corner,
         positions[corner],
-        px[seen][view, corner],
+        px[shows][view, corner],
     )
-    return stack, seen
+    return stack, shows
 
 
 def _sight_weights(

@@ -157,16 +157,16 @@ def _pick_covariances(
     is that of the camera's pose, a right perturbation; the noise (6,) is variances of the flange.
     """
     middle = corner_positions(cell.target).mean(axis=0)
-    seen = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
+    points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
     turn = cell.x[:3, :3]
-    jacobian = _point_jacobians(seen)
+    jacobian = _point_jacobians(points)
     jacobian[:, :3], jacobian[:, 3:] = (
         turn @ jacobian[:, :3],
         turn @ jacobian[:, 3:],
     )
     covariances = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + np.diag(noise)
     if cell.mount == "eye-in-hand":
-        flange_jacobian = _point_jacobians(seen @ turn.T + cell.x[:3, 3])
+        flange_jacobian = _point_jacobians(points @ turn.T + cell.x[:3, 3])
         covariances = covariances + (flange_jacobian * noise) @ np.swapaxes(flange_jacobian, 1, 2)
     return np.asarray(covariances)
 

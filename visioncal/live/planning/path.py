@@ -46,11 +46,11 @@ class Detours:
         blocked = self._collisions.on_the_way(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
-        found = self._rrt_connect(start, end) if self._failed_searches < _MOST_FAILED else None
-        if found is None:
+        detour = self._rrt_connect(start, end) if self._failed_searches < _MOST_FAILED else None
+        if detour is None:
             self._failed_searches += 1
             return blocked
-        return self._shortcut(found)[1:-1]
+        return self._shortcut(detour)[1:-1]
 
     def _rrt_connect(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
         """RRT-Connect: two trees grow towards draws and each other (Kuffner and LaValle 2000).
@@ -248,11 +248,11 @@ class _Tour:
         return True
 
     def _path(self, start: FloatArray, end: FloatArray, row: int) -> FloatArray | None:
-        found = self._detours.path(start, end)
-        if isinstance(found, int):
-            self._blocked[row] = found
+        path = self._detours.path(start, end)
+        if isinstance(path, int):
+            self._blocked[row] = path
             return None
-        return found
+        return path
 
     def _before(self, place: int) -> FloatArray | None:
         """Posture before a place of the order; None at the start where none is given."""
@@ -264,11 +264,11 @@ def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[
     points = q if start_q is None else np.vstack([q, start_q])
     distance = np.linalg.norm(points[:, None] - points[None], axis=2)
     order = [first if start_q is None else len(q)]
-    left = set(range(len(q))) - set(order)
-    while left:
+    remaining = set(range(len(q))) - set(order)
+    while remaining:
         last = order[-1]
-        order.append(min(left, key=lambda row: distance[last, row]))
-        left.remove(order[-1])
+        order.append(min(remaining, key=lambda row: distance[last, row]))
+        remaining.remove(order[-1])
     tour = np.array(order)
     for _ in range(_ROUNDS):
         if not _improve_by_reversals(tour, distance):

@@ -165,12 +165,12 @@ def make_plan(
     planning = _Planning(cells, request, stops, worlds, begun)
     design, route, in_the_way = planning.drivable_design(progress)
     map_m, map_sigma_m = planning.sigma_map(design)
-    needed = None
+    need = None
     if request.need is not None:
         picking = Picking(cells, worlds, stops.q, request.need)
-        needed = need_planned(picking, design.rows, request.count)
+        need = need_planned(picking, design.rows, request.count)
     shortfalls = [] if request.wish is None else [shortfall(design, request.wish, request.count)]
-    shortfalls += [] if needed is None else [needed.limits]
+    shortfalls += [] if need is None else [need.limits]
     return Plan(
         cell,
         request,
@@ -184,7 +184,7 @@ def make_plan(
         " ".join(name for name in shortfalls if name),
         map_m,
         map_sigma_m,
-        needed,
+        need,
     )
 
 
@@ -328,10 +328,10 @@ def _need_met_error(need: Need, before: float) -> DataError:
 
 
 def _wish_met_error(design: Design) -> DataError:
-    found = design.before
+    before = design.before
     return DataError(
         "plan: the wish is met by what was recorded, which predicts "
-        f"{mm_and_deg(found.mm, found.deg)}; no stop needs to be added.",
+        f"{mm_and_deg(before.mm, before.deg)}; no stop needs to be added.",
         next_step="Wish for more, or leave the wish out to see what further stops would give.",
     )
 

@@ -163,8 +163,8 @@ def _board_distances_m(cell: PlanCell, problem: Problem) -> tuple[float, float]:
     of_board = np.array(problem.observations.observed) == board
     flange = problem.poses[problem.robots[0]][problem.observations.stops[of_board]]
     low, high = extent_m(cell.target)
-    seen, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
-    distance = np.linalg.norm(seen[:, :3, :3] @ centre + seen[:, :3, 3], axis=1)
+    poses, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
+    distance = np.linalg.norm(poses[:, :3, :3] @ centre + poses[:, :3, 3], axis=1)
     return float(distance.min()), float(distance.max())
 
 
@@ -217,23 +217,23 @@ def _start_from_fit(run: RunState, solved: Solved) -> _RecordedStart:
         raise _missing_input_error(run)
     part, arm = solved.part, run.robot_arm
     observed = part.observations.observed
-    most = max(dict.fromkeys(observed), key=observed.count)
+    planned = max(dict.fromkeys(observed), key=observed.count)
     stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
     frames = part.frames(solved.agreed.fit.state)
     # Errors of the arm are added again with the purpose's priors.
     bare = part.with_effects(
         [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]
     )
-    seen_at = np.isin(np.arange(len(arm.stood)), stops)
+    kept_stops = np.isin(np.arange(len(arm.stood)), stops)
     camera, *boards = part.unknown
     order = [branch for branch in part.tree.branches if branch not in part.unknown]
-    order += [camera, most, *(board for board in boards if board != most)]
+    order += [camera, planned, *(board for board in boards if board != planned)]
     problem = replace(
         bare,
         tree=replace(part.tree, branches={name: part.tree.branches[name] for name in order}),
         poses={name: pose[stops] for name, pose in part.poses.items()},
         observations=replace(part.observations, stops=of),
-        effects=tuple(effect.of_stops(seen_at) for effect in bare.effects),
+        effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
     ).merged()
     noise = solved.agreed.fit.noise
     return _RecordedStart(
@@ -242,7 +242,7 @@ def _start_from_fit(run: RunState, solved: Solved) -> _RecordedStart:
         replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
         free_of(solved.seen),
         arm.at(stops),
-        tuple(frame_name("target", board) for board in run.session.boards).index(most),
+        tuple(frame_name("target", board) for board in run.session.boards).index(planned),
         tuple(run.used[index] for index in first.tolist()),
     )
 
@@ -250,9 +250,8 @@ def _start_from_fit(run: RunState, solved: Solved) -> _RecordedStart:
 def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart:
     """Recorded stops of a session with too few for a fit, from a guess."""
     observed = ObservedPoses.of(run)
-    views = [
-        pose for pose in run.poses if pose in run.base_from_flange and pose not in run.held_back
-    ]
+    posed = run.base_from_flange
+    views = [view for view in run.poses if view in posed and view not in run.held_back]
     if guess is None or not views:
         raise _too_vague_error(run, len(views))
     shown = [run.poses[view].board for view in views]
@@ -267,10 +266,7 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
         for index, pose in zip(chosen, invert(robot @ guess.x) @ guess.z, strict=True)
     ]
     ((frame, scene),) = run.scenes.items()
-    problem, alone = (
-        observed.posed(poses).problem(chosen),
-        np.ones(len(chosen), dtype=bool),
-    )
+    problem, alone = observed.posed(poses).problem(chosen), np.ones(len(chosen), dtype=bool)
     looks = FramesSide(problem, alone, chosen, {}).looks({frame: scene}, {frame: poses})
     observed = replace(observed, free=free_of(looks.seen(looks.first))).posed(poses)
     problem = observed.problem(chosen).merged()
@@ -291,21 +287,17 @@ def _held_gradient(run: RunState, problem: Problem) -> FloatArray:
         return np.zeros((0, 0))
     fitted, state, noise = run.answer.problem, run.answer.state, run.answer.noise
     gradient = normal_equations(fitted, state, noise)[1] * (fitted.counted & ~fitted.moving)
-    columns = [fitted.effect_columns[effect.name] for effect in problem.effects]
-    return np.concatenate(
-        [np.zeros(0), *(gradient[column.start : column.stop] for column in columns)]
-    )[:, None]
+    columns = (fitted.effect_columns[effect.name] for effect in problem.effects)
+    parts = [np.zeros(0), *(gradient[column.start : column.stop] for column in columns)]
+    return np.concatenate(parts)[:, None]
 
 
 def _edge_error_root(run: RunState, start: "_RecordedStart") -> FloatArray:
     """Root (12, c) of the edges' covariance from errors of an arm without joint angles, if any."""
     if run.answer is None or start.arm.is_modelled or "arm" not in run.answer.beside:
         return np.zeros((12, 0))
-    names = tuple(start.problem.unknown)[:2]
-    columns = [
-        np.arange(item.start, item.stop) for item in map(run.solved.problem.edge_columns, names)
-    ]
-    index = np.concatenate(columns)
+    columns = map(run.solved.problem.edge_columns, tuple(start.problem.unknown)[:2])
+    index = np.concatenate([np.arange(column.start, column.stop) for column in columns])
     values, vectors = np.linalg.eigh(run.answer.beside["arm"][np.ix_(index, index)])
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0])
 

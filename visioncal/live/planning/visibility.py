@@ -90,10 +90,10 @@ def _planes(tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
         ahead, aside = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
         return np.array([ahead, -ahead, aside, -aside]), np.array([ahead] * 4)
     top, bottom, left, right = tangents
-    off = _PLANE_MARGIN * np.ptp(tangents.reshape(-1, 2), axis=0)
+    margin = _PLANE_MARGIN * np.ptp(tangents.reshape(-1, 2), axis=0)
     inner = [left[:, 0].max(), right[:, 0].min(), top[:, 1].max(), bottom[:, 1].min()]
     outer = [left[:, 0].min(), right[:, 0].max(), top[:, 1].min(), bottom[:, 1].max()]
-    inward = np.array([off[0], -off[0], off[1], -off[1]])
+    inward = np.array([margin[0], -margin[0], margin[1], -margin[1]])
     return _normals(np.array(inner) + inward), _normals(np.array(outer) - inward)
 
 
@@ -186,15 +186,15 @@ class CameraAim:
         Poses that cannot reach the wanted share any more are not evaluated further: theirs is a
         lower bound.
         """
-        seen = np.zeros(len(base_from_flange))
+        counts = np.zeros(len(base_from_flange))
         checked, possible = 0, np.arange(len(base_from_flange))
         for upto in _CHECKED:
             shows = self._drawn_shows(base_from_flange[possible], slice(checked, upto))
-            seen[possible] += shows.sum(axis=1)
+            counts[possible] += shows.sum(axis=1)
             checked = upto
-            possible = possible[(_GUESSES - upto + seen[possible]) / _GUESSES >= wanted]
-        share = np.minimum(seen / _GUESSES, np.nextafter(wanted, 0.0))
-        share[possible] = seen[possible] / _GUESSES
+            possible = possible[(_GUESSES - upto + counts[possible]) / _GUESSES >= wanted]
+        share = np.minimum(counts / _GUESSES, np.nextafter(wanted, 0.0))
+        share[possible] = counts[possible] / _GUESSES
         return share
 
     def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
@@ -235,8 +235,8 @@ def sight_of(cell: PlanCell, seed: int) -> CameraAim:
         DataError: The lens has no field of view, or next to none.
     """
     border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
-    seen = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
-    if not len(seen) or seen.min() < _NARROWEST:
+    tangents = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
+    if not len(tangents) or tangents.min() < _NARROWEST:
         raise DataError(
             "camera: no ray of this lens reaches the border of its image, or all are parallel: "
             f"matrix is {cell.camera.matrix.tolist()}, distortion "
@@ -355,30 +355,31 @@ def _box_blocks(
     along = np.where(along == 0.0, _TINY, along)
     faces = np.stack([(side * size_m - start) / along for side in (-0.5, 0.5)])
     enters, leaves = faces.min(axis=0).max(axis=-1), faces.max(axis=0).min(axis=-1)
-    meets = (enters <= leaves) & (enters < _FREE_SHARE) & (leaves > 0.0)
-    return np.asarray(meets.any(axis=1))
+    intersects = (enters <= leaves) & (enters < _FREE_SHARE) & (leaves > 0.0)
+    return np.asarray(intersects.any(axis=1))
 
 
 def _capsule_blocks(
     starts: FloatArray, ends: FloatArray, base_from_capsule: FloatArray, size_m: FloatArray
 ) -> Mask:
     """Whether any of the lines (k, p) of a row intersects a capsule at (k or 1, 4, 4)."""
-    # Closest points of two segments (Ericson 2005, Real-Time Collision Detection, 5.1.9). Lines
-    # that start inside do not count: the camera is really beside the link, whose shape is rough.
+    # Closest points of two segments (Ericson 2005, Real-Time Collision Detection, 5.1.9, whose
+    # names a, b, c, e, f are kept). Lines that start inside do not count: the camera is really
+    # beside the link, whose shape is rough.
     radius, length = size_m
     axis = length * base_from_capsule[:, None, :3, 2]
     foot = base_from_capsule[:, None, :3, 3] - 0.5 * axis
-    along, apart = _FREE_SHARE * (ends - starts), starts - foot
-    far, long = _dot(along, along), max(length**2, _TINY)
-    both, by_line, by_axis = _dot(along, axis), _dot(along, apart), _dot(axis, apart)
-    across = np.maximum(far * long - both**2, _TINY * far * long)
-    at_line = np.clip((both * by_axis - by_line * long) / across, 0.0, 1.0)
-    at_axis = np.clip((both * at_line + by_axis) / long, 0.0, 1.0)
-    at_line = np.clip((both * at_axis - by_line) / far, 0.0, 1.0)
-    between = apart + at_line[..., None] * along - at_axis[..., None] * axis
-    inside = apart - np.clip(by_axis / long, 0.0, 1.0)[..., None] * axis
-    meets = (_dot(between, between) < radius**2) & (_dot(inside, inside) > radius**2)
-    return np.asarray(meets.any(axis=1))
+    along, from_foot = _FREE_SHARE * (ends - starts), starts - foot
+    a, e = _dot(along, along), max(length**2, _TINY)
+    b, c, f = _dot(along, axis), _dot(along, from_foot), _dot(axis, from_foot)
+    determinant = np.maximum(a * e - b**2, _TINY * a * e)
+    at_line = np.clip((b * f - c * e) / determinant, 0.0, 1.0)
+    at_axis = np.clip((b * at_line + f) / e, 0.0, 1.0)
+    at_line = np.clip((b * at_axis - c) / a, 0.0, 1.0)
+    between = from_foot + at_line[..., None] * along - at_axis[..., None] * axis
+    inside = from_foot - np.clip(f / e, 0.0, 1.0)[..., None] * axis
+    intersects = (_dot(between, between) < radius**2) & (_dot(inside, inside) > radius**2)
+    return np.asarray(intersects.any(axis=1))
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:

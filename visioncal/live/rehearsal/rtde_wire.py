@@ -75,8 +75,8 @@ class Recipe:
         values: dict[str, Value] = {}
         for name, type_name in zip(self.names, self.types, strict=True):
             count = int(_FORMATS[type_name][:-1] or "1")
-            taken, flat = flat[:count], flat[count:]
-            values[name] = tuple(taken) if count > 1 else taken[0]
+            part, flat = flat[:count], flat[count:]
+            values[name] = tuple(part) if count > 1 else part[0]
         return values
 
 
