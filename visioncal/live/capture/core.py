@@ -1,4 +1,4 @@
-"""One view after the other: settled, taken, checked, put on the disk, and reported in words."""
+"""Recording of views: settling, taking, checking, storing and reporting each."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ from visioncal.vision.finders.imaging import decode_image
 
 @dataclass(frozen=True)
 class Times:
-    """How long a view took: on the way, until all stood still, and for everything else [s]."""
+    """Duration of a view: motion, settling, and everything else [s]."""
 
     moved_s: float
     settled_s: float
@@ -32,17 +32,16 @@ class Times:
 
 @dataclass(frozen=True, eq=False)
 class CaptureEvent:
-    """What became of a view, for whoever watches.
+    """Result of a stop, for watchers.
 
     Attributes:
-        view: Its number.
-        place: Which of the stops it is, from 1 on; of `count`, 0 where that is not known.
-        count: How many there are.
-        found: What was taken, or why nothing was.
-        covered: What is covered so far, in words.
-        accuracy: What is predicted so far; None while nothing is.
+        view: Number of the view.
+        place: Number of the stop, from 1 on.
+        count: Number of stops; 0 where it is not known.
+        found: The view, or why there is none.
+        covered: Coverage so far, in words.
+        accuracy: Accuracy predicted so far; None while there is no prediction.
         advice: What comes next, in words.
-        times: How long it took.
     """
 
     view: int
@@ -56,26 +55,20 @@ class CaptureEvent:
 
 
 class Watcher(Protocol):
-    """Whoever watches a recording; what it does must be quick."""
+    """Observer of a recording; it must be quick."""
 
     def stepped(self, step: CaptureEvent) -> None:
-        """Takes note of a view on the disk, or of a stop that gave none."""
+        """Handles a stored view, or a stop that gave none."""
 
 
 @dataclass(eq=False)
 class Capture:
-    """A recording at work.
+    """A recording in progress.
 
     Attributes:
-        cell: The devices.
-        target: What is to be seen.
-        journal: Where the views go.
-        options: How they are taken.
-        agreement: Whether joints and pose belong together.
-        coach: What is covered.
-        prediction: How accurate the result will be.
-        watchers: Who is notified.
-        steps: What became of each stop so far.
+        agreement: Consistency check of joints and pose.
+        coach: Coverage, and advice for the next view.
+        prediction: Predicted accuracy.
     """
 
     cell: LiveCell
@@ -89,12 +82,12 @@ class Capture:
     steps: list[CaptureEvent] = field(default_factory=list)
 
     def catch_up(self) -> None:
-        """Takes into account what is on the disk already."""
+        """Takes the views on the disk into account."""
         for view in self.journal.views:
             image = decode_image(self.journal.image(view))
-            found = None if isinstance(image, str) else look_for(image, self.target, view.number)
-            if found is not None and isinstance(found[0], Corners):
-                self.coach.add(found[0])
+            detected = None if isinstance(image, str) else look_for(image, self.target, view.number)
+            if detected is not None and isinstance(detected[0], Corners):
+                self.coach.add(detected[0])
             state = state_of(view)
             if state is not None:
                 self.agreement.why_not(state)
@@ -107,80 +100,80 @@ class Capture:
         moved_s: float,
         advise: Callable[[], str],
     ) -> CaptureEvent:
-        """Takes a view where the arm stands.
+        """Takes a view at the arm's present pose.
 
         Args:
-            number: The view's number.
-            place: Which of the stops it is, from 1 on.
-            count: How many there are; 0 where that is not known.
-            moved_s: How long the arm was on its way here [s].
-            advise: Says what comes next, once the view is there.
+            number: Number of the view.
+            place: Number of the stop, from 1 on.
+            count: Number of stops; 0 where it is not known.
+            moved_s: Duration of the motion to the stop [s].
+            advise: States what comes next, once the view is stored.
 
         Raises:
             DriverError: A device fails, or the arm is stopped.
-            DataError: The view cannot be written, or nothing was seen at too many stops in a row.
+            DataError: The view cannot be written, or too many stops in a row gave none.
         """
         clock = self.cell.clock
-        begun = clock.now()
-        settled = settle(self.cell, self.options)
-        rested = clock.now()
-        found: TakenView | Missed
-        if isinstance(settled, Missed):
-            found = settled
+        start = clock.now()
+        rest = settle(self.cell, self.options)
+        settled_at = clock.now()
+        result: TakenView | Missed
+        if isinstance(rest, Missed):
+            result = rest
         else:
-            found = take(self.cell, settled, self.target, number, self.options)
-        found = self._kept(number, found)
+            result = take(self.cell, rest, self.target, number, self.options)
+        result = self._stored(number, result)
         accuracy = self._accuracy()
-        times = Times(moved_s, rested - begun, clock.now() - rested)
+        times = Times(moved_s, settled_at - start, clock.now() - settled_at)
         advice = advise()
         step = CaptureEvent(
-            number, place, count, found, self.coach.words(), accuracy, advice, times
+            number, place, count, result, self.coach.words(), accuracy, advice, times
         )
         self.steps.append(step)
         for watcher in self.watchers:
             watcher.stepped(step)
-        self._check_lost()
+        self._check_missed_in_a_row()
         return step
 
     def onward(self, view: int | None) -> str:
-        """Names the view that is next, and what is predicted with it; empty where none is."""
+        """Names the next view and the accuracy predicted with it; empty without a next view."""
         if view is None:
             return ""
         if self.prediction is None:
             return f"view {view}"
-        then = self.prediction.after([*(other.number for other in self.journal.views), view])
-        if then is None or then.is_open:
+        predicted = self.prediction.after([*(taken.number for taken in self.journal.views), view])
+        if predicted is None or predicted.is_open:
             return f"view {view}"
-        return f"view {view}, for {figure(then.mm)} mm"
+        return f"view {view}, for {figure(predicted.mm)} mm"
 
-    def _kept(self, number: int, found: TakenView | Missed) -> TakenView | Missed:
-        """Puts a view on the disk, if it can be believed."""
-        if isinstance(found, Missed):
-            return found
-        disagreement = self.agreement.why_not(found.state)
+    def _stored(self, number: int, taken: TakenView | Missed) -> TakenView | Missed:
+        """Stores a view if its joints and pose are consistent."""
+        if isinstance(taken, Missed):
+            return taken
+        disagreement = self.agreement.why_not(taken.state)
         if disagreement:
             return Missed(disagreement)
-        self.journal.append(number, found)
-        self.coach.add(found.corners)
-        return found
+        self.journal.append(number, taken)
+        self.coach.add(taken.corners)
+        return taken
 
     def _accuracy(self) -> Accuracy | None:
         if self.prediction is None:
             return None
         return self.prediction.after([view.number for view in self.journal.views])
 
-    def _check_lost(self) -> None:
+    def _check_missed_in_a_row(self) -> None:
         if not self.options.lost:
             return
-        last = self.steps[-self.options.lost :]
-        reasons = [step.found.reason for step in last if isinstance(step.found, Missed)]
+        recent = self.steps[-self.options.lost :]
+        reasons = [step.found.reason for step in recent if isinstance(step.found, Missed)]
         if len(reasons) < self.options.lost:
             return
         raise DataError(
-            f"no view at {len(last)} stops in a row "
-            f"({', '.join(f'{step.view}' for step in last)}): "
+            f"no view at {len(recent)} stops in a row "
+            f"({', '.join(f'{step.view}' for step in recent)}): "
             f"{reasons[-1]}.",
-            culprits=[f"view {step.view}" for step in last],
+            culprits=[f"view {step.view}" for step in recent],
             next_step="Look at the board: does it lie where the plan has it, in the light and "
             f"unhidden? Is it a {self.target.name}, and the lens in focus? Then go on with "
             "--resume.",
@@ -188,22 +181,22 @@ class Capture:
 
 
 def missed(steps: Sequence[CaptureEvent]) -> Iterator[tuple[int, str]]:
-    """The stops that gave no view, with the reasons."""
+    """Stops that gave no view, with the reasons."""
     for step in steps:
         if isinstance(step.found, Missed):
             yield step.view, step.found.reason
 
 
 def line_of(step: CaptureEvent) -> str:
-    """Says what became of a view: `[3/30] view 2: 54 corners, ...; coverage 45 % -> next: ...`."""
-    found, place = step.found, f"[{step.place}{f'/{step.count}' if step.count else ''}]"
-    onward = f" -> next: {step.advice}" if step.advice else ""
-    if isinstance(found, Missed):
-        return f"{place} view {step.view}: not taken: {found.reason}{onward}"
+    """Reports a stop: `[3/30] view 2: 54 corners, ...; coverage 45 % -> next: ...`."""
+    result, place = step.found, f"[{step.place}{f'/{step.count}' if step.count else ''}]"
+    next_words = f" -> next: {step.advice}" if step.advice else ""
+    if isinstance(result, Missed):
+        return f"{place} view {step.view}: not taken: {result.reason}{next_words}"
     return (
-        f"{place} view {step.view}: {len(found.corners.ids)} corners, edges "
-        f"{found.corners.blur_px:.1f} px, {found.motion_px:.2f} px still; {step.covered}"
-        f"{_accuracy(step.accuracy)}{onward}"
+        f"{place} view {step.view}: {len(result.corners.ids)} corners, edges "
+        f"{result.corners.blur_px:.1f} px, {result.motion_px:.2f} px still; {step.covered}"
+        f"{_accuracy(step.accuracy)}{next_words}"
     )
 
 
@@ -213,9 +206,9 @@ def note_of(step: CaptureEvent) -> str:
     return f"**View {step.view}**\n\n{step.covered}{sigma}\n\nNext: {step.advice or 'anything new'}"
 
 
-def _accuracy(found: Accuracy | None) -> str:
-    if found is None:
+def _accuracy(accuracy: Accuracy | None) -> str:
+    if accuracy is None:
         return ""
-    if found.is_open:
+    if accuracy.is_open:
         return "; predicted sigma: not determined yet"
-    return f"; predicted sigma {figure(found.mm)} mm"
+    return f"; predicted sigma {figure(accuracy.mm)} mm"

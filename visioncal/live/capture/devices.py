@@ -1,4 +1,4 @@
-"""Devices by the words in which a user names them: `ur:192.168.0.10`, `oak`, `folder:images`."""
+"""Devices by the names that a user gives: `ur:192.168.0.10`, `oak`, `folder:images`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -13,14 +13,14 @@ from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
 @dataclass(frozen=True)
 class ArmWish:
-    """What is asked of an arm that is opened.
+    """Options of an arm to open.
 
     Attributes:
         address: What follows the kind: a host.
-        watch_only: Whether it is only looked at, and need not be ready to be driven.
-        ask: Asks a question and gives the line that was typed.
-        form: In which form poses are typed; None to recognise it.
-        answers: Whether a person types; lines of a file answer nothing.
+        watch_only: Whether it is only read, and need not be ready to be driven.
+        ask: Asks a question and returns the line that was typed.
+        form: Form of typed poses; None to recognise it.
+        answers: Whether a person types, who can be asked again, unlike a file.
     """
 
     address: str
@@ -40,7 +40,7 @@ def open_arm(words: str, wish: ArmWish) -> Arm:
 
     Args:
         words: `KIND` or `KIND:ADDRESS`.
-        wish: What is asked of it; its address is replaced by that of the words.
+        wish: Its options; the address is replaced by that of the words.
 
     Raises:
         DataError: There is no such kind.
@@ -51,7 +51,7 @@ def open_arm(words: str, wish: ArmWish) -> Arm:
 
 
 def open_camera(words: str, requested: DeviceSetup) -> CameraDevice:
-    """Opens a camera; the arguments are like those of `open_arm`.
+    """Opens a camera, named as in `open_arm`.
 
     Raises:
         DataError: There is no such kind.
@@ -62,7 +62,7 @@ def open_camera(words: str, requested: DeviceSetup) -> CameraDevice:
 
 
 def is_folder(words: str) -> bool:
-    """Tells whether a camera is a folder of pictures, each of another place."""
+    """Whether a camera is a folder of pictures, each taken at another pose."""
     return words.partition(":")[0] == "folder"
 
 
@@ -82,7 +82,7 @@ def _needs(address: str, words: str) -> str:
     return address
 
 
-# The drivers and their client libraries are imported when a device is asked for.
+# Drivers and their client libraries are imported only when a device is opened.
 
 
 def _ur(wish: ArmWish) -> Arm:

@@ -1,4 +1,4 @@
-"""What is written of a live cell: the session's own facts, and the rows of its views."""
+"""Session files of a live cell: constant facts, and the rows of its views."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,19 +20,15 @@ _TARGET_FILE = "target.toml"
 
 @dataclass(frozen=True, eq=False)
 class CaptureFacts:
-    """What does not change from view to view.
+    """Facts of a recording that are the same for all views.
 
     Attributes:
-        name: The session's name.
-        mount: Where the camera is.
-        target: The board.
         robot: The arm's model; None where it is not known.
-        arm: What the arm calls itself.
-        camera: What the camera calls itself.
+        arm: The name that the arm reports.
+        camera: The name that the camera reports.
         resolution: (width, height) of its pictures [px].
-        lens: The intrinsics that it reports, to be refined; None to have them estimated.
-        settings: What it is set to.
-        plan: The digest of the plan that is driven; empty for none.
+        lens: Intrinsics that it reports, to be refined; None to have them estimated.
+        plan: Digest of the plan that is driven; empty for none.
     """
 
     name: str
@@ -47,7 +43,7 @@ class CaptureFacts:
     plan: str
 
     def texts(self) -> dict[str, str]:
-        """The files of the session besides its views, by name; session.toml is the last."""
+        """Files of the session besides its views, by name; session.toml is the last."""
         texts: dict[str, str] = {}
         document: dict[str, Any] = {"schema": 1, "name": self.name, "mount": self.mount}
         document["target"] = _shipped_target(self.target)
@@ -58,14 +54,15 @@ class CaptureFacts:
         if self.robot is not None:
             model = _shipped_robot(self.robot)
             if not model:
-                model, text = _placed(self.robot)
+                named = "robot.json" if "kind" in self.robot.document else ""
+                model, text = robot_file(self.robot.document, named)
                 texts[model] = text
             document["robot"] = {"model": model, "tip": self.robot.tip}
         texts["session.toml"] = tomli_w.dumps(document)
         return texts
 
     def provenance(self) -> dict[str, Any]:
-        """What a recording must have in common with the one that it goes on with, for people."""
+        """Facts that a resumed recording must share with its beginning."""
         return {
             "arm": self.arm,
             "camera": self.camera,
@@ -88,15 +85,7 @@ class CaptureFacts:
 def view_of(
     number: int, image: str, taken: TakenView, facts: CaptureFacts, unix_offset_s: float
 ) -> View:
-    """Writes a view as a row of views.csv.
-
-    Args:
-        number: Its number.
-        image: The path of its image.
-        taken: What was taken.
-        facts: What does not change.
-        unix_offset_s: What makes the host's monotonic clock UNIX time [s].
-    """
+    """Builds the row of views.csv for a view; the offset is from monotonic to UNIX time [s]."""
     state, frame = taken.state, taken.frame
     numbers = {
         "stamp_s": round(frame.stamp_s + unix_offset_s, 6),
@@ -120,7 +109,7 @@ def view_of(
 
 
 def state_of(view: View) -> ArmState | None:
-    """The joints and the pose of a row; None where it has no pose."""
+    """Joints and pose of a row; None where it has no pose."""
     pose = view.base_from_flange()
     if pose is None:
         return None
@@ -128,7 +117,7 @@ def state_of(view: View) -> ArmState | None:
 
 
 def _texts(taken: TakenView, state: ArmState, facts: CaptureFacts) -> dict[str, str]:
-    """Columns that calibration passes through: what the devices said of themselves."""
+    """Columns that calibration passes through: what the devices report."""
     texts = {
         "safety": state.safety,
         "blur_px": f"{taken.corners.blur_px:.2f}",
@@ -144,22 +133,16 @@ def _texts(taken: TakenView, state: ArmState, facts: CaptureFacts) -> dict[str, 
 
 
 def _shipped_target(target: Target) -> str:
-    """The name of a board that comes with visioncal; empty for another."""
+    """Name of a board that comes with visioncal; empty for another."""
     if target.name in target_names() and load_target(target.name) == target:
         return target.name
     return ""
 
 
 def _shipped_robot(robot: Robot) -> str:
-    """The name of an arm that comes with visioncal; empty for another."""
+    """Name of an arm that comes with visioncal; empty for another."""
     for name in robot_names():
         shipped = load_robot(name)
         if shipped.name == robot.name and dict(shipped.document) == dict(robot.document):
             return name
     return ""
-
-
-def _placed(robot: Robot) -> tuple[str, str]:
-    """An arm of one's own as a file: its name and content."""
-    named = "robot.json" if "kind" in robot.document else ""
-    return robot_file(robot.document, named)

@@ -1,4 +1,4 @@
-"""Brings the tip of a driven arm to a safe height above points that a person then touches."""
+"""Driving an arm's tip to a safe height above points that a person then touches."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,25 +17,24 @@ from visioncal.robot.inverse import Inverse
 
 # Somebody stands beside the arm.
 _PACE = JointPace(speed=0.25, acceleration=0.5)
-# On its way the tip keeps this share of the height; it is looked at in so many places.
+# Share of the height that the tip keeps on its path, and the number of checked postures.
 _KEPT, _PLACES = 0.5, 100
-# Joints that turn farther are brought nearer by hand [rad].
+# Greatest travel of a joint [rad]; beyond it the arm is guided nearer by hand.
 _FARTHEST_RAD = 2.5
-# A controller's own model of the arm may depart from ours by more than this [mm].
+# Flange error above which the deviation of the controller's model from ours is corrected [mm].
 _THERE_MM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Hovering:
-    """What is driven, and the plane that its tip stays above.
+    """Driven arm, and the plane that its tip stays above.
 
     Attributes:
-        arm: What is driven.
-        robot: Its model, as its controller has it.
-        tip_m: (3,) the tip in the flange's frame [m].
+        robot: Model of the arm, as in its controller.
+        tip_m: (3,) the tip in the flange frame [m].
         point_m: (3,) a point of the plane, in the base [m].
-        normal: (3,) of the plane, in the base, into what is touched.
-        height_m: How high the tip hovers [m].
+        normal: (3,) normal of the plane, in the base, into what is touched.
+        height_m: Height of the tip [m].
     """
 
     arm: MovingArm
@@ -46,71 +45,71 @@ class Hovering:
     height_m: float
 
     def bring(self, base_from_flange: FloatArray) -> None:
-        """Drives the flange to a (4, 4) pose, as its controller reports it.
+        """Drives the flange to a (4, 4) pose, as its controller reports it [m].
 
-        A tip that stands lower than it is to hover is lifted first, straight up.
+        A tip that is too low is first lifted along the normal.
 
         Raises:
-            DataError: The way is too long, or leads the tip too near to the plane.
+            DataError: The path is too long, or leads the tip too near to the plane.
             DriverError: The arm is stopped or lost, or does not arrive.
         """
         start = self._joints()
-        way = [*self._way(start, base_from_flange)]
-        self._check(np.array([start, *way]))
+        path = [*self._path(start, base_from_flange)]
+        self._check(np.array([start, *path]))
         try:
-            for goal in way:
+            for goal in path:
                 self._move(goal)
             reported = self.arm.state().base_from_flange
             if pose_difference(reported, base_from_flange)[0] > _THERE_MM:
-                # By how much the controller's model of the arm departs from ours, here.
-                away = invert(reported) @ self.robot.base_from_flange(way[-1][None])[0]
-                again = self._posture(base_from_flange @ away, way[-1])
-                self._check(np.array([way[-1], again]))
-                self._move(again)
+                # Local deviation of the controller's model from ours.
+                correction = invert(reported) @ self.robot.base_from_flange(path[-1][None])[0]
+                corrected = self._posture(base_from_flange @ correction, path[-1])
+                self._check(np.array([path[-1], corrected]))
+                self._move(corrected)
         except BaseException:
             self.arm.halt()
             raise
 
-    def _way(self, start: FloatArray, goal: FloatArray) -> Iterator[FloatArray]:
-        here = self.robot.base_from_flange(start[None])[0]
-        lift = self.height_m - float(self._heights(here[None])[0])
+    def _path(self, start: FloatArray, goal: FloatArray) -> Iterator[FloatArray]:
+        base_from_flange = self.robot.base_from_flange(start[None])[0]
+        lift = self.height_m - float(self._heights(base_from_flange[None])[0])
         if lift > 0.0:
-            raised = here.copy()
+            raised = base_from_flange.copy()
             raised[:3, 3] -= lift * self.normal
             start = self._posture(raised, start)
             yield start
         yield self._posture(goal, start)
 
     def _posture(self, goal: FloatArray, near: FloatArray) -> FloatArray:
-        """(n,) joint angles that bring the flange to a pose, near to others [rad]."""
+        """Joint angles (n,) for a pose of the flange, near to others [rad]."""
         chain = self.robot.chain
-        found = Inverse(self.robot).solve(goal, chain.effective(near[None])[0])
-        if not found.reached:
+        solution = Inverse(self.robot).solve(goal, chain.effective(near[None])[0])
+        if not solution.reached:
             raise DataError(
-                f"{self.arm.name} does not reach a point: {1e3 * found.off_m:.0f} mm are left.",
+                f"{self.arm.name} does not reach a point: {1e3 * solution.off_m:.0f} mm are left.",
                 culprits=["--drive"],
                 next_step="Put the board nearer, or give the robot's model as it is.",
             )
-        return np.asarray(chain.encoded(found.positions[None])[0])
+        return np.asarray(chain.encoded(solution.positions[None])[0])
 
     def _heights(self, base_from_flange: FloatArray) -> FloatArray:
-        """(m,) how high the tip is above the plane, of (m, 4, 4) poses of the flange [m]."""
+        """Heights (m,) of the tip above the plane for (m, 4, 4) poses of the flange [m]."""
         tips = base_from_flange[:, :3, :3] @ self.tip_m + base_from_flange[:, :3, 3]
         return np.asarray((self.point_m - tips) @ self.normal)
 
-    def _check(self, way: FloatArray) -> None:
-        """Refuses a way of (k, n) postures that is long or low."""
-        turned = np.abs(np.diff(way, axis=0)).max()
-        if turned > _FARTHEST_RAD:
+    def _check(self, path: FloatArray) -> None:
+        """Refuses a path of (k, n) postures that is too long or too low."""
+        largest_turn = np.abs(np.diff(path, axis=0)).max()
+        if largest_turn > _FARTHEST_RAD:
             raise DataError(
-                f"{self.arm.name}: a joint would turn by {np.rad2deg(turned):.0f} deg; up to "
+                f"{self.arm.name}: a joint would turn by {np.rad2deg(largest_turn):.0f} deg; up to "
                 f"{np.rad2deg(_FARTHEST_RAD):.0f} are driven.",
                 culprits=["--drive"],
                 next_step="Bring the tip above the board by hand first.",
             )
-        for begin, end in pairwise(way):
-            between = begin + np.linspace(0.0, 1.0, _PLACES)[:, None] * (end - begin)
-            heights = self._heights(self.robot.base_from_flange(between))
+        for start, end in pairwise(path):
+            postures = start + np.linspace(0.0, 1.0, _PLACES)[:, None] * (end - start)
+            heights = self._heights(self.robot.base_from_flange(postures))
             least = min(float(heights[0]), _KEPT * self.height_m) - 1e-4
             if heights.min() < least:
                 raise DataError(

@@ -1,4 +1,4 @@
-"""Views on disk, one at a time: each is whole and flushed before the next one is taken."""
+"""Storage of views on disk: each is complete and flushed before the next one is taken."""
 
 import errno
 import json
@@ -19,31 +19,27 @@ from visioncal.live.capture.take import TakenView
 from visioncal.session import Session, View
 from visioncal.session.table import write_csv
 
-# What a recording is of, beside the session; it is there before the first view.
+# File that names devices and plan; written before the first view.
 PROVENANCE = "recorded.toml"
 _IMAGES, _TABLE = "images", "views.csv"
-# Noise does not get smaller by trying harder; flushing waits for every byte.
+# Low compression: noise hardly compresses, and speed matters more.
 _PNG_EFFORT = 1
-# Tables and folders take little; the last bytes of a disk are not to be counted on.
+# Reserve for tables, folders and the disk's own use.
 _SPARE_BYTES = 256_000
-# Letters of a digest, which are cut short for people.
+# Length of a digest, which messages shorten.
 _DIGEST = 64
 
 
 class Journal:
-    """A session's folder that grows view by view.
+    """Session folder that grows view by view.
 
-    The table of views is replaced as a whole for each view, after its image is on the disk: at any
-    moment the folder holds the session of all views that were acknowledged, or, before the first,
-    none. The death of the process at any moment loses at most the view that is being written.
-
-    Attributes:
-        folder: The session's folder.
-        views: The views that are on the disk.
+    The table of views is replaced atomically for each view, after its image is on the disk: at any
+    moment the folder holds a session of all acknowledged views, or, before the first, none. If the
+    process is killed, at most the view that is being written is lost.
     """
 
     def __init__(self, folder: Path, facts: CaptureFacts, unix_offset_s: float) -> None:
-        """Takes a folder as it is; `begin` and `resume` prepare one."""
+        """Uses a folder that `begin` or `resume` has prepared."""
         self.folder = folder
         self.views: tuple[View, ...] = ()
         self._columns: tuple[str, ...] = ()
@@ -53,20 +49,20 @@ class Journal:
     def begin(
         cls, folder: Path, facts: CaptureFacts, unix_offset_s: float, views: int
     ) -> "Journal":
-        """Begins a session.
+        """Begins a session in a new or empty folder.
 
         Args:
-            folder: Where; it must be new, or empty.
-            facts: What is recorded of.
-            unix_offset_s: What makes the host's monotonic clock UNIX time [s].
-            views: How many views are to come; 0 where that is not known.
+            folder: The folder.
+            facts: Facts of the recording.
+            unix_offset_s: Offset from the host's monotonic clock to UNIX time [s].
+            views: Number of views to come; 0 where it is not known.
 
         Raises:
             DataError: The folder holds something, cannot be written, or has no room for the views.
         """
         with named_errors(folder):
-            taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-        if taken:
+            occupied = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+        if occupied:
             recorded = (folder / PROVENANCE).is_file()
             raise DataError(
                 f"{folder} exists and is not empty; a session is recorded into a new folder.",
@@ -90,15 +86,9 @@ class Journal:
     def resume(
         cls, folder: Path, facts: CaptureFacts, unix_offset_s: float, views: int
     ) -> "Journal":
-        """Goes on with a session, or begins it where nothing was recorded yet.
+        """Resumes a session, or begins it where nothing was recorded; arguments are as for `begin`.
 
-        What a killed process left half written is removed.
-
-        Args:
-            folder: The session's folder.
-            facts: What is recorded of; the same as before.
-            unix_offset_s: What makes the host's monotonic clock UNIX time [s].
-            views: How many views there are to be in all; 0 where that is not known.
+        Partly written files of a killed process are removed.
 
         Raises:
             DataError: The folder holds another recording, or something else.
@@ -120,10 +110,10 @@ class Journal:
         return journal
 
     def append(self, number: int, taken: TakenView) -> View:
-        """Puts a view on the disk; when this returns, it stays there.
+        """Writes a view; when this returns, it is flushed to the disk.
 
         Raises:
-            DataError: It cannot be written; the session is what it was before.
+            DataError: It cannot be written; the session is unchanged.
         """
         image = f"{_IMAGES}/{number:03d}.png"
         view = view_of(number, image, taken, self._facts, self._offset_s)
@@ -186,7 +176,7 @@ def _columns(view: View) -> tuple[str, ...]:
 
 
 def _check_same(before: dict[str, Any], facts: CaptureFacts, folder: Path) -> None:
-    """Refuses to go on with the recording of something else."""
+    """Refuses to resume a recording of other devices or another plan."""
     now = facts.provenance()
     differ = [name for name, value in now.items() if before.get(name) != value]
     if not differ:

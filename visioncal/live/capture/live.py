@@ -1,4 +1,4 @@
-"""The devices of a live cell and its clock, and what holds of every moment of it."""
+"""Devices of a live cell and their clock."""
 
 import time
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from typing import Protocol
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Arm, ArmState, CameraDevice, MovingArm
 
-# A state older than this is no news [s].
+# Greatest age of a state [s].
 _STALE_S = 1.0
 _STOPPED = {
     "protective-stop": "Look at what the arm ran into, clear the stop on the pendant (Enable "
@@ -21,16 +21,16 @@ _STOPPED = {
 
 
 class Clock(Protocol):
-    """A clock that never goes back, and a way to wait by it."""
+    """Monotonic clock."""
 
     def now(self) -> float:
-        """The time, on the clock by which arm and camera stamp [s]."""
+        """Time on the clock by which arm and camera stamp [s]."""
 
     def sleep(self, seconds: float) -> None:
         """Waits."""
 
     def unix_offset_s(self) -> float:
-        """What makes a time of this clock a UNIX time [s]."""
+        """Offset from this clock to UNIX time [s]."""
 
 
 class HostClock:
@@ -45,30 +45,30 @@ class HostClock:
         time.sleep(seconds)
 
     def unix_offset_s(self) -> float:
-        """What makes a time of this clock a UNIX time [s]."""
+        """Offset from this clock to UNIX time [s]."""
         return time.time() - time.monotonic()
 
 
 @dataclass(frozen=True, eq=False)
 class LiveCell:
-    """An arm and a camera, and the clock by which they stamp."""
+    """An arm, a camera, and the clock by which they stamp."""
 
     arm: Arm
     camera: CameraDevice
     clock: Clock = field(default_factory=HostClock)
 
     def state(self) -> ArmState:
-        """Asks the arm where it is, and whether it may move.
+        """Reads the arm's state.
 
         Raises:
-            DriverError: It is stopped, its link is lost, or what it says is old.
+            DriverError: It is stopped, its connection is lost, or the state is old.
         """
         state = self.arm.state()
-        old_s = self.clock.now() - state.stamp_s
-        if old_s > _STALE_S:
-            # This computer may have slept in between.
+        age_s = self.clock.now() - state.stamp_s
+        if age_s > _STALE_S:
+            # This computer may have been suspended in between.
             state = self.arm.state()
-            old_s = self.clock.now() - state.stamp_s
+            age_s = self.clock.now() - state.stamp_s
         if state.safety in _STOPPED:
             words = state.safety.replace("-", " ")
             raise DriverError(
@@ -76,9 +76,9 @@ class LiveCell:
                 culprits=[self.arm.name],
                 next_step=f"{_STOPPED[state.safety]} and go on with --resume.",
             )
-        if old_s > _STALE_S:
+        if age_s > _STALE_S:
             raise DriverError(
-                f"{self.arm.name}: its newest state is {old_s:.1f} s old; one of the last "
+                f"{self.arm.name}: its newest state is {age_s:.1f} s old; one of the last "
                 f"{_STALE_S:g} s is needed.",
                 culprits=[self.arm.name],
                 next_step="Check the network cable to the controller.",
@@ -87,7 +87,7 @@ class LiveCell:
 
     @contextmanager
     def halting(self) -> Iterator[None]:
-        """Runs a block after which the arm stands still, however the block ends."""
+        """Runs a block, and halts the arm if it raises."""
         try:
             yield
         except BaseException:

@@ -1,4 +1,4 @@
-"""Records what joints do during a motion that somebody else drives."""
+"""Recording of joint states during a motion that another program drives."""
 
 from collections import deque
 from collections.abc import Callable
@@ -9,9 +9,9 @@ from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import Joints, JointSample
 from visioncal.session import Stream
 
-# A joint that is faster than this moves [rad/s].
+# Speed from which a joint counts as moving [rad/s].
 _MOVING_RAD_S = 0.005
-# So much of the rest before and behind a motion is kept: filters begin and end in it [s].
+# Rest that is kept before and after a motion, for filters to settle [s].
 _LEAD_S = 1.0
 
 
@@ -22,25 +22,25 @@ def record_motion(
     patience_s: float = 120.0,
     report: Callable[[str], None] = lambda _: None,
 ) -> Stream:
-    """Waits for a motion, and records it until its joints have come to rest.
+    """Waits for a motion, and records it until the joints have come to rest.
 
     Args:
-        joints: Who reports what they do.
-        rest_s: Joints at rest for so long have come to the motion's end [s].
-        patience_s: How long the motion's begin is waited for [s].
-        report: Called with what is going on, in words.
+        joints: Source of joint states.
+        rest_s: Rest after which the motion has ended [s].
+        patience_s: How long to wait for the motion [s].
+        report: Called with progress messages.
 
     Returns:
         Times on the controller's clock, angles, speeds and currents.
 
     Raises:
-        DriverError: No motion begins, or the joints cannot be read.
+        DriverError: No motion starts, or the joints cannot be read.
     """
-    lead: deque[JointSample] = deque(maxlen=max(int(_LEAD_S * joints.rate_hz), 1))
+    before_motion: deque[JointSample] = deque(maxlen=max(int(_LEAD_S * joints.rate_hz), 1))
     first = joints.sample()
     report(f"waiting for the {joints.name} to move: start its program now")
     while not _moves(sample := joints.sample()):
-        lead.append(sample)
+        before_motion.append(sample)
         if sample.stamp_s - first.stamp_s > patience_s:
             raise DriverError(
                 f"The {joints.name} has not moved for {patience_s:g} s.",
@@ -48,15 +48,15 @@ def record_motion(
                 next_step="Start the program on the pendant while this command waits.",
             )
     report("it moves")
-    kept, moved_s = [*lead, sample], sample.stamp_s
+    samples, moved_s = [*before_motion, sample], sample.stamp_s
     while sample.stamp_s - moved_s < rest_s:
         sample = joints.sample()
-        kept.append(sample)
+        samples.append(sample)
         if _moves(sample):
             moved_s = sample.stamp_s
-    report(f"it has come to rest after {moved_s - kept[0].stamp_s:.1f} s")
+    report(f"it has come to rest after {moved_s - samples[0].stamp_s:.1f} s")
     return _stream(
-        [joint_sample for joint_sample in kept if joint_sample.stamp_s <= moved_s + _LEAD_S]
+        [joint_sample for joint_sample in samples if joint_sample.stamp_s <= moved_s + _LEAD_S]
     )
 
 
@@ -65,9 +65,9 @@ def _moves(sample: JointSample) -> bool:
 
 
 def _stream(samples: list[JointSample]) -> Stream:
-    """Samples as a stream; those that did not ascend in time were sent twice."""
+    """Samples as a stream, without those that were sent twice."""
     stamps_s = np.array([sample.stamp_s for sample in samples])
-    new = np.concatenate([[True], np.diff(stamps_s) > 0.0])
+    ascending = np.concatenate([[True], np.diff(stamps_s) > 0.0])
     count = len(samples[0].q)
     parts = [
         np.array([getattr(sample, name) for sample in samples])
@@ -78,4 +78,4 @@ def _stream(samples: list[JointSample]) -> Stream:
         for name in ("q{}_rad", "dq{}_rad_s", "current{}_a")
         for joint in range(1, count + 1)
     ]
-    return Stream(("stamp_s", *columns), np.column_stack([stamps_s, *parts])[new])
+    return Stream(("stamp_s", *columns), np.column_stack([stamps_s, *parts])[ascending])

@@ -1,4 +1,4 @@
-"""How a session is recorded."""
+"""Options of a recording."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -7,20 +7,20 @@ from visioncal.core.choices import PLAN_ACCELERATION, PLAN_SPEED
 from visioncal.core.errors import DataError
 
 Keep = Literal["sharpest", "mean"]
-# Nobody watches an arm at a faster pace with a hand on the stop button [rad/s].
+# Fastest joint speed at which a person can watch with a hand on the stop button [rad/s].
 FASTEST = 1.5
 
 
 @dataclass(frozen=True)
 class Stillness:
-    """When arm and image count as still.
+    """Limits within which arm and image count as still.
 
     Attributes:
-        joint_speed: Of the fastest joint [rad/s].
-        joint_rad: How far a joint may stand from where it stood when the rest began [rad].
-        flange_m: The same for the flange [m]; well-kept arms repeat to it.
-        flange_rad: And for its rotation [rad].
-        image_px: How far the image may have moved since then [px].
+        joint_speed: Speed of the fastest joint [rad/s].
+        joint_rad: Motion of a joint since the rest began [rad].
+        flange_m: Motion of the flange since then [m]; the repeatability of well-kept arms.
+        flange_rad: Rotation of the flange since then [rad].
+        image_px: Motion of the image since then [px].
         quiet_s: How long all of this must have held before the first frame that counts [s].
         patience_s: How long to wait for it [s].
     """
@@ -36,18 +36,18 @@ class Stillness:
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """How a session is recorded.
+    """Options of a recording.
 
     Attributes:
-        speed: Of the joint that turns farthest [rad/s].
-        acceleration: Likewise [rad/s^2].
-        frames: Frames a view.
-        keep: Whether the sharpest of them is kept, or their mean.
-        still: When arm and image count as still.
-        single: Whether every frame is of another place, as in a folder of pictures: then one is
-            taken as it comes.
-        lost: After so many stops in a row without a view, the recording ends; 0 for never, where a
-            person sees it and goes elsewhere.
+        speed: Speed of the joint that travels farthest [rad/s].
+        acceleration: Its acceleration [rad/s^2].
+        frames: Frames per view.
+        keep: Whether the sharpest frame is kept, or their mean.
+        still: Limits within which arm and image count as still.
+        single: Whether every frame is of another pose, as in a folder of pictures; it is then taken
+            without waiting.
+        lost: Number of stops in a row without a view that ends the recording; 0 for never, where a
+            person sees it.
     """
 
     speed: float = PLAN_SPEED

@@ -1,4 +1,4 @@
-"""How accurate the views so far are predicted to make the result."""
+"""Accuracy predicted from the views so far."""
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,23 +15,23 @@ from visioncal.live.planning.read_back import PlanFile
 from visioncal.live.planning.recorded import so_far
 from visioncal.session import Session
 
-# Fewer views determine nothing.
+# Least number of views for a calibration.
 _FEWEST = 3
 
 
 class Prediction(Protocol):
-    """Tells how accurate the result will be."""
+    """Source of predicted accuracy."""
 
     def after(self, views: Sequence[int]) -> Accuracy | None:
-        """What is predicted of some views; None while nothing is known of it."""
+        """Accuracy predicted with some views; None while there is no prediction."""
 
     def close(self) -> None:
-        """Ends whatever works for it."""
+        """Releases resources."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedAccuracy:
-    """Predicts by the plan's own means, what the stops were chosen by; it takes a millisecond."""
+    """Prediction from the plan's information; it takes a millisecond."""
 
     views: tuple[int, ...]
     world: World
@@ -44,8 +44,8 @@ class PlannedAccuracy:
         return cls(tuple(stop.view for stop in plan.stops), world)
 
     def after(self, views: Sequence[int]) -> Accuracy | None:
-        """What is predicted of some of the plan's views; None without any."""
-        rows = [at for at, view in enumerate(self.views) if view in set(views)]
+        """Accuracy predicted with some of the plan's views; None without any."""
+        rows = [row for row, view in enumerate(self.views) if view in set(views)]
         if not rows:
             return None
         covariance = self.world.covariance(rows)
@@ -55,44 +55,44 @@ class PlannedAccuracy:
         return Accuracy.of(float(place), float(turn))
 
     def close(self) -> None:
-        """Nothing works for it."""
+        """Holds no resources."""
 
 
 class RecordedAccuracy:
-    """Predicts by calibrating what is on the disk, on a thread beside the recording.
+    """Prediction from calibrating the session on the disk in a background thread.
 
-    What it says is of the views that were there when it began; a new look begins when the last one
+    It is for the views that were there when the calibration started; a new one starts when the last
     has ended.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Prepares to look at a session's folder."""
+        """Prepares to calibrate a session's folder."""
         self._folder = folder
         self._worker = ThreadPoolExecutor(1)
-        self._looking: Future[Accuracy | None] | None = None
-        self._found: Accuracy | None = None
+        self._pending: Future[Accuracy | None] | None = None
+        self._latest: Accuracy | None = None
 
     def after(self, views: Sequence[int]) -> Accuracy | None:
-        """What the newest look gave; None while there was none, or it determined nothing."""
-        if self._looking is not None and self._looking.done():
-            self._found, self._looking = self._looking.result(), None
-        if self._looking is None and len(views) >= _FEWEST:
-            self._looking = self._worker.submit(_calibrated, self._folder)
-        return self._found
+        """Accuracy of the newest calibration; None while there is none, or it gave no result."""
+        if self._pending is not None and self._pending.done():
+            self._latest, self._pending = self._pending.result(), None
+        if self._pending is None and len(views) >= _FEWEST:
+            self._pending = self._worker.submit(_session_accuracy, self._folder)
+        return self._latest
 
     def close(self) -> None:
-        """Waits for a look at work."""
+        """Waits for a calibration in progress."""
         self._worker.shutdown()
 
 
-def _calibrated(folder: Path) -> Accuracy | None:
-    """The accuracy of the camera's place from a session as it is now."""
+def _session_accuracy(folder: Path) -> Accuracy | None:
+    """Accuracy of the camera's pose from a session as it is now."""
     try:
-        known = so_far(Session.load(folder)).known
+        run = so_far(Session.load(folder)).known
     except VisioncalError:
-        # Too little as yet; why is reported when the session is calibrated.
+        # Too few views yet; the reason is reported when the session is calibrated.
         return None
-    if known.answer is None:
+    if run.answer is None:
         return None
-    covariance = known.answer.covariance[:6, :6]
+    covariance = run.answer.covariance[:6, :6]
     return Accuracy.of(float(np.trace(covariance[3:, 3:])), float(np.trace(covariance[:3, :3])))

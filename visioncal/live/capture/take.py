@@ -1,4 +1,4 @@
-"""Taking a view: wait until all stands still, take several frames, keep one or their mean."""
+"""Taking a view: wait for arm and image to settle, take frames, keep one or their mean."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +14,9 @@ from visioncal.live.capture.still import StillFrame, grey, why_arm_moves, why_im
 from visioncal.live.drivers.protocols import ArmState, Frame
 from visioncal.vision.finders import blur_of
 
-# Stamps of a frame may lie so far before the moment at which it was asked for [s].
+# Tolerance of a frame's stamp before it was requested, or after it arrived [s].
 _EARLY_S = 0.02
-# Frames that something moved in are thrown away, and taken again so often.
+# Attempts per view, as frames during which something moved are discarded.
 _ROUNDS = 3
 
 
@@ -25,10 +25,10 @@ class TakenView:
     """A view.
 
     Attributes:
-        frame: What is kept: the sharpest frame, or the mean of all.
+        frame: The sharpest frame, or the mean of all.
         state: The arm at its exposure.
-        corners: What is seen of the target in it.
-        motion_px: How far the image moved from the first to the last frame [px].
+        corners: Corners detected in it.
+        motion_px: Image motion from the first to the last frame [px].
     """
 
     frame: Frame
@@ -39,20 +39,20 @@ class TakenView:
 
 @dataclass(frozen=True)
 class Missed:
-    """Why there is no view, in words."""
+    """Reason why there is no view, in words."""
 
     reason: str
 
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """The first look of a rest, and the last by which it was long enough."""
+    """First and latest frame of a rest that has lasted long enough."""
 
     first: StillFrame
     last: StillFrame
 
 
-def _take_look(cell: LiveCell) -> StillFrame:
+def _capture_still(cell: LiveCell) -> StillFrame:
     """Takes a frame, with the states of the arm around its exposure."""
     asked = cell.clock.now()
     before = cell.state()
@@ -69,34 +69,36 @@ def _take_look(cell: LiveCell) -> StillFrame:
 
 
 def settle(cell: LiveCell, options: CaptureOptions) -> Settled | Missed:
-    """Waits until arm and image stand still.
+    """Waits until arm and image are still.
 
     Raises:
         DriverError: A device fails, or the arm is stopped.
     """
     still = options.still
-    begun = cell.clock.now()
-    first = _take_look(cell)
+    start = cell.clock.now()
+    first = _capture_still(cell)
     if options.single:
         return Settled(first, first)
     while True:
-        then = _take_look(cell)
-        why = _why_moving(first, then, options)[0]
-        if why:
-            first = then
-        elif then.after.stamp_s - first.before.stamp_s >= still.quiet_s:
-            return Settled(first, then)
-        if cell.clock.now() - begun > still.patience_s:
-            return Missed(f"nothing came to rest in {still.patience_s:g} s: {why or 'too slow'}")
+        latest = _capture_still(cell)
+        reason = _why_moving(first, latest, options)[0]
+        if reason:
+            first = latest
+        elif latest.after.stamp_s - first.before.stamp_s >= still.quiet_s:
+            return Settled(first, latest)
+        if cell.clock.now() - start > still.patience_s:
+            return Missed(f"nothing came to rest in {still.patience_s:g} s: {reason or 'too slow'}")
 
 
-def _why_moving(first: StillFrame, then: StillFrame, options: CaptureOptions) -> tuple[str, float]:
-    """Says what moved from one look to another, or nothing; and the image's motion [px]."""
-    why = why_arm_moves(first.before, then.before, options.still)
-    why = why or why_arm_moves(first.before, then.after, options.still)
-    if why:
-        return why, 0.0
-    return why_image_moves(grey(first.frame.image), grey(then.frame.image), options.still)
+def _why_moving(
+    first: StillFrame, latest: StillFrame, options: CaptureOptions
+) -> tuple[str, float]:
+    """Describes what moved between two frames, if anything, and measures image motion [px]."""
+    reason = why_arm_moves(first.before, latest.before, options.still)
+    reason = reason or why_arm_moves(first.before, latest.after, options.still)
+    if reason:
+        return reason, 0.0
+    return why_image_moves(grey(first.frame.image), grey(latest.frame.image), options.still)
 
 
 def take(
@@ -104,71 +106,68 @@ def take(
 ) -> TakenView | Missed:
     """Takes a view of an arm at rest.
 
-    All frames, and the arm around each of them, must stand where they stood when the rest began;
-    else they are thrown away, and the rest is waited for again.
-
-    Args:
-        cell: The devices.
-        settled: The rest.
-        target: What is to be seen.
-        view: The view's number.
-        options: How many frames, and what becomes of them.
+    In all frames image and arm must be where they were when the rest began; otherwise the frames
+    are discarded, and the next rest is waited for.
 
     Raises:
         DriverError: A device fails, or the arm is stopped.
     """
-    why = ""
+    reason = ""
     for _ in range(_ROUNDS):
-        looks, why, moved = _frames(cell, settled, options)
-        if not why:
-            return _chosen(looks, target, view, options, moved)
-        again = settle(cell, options)
-        if isinstance(again, Missed):
-            return again
-        settled = again
-    return Missed(f"something moved during every exposure: {why}")
+        frames, reason, motion_px = _frames(cell, settled, options)
+        if not reason:
+            return _select_frame(frames, target, view, options, motion_px)
+        rest = settle(cell, options)
+        if isinstance(rest, Missed):
+            return rest
+        settled = rest
+    return Missed(f"something moved during every exposure: {reason}")
 
 
 def _frames(
     cell: LiveCell, settled: Settled, options: CaptureOptions
 ) -> tuple[list[StillFrame], str, float]:
-    """Frames of one rest, the reason why they are none, and how far the image moved [px]."""
-    looks, moved = [settled.last], 0.0
-    while len(looks) < (1 if options.single else options.frames):
-        then = _take_look(cell)
-        why, moved = _why_moving(settled.first, then, options)
-        if why:
-            return [], why, moved
-        looks.append(then)
-    return looks, "", moved
+    """Takes the frames of a rest; none with the reason if something moved; image motion [px]."""
+    frames, motion_px = [settled.last], 0.0
+    while len(frames) < (1 if options.single else options.frames):
+        latest = _capture_still(cell)
+        reason, motion_px = _why_moving(settled.first, latest, options)
+        if reason:
+            return [], reason, motion_px
+        frames.append(latest)
+    return frames, "", motion_px
 
 
-def _chosen(
-    looks: Sequence[StillFrame], target: Target, view: int, options: CaptureOptions, moved: float
+def _select_frame(
+    frames: Sequence[StillFrame],
+    target: Target,
+    view: int,
+    options: CaptureOptions,
+    motion_px: float,
 ) -> TakenView | Missed:
     if options.keep == "mean":
-        return _taken(_mean(looks), target, view, moved)
-    first = _taken(looks[0], target, view, moved)
+        return _detect(_mean_frame(frames), target, view, motion_px)
+    first = _detect(frames[0], target, view, motion_px)
     if isinstance(first, Missed):
         return first
-    # The board stands still: the corners of one frame are those of all.
-    found = first.corners
-    blurs = [blur_of(grey(look.frame.image), target, found.ids, found.px) for look in looks]
+    # Image and arm are still: the corners of one frame hold for all.
+    corners = first.corners
+    blurs = [blur_of(grey(frame.frame.image), target, corners.ids, corners.px) for frame in frames]
     sharpest = int(np.argmin(blurs))
-    return first if sharpest == 0 else _taken(looks[sharpest], target, view, moved)
+    return first if sharpest == 0 else _detect(frames[sharpest], target, view, motion_px)
 
 
-def _taken(kept: StillFrame, target: Target, view: int, moved: float) -> TakenView | Missed:
-    found, _ = look_for(grey(kept.frame.image), target, view)
-    if isinstance(found, Rejection):
-        return Missed(found.reason)
-    return TakenView(kept.frame, kept.state, found, moved)
+def _detect(still: StillFrame, target: Target, view: int, motion_px: float) -> TakenView | Missed:
+    corners, _ = look_for(grey(still.frame.image), target, view)
+    if isinstance(corners, Rejection):
+        return Missed(corners.reason)
+    return TakenView(still.frame, still.state, corners, motion_px)
 
 
-def _mean(looks: Sequence[StillFrame]) -> StillFrame:
-    """The mean of all frames, with the arm as it was at the middle one."""
-    middle = looks[len(looks) // 2]
-    images = np.stack([look.frame.image for look in looks]).astype(np.float32)
+def _mean_frame(frames: Sequence[StillFrame]) -> StillFrame:
+    """Mean of all frames, with the arm's state at the middle one."""
+    middle = frames[len(frames) // 2]
+    images = np.stack([frame.frame.image for frame in frames]).astype(np.float32)
     image: Image = np.asarray(np.rint(images.mean(axis=0)), dtype=np.uint8)
-    stamp = float(np.mean([look.frame.stamp_s for look in looks]))
+    stamp = float(np.mean([frame.frame.stamp_s for frame in frames]))
     return replace(middle, frame=replace(middle.frame, image=image, stamp_s=stamp))

@@ -1,1 +1,1 @@
-"""Devices behind two small protocols: an arm and a camera."""
+"""Device drivers behind two small protocols: an arm and a camera."""

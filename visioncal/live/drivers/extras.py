@@ -1,6 +1,6 @@
-"""Client libraries that only some users need, and the command that installs a missing one.
+"""Import of optional client libraries, with the command that installs a missing one.
 
-DepthAI, the library of Luxonis' OAK cameras, is imported here alone, with its telemetry off.
+DepthAI, the library of Luxonis' OAK cameras, is imported only here, with its telemetry off.
 """
 
 import os
@@ -12,21 +12,21 @@ from typing import Any, TypeAlias
 
 from visioncal.core.errors import DriverError
 
-# What the extras of this package install, by their names in pyproject.toml.
+# Packages of the extras, by their names in pyproject.toml.
 _PACKAGES = {"ur": "ur-rtde>=1.6.5,<2", "oak": "depthai>=3.12,<4"}
-# A pipeline, a node, an output, a message: their classes are there only where the library is.
+# A pipeline, a node, an output, a message: their classes exist only where the library is installed.
 Handle: TypeAlias = Any
 
 
 def refuse_without(needed: str, extras: Mapping[str, str]) -> None:
-    """Refuses what needs client libraries, naming all that are missing.
+    """Checks that a required client library is installed, naming all that are missing.
 
     Args:
-        needed: The extra that it cannot do without.
-        extras: The module of each extra that it uses.
+        needed: The required extra.
+        extras: Modules of the required and the optional extras.
 
     Raises:
-        DriverError: The one that is needed is not installed, with the command that installs all.
+        DriverError: The required one is not installed, with the command that installs all.
     """
     missing = [extra for extra, module in extras.items() if find_spec(module) is None]
     if needed in missing:
@@ -40,11 +40,7 @@ def refuse_without(needed: str, extras: Mapping[str, str]) -> None:
 
 
 def client_library(module: str, extra: str) -> ModuleType:
-    """Imports a client library.
-
-    Args:
-        module: The module's name.
-        extra: The extra that brings it.
+    """Imports a client library that an extra brings.
 
     Raises:
         DriverError: It is not installed, with the command that installs it.
@@ -62,14 +58,14 @@ def client_library(module: str, extra: str) -> ModuleType:
 def depthai() -> ModuleType:
     """Imports depthai.
 
-    It reads its environment once, when it is imported; by default it reports to its maker.
+    It reads its environment once, on import; by default it sends telemetry.
 
     Raises:
         DriverError: It is not installed, with the command that installs it.
     """
     os.environ["DEPTHAI_TELEMETRY"] = "0"
-    # Its warnings about USB in containers are no news to a user of a recording or a rehearsal.
+    # Hides warnings about USB in containers.
     os.environ.setdefault("DEPTHAI_LEVEL", "error")
-    # It looks for a device for 10 s; one that is there is found within one.
+    # By default it searches for a device for 10 s; one that is connected is found within one.
     os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", "3000")
     return client_library("depthai", "oak")

@@ -1,4 +1,4 @@
-"""A folder of images as a camera, one file after the other."""
+"""Camera device that returns the images of a folder in order."""
 
 import time
 from collections.abc import Mapping
@@ -15,20 +15,16 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
 class FolderCamera:
-    """A camera device whose next picture is the folder's next file, in the order of its numbers.
+    """Camera device whose next picture is the folder's next file, in the order of the numbers.
 
-    It stands for a camera that somebody else triggers: the files are taken as they are found when
-    it is opened, read in grey, and each is taken for a picture of the moment at which it is asked
-    for.
-
-    Args:
-        folder: The folder.
+    It replaces a camera that another program triggers: the files are listed on opening, read in
+    grey, and each is stamped when it is requested.
 
     Raises:
-        DataError: It is missing or holds no images, or the first cannot be read.
+        DataError: The folder is missing or holds no images, or the first cannot be read.
     """
 
-    # A folder knows no intrinsics.
+    # A folder has no intrinsics.
     factory: Camera | None = None
 
     def __init__(self, folder: Path) -> None:
@@ -49,10 +45,10 @@ class FolderCamera:
         self.resolution = (width, height)
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
-        """Returns the next image, stamped now; no time limit is needed.
+        """Returns the next image, stamped now; the timeout is ignored.
 
         Raises:
-            DriverError: There is no further one.
+            DriverError: There is none.
             DataError: It cannot be read, or has another resolution than the first.
         """
         del timeout_s
@@ -75,4 +71,4 @@ class FolderCamera:
         return Frame(image, time.monotonic())
 
     def close(self) -> None:
-        """Lets go of it; there is nothing to let go of."""
+        """Holds no resources."""

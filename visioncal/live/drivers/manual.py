@@ -1,4 +1,4 @@
-"""An arm without a connection: a person types or pastes its poses from the pendant."""
+"""Arm without a connection, whose poses a person types or pastes from the pendant."""
 
 import time
 from collections.abc import Callable
@@ -13,21 +13,21 @@ from visioncal.core.transforms import rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.live.drivers.protocols import ArmState
 
-# Our own form has the name of whom it is shared with.
+# Visioncal's own form is that of ROS.
 _OURS = {"ours": "ros"}
 
 
 class ManualArm:
-    """An arm without motion, whose state is the pose that a person enters.
+    """Arm whose state is the pose that a person enters.
 
-    It asks until it has understood a pose, shows how, and takes it when the person agrees.
+    It asks until it can read a pose, shows its interpretation, and uses it once confirmed.
 
     Args:
-        ask: Asks a question and gives the line that was typed.
-        form: In which form poses are typed: a name among `POSE_FORMS`, or `ours`; None to have it
-            recognised by their numbers, and asked where these leave it open.
-        answers: Whether a person answers. Lines of a file are a pose each: nothing is asked back,
-            and the file's end, which a `q` is too, raises EOFError.
+        ask: Asks a question and returns the line that was typed.
+        form: Form of the typed poses: a name among `POSE_FORMS`, or `ours`; None to recognise it
+            from their numbers, and to ask where these are ambiguous.
+        answers: Whether a person answers. Otherwise each line of a file is a pose, no questions are
+            asked, and the file's end or a `q` raises EOFError.
 
     Raises:
         DriverError: There is no such form.
@@ -37,37 +37,37 @@ class ManualArm:
         self, ask: Callable[[str], str], form: str | None = None, *, answers: bool = True
     ) -> None:
         self._ask, self.answers = ask, answers
-        self._form = None if form is None else _known(form)
+        self._form = None if form is None else _form_name(form)
 
     @property
     def name(self) -> str:
-        """What it is."""
+        """Name in messages."""
         return "poses typed by hand"
 
     def state(self) -> ArmState:
-        """Asks for the pose of the flange; it takes as long as the person does.
+        """Asks for the pose of the flange, without a timeout.
 
         Raises:
-            DriverError: The input is at its end; or a line of a file is no pose, as a pose that was
-                passed over would shift all that follow.
+            DriverError: The input has ended; or a line of a file is no pose, and skipping it would
+                shift all that follow.
         """
         if not self.answers:
-            return self._next()
+            return self._next_of_file()
         line = self._answer("Pose of the flange: ")
         while True:
-            found = self._read(line)
-            if isinstance(found, str):
-                line = self._answer(f"{found}\nPose of the flange: ")
+            pose = self._read(line)
+            if isinstance(pose, str):
+                line = self._answer(f"{pose}\nPose of the flange: ")
                 continue
             line = self._answer(
-                f"Read as {found.words}: {pose_words(found.pose)}. Enter takes it; else type it "
+                f"Read as {pose.words}: {pose_words(pose.pose)}. Enter takes it; else type it "
                 "again: "
             )
             if not line.strip():
-                return ArmState(time.monotonic(), found.pose)
+                return ArmState(time.monotonic(), pose.pose)
 
-    def _next(self) -> ArmState:
-        """The pose of the next line of a file that is not empty."""
+    def _next_of_file(self) -> ArmState:
+        """State from the next line of a file that is not empty."""
         while not (line := self._ask("").strip()):
             pass
         if line.lower() == "q":
@@ -79,21 +79,23 @@ class ManualArm:
                 culprits=["stdin"],
                 next_step=f"Say which: --pose-form {forms[0]}.",
             )
-        found = self._read(line)
-        if isinstance(found, str):
-            raise DriverError(found, culprits=["stdin"], next_step="Correct it: a pose a line.")
-        return ArmState(time.monotonic(), found.pose)
+        pose = self._read(line)
+        if isinstance(pose, str):
+            raise DriverError(pose, culprits=["stdin"], next_step="Correct it: a pose a line.")
+        return ArmState(time.monotonic(), pose.pose)
 
     def close(self) -> None:
-        """Lets go of it; there is nothing to let go of."""
+        """Holds no resources."""
 
     def _read(self, line: str) -> PendantPose | str:
-        """Reads a line; why it cannot be read, in words."""
+        """Reads a pose from a line; else the reason in words."""
         forms = possible_forms(line)
         while self._form is None and len(forms) > 1:
-            # Asked once: a pendant does not change its form from pose to pose.
-            said = self._answer(f"That may be a pose of {', '.join(forms)}. Which is it? ").strip()
-            self._form = said if said in forms else None
+            # Asked once: a pendant keeps its form.
+            chosen = self._answer(
+                f"That may be a pose of {', '.join(forms)}. Which is it? "
+            ).strip()
+            self._form = chosen if chosen in forms else None
         try:
             return read_pose(line, "the line", self._form)
         except DataError as error:
@@ -107,17 +109,17 @@ class ManualArm:
 
 
 def pose_words(pose: FloatArray) -> str:
-    """Words a (4, 4) pose [m] as a person can compare it with a pendant, whatever its form."""
+    """Describes a (4, 4) pose [m] so that it can be compared with a pendant of any form."""
     x, y, z = 1e3 * pose[:3, 3]
     turned = np.rad2deg(rotation_angle(pose))
-    down = pose[:3, 2]
+    axis = pose[:3, 2]
     return (
         f"x {x:.2f}, y {y:.2f}, z {z:.2f} mm; turned by {turned:.2f} deg; the flange points along "
-        f"({down[0]:.2f}, {down[1]:.2f}, {down[2]:.2f})"
+        f"({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})"
     )
 
 
-def _known(form: str) -> str:
+def _form_name(form: str) -> str:
     name = _OURS.get(form, form)
     if name not in POSE_FORMS:
         names = (*_OURS, *POSE_FORMS)

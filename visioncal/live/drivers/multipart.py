@@ -1,4 +1,4 @@
-"""Pictures as network cameras send them over HTTP: JPEG files one after the other, without end."""
+"""Streams of JPEG files over HTTP, as network cameras send them (MJPEG)."""
 
 import http.client
 import os
@@ -16,36 +16,35 @@ UNREACHED = (
     "Look at its address, its power and its network: does another player on this computer show its "
     "pictures?"
 )
-# How long it may take to answer, and how long it may then send nothing before it is given up [s].
-_SILENT_S = 5.0
-# More than any picture, and any line of a header, has [B].
+# Timeout of the answer, and of silence afterwards [s].
+_TIMEOUT_S = 5.0
+# Upper bounds of a picture, and of a line of a header [B].
 _PICTURE_B, _LINE_B = 1 << 27, 1 << 16
-_HEADERS = 100
-_BEGINS, _ENDS = b"\xff\xd8", b"\xff\xd9"
+_MAX_HEADER_LINES = 100
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
 
 def without_password(url: str) -> str:
-    """A URL as it may be shown and kept: without user and password."""
-    scheme, found, rest = url.partition("://")
+    """A URL without user and password, to be shown and stored."""
+    scheme, separator, rest = url.partition("://")
     authority, slash, path = rest.partition("/")
-    return f"{scheme}{found}{authority.rpartition('@')[2]}{slash}{path}" if found else url
+    return f"{scheme}{separator}{authority.rpartition('@')[2]}{slash}{path}" if separator else url
 
 
 def open_multipart(url: str) -> "MultipartPictures | None":
     """Opens a stream of JPEG files; None where the URL answers with something else.
 
-    Args:
-        url: Of http or https, with user and password in it where the camera asks for them.
+    User and password are part of the URL where the camera requires them.
 
     Raises:
         DriverError: It does not answer, or refuses.
     """
     shown = without_password(url)
     try:
-        response = _opener(url).open(shown, timeout=_SILENT_S)
+        response = _opener(url).open(shown, timeout=_TIMEOUT_S)
     except urllib.error.HTTPError as error:
         error.close()
-        raise _refused(shown, error) from None
+        raise _refused_error(shown, error) from None
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise DriverError(
             f"The camera {shown} cannot be opened: {getattr(error, 'reason', error)}.",
@@ -60,7 +59,7 @@ def open_multipart(url: str) -> "MultipartPictures | None":
 
 
 def _opener(url: str) -> urllib.request.OpenerDirector:
-    # A camera of the cell is reached directly, and signs its certificate itself.
+    # A camera of the cell is reached without a proxy, and has a self-signed certificate.
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     words = urlsplit(url)
@@ -78,7 +77,7 @@ def _opener(url: str) -> urllib.request.OpenerDirector:
 
 
 class _ClosingRefused(urllib.request.BaseHandler):
-    """Closes an answer that asks for a password, before the handlers that ask again with one."""
+    """Closes an answer that requires a password, before the handlers that repeat the request."""
 
     handler_order = 100
 
@@ -88,11 +87,11 @@ class _ClosingRefused(urllib.request.BaseHandler):
         response: http.client.HTTPResponse,
         *_: object,
     ) -> None:
-        """Is called with such an answer; what comes next is left to others."""
+        """Closes the answer; other handlers go on."""
         response.close()
 
 
-def _refused(shown: str, error: urllib.error.HTTPError) -> DriverError:
+def _refused_error(shown: str, error: urllib.error.HTTPError) -> DriverError:
     scheme, _, rest = shown.partition("://")
     asks = error.code == http.HTTPStatus.UNAUTHORIZED
     return DriverError(
@@ -105,101 +104,102 @@ def _refused(shown: str, error: urllib.error.HTTPError) -> DriverError:
 
 
 class MultipartPictures:
-    """A source of JPEG files out of an answer of the kind multipart/x-mixed-replace.
+    """Source of JPEG files from a multipart/x-mixed-replace response.
 
-    They are read and not decoded, so that this keeps pace with any network.
+    They are read without decoding, which keeps pace with any network.
 
     Args:
-        response: The answer, of which nothing was read yet.
-        boundary: What stands between its parts, without dashes.
-        name: Where it is from, for people.
+        response: The response, of which nothing was read yet.
+        boundary: Separator of its parts, without dashes.
+        name: Name of the camera in messages.
     """
 
     def __init__(self, response: http.client.HTTPResponse, boundary: bytes, name: str) -> None:
         self._response, self._boundary, self._name = response, boundary, name
-        # Closing it while another thread reads would wait for that thread; this wakes it.
-        self._line = socket.socket(fileno=os.dup(response.fileno()))
+        # Closing the response while another thread reads would wait for that thread; shutting down
+        # this duplicate wakes it.
+        self._connection = socket.socket(fileno=os.dup(response.fileno()))
         self._jpeg = b""
 
     def grab(self) -> Arrival:
-        """Waits for the next whole picture; it is stamped when its first bytes come.
+        """Waits for the next whole picture, stamped when its first bytes arrive.
 
         Raises:
-            DriverError: The stream is at its end, sends nothing for long, or other things.
+            DriverError: The stream ends, times out, or sends anything but pictures.
         """
         try:
-            came_s, self._jpeg = self._part()
-            while not self._jpeg.rstrip(b"\r\n\0").endswith(_ENDS):
-                came_s, self._jpeg = self._part()
+            arrived_s, self._jpeg = self._read_part()
+            while not self._jpeg.rstrip(b"\r\n\0").endswith(_JPEG_END):
+                arrived_s, self._jpeg = self._read_part()
         except TimeoutError as error:
-            raise self._ended(f"sent nothing for {_SILENT_S:g} s") from error
+            raise self._ended_error(f"sent nothing for {_TIMEOUT_S:g} s") from error
         except (OSError, http.client.HTTPException, ValueError) as error:
-            raise self._ended(f"is lost: {error}") from error
-        return Arrival(came_s)
+            raise self._ended_error(f"is lost: {error}") from error
+        return Arrival(arrived_s)
 
     def take(self) -> bytes:
-        """Returns the file of the picture that was grabbed last."""
+        """Returns the file of the last grabbed picture."""
         return self._jpeg
 
     def interrupt(self) -> None:
         """Ends the connection."""
         try:
-            self._line.shutdown(socket.SHUT_RDWR)
+            self._connection.shutdown(socket.SHUT_RDWR)
         except OSError:
             # It has ended already.
             return
 
     def close(self) -> None:
-        """Lets go of the connection."""
+        """Closes the connection."""
         self._response.close()
-        self._line.close()
+        self._connection.close()
 
-    def _part(self) -> tuple[float, bytes]:
-        """The next part, and when its first bytes came."""
-        size = self._size()
-        begins = self._response.read(len(_BEGINS))
-        came_s = time.monotonic()
-        if begins != _BEGINS:
-            raise self._ended(
-                "closed the stream" if not begins else "sends something else than JPEG"
+    def _read_part(self) -> tuple[float, bytes]:
+        """Reads the next part, with the time of its first bytes [s]."""
+        size = self._read_part_size()
+        start = self._response.read(len(_JPEG_START))
+        arrived_s = time.monotonic()
+        if start != _JPEG_START:
+            raise self._ended_error(
+                "closed the stream" if not start else "sends something else than JPEG"
             )
         if size is not None:
-            return came_s, begins + self._response.read(size - len(begins))
-        parts, length = [begins], len(begins)
+            return arrived_s, start + self._response.read(size - len(start))
+        parts, length = [start], len(start)
         while not self._is_boundary(line := self._read_line()):
             parts.append(line)
             length += len(line)
             if length > _PICTURE_B:
-                raise self._ended("sends pictures without end")
-        return came_s, b"".join(parts)
+                raise self._ended_error("sends pictures without end")
+        return arrived_s, b"".join(parts)
 
-    def _size(self) -> int | None:
-        """Reads up to where a part's content begins; its size, where it is stated [B]."""
+    def _read_part_size(self) -> int | None:
+        """Reads a part's headers; returns its size where it is stated [B]."""
         size, has_headers = None, False
-        for _ in range(_HEADERS):
+        for _ in range(_MAX_HEADER_LINES):
             line = self._read_line().strip()
-            name, found, value = line.partition(b":")
-            if found:
+            name, separator, value = line.partition(b":")
+            if separator:
                 has_headers = True
                 if name.strip().lower() == b"content-length":
                     size = int(value)
             elif not line and has_headers:
-                if size is not None and not len(_BEGINS) < size < _PICTURE_B:
-                    raise self._ended(f"states {size} bytes for a picture")
+                if size is not None and not len(_JPEG_START) < size < _PICTURE_B:
+                    raise self._ended_error(f"states {size} bytes for a picture")
                 return size
-        raise self._ended("sends no pictures")
+        raise self._ended_error("sends no pictures")
 
     def _read_line(self) -> bytes:
         line = self._response.readline(_LINE_B)
         if not line:
-            raise self._ended("closed the stream")
+            raise self._ended_error("closed the stream")
         return line
 
     def _is_boundary(self, line: bytes) -> bool:
-        # Some state it with its dashes, and some send it without.
+        # Some cameras state it with its dashes, and some send it without.
         return bool(self._boundary) and line.strip().strip(b"-") == self._boundary
 
-    def _ended(self, how: str) -> DriverError:
+    def _ended_error(self, how: str) -> DriverError:
         return DriverError(
             f"The camera {self._name} gives no more pictures: it {how}.",
             culprits=[self._name],

@@ -1,7 +1,7 @@
-"""The newest picture of a camera that sends picture after picture, asked for or not.
+"""Reader of the newest picture of a camera that sends pictures continuously.
 
-Pictures that nobody takes wait in a driver's or a network's buffers, and whoever takes one then
-gets an old one. So a thread takes all of them, at the pace at which they come, and notes the time.
+Unread pictures wait in a driver's or a network's buffers and get old. A thread therefore reads all
+of them as they come, and notes the time.
 """
 
 import math
@@ -15,16 +15,16 @@ from typing import Generic, Protocol, TypeVar
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.stopwatch import Stopwatch
 
-# The longest wait, in intervals between this camera's last pictures: one under way when it is
-# asked for, the one that is wanted, and one more for a network's jitter. Intervals longer than this
-# are a stall and no pace [s].
-_INTERVALS, _LAST, _LONGEST_S = 3.0, 4, 3.0
-# A camera's pace is its mean over so long [s]: what a stall delays, a burst then brings. What comes
-# after less than this share of an interval had waited in a buffer.
+# The longest wait, in intervals between this camera's recent pictures: one under way at the
+# request, the requested one, and one more for network jitter; how many recent intervals count; and
+# the longest interval that is not a stall [s].
+_INTERVALS, _RECENT_INTERVALS, _LONGEST_S = 3.0, 4, 3.0
+# Time over which a camera's mean interval is taken [s], as a burst follows a stall. A picture that
+# comes after less than this share of an interval had waited in a buffer.
 _PACE_S, _BURST = 10.0, 0.3
-# How long the thread may take to end; one that hangs in a driver ends with the process [s].
-_ENDING_S = 2.0
-# How often who waits looks at the time [s].
+# Timeout of the thread's end [s]; one that hangs in a driver ends with the process.
+_JOIN_S = 2.0
+# Polling interval of waiting callers [s].
 _GLANCE_S = 0.05
 
 T_co = TypeVar("T_co", covariant=True)
@@ -33,11 +33,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Arrival:
-    """When a picture came, on the host's monotonic clock.
+    """Time of a picture on the host's monotonic clock.
 
     Attributes:
-        stamp_s: When it came [s].
-        began_s: Its exposure began no earlier [s]; None where its driver knows no times.
+        stamp_s: Time of arrival [s].
+        began_s: Lower bound of the start of exposure [s]; None where the driver has no timestamps.
     """
 
     stamp_s: float
@@ -45,41 +45,36 @@ class Arrival:
 
 
 class Source(Protocol[T_co]):
-    """Gives all pictures of a camera, one after the other; one thread alone calls it."""
+    """Source of all pictures of a camera in order; a single thread calls it."""
 
     def grab(self) -> Arrival:
         """Waits for the next picture.
 
         Raises:
-            DriverError: There are no more.
+            DriverError: There is none.
         """
 
     def take(self) -> T_co:
-        """Returns the picture that was grabbed last; costly where it has to be decoded for that."""
+        """Returns the last grabbed picture; may be costly, as it may decode it."""
 
     def interrupt(self) -> None:
-        """Lets `grab` end soon, where that can be; called by another thread."""
+        """Makes `grab` return soon, where possible; called from another thread."""
 
     def close(self) -> None:
-        """Lets go of the camera."""
+        """Releases the camera."""
 
 
 @dataclass(eq=False)
 class _PictureRequest(Generic[T]):
-    """A wish for a picture whose exposure began after a moment [s], and what came of it."""
+    """Request for a picture whose exposure began after a moment [s], and its answer."""
 
     moment_s: float
-    given: tuple[Arrival, T] | None = None
-    passed_by: int = 0
+    answer: tuple[Arrival, T] | None = None
+    too_old: int = 0
 
 
 class Newest(Generic[T]):
-    """The newest picture of a source, which a thread reads all the time.
-
-    Args:
-        source: The source; closed by the thread at its end.
-        name: Whose pictures they are, for people.
-    """
+    """Newest picture of a source that a thread reads continuously, and closes at its end."""
 
     def __init__(self, source: Source[T], name: str) -> None:
         self._source, self._name = source, name
@@ -94,56 +89,54 @@ class Newest(Generic[T]):
         self._thread.start()
 
     def first(self, timeout_s: float) -> tuple[Arrival, T]:
-        """Waits for the first picture of all; the arguments and errors are those of `after`."""
-        return self._answered(self._first, timeout_s)
+        """Waits for the very first picture; arguments and errors are those of `after`."""
+        return self._wait_for(self._first, timeout_s)
 
     def after(self, moment_s: float, timeout_s: float) -> tuple[Arrival, T]:
-        """Waits for a picture whose exposure began after a moment.
+        """Waits for a picture whose exposure began after a moment on the monotonic clock [s].
 
-        Args:
-            moment_s: The moment, on the host's monotonic clock [s].
-            timeout_s: How long to wait [s]; for a slow camera longer, by its own pace.
+        The timeout [s] of a slow camera is longer.
 
         Raises:
-            DriverError: None came, with for how long, or the camera is at its end.
+            DriverError: None came in time, or the source has ended.
         """
         request: _PictureRequest[T] = _PictureRequest(moment_s)
         with self._news:
             self._request = request
-        return self._answered(request, timeout_s)
+        return self._wait_for(request, timeout_s)
 
     def close(self) -> None:
-        """Ends the thread, which lets go of the camera; may be called twice."""
+        """Ends the thread, which releases the camera; may be called twice."""
         self._is_closing = True
         self._source.interrupt()
-        self._thread.join(_ENDING_S)
+        self._thread.join(_JOIN_S)
 
-    def _answered(self, request: _PictureRequest[T], timeout_s: float) -> tuple[Arrival, T]:
+    def _wait_for(self, request: _PictureRequest[T], timeout_s: float) -> tuple[Arrival, T]:
         waiting = Stopwatch()
         with self._news:
-            while request.given is None:
+            while request.answer is None:
                 if self._error is not None:
                     raise self._error
-                patience_s = max(timeout_s, _INTERVALS * self._longest_interval_s())
-                left_s = patience_s - waiting.read()
-                if left_s <= 0.0:
-                    raise self._missed(request)
-                self._news.wait(min(left_s, _GLANCE_S))
-            return request.given
+                limit_s = max(timeout_s, _INTERVALS * self._longest_interval_s())
+                remaining_s = limit_s - waiting.read()
+                if remaining_s <= 0.0:
+                    raise self._timeout_error(request)
+                self._news.wait(min(remaining_s, _GLANCE_S))
+            return request.answer
 
     def _read(self) -> None:
         try:
             while not self._is_closing:
-                self._note(self._source.grab())
+                self._handle(self._source.grab())
         except Exception as error:  # noqa: BLE001
-            # Whoever waits for a picture raises it.
+            # Raised to whoever waits for a picture.
             with self._news:
                 self._error = error
                 self._news.notify_all()
         finally:
             self._source.close()
 
-    def _note(self, arrival: Arrival) -> None:
+    def _handle(self, arrival: Arrival) -> None:
         now = time.monotonic()
         with self._news:
             began_s = self._began_s(arrival)
@@ -155,19 +148,20 @@ class Newest(Generic[T]):
             if request is None:
                 return
             if began_s < request.moment_s:
-                request.passed_by += 1
+                request.too_old += 1
                 return
-        # Not under the lock: it may take long, and whoever waits must be able to give up.
-        taken = self._source.take()
+        # Not under the lock: it may take long, and a waiting caller must be able to time out.
+        picture = self._source.take()
         with self._news:
-            request.given = (arrival, taken)
+            request.answer = (arrival, picture)
             if self._request is request:
                 self._request = None
             self._news.notify_all()
 
     def _began_s(self, arrival: Arrival) -> float:
-        """When a picture's exposure may have begun at the earliest."""
-        # Where no times are known that is when the picture before it came, if it was waited for.
+        """Earliest possible start of a picture's exposure [s]."""
+        # Without timestamps that is the arrival of the picture before, unless this one had waited
+        # in a buffer.
         if arrival.began_s is not None:
             return arrival.began_s
         stamps = self._stamps_s
@@ -178,12 +172,12 @@ class Newest(Generic[T]):
         return stamps[-1] if is_waited_for else -math.inf
 
     def _longest_interval_s(self) -> float:
-        """The longest of the last intervals between pictures that is none of a stall [s]."""
-        last = list(self._stamps_s)[-_LAST - 1 :]
+        """Longest recent interval between pictures, without stalls [s]."""
+        last = list(self._stamps_s)[-_RECENT_INTERVALS - 1 :]
         return max((min(b - a, _LONGEST_S) for a, b in pairwise(last)), default=0.0)
 
-    def _missed(self, request: _PictureRequest[T]) -> DriverError:
-        if request.passed_by > _INTERVALS:
+    def _timeout_error(self, request: _PictureRequest[T]) -> DriverError:
+        if request.too_old > _INTERVALS:
             return DriverError(
                 f"The {self._name} gives no fresh pictures: its last one came {self._late_s:.1f} s "
                 "late.",

@@ -1,4 +1,4 @@
-"""Luxonis' OAK cameras through depthai: fixed focus and exposure, factory intrinsics, own times."""
+"""Luxonis' OAK cameras through depthai: held focus and exposure, factory intrinsics, timestamps."""
 
 import math
 import time
@@ -17,13 +17,12 @@ from visioncal.live.drivers.oak_frames import FrameEnd, began_after, worded
 from visioncal.live.drivers.protocols import DeviceSetup, Frame
 from visioncal.live.drivers.stopwatch import Stopwatch
 
-# Where no resolution is wished the sensor's is divided by a whole number, to about this width [px].
+# The default resolution is the sensor's, divided by a whole number to at most this width [px].
 _WIDTH_PX = 2048
 _RATE_HZ = 10.0
-# How long the camera may look for its exposure and focus before they are held, and how long the
-# first picture of all may take [s].
+# Time for automatic exposure and focus before they are held, and timeout of the first picture [s].
 _SETTLE_S, _FIRST_S = 1.5, 5.0
-# How often who waits looks at the time [s].
+# Polling interval of waiting callers [s].
 _GLANCE_S = 0.05
 _UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
 _OPTIONS = ("socket", "rate_hz", "raw")
@@ -32,17 +31,17 @@ _OPTIONS = ("socket", "rate_hz", "raw")
 class OakCamera:
     """One camera of an OAK, as a camera device.
 
-    What is not wished the device finds by itself once, and then it is held: the focus where the
-    factory calibrated it, else where autofocus went; exposure and gain where automatic exposure
-    went. All of it is in `settings`.
+    Settings that are not requested are determined once and then held: the focus is that of the
+    factory calibration, else that of autofocus; exposure and gain are those of automatic exposure.
+    All of them are in `settings`.
 
     Args:
-        requested: What is asked of it; `more` may name the `socket` (CAM_A), `rate_hz`, and `raw`,
-            a file to record every frame into, `.avi` or `.mkv`.
-        device: Which OAK, by its id, its address or its USB path; None for the only one.
+        requested: Requested settings; `more` may name the `socket` (CAM_A), `rate_hz`, and `raw`, a
+            file to record every frame into, `.avi` or `.mkv`.
+        device: Id, address or USB path of the OAK; None for the only one.
 
     Raises:
-        DriverError: depthai or the device is missing, or the device has no such camera.
+        DriverError: Depthai or the device is missing, or the device has no such camera.
         DataError: Frames cannot be recorded into that file.
     """
 
@@ -51,14 +50,16 @@ class OakCamera:
         requested = requested or DeviceSetup()
         self._socket, rate_hz = _options(requested.more)
         with ExitStack() as closing:
-            opened = _opened(dai, device)
+            opened = _open_device(dai, device)
             closing.callback(opened.close)
             with worded(dai, "The OAK", "does not start"):
                 sensor = _sensor(opened, self._socket)
                 self.name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
-                self.resolution = requested.resolution or _fitting(sensor.width, sensor.height)
+                self.resolution = requested.resolution or _default_resolution(
+                    sensor.width, sensor.height
+                )
                 calibration = opened.readCalibrationOrDefault()
-                requested = _focused(requested, calibration, sensor)
+                requested = _with_focus(requested, calibration, sensor)
                 pipeline = dai.Pipeline(opened)
                 node = pipeline.create(dai.node.Camera).build(sensor.socket)
                 output = self._output(dai, node, requested, sensor, rate_hz)
@@ -68,18 +69,18 @@ class OakCamera:
                 dai, pipeline, output, self.name, raw=None if raw is None else Path(raw)
             )
             closing.callback(self._end.close)
-            held = self._held(dai, requested, sensor, control)
-            self.factory, known = self._intrinsics(calibration, sensor)
-            self.settings = MappingProxyType({"rate_hz": rate_hz, **known, **held})
+            held = self._hold_settings(dai, requested, sensor, control)
+            self.factory, provenance = self._intrinsics(calibration, sensor)
+            self.settings = MappingProxyType({"rate_hz": rate_hz, **provenance, **held})
             self._closing = closing.pop_all()
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call.
 
         Raises:
-            DriverError: None came in time: unplugged.
+            DriverError: None came in time; it may be unplugged.
         """
-        asked = time.monotonic()
+        requested_at = time.monotonic()
         waiting = Stopwatch()
         self._end.drop_old()
         while True:
@@ -90,17 +91,17 @@ class OakCamera:
                     culprits=[self.name],
                     next_step="Look at its cable and its power; then go on with --resume.",
                 )
-            if frame is not None and began_after(frame, asked):
+            if frame is not None and began_after(frame, requested_at):
                 return frame
 
     def close(self) -> None:
-        """Stops it and lets go of the device; may be called twice."""
+        """Stops and releases the device; may be called twice."""
         self._closing.close()
 
     def _output(
         self, dai: ModuleType, node: Handle, requested: DeviceSetup, sensor: Handle, rate_hz: float
     ) -> Handle:
-        """Sets what is known beforehand, and asks the camera's node for pictures."""
+        """Sets what is requested, and creates the camera node's output."""
         if requested.focus is not None:
             node.initialControl.setManualFocus(requested.focus)
         if requested.exposure_us is not None and requested.gain is not None:
@@ -111,10 +112,10 @@ class OakCamera:
         crop = dai.ImgResizeMode.CROP
         return node.requestOutput(self.resolution, kind, crop, rate_hz, False)
 
-    def _held(
+    def _hold_settings(
         self, dai: ModuleType, requested: DeviceSetup, sensor: Handle, control_queue: Handle
     ) -> dict[str, str | float]:
-        """Holds what the camera set by itself, and returns it."""
+        """Fixes the settings that the camera determined by itself, and returns them."""
         frame = self._end.message(_FIRST_S)
         until = time.monotonic() + _SETTLE_S
         while frame is not None and time.monotonic() < until:
@@ -141,18 +142,18 @@ class OakCamera:
     def _intrinsics(
         self, calibration: Handle, sensor: Handle
     ) -> tuple[Camera | None, dict[str, str | float]]:
-        """The factory's intrinsics; where they cannot be used, why, as a setting."""
+        """Factory intrinsics, with a setting that states their source or why they are not used."""
         try:
             camera = factory_intrinsics(calibration, self._socket, self.resolution)
         except DriverError as error:
             return None, {"factory_intrinsics": f"not used: {error.message}"}
         focus = _calibrated_focus(calibration, sensor)
-        at = "" if focus is None else f", for focus {focus}"
-        return camera, {"factory_intrinsics": f"read from the device{at}"}
+        suffix = "" if focus is None else f", for focus {focus}"
+        return camera, {"factory_intrinsics": f"read from the device{suffix}"}
 
 
 def _options(more: Mapping[str, str]) -> tuple[str, float]:
-    """Socket and rate [Hz] out of a user's words."""
+    """Socket and rate [Hz] from a user's options."""
     for name in more:
         if name not in _OPTIONS:
             raise DriverError(
@@ -178,7 +179,7 @@ def _options(more: Mapping[str, str]) -> tuple[str, float]:
     return socket, rate_hz
 
 
-def _opened(dai: ModuleType, device: str | None) -> Handle:
+def _open_device(dai: ModuleType, device: str | None) -> Handle:
     try:
         return dai.Device() if device is None else dai.Device(dai.DeviceInfo(device))
     except RuntimeError as error:
@@ -193,11 +194,8 @@ def _opened(dai: ModuleType, device: str | None) -> Handle:
 
 
 def _sensor(device: Handle, socket: str) -> Handle:
-    """What the device says of the sensor on a socket."""
-    sensors = {
-        getconnectedcamerafeature.socket.name: getconnectedcamerafeature
-        for getconnectedcamerafeature in device.getConnectedCameraFeatures()
-    }
+    """The device's description of the sensor on a socket."""
+    sensors = {feature.socket.name: feature for feature in device.getConnectedCameraFeatures()}
     if socket not in sensors:
         raise DriverError(
             f"The OAK has no camera on {socket}; it has {', '.join(sensors) or 'none'}.",
@@ -207,21 +205,21 @@ def _sensor(device: Handle, socket: str) -> Handle:
     return sensors[socket]
 
 
-def _fitting(width: int, height: int) -> tuple[int, int]:
-    """The sensor's whole view in a size that a USB cable carries; an even number of pixels."""
+def _default_resolution(width: int, height: int) -> tuple[int, int]:
+    """Resolution of the sensor's whole view that USB can carry, in even numbers of pixels."""
     parts = math.ceil(width / _WIDTH_PX)
     return width // parts // 2 * 2, height // parts // 2 * 2
 
 
-def _focused(requested: DeviceSetup, calibration: Handle, sensor: Handle) -> DeviceSetup:
-    """Focuses where the factory calibrated, unless another focus is wished."""
+def _with_focus(requested: DeviceSetup, calibration: Handle, sensor: Handle) -> DeviceSetup:
+    """Adds the factory calibration's focus, unless another one is requested."""
     if requested.focus is not None or not sensor.hasAutofocus:
         return requested
     return replace(requested, focus=_calibrated_focus(calibration, sensor))
 
 
 def _calibrated_focus(calibration: Handle, sensor: Handle) -> int | None:
-    """The position of the lens for which the factory's intrinsics are; None for a fixed lens."""
+    """Lens position of the factory calibration; None for a fixed lens."""
     if not sensor.hasAutofocus or not calibration.hasCameraCalibration(sensor.socket):
         return None
     position = int(calibration.getLensPosition(sensor.socket))

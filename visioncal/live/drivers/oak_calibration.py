@@ -1,8 +1,8 @@
-"""The calibration that an OAK keeps: its factory's intrinsics, and ours in its form.
+"""Calibration stored in an OAK: reading the factory's intrinsics, and writing ours.
 
-depthai's CalibrationHandler: single precision, lengths in centimetres, one matrix a camera at one
-size of the sensor, from which others follow by scaling to cover and cropping about the middle;
-distortion as OpenCV's 14 coefficients, or the fisheye's 4.
+Depthai's CalibrationHandler uses single precision, lengths in centimetres, and one matrix per
+camera at one size of the sensor, from which others follow by scaling to cover and cropping about
+the middle; distortion is OpenCV's 14 coefficients, or the fisheye's 4.
 """
 
 import json
@@ -20,33 +20,33 @@ _COEFFICIENTS = 14
 
 
 def factory_intrinsics(handler: Handle, socket: str, resolution: tuple[int, int]) -> Camera:
-    """Takes a camera's intrinsics out of a device's calibration.
+    """Reads a camera's intrinsics from a device's calibration.
 
     Args:
         handler: Its CalibrationHandler.
-        socket: Which camera, as `CAM_A`.
+        socket: The camera, such as `CAM_A`.
         resolution: (width, height) of the pictures, scaled and cropped from the sensor's [px].
 
     Raises:
-        DriverError: It has none of this camera, or a lens that our models do not describe.
+        DriverError: It has none of this camera, or its lens model is not supported.
     """
     dai = depthai()
-    place = _place(dai, socket)
+    board_socket = _socket_of(dai, socket)
     try:
-        matrix = np.array(handler.getCameraIntrinsics(place, *resolution), dtype=float)
-        coefficients = np.array(handler.getDistortionCoefficients(place), dtype=float)
-        model = handler.getDistortionModel(place)
+        matrix = np.array(handler.getCameraIntrinsics(board_socket, *resolution), dtype=float)
+        coefficients = np.array(handler.getDistortionCoefficients(board_socket), dtype=float)
+        model = handler.getDistortionModel(board_socket)
     except RuntimeError as error:
         raise DriverError(
             f"The device has no calibration of {socket}: {error}.",
             culprits=[socket],
             next_step="Leave the intrinsics out: they are then estimated from the images.",
         ) from error
-    four = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
     if model == dai.CameraModel.Fisheye:
-        return Camera("fisheye", resolution, four, coefficients[:4])
+        return Camera("fisheye", resolution, intrinsics, coefficients[:4])
     if model == dai.CameraModel.Perspective:
-        return Camera("brown", resolution, four, _brown(coefficients, socket))
+        return Camera("brown", resolution, intrinsics, _brown(coefficients, socket))
     raise DriverError(
         f"The device's lens {socket} is of the model {model.name}; Perspective or Fisheye is "
         "needed.",
@@ -60,30 +60,30 @@ def calibration_json(camera: Camera, socket: str, onto: str | None = None) -> st
 
     Args:
         camera: The intrinsics.
-        socket: Which camera of the device they are of, as `CAM_A`.
-        onto: The device's own JSON, of which all else is kept: the board, the other cameras, where
-            they sit; None for a calibration of this camera alone.
+        socket: The camera of the device, such as `CAM_A`.
+        onto: The device's own JSON, of which all else is kept: the board, the other cameras and
+            their extrinsics; None for a calibration of this camera alone.
 
     Raises:
-        DriverError: depthai is not installed.
+        DriverError: Depthai is not installed.
         DataError: There is no such socket, or `onto` is no calibration of an OAK.
     """
     dai = depthai()
-    place = _place(dai, socket)
+    board_socket = _socket_of(dai, socket)
     handler = dai.CalibrationHandler() if onto is None else _read(dai, onto)
-    size = _sensor_size(handler, place) or camera.resolution
-    matrix = _on_the_sensor(camera, size)
-    handler.setCameraIntrinsics(place, matrix.tolist(), *size)
+    size = _sensor_size(handler, board_socket) or camera.resolution
+    matrix = _sensor_matrix(camera, size)
+    handler.setCameraIntrinsics(board_socket, matrix.tolist(), *size)
     fisheye = camera.model == "fisheye"
     padded = np.pad(camera.distortion, (0, _COEFFICIENTS - len(camera.distortion)))
-    handler.setDistortionCoefficients(place, padded.tolist())
+    handler.setDistortionCoefficients(board_socket, padded.tolist())
     handler.setCameraType(
-        place, dai.CameraModel.Fisheye if fisheye else dai.CameraModel.Perspective
+        board_socket, dai.CameraModel.Fisheye if fisheye else dai.CameraModel.Perspective
     )
     return json.dumps(handler.eepromToJson(), indent=1) + "\n"
 
 
-def _place(dai: ModuleType, socket: str) -> Handle:
+def _socket_of(dai: ModuleType, socket: str) -> Handle:
     if socket not in SOCKETS:
         raise DataError(
             f"An OAK has no camera {socket!r}; {SOCKETS[0]} to {SOCKETS[-1]} are the names.",
@@ -93,7 +93,7 @@ def _place(dai: ModuleType, socket: str) -> Handle:
 
 
 def _brown(coefficients: FloatArray, socket: str) -> FloatArray:
-    """Takes 5 or 8 of 14 coefficients, where the others are zero."""
+    """The first 5 or 8 of 14 coefficients, where the others are zero."""
     tail = coefficients[8:]
     if np.any(tail != 0.0):
         raise DriverError(
@@ -122,16 +122,16 @@ def _read(dai: ModuleType, text: str) -> Handle:
     return handler
 
 
-def _sensor_size(handler: Handle, place: Handle) -> tuple[int, int] | None:
-    """The size for which the device's calibration has this camera's matrix; None without one."""
-    if not handler.hasCameraCalibration(place):
+def _sensor_size(handler: Handle, board_socket: Handle) -> tuple[int, int] | None:
+    """Resolution of the matrix in the device's calibration [px]; None without one."""
+    if not handler.hasCameraCalibration(board_socket):
         return None
-    _, width, height = handler.getDefaultIntrinsics(place)
+    _, width, height = handler.getDefaultIntrinsics(board_socket)
     return (int(width), int(height)) if width > 0 and height > 0 else None
 
 
-def _on_the_sensor(camera: Camera, size: tuple[int, int]) -> FloatArray:
-    """(3, 3) the matrix at the sensor's size: the inverse of scaling to cover, and cropping."""
+def _sensor_matrix(camera: Camera, size: tuple[int, int]) -> FloatArray:
+    """Matrix (3, 3) at the sensor's size: the inverse of scaling to cover, and cropping."""
     (width, height), (wide, high) = camera.resolution, size
     scale = max(width / wide, height / high)
     matrix = matrix_3x3(camera)

@@ -1,4 +1,4 @@
-"""The end of a depthai pipeline on this host: its frames, and their recording."""
+"""Output queue of a depthai pipeline on this host, and recording of its frames."""
 
 import time
 import weakref
@@ -16,23 +16,23 @@ from visioncal.core.types import Image
 from visioncal.live.drivers.extras import Handle
 from visioncal.live.drivers.protocols import Frame
 
-# What depthai's recorder keeps without loss; into others it encodes.
+# Formats that depthai's recorder writes without loss.
 _RAW_ENDINGS = (".avi", ".mkv")
-# Only players of such a file care: every frame's own time is in the file beside it.
+# Only for players of such a file: every frame's time is in the file beside it.
 _NOMINAL_HZ = 30
-# Longest wait for the recorder to write what it was given [s].
+# Longest wait for the recorder to write its queue [s].
 _DRAIN_S = 5.0
 
 
 class FrameEnd:
-    """The queue at the end of a pipeline, which it runs.
+    """Output queue of a pipeline, which it starts and stops.
 
     Args:
         dai: The library.
         pipeline: The pipeline, not yet running.
-        output: The output of a node whose frames are wanted.
-        name: Whose they are, for messages.
-        raw: A file to record every frame into, and its times beside it.
+        output: The output of a node to read.
+        name: Name of the device in messages.
+        raw: File to record every frame into, with its times in a file beside it.
 
     Raises:
         DriverError: The pipeline does not start.
@@ -57,12 +57,12 @@ class FrameEnd:
         self._stop = weakref.finalize(self, _stop, pipeline)
 
     def drop_old(self) -> None:
-        """Forgets the frames that nobody has taken."""
+        """Discards unread frames."""
         with worded(self._dai, self._name):
             self._queue.tryGetAll()
 
     def next(self, timeout_s: float) -> Frame | None:
-        """Takes the next frame; None where there is none in time.
+        """Returns the next frame; None where there is none in time.
 
         Raises:
             DriverError: The pipeline has ended, or the device is gone.
@@ -71,14 +71,14 @@ class FrameEnd:
         return None if message is None else _frame(self._dai, message)
 
     def message(self, timeout_s: float) -> Handle | None:
-        """Takes the next frame as depthai has it, with all that the camera says of it."""
+        """Returns depthai's message of the next frame, with the camera's own data."""
         with worded(self._dai, self._name):
             return self._queue.get(timedelta(seconds=max(timeout_s, 0.0)))
 
     def close(self) -> None:
-        """Stops the pipeline once all that it records is written; may be called twice."""
-        until = time.monotonic() + _DRAIN_S
-        while self._recorder is not None and self._stop.alive and time.monotonic() < until:
+        """Stops the pipeline once its recording is written; may be called twice."""
+        ends_s = time.monotonic() + _DRAIN_S
+        while self._recorder is not None and self._stop.alive and time.monotonic() < ends_s:
             if self._recorder.input.getSize() == 0:
                 break
             time.sleep(0.005)
@@ -86,21 +86,21 @@ class FrameEnd:
 
 
 def _times_beside(raw: Path) -> Path:
-    """Where the times of raw frames are: a file beside theirs."""
+    """File with the times of raw frames, beside theirs."""
     return raw.with_suffix(".mcap")
 
 
-def began_after(frame: Frame, asked: float) -> bool:
-    """Tells whether a frame's exposure began after a moment of the monotonic clock."""
-    return frame.stamp_s - 0.5 * (frame.exposure_s or 0.0) >= asked
+def began_after(frame: Frame, moment: float) -> bool:
+    """Whether a frame's exposure began after a moment of the monotonic clock."""
+    return frame.stamp_s - 0.5 * (frame.exposure_s or 0.0) >= moment
 
 
 @contextmanager
 def worded(dai: ModuleType, name: str, what: str = "gives no frames any more") -> Iterator[None]:
-    """Words what depthai raises: RuntimeError of devices and pipelines, and of closed queues.
+    """Translates depthai's exceptions of devices, pipelines and closed queues.
 
     Raises:
-        DriverError: It did.
+        DriverError: Depthai raised one.
     """
     try:
         yield
@@ -129,14 +129,14 @@ def _recorder(dai: ModuleType, pipeline: Handle, output: Handle, raw: Path) -> H
     recorder = pipeline.create(dai.node.RecordVideo)
     recorder.setRecordVideoFile(raw)
     recorder.setRecordMetadataFile(_times_beside(raw))
-    # Where none is said it is reckoned from the first frames, and fails on ones sent at once.
+    # Otherwise it is estimated from the first frames, which fails on ones sent at once.
     recorder.setFps(_NOMINAL_HZ)
     output.link(recorder.input)
     return recorder
 
 
 def _frame(dai: ModuleType, message: Handle) -> Frame:
-    """Takes a frame over; depthai's clock is this host's monotonic one."""
+    """Converts a message; depthai's clock is this host's monotonic one."""
     image: Image = np.array(message.getCvFrame(), dtype=np.uint8)
     middle = message.getTimestamp(dai.CameraExposureOffset.MIDDLE).total_seconds()
     return Frame(image, middle, message.getExposureTime().total_seconds() or None)

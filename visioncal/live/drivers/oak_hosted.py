@@ -1,4 +1,4 @@
-"""Frames from anywhere, through depthai's pipeline on this host as an OAK's frames come."""
+"""Camera device whose frames come from any source through a depthai pipeline on this host."""
 
 import threading
 import time
@@ -14,23 +14,23 @@ from visioncal.live.drivers.oak_frames import FrameEnd, began_after
 from visioncal.live.drivers.protocols import Frame
 from visioncal.live.drivers.stopwatch import Stopwatch
 
-# A source that computes its pictures may take longer than a camera [s].
+# Longest wait for a source that computes its pictures [s].
 _PATIENCE_S = 10.0
 _GLANCE_S = 0.05
 
 
 class HostedOak:
-    """A camera device whose pictures a source gives.
+    """Camera device whose pictures come from a source.
 
-    The source is asked for a picture when one is wanted, in a thread of the pipeline.
+    The source is called on request, in a thread of the pipeline.
 
     Args:
-        source: Gives a picture with its time, exposed after the call; None when there are no more.
-            What it raises as DriverError is raised to whoever asked for the frame.
+        source: Returns a picture with its time, exposed after the call; None at its end. Its
+            DriverError is raised to the caller of `frame`.
         resolution: (width, height) of its pictures [px].
-        factory: The intrinsics that are known of it.
-        settings: What it is set to.
-        raw: A file to record every frame into, `.avi` or `.mkv`.
+        factory: Its known intrinsics.
+        settings: Its settings.
+        raw: File to record every frame into, `.avi` or `.mkv`.
 
     Raises:
         DriverError: depthai is not installed.
@@ -62,21 +62,21 @@ class HostedOak:
         Raises:
             DriverError: The source has none, failed, or was closed.
         """
-        asked = time.monotonic()
+        requested_at = time.monotonic()
         waiting, quiet = Stopwatch(), Stopwatch()
         self._end.drop_old()
         self._feed.ask()
         while True:
             frame = self._end.next(_GLANCE_S)
-            if frame is not None and began_after(frame, asked):
-                return self._checked(frame)
+            if frame is not None and began_after(frame, requested_at):
+                return self._check_resolution(frame)
             if frame is not None:
-                # It was under way already when this one was asked for.
+                # It was under way already when this one was requested.
                 self._feed.ask()
-            self._feed.raise_what_went_wrong()
+            self._feed.raise_error()
             waited_s = waiting.read()
-            if self._feed.is_at_work:
-                # What the source then makes is still on its way through the pipeline.
+            if self._feed.is_busy:
+                # The source's picture must still pass through the pipeline.
                 quiet.restart()
             if waited_s > _PATIENCE_S or quiet.read() > timeout_s:
                 raise DriverError(
@@ -88,7 +88,7 @@ class HostedOak:
         """Stops the pipeline; may be called twice."""
         self._end.close()
 
-    def _checked(self, frame: Frame) -> Frame:
+    def _check_resolution(self, frame: Frame) -> Frame:
         height, width = frame.image.shape[:2]
         if (width, height) != self.resolution:
             raise DriverError(
@@ -100,23 +100,23 @@ class HostedOak:
 
 
 class _Feed:
-    """What the pipeline's thread and the one that wants a frame share."""
+    """State that the pipeline's thread shares with the caller of `frame`."""
 
     def __init__(self, source: Callable[[], Frame | None]) -> None:
         self._source = source
         self._wanted = threading.Event()
         self._error: DriverError | None = None
-        self.is_at_work = False
+        self.is_busy = False
 
     def ask(self) -> None:
-        """Wants a picture."""
+        """Requests a picture."""
         self._wanted.set()
 
     def answer(self) -> Frame | None:
-        """Takes a picture where one is wanted; called by the pipeline again and again."""
+        """Returns a picture where one was requested; called by the pipeline repeatedly."""
         if not self._wanted.wait(_GLANCE_S):
             return None
-        self.is_at_work = True
+        self.is_busy = True
         self._wanted.clear()
         try:
             frame = self._source()
@@ -126,18 +126,18 @@ class _Feed:
             self._error = error
             return None
         finally:
-            self.is_at_work = False
+            self.is_busy = False
         return frame
 
-    def raise_what_went_wrong(self) -> None:
-        """Raises what the source raised, once: a camera may be plugged in again."""
+    def raise_error(self) -> None:
+        """Raises the source's error, once: a camera may be plugged in again."""
         error, self._error = self._error, None
         if error is not None:
             raise error
 
 
 def _source_node(dai: ModuleType, pipeline: Handle, feed: _Feed) -> Handle:
-    """Makes the node that sends the feed's pictures; depthai's classes exist once it is there."""
+    """Creates the node that sends the feed's pictures; its class needs depthai to be imported."""
 
     class Source(dai.node.ThreadedHostNode):  # type: ignore[misc, name-defined]
         def __init__(self) -> None:
@@ -156,7 +156,7 @@ def _source_node(dai: ModuleType, pipeline: Handle, feed: _Feed) -> Handle:
 
 
 def _message(dai: ModuleType, frame: Frame, number: int) -> Handle:
-    """Writes a frame as a device would: depthai counts time from the end of the exposure."""
+    """Builds a device's message for a frame; depthai stamps the end of the exposure."""
     kinds = dai.ImgFrame.Type
     message = dai.ImgFrame()
     message.setCvFrame(frame.image, kinds.GRAY8 if frame.image.ndim == 2 else kinds.BGR888i)

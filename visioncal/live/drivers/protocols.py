@@ -1,4 +1,4 @@
-"""What is asked of an arm and of a camera; the drivers know nothing of sessions or calibration."""
+"""Interfaces of arms and cameras; the drivers know nothing of sessions or calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,16 +12,16 @@ Safety = Literal["normal", "reduced", "protective-stop", "emergency-stop", "faul
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """What the arm says of itself at one moment; what it does not report is None.
+    """State of an arm at one moment; what it does not report is None.
 
     Attributes:
-        stamp_s: When the host had it, on the host's monotonic clock (`time.monotonic`) [s].
-        base_from_flange: (4, 4) the flange in the controller's base frame [m].
+        stamp_s: Time of arrival, on the host's monotonic clock (`time.monotonic`) [s].
+        base_from_flange: (4, 4) flange in the controller's base frame [m].
         q: (n,) joint angles [rad].
         dq: (n,) joint speeds [rad/s].
-        flange_from_tool: (4, 4) the tool offset that the controller is set to [m].
-        payload_kg: The load that the controller reckons with [kg].
-        payload_m: (3,) the centre of that load, in the flange frame [m].
+        flange_from_tool: (4, 4) tool offset that is set in the controller [m].
+        payload_kg: Payload that is set in the controller [kg].
+        payload_m: (3,) its centre of mass, in the flange frame [m].
         currents_a: (n,) motor currents [A].
         temperatures_c: (n,) joint temperatures [C].
         safety: Whether it may move.
@@ -41,12 +41,12 @@ class ArmState:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture.
+    """A picture.
 
     Attributes:
         image: (h, w) grey or (h, w, 3) blue, green, red.
-        stamp_s: The middle of its exposure, on the host's monotonic clock [s].
-        exposure_s: How long it was exposed [s], where the camera reports it.
+        stamp_s: Middle of the exposure, on the host's monotonic clock [s].
+        exposure_s: Exposure time [s], where the camera reports it.
     """
 
     image: Image
@@ -56,10 +56,10 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class JointSample:
-    """What joints do at one moment.
+    """Joint states at one moment.
 
     Attributes:
-        stamp_s: When, on the controller's own clock [s].
+        stamp_s: Time on the controller's own clock [s].
         q: (n,) joint angles [rad].
         dq: (n,) joint speeds [rad/s].
         currents_a: (n,) motor currents [A].
@@ -72,11 +72,11 @@ class JointSample:
 
 
 class Joints(Protocol):
-    """Joints that report what they do, many times a second.
+    """Source of joint states at a high rate.
 
     Attributes:
-        name: What and where they are, for people: `UR10e at 192.168.0.10`.
-        rate_hz: How often they report it.
+        name: Name in messages: `UR10e at 192.168.0.10`.
+        rate_hz: Rate of the samples.
     """
 
     name: str
@@ -87,52 +87,52 @@ class Joints(Protocol):
 
 
 class Arm(Protocol):
-    """An arm that reports where it is.
+    """An arm that reports its state.
 
-    Every call returns within a second, or raises DriverError: link lost, stopped, refused.
+    Every call returns within a second, or raises DriverError: connection lost, stopped, refused.
     """
 
     @property
     def name(self) -> str:
-        """What and where it is, for people: `UR10e at 192.168.0.10`."""
+        """Name in messages: `UR10e at 192.168.0.10`."""
 
     def state(self) -> ArmState:
         """Returns a state that the controller sent after the call before it."""
 
     def close(self) -> None:
-        """Lets go of it, after a halt where it was moving; may be called twice."""
+        """Disconnects, after a halt where it was moving; may be called twice."""
 
 
 @runtime_checkable
 class MovingArm(Arm, Protocol):
-    """An arm that can be sent somewhere."""
+    """An arm that can be driven."""
 
     def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
-        """Starts towards a posture, every joint straight to its goal, and returns at once.
+        """Starts a motion straight in joint space to a posture, and returns at once.
 
         Args:
             q: (n,) the posture [rad].
-            speed: Of the joint that turns farthest [rad/s].
-            acceleration: Likewise [rad/s^2].
+            speed: Speed of the joint that travels farthest [rad/s].
+            acceleration: Its acceleration [rad/s^2].
 
         Raises:
-            DriverError: The controller refuses, with what it needs.
+            DriverError: The controller refuses, with the remedy.
         """
 
     def moving(self) -> bool:
-        """Tells whether the last motion is still going on."""
+        """Whether the last motion is still in progress."""
 
     def halt(self) -> None:
-        """Brakes at once; harmless where nothing moves or the link is gone."""
+        """Brakes at once; harmless where nothing moves or the connection is lost."""
 
 
 @runtime_checkable
 class CameraDevice(Protocol):
-    """A camera that gives picture after picture."""
+    """A camera."""
 
     @property
     def name(self) -> str:
-        """What it is, for people and for `[camera] name`."""
+        """Name in messages and in `[camera] name`."""
 
     @property
     def resolution(self) -> tuple[int, int]:
@@ -140,33 +140,33 @@ class CameraDevice(Protocol):
 
     @property
     def factory(self) -> Camera | None:
-        """The intrinsics that the device itself reports, at this resolution."""
+        """Intrinsics that the device itself reports, at this resolution."""
 
     @property
     def settings(self) -> Mapping[str, str | float]:
-        """What it is set to, as `exposure_us` or `focus`, to be recorded."""
+        """Its settings, such as `exposure_us` or `focus`, to be recorded."""
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call.
 
         Raises:
-            DriverError: None came in time: unplugged, or at its end.
+            DriverError: None came in time; it may be unplugged, or at its end.
         """
 
     def close(self) -> None:
-        """Lets go of it; may be called twice."""
+        """Releases it; may be called twice."""
 
 
 @dataclass(frozen=True)
 class DeviceSetup:
-    """What a user may ask of a camera; what is None is the driver's choice, then held.
+    """Requested settings of a camera; None leaves the choice to the driver, which then holds it.
 
     Attributes:
         resolution: (width, height) [px].
         exposure_us: Exposure time [us].
-        gain: ISO or the device's own unit.
+        gain: ISO, or in the device's own unit.
         focus: Lens position in the device's own unit.
-        more: The driver's own options.
+        more: Options of the particular driver.
     """
 
     resolution: tuple[int, int] | None = None

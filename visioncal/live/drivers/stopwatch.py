@@ -1,21 +1,18 @@
-"""Time by which others are called silent: a stall of this computer does not count."""
+"""Stopwatch for timeouts that ignores stalls of this computer."""
 
 import time
 from collections.abc import Callable
 
-# Who waits reads the watch at least so often; what a reading takes beyond it, this computer slept
-# or was busy elsewhere, and heard nobody [s].
+# Most time that counts between two readings [s]: waiting callers read more often, and anything
+# longer is a stall of this computer.
 _LONGEST_S = 0.2
 
 
 class Stopwatch:
-    """The time since its start in which this program ran.
+    """Time since its start during which this program ran.
 
-    It is read again and again while something is waited for. A virtual machine that pauses, or a
-    computer that swaps, sees all its partners late at once: none of them was silent.
-
-    Args:
-        now: The clock [s].
+    It is read repeatedly while waiting for a device. When a virtual machine pauses or a computer
+    swaps, all devices seem late at once, though none was silent.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -27,7 +24,7 @@ class Stopwatch:
         self._read_s, self._sum_s = self._now(), 0.0
 
     def read(self) -> float:
-        """The time since its start, what stalls took left out [s]."""
+        """Time since its start without stalls [s]."""
         now = self._now()
         self._sum_s += min(now - self._read_s, _LONGEST_S)
         self._read_s = now

@@ -29,22 +29,22 @@ from visioncal.live.drivers.ur_watch import StateStream
 
 _EXTRA = "ur"
 _RATE_HZ = 125.0
-# A call takes three or four states, 30 ms; this is what a caller is promised.
+# Timeout of a call [s]; it takes three or four states, 30 ms.
 _CALL_S = 0.9
 _CLOSE_S = 0.9
-# How long a controller that sends no more states is waited for, for a last order [s].
-_LAST_WORD_S = 0.3
+# Timeout of a last stop command to a controller that sends no more states [s].
+_LAST_STOP_S = 0.3
 # The controller ends its program, and stops the arm, where this computer is silent for 1 s.
 _LEAST_HZ, _KICK_S = 1.0, 0.1
-# Until an asynchronous motion has begun, it is not over [s].
+# Timeout of the start of an asynchronous motion [s].
 _BEGIN_S = 0.5
-# Braking of `halt`: a joint at 1 rad/s stands after a quarter of a second.
+# Deceleration of `halt`: a joint at 1 rad/s stops within a quarter of a second.
 _BRAKE_RAD_S2 = 4.0
 _STILL_RAD_S = 1e-3
-# What the client lets pass.
-_MOST_RAD_S, _MOST_RAD_S2 = 3.14, 40.0
+# The client library's limits [rad/s, rad/s^2].
+_SPEED_LIMIT, _ACCELERATION_LIMIT = 3.14, 40.0
 
-# States a second of the e-Series and of the CB3, by PolyScope's major version.
+# State rates of CB3 and e-Series, by PolyScope's major version.
 _RATES_HZ = {3: 125.0, 5: 500.0}
 
 
@@ -53,12 +53,12 @@ class UrArm:
 
     Args:
         host: The controller's address.
-        watch_only: Whether it is only watched, as while it is led by hand: then it needs no remote
-            control, and cannot be moved from here. The tool offset is read once.
+        watch_only: Whether only states are read, as while it is guided by hand: it then needs no
+            remote control, and cannot be moved from here. The tool offset is read once.
 
     Raises:
         DriverError: The client library is missing; the host is unreachable or no UR; the arm is
-            off, stopped or in local control; each with what to do.
+            off, stopped or in local control; each with a remedy.
     """
 
     def __init__(self, host: str, *, watch_only: bool = False) -> None:
@@ -71,7 +71,7 @@ class UrArm:
         self._control: Any = None
         self._line: Line | None = None
         self._moves_before: int | None = None
-        self._begun = Stopwatch()
+        self._motion_timer = Stopwatch()
         self._closed = False
         if control is None:
             self._flange_from_tool = _matrix(read_tool_offset(self._host))
@@ -84,18 +84,18 @@ class UrArm:
 
     @property
     def name(self) -> str:
-        """The arm's model and address."""
+        """Model and address of the arm."""
         return self._name
 
     @property
     def model(self) -> str:
-        """The model by the name that visioncal has for it, as `ur10e`."""
+        """Visioncal's name of the model, such as `ur10e`."""
         return self._model
 
     def state(self) -> ArmState:
         """Waits for the next state that the controller sends.
 
-        A stop by the safety system is reported in it, and is no error.
+        A stop by the safety system is part of the state, not an error.
 
         Raises:
             DriverError: None comes for 0.8 s.
@@ -106,9 +106,9 @@ class UrArm:
             stamp = self._states.wait()
             pose, q, dq = client.getActualTCPPose(), client.getActualQ(), client.getActualQd()
             currents, temperatures = client.getActualCurrent(), client.getJointTemperatures()
-            load = self._load()
+            payload = self._payload()
             safety = self._states.safety
-            # Another state that came in between would mix with this one.
+            # Otherwise values of a newer state are among them.
             if client.getTimestamp() == stamp:
                 break
         return ArmState(
@@ -117,42 +117,43 @@ class UrArm:
             q=np.array(q),
             dq=np.array(dq),
             flange_from_tool=self._flange_from_tool,
-            payload_kg=load[0],
-            payload_m=load[1],
+            payload_kg=payload[0],
+            payload_m=payload[1],
             currents_a=np.array(currents),
             temperatures_c=np.array(temperatures),
             safety=safety,
         )
 
     def start_move(self, q: FloatArray, *, speed: float, acceleration: float) -> None:
-        """Starts towards a posture and returns; see `MovingArm`.
+        """Starts a motion to a posture and returns; see `MovingArm`.
 
         Raises:
-            DriverError: It is only watched, lost or stopped, or the controller refuses.
+            DriverError: It was opened to be watched only, is lost or stopped, or the controller
+                refuses.
         """
         goal = np.asarray(q, dtype=float)
         _check_goal(goal, speed, acceleration)
-        line = self._moving_line()
+        line = self._control_line()
         self._states.check()
         self._check_safety()
         if not self._control.isProgramRunning():
-            self._start_program_again(line)
+            self._restart_program(line)
         before = self._control.getAsyncOperationProgressEx().changeCount()
-        taken = line.call(
+        accepted = line.call(
             lambda: self._control.moveJ(goal.tolist(), speed, acceleration, True),
             limit_s=_CALL_S,
             what="take a motion",
         )
-        if not taken:
-            raise self._explain("refused a motion")
+        if not accepted:
+            raise self._explained_error("refused a motion")
         self._moves_before = before
-        self._begun.restart()
+        self._motion_timer.restart()
 
     def moving(self) -> bool:
-        """Tells whether the last motion is still going on.
+        """Whether the last motion is still in progress.
 
         Raises:
-            DriverError: It was cut short: the controller is lost, a safety stop, or its program
+            DriverError: It was interrupted: the controller is lost, a safety stop, or its program
                 ended.
         """
         self._check_open()
@@ -162,7 +163,7 @@ class UrArm:
         self._check_safety()
         if not self._control.isProgramRunning():
             self._moves_before = None
-            raise self._explain(
+            raise self._explained_error(
                 "ended its program during a motion, as it does where this computer is silent for "
                 f"{1.0 / _LEAST_HZ:.0f} s"
             )
@@ -170,96 +171,98 @@ class UrArm:
         if progress.isAsyncOperationRunning():
             return True
         if progress.changeCount() == self._moves_before:
-            if self._begun.read() < _BEGIN_S:
+            if self._motion_timer.read() < _BEGIN_S:
                 return True
-            raise self._explain(f"did not begin a motion within {_BEGIN_S} s")
+            raise self._explained_error(f"did not begin a motion within {_BEGIN_S} s")
         self._moves_before = None
         return False
 
     def halt(self) -> None:
-        """Brakes at once; harmless where nothing moves or the link is gone."""
+        """Brakes at once; harmless where nothing moves or the connection is lost."""
         if self._line is None or self._closed:
             return
         self._moves_before = None
         if self._states.alive:
             with suppress(DriverError):
-                # The call returns as the arm begins to brake.
+                # The call returns when the arm starts to brake.
                 self._line.call(
                     lambda: self._control.stopJ(_BRAKE_RAD_S2, True), limit_s=_CALL_S, what="stop"
                 )
                 return
-        # What no longer comes may still be heard.
-        with suppress(DriverError), Dashboard(self._host, _LAST_WORD_S) as dashboard:
+        # A controller whose states no longer arrive may still receive commands.
+        with suppress(DriverError), Dashboard(self._host, _LAST_STOP_S) as dashboard:
             dashboard.ask("stop")
 
     def close(self) -> None:
-        """Lets go of it, after a halt where it was moving; may be called twice."""
+        """Disconnects, after a halt where it was moving; may be called twice."""
         if self._closed:
             return
         if self._moves_before is not None:
             self.halt()
         self._closed = True
         keep(self._states.client)
-        # Each disconnection sleeps for half a second, so they do it together; a client whose
-        # controller is gone may not return at all.
-        states = threading.Thread(target=self._states.client.disconnect, daemon=True)
-        states.start()
+        # Each disconnection sleeps for half a second, so they run in parallel; one whose controller
+        # is gone may not return at all.
+        disconnecting_states = threading.Thread(target=self._states.client.disconnect, daemon=True)
+        disconnecting_states.start()
         ends_s = time.monotonic() + _CLOSE_S
         if self._line is not None:
             keep(self._control)
             with suppress(DriverError):
-                self._line.call(self._let_go, limit_s=_CLOSE_S, what="close")
+                self._line.call(self._disconnect_control, limit_s=_CLOSE_S, what="close")
             self._line.end()
-        states.join(max(0.0, ends_s - time.monotonic()))
+        disconnecting_states.join(max(0.0, ends_s - time.monotonic()))
 
     def _take_control(self, library: Any) -> None:  # noqa: ANN401
-        """Sends the control script, and asks for the tool offset."""
+        """Sends the control script, and reads the tool offset."""
         try:
             self._control = library.RTDEControlInterface(self._host, _RATE_HZ)
         except RuntimeError as error:
-            raise self._explain(f"does not take the control script: {error}") from error
-        self._line = Line(self._name, self._kick, _KICK_S)
+            raise self._explained_error(f"does not take the control script: {error}") from error
+        self._line = Line(self._name, self._kick_watchdog, _KICK_S)
         offset = self._line.call(
             self._control.getTCPOffset, limit_s=_CALL_S, what="report its tool offset"
         )
         self._flange_from_tool = _matrix(offset)
-        self._watch_me(self._line)
+        self._enable_watchdog(self._line)
 
-    def _watch_me(self, line: Line) -> None:
-        """Lets the controller stop the arm where this computer falls silent."""
+    def _enable_watchdog(self, line: Line) -> None:
+        """Makes the controller stop the arm if this computer falls silent."""
         line.call(
-            lambda: self._control.setWatchdog(_LEAST_HZ), limit_s=_CALL_S, what="set its watchdog"
+            lambda: self._control.setWatchdog(_LEAST_HZ),
+            limit_s=_CALL_S,
+            what="set its watchdog",
         )
 
-    def _kick(self) -> None:
-        """Tells the controller's watchdog that this computer is there."""
+    def _kick_watchdog(self) -> None:
+        """Resets the controller's watchdog."""
         with suppress(RuntimeError):
             if self._states.alive and self._control.isProgramRunning():
                 self._control.kickWatchdog()
 
-    def _start_program_again(self, line: Line) -> None:
-        """Sends the control script again: at the pendant, or in a pause, it was ended."""
+    def _restart_program(self, line: Line) -> None:
+        """Sends the control script again after it was ended at the pendant, or in a pause."""
         read_condition(self._host).check_moves()
         line.call(self._control.reuploadScript, limit_s=_CALL_S, what="take the control script")
-        begun = Stopwatch()
+        timer = Stopwatch()
         while not self._control.isProgramRunning():
-            if begun.read() > _CALL_S:
-                raise self._explain("does not run the control script")
+            if timer.read() > _CALL_S:
+                raise self._explained_error("does not run the control script")
             time.sleep(0.01)
-        self._watch_me(line)
+        self._enable_watchdog(line)
 
-    def _let_go(self) -> None:
+    def _disconnect_control(self) -> None:
         if self._states.alive and self._control.isProgramRunning():
             self._control.stopScript()
         self._control.disconnect()
 
-    def _load(self) -> tuple[float | None, FloatArray | None]:
-        if not self._states.reports_load:
+    def _payload(self) -> tuple[float | None, FloatArray | None]:
+        if not self._states.reports_payload:
             return None, None
         client = self._states.client
         return float(client.getPayload()), np.array(client.getPayloadCog())
 
-    def _moving_line(self) -> Line:
+    def _control_line(self) -> Line:
         self._check_open()
         if self._line is None:
             raise DriverError(
@@ -277,10 +280,10 @@ class UrArm:
         safety = self._states.safety
         if safety not in ("normal", "reduced"):
             self._moves_before = None
-            raise self._explain(f"is stopped: {safety}")
+            raise self._explained_error(f"is stopped: {safety}")
 
-    def _explain(self, what: str) -> DriverError:
-        """The error that the dashboard's words explain, else one that says what was seen."""
+    def _explained_error(self, what: str) -> DriverError:
+        """The dashboard's explanation as an error, else an error that states what was observed."""
         try:
             read_condition(self._host).check_moves()
         except DriverError as error:
@@ -294,7 +297,7 @@ class UrArm:
 
 
 def check_controller(host: str, *, moves: bool) -> Condition:
-    """Asks everything by plain connections first: the library's constructors wait without end.
+    """Checks a controller by plain connections, as the library's constructors have no timeout.
 
     Raises:
         DriverError: It cannot be reached, is no UR, reports nothing, or could not be moved.
@@ -310,10 +313,10 @@ def check_controller(host: str, *, moves: bool) -> Condition:
 
 
 def keep(client: Any) -> None:  # noqa: ANN401
-    """Keeps a client from being destroyed, ever.
+    """Prevents a client's destruction for good.
 
-    Its destructor disconnects once more, sleeping for half a second with Python's lock held: the
-    whole program would stand still at a moment that the garbage collector chooses.
+    Its destructor disconnects once more, sleeping for half a second with the interpreter lock held:
+    the whole program would freeze whenever the garbage collector runs it.
     """
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
 
@@ -321,25 +324,22 @@ def keep(client: Any) -> None:  # noqa: ANN401
 def _check_goal(q: FloatArray, speed: float, acceleration: float) -> None:
     if q.shape != (6,) or not np.isfinite(q).all():
         raise DriverError(f"A UR has six joints; a motion to {q.tolist()} cannot be asked for.")
-    if not (0.0 < speed <= _MOST_RAD_S and 0.0 < acceleration <= _MOST_RAD_S2):
+    if not (0.0 < speed <= _SPEED_LIMIT and 0.0 < acceleration <= _ACCELERATION_LIMIT):
         raise DriverError(
             f"A motion at {speed:g} rad/s and {acceleration:g} rad/s^2 cannot be asked for; more "
-            f"than 0 and at most {_MOST_RAD_S} and {_MOST_RAD_S2} are needed."
+            f"than 0 and at most {_SPEED_LIMIT} and {_ACCELERATION_LIMIT} are needed."
         )
 
 
 def _matrix(pose: list[float]) -> FloatArray:
-    """(4, 4) of x, y, z [m] and a rotation vector."""
+    """Pose (4, 4) from x, y, z [m] and a rotation vector [rad]."""
     numbers = np.array(pose)
     form = ROTATION_FORMS[POSE_FORMS["ur"].rotation]
     return compose(form.read(numbers[None, 3:])[0], numbers[:3])
 
 
 class UrMotion:
-    """The joints of a UR, which is only watched: who moves it is not asked.
-
-    Args:
-        host: The controller's address.
+    """Joint states of the UR at a host, which another program moves.
 
     Raises:
         DriverError: The client library is missing, or the host is unreachable or no UR.
@@ -364,7 +364,7 @@ class UrMotion:
         while True:
             stamp_s = self._states.wait()
             q, dq, currents = client.getActualQ(), client.getActualQd(), client.getActualCurrent()
-            # Another state that came in between would mix with this one.
+            # Otherwise values of a newer state are among them.
             if client.getTimestamp() == stamp_s:
                 break
         if self._states.safety not in ("normal", "reduced"):
@@ -376,9 +376,9 @@ class UrMotion:
         return JointSample(stamp_s, np.array(q), np.array(dq), np.array(currents))
 
     def close(self) -> None:
-        """Lets go of it."""
+        """Disconnects."""
         keep(self._states.client)
         # A client whose controller is gone may not return at all.
-        going = threading.Thread(target=self._states.client.disconnect, daemon=True)
-        going.start()
-        going.join(_CLOSE_S)
+        disconnecting = threading.Thread(target=self._states.client.disconnect, daemon=True)
+        disconnecting.start()
+        disconnecting.join(_CLOSE_S)

@@ -1,7 +1,7 @@
-"""Calls into the client library in a thread of their own, with a limit of time.
+"""Calls into the client library in a thread of their own, with a timeout.
 
-The library's control interface serves one call at a time and, where the controller falls silent,
-may not return for minutes. One thread owns it; who calls waits no longer than the limit.
+The library's control interface serves one call at a time and, if the controller falls silent, may
+not return for minutes. One thread owns it; callers wait no longer than their timeout.
 """
 
 import queue
@@ -14,20 +14,14 @@ from visioncal.core.errors import DriverError
 from visioncal.live.drivers.stopwatch import Stopwatch
 
 T = TypeVar("T")
-# What the library throws, standard C++ exceptions, arrives as these.
+# Python exceptions for the C++ ones that the library throws.
 _THROWN = (RuntimeError, ValueError)
-# How often who waits looks at the time [s].
+# Polling interval of waiting callers [s].
 _GLANCE_S = 0.05
 
 
 class Line:
-    """A thread that works off calls in order, and does something small while there are none.
-
-    Args:
-        name: Who is at the other end, for messages.
-        idle: What is done while no call waits.
-        every_s: How often that is [s].
-    """
+    """Worker thread that runs calls in order, and a periodic task [s] while there are none."""
 
     def __init__(self, name: str, idle: Callable[[], None], every_s: float) -> None:
         self._name = name
@@ -37,12 +31,7 @@ class Line:
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def call(self, work: Callable[[], T], *, limit_s: float, what: str) -> T:
-        """Runs a call in the thread.
-
-        Args:
-            work: The call.
-            limit_s: How long to wait for it [s].
-            what: What it does, for messages.
+        """Runs a call in the thread, with a timeout [s]; `what` it does is for messages.
 
         Raises:
             DriverError: It threw, or did not return in time.
@@ -72,7 +61,7 @@ class Line:
             ) from error
 
     def end(self) -> None:
-        """Lets the thread end behind the calls that wait."""
+        """Ends the thread after the queued calls."""
         self._jobs.put(None)
 
     def _work(self) -> None:

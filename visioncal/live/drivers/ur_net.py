@@ -1,9 +1,9 @@
-"""Plain connections to a UR controller, with a limit of time on everything.
+"""Plain connections to a UR controller, all with timeouts.
 
-The client library waits for a silent controller with no limit, and holds Python's lock while it
-does. So whatever it is going to talk to is asked first, from here: the dashboard, and the primary
-interface, whose message is its size, its type and its content; a robot state message (16) holds
-packages of the same form; numbers are big-endian (Universal Robots, "Remote Control Via TCP/IP").
+The client library waits for a silent controller without a timeout, holding the interpreter lock.
+Its servers are therefore checked from here first: the dashboard, and the primary interface, whose
+message is its size, its type and its content; a robot state message (16) holds packages of the same
+form; numbers are big-endian (Universal Robots, "Remote Control Via TCP/IP").
 """
 
 import queue
@@ -22,36 +22,36 @@ _CONNECT_S = 0.8
 _ANSWER_S = 1.0
 _BANNER = "Universal Robots Dashboard Server"
 _HEADER = struct.Struct(">HB")
-# Types of RTDE's frames: request of a version, what is sent, start, a state.
+# Types of RTDE's frames: request of a version, output recipe, start, state.
 _PROTOCOL, _OUTPUTS, _START, _DATA = b"VOSU"
-# The first only reads, and is open where the second is not.
+# Primary interface: the read-only port is open where the other may not be.
 _PORTS = (30011, 30001)
 _WAIT_S = 1.0
 _PRIMARY_HEADER = struct.Struct(">IB")
 _ROBOT_STATE, _CARTESIAN = 16, 4
 _TOOL = struct.Struct(">6d6d")
-# No message of a controller comes near it.
-_MOST_BYTES = 1 << 20
+# Upper bound of a message's size.
+_MAX_BYTES = 1 << 20
 
 
 def resolve(host: str) -> str:
-    """Finds a host's address, as `192.168.0.10`.
+    """Resolves a host's name to its address, such as `192.168.0.10`.
 
     Raises:
-        DriverError: The name is not known, or no server of names answers in time.
+        DriverError: The name is not known, or no name server answers in time.
     """
-    found: queue.SimpleQueue[str | OSError] = queue.SimpleQueue()
+    result: queue.SimpleQueue[str | OSError] = queue.SimpleQueue()
 
     def ask() -> None:
         try:
-            found.put(socket.gethostbyname(host))
+            result.put(socket.gethostbyname(host))
         except OSError as error:
-            found.put(error)
+            result.put(error)
 
-    # The system asks servers of names for many seconds, and takes no limit.
+    # The system's resolver takes many seconds, and has no timeout.
     threading.Thread(target=ask, daemon=True).start()
     try:
-        address = found.get(timeout=_ANSWER_S)
+        address = result.get(timeout=_ANSWER_S)
     except queue.Empty:
         address = TimeoutError(f"no answer within {_ANSWER_S} s")
     if isinstance(address, str):
@@ -64,12 +64,7 @@ def resolve(host: str) -> str:
 
 
 def connect(host: str, port: int, what: str) -> socket.socket:
-    """Opens a connection.
-
-    Args:
-        host: The controller's address.
-        port: Its port.
-        what: What listens there, for messages.
+    """Opens a connection to a port of a controller; `what` listens there is for messages.
 
     Raises:
         DriverError: The host cannot be reached, or does not listen there.
@@ -97,12 +92,7 @@ def connect(host: str, port: int, what: str) -> socket.socket:
 
 
 class Dashboard:
-    """The controller's server of questions and orders in plain words, one line each.
-
-    Args:
-        host: The controller's address.
-        answer_s: How long to wait for an answer [s].
-    """
+    """Client of a controller's dashboard server, which takes commands as lines of text."""
 
     def __init__(self, host: str, answer_s: float = _ANSWER_S) -> None:
         self._label = f"{host}:{DASHBOARD_PORT}"
@@ -119,12 +109,12 @@ class Dashboard:
         """Sends a line and returns the answer.
 
         Raises:
-            DriverError: None comes.
+            DriverError: There is none.
         """
         try:
             self._socket.sendall(line.encode("ascii") + b"\n")
         except OSError as error:
-            raise self._silent(error) from error
+            raise self._no_answer_error(error) from error
         return self._line()
 
     def close(self) -> None:
@@ -151,12 +141,12 @@ class Dashboard:
         try:
             line = self._file.readline(1000)
         except OSError as error:
-            raise self._silent(error) from error
+            raise self._no_answer_error(error) from error
         if not line:
-            raise self._silent("it closed the connection")
+            raise self._no_answer_error("it closed the connection")
         return line.decode("utf-8", "replace").strip()
 
-    def _silent(self, why: object) -> DriverError:
+    def _no_answer_error(self, why: object) -> DriverError:
         return DriverError(
             f"The dashboard of the controller at {self._label} does not answer: {why}.",
             culprits=[self._label],
@@ -165,7 +155,7 @@ class Dashboard:
 
 
 def check_states_come(host: str) -> None:
-    """Checks that the controller sends states, by taking one.
+    """Checks that the controller sends states, by receiving one.
 
     Raises:
         DriverError: It is no RTDE server, or sends nothing.
@@ -199,13 +189,13 @@ def _frame(kind: int, payload: bytes = b"") -> bytes:
 
 
 def _read(file: BinaryIO) -> tuple[int, bytes]:
-    """Reads a frame: its type and payload; an end of the stream is a `struct.error`."""
+    """Reads a frame's type and payload; raises `struct.error` at the end of the stream."""
     size, kind = _HEADER.unpack(file.read(_HEADER.size))
     return kind, file.read(size - _HEADER.size)
 
 
 def read_tool_offset(host: str) -> list[float]:
-    """Reads the tool offset that is set: x, y, z [m] and a rotation vector [rad].
+    """Reads the active tool offset: x, y, z [m] and a rotation vector [rad].
 
     Raises:
         DriverError: The controller cannot be reached, or does not report it.
@@ -215,8 +205,8 @@ def read_tool_offset(host: str) -> list[float]:
 
 
 def _package(host: str, kind: int, size: int, what: str) -> bytes:
-    for found, content in _packages(host):
-        if found == kind and len(content) >= size:
+    for package_kind, content in _packages(host):
+        if package_kind == kind and len(content) >= size:
             return content
     raise DriverError(
         f"The controller at {host} does not report {what} on its primary interface.",
@@ -227,7 +217,7 @@ def _package(host: str, kind: int, size: int, what: str) -> bytes:
 
 
 def _packages(host: str) -> Iterator[tuple[int, bytes]]:
-    """The packages of all robot states that come within the time."""
+    """Packages of all robot states that arrive within the timeout."""
     ends_s = time.monotonic() + _WAIT_S
     try:
         link = connect(host, _PORTS[0], "the primary interface")
@@ -237,20 +227,20 @@ def _packages(host: str) -> Iterator[tuple[int, bytes]]:
         try:
             while time.monotonic() < ends_s:
                 size, kind = _PRIMARY_HEADER.unpack(file.read(_PRIMARY_HEADER.size))
-                if not _PRIMARY_HEADER.size <= size <= _MOST_BYTES:
+                if not _PRIMARY_HEADER.size <= size <= _MAX_BYTES:
                     return
                 message = file.read(size - _PRIMARY_HEADER.size)
                 if kind == _ROBOT_STATE:
-                    yield from _split(message)
+                    yield from _split_packages(message)
         except (OSError, struct.error):
             return
 
 
-def _split(message: bytes) -> Iterator[tuple[int, bytes]]:
-    at = 0
-    while at + _PRIMARY_HEADER.size <= len(message):
-        size, kind = _PRIMARY_HEADER.unpack_from(message, at)
+def _split_packages(message: bytes) -> Iterator[tuple[int, bytes]]:
+    offset = 0
+    while offset + _PRIMARY_HEADER.size <= len(message):
+        size, kind = _PRIMARY_HEADER.unpack_from(message, offset)
         if size < _PRIMARY_HEADER.size:
             return
-        yield kind, message[at + _PRIMARY_HEADER.size : at + size]
-        at += size
+        yield kind, message[offset + _PRIMARY_HEADER.size : offset + size]
+        offset += size

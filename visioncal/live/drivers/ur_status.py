@@ -1,4 +1,4 @@
-"""What a UR controller says of its condition, and what to press where it does not suit."""
+"""Condition of a UR controller, and the remedy where it is not usable."""
 
 import re
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ from visioncal.live.drivers.protocols import Safety
 from visioncal.live.drivers.ur_net import Dashboard
 
 _VERSION = re.compile(r"(\d+)\.(\d+)\.(\d+)\.\d+")
-# What ur-rtde's control script needs: registers of floating-point numbers for programs.
+# Oldest versions with the floating-point registers that ur-rtde's control script needs.
 _LEAST = {3: (3, 4), 5: (5, 4)}
-# From here on, the controller reports whether it is in remote control.
-_SAYS_REMOTE = (5, 6)
+# First version that reports whether it is in remote control.
+_REPORTS_REMOTE = (5, 6)
 _RUNNING = "RUNNING"
-# The dashboard reports the size alone of arms that there are, or could be, in two series.
-_BOTH_SERIES = ("UR3", "UR5", "UR10", "UR16")
-# In which modes joints report where they are.
-_AWAKE = (_RUNNING, "IDLE", "BACKDRIVE")
+# Models that exist in two series, of which the dashboard reports only the size.
+_MODELS_OF_TWO_SERIES = ("UR3", "UR5", "UR10", "UR16")
+# Modes in which joints report their positions.
+_REPORTING_MODES = (_RUNNING, "IDLE", "BACKDRIVE")
 _MODE_STEPS = {
     "POWER_OFF": "Switch it on at the pendant: the circle at the lower left, then On and Start.",
     "IDLE": "Release its brakes at the pendant: the circle at the lower left, then Start.",
@@ -53,11 +53,10 @@ class Condition:
     """The dashboard's answers.
 
     Attributes:
-        host: The controller's address.
         version: PolyScope's version: major, minor, bug fix.
-        model: The arm's name, as `UR10e`.
-        mode: The robot's mode, as `RUNNING`.
-        safety: The state of the safety system, as `NORMAL`.
+        model: The arm's name, such as `UR10e`.
+        mode: The robot's mode, such as `RUNNING`.
+        safety: The state of the safety system, such as `NORMAL`.
         remote: Whether it is in remote control; True where it does not report it.
     """
 
@@ -72,7 +71,7 @@ class Condition:
         """Checks that it can be moved from outside.
 
         Raises:
-            DriverError: It cannot, with what to press.
+            DriverError: It cannot, with the remedy.
         """
         if self.safety not in ("NORMAL", "REDUCED"):
             raise self._refuse(
@@ -90,12 +89,12 @@ class Condition:
             )
 
     def check_reports(self) -> None:
-        """Checks that it reports where its joints are.
+        """Checks that it reports its joint positions.
 
         Raises:
-            DriverError: It does not, with what to press.
+            DriverError: It does not, with the remedy.
         """
-        if self.mode not in _AWAKE:
+        if self.mode not in _REPORTING_MODES:
             raise self._refuse(
                 f"does not know where its joints are: its mode is {self.mode}", self._mode_step
             )
@@ -111,19 +110,21 @@ class Condition:
 
 
 def read_condition(host: str) -> Condition:
-    """Asks the dashboard.
+    """Reads the condition from the dashboard.
 
     Raises:
-        DriverError: It cannot be reached, is no UR's, or is too old.
+        DriverError: It cannot be reached, is not a UR's, or is too old.
     """
     with Dashboard(host) as dashboard:
         version = _read_version(host, dashboard.ask("PolyscopeVersion"))
         model = dashboard.ask("get robot model")
         mode = dashboard.ask("robotmode").rpartition(":")[2].strip()
-        word = "safetystatus" if version >= (5, 4, 0) else "safetymode"
-        safety = dashboard.ask(word).rpartition(":")[2].strip()
-        remote = version < _SAYS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
-    series = "e" if version[0] == 5 and model in _BOTH_SERIES else ""
+        query = "safetystatus" if version >= (5, 4, 0) else "safetymode"
+        safety = dashboard.ask(query).rpartition(":")[2].strip()
+        remote = (
+            version < _REPORTS_REMOTE or "true" in dashboard.ask("is in remote control").lower()
+        )
+    series = "e" if version[0] == 5 and model in _MODELS_OF_TWO_SERIES else ""
     return Condition(host, version, f"{model}{series}", mode, safety, remote)
 
 
@@ -136,8 +137,8 @@ def safety_of(bits: int) -> Safety:
 
 
 def _read_version(host: str, text: str) -> tuple[int, int, int]:
-    found = _VERSION.search(text)
-    version = tuple(map(int, found.groups())) if found else ()
+    match = _VERSION.search(text)
+    version = tuple(map(int, match.groups())) if match else ()
     if len(version) != 3:
         raise DriverError(
             f"The controller at {host} answers {text[:60]!r} when asked for its version; four "

@@ -1,4 +1,4 @@
-"""The stream of a UR's states: what the arm reports, and since when it has been silent."""
+"""Stream of a UR's states, with detection of silence."""
 
 import time
 from collections import deque
@@ -10,8 +10,8 @@ from visioncal.live.drivers.protocols import Safety
 from visioncal.live.drivers.stopwatch import Stopwatch
 from visioncal.live.drivers.ur_status import safety_of
 
-# Names that the client's own table of variables has; one that it lacks would shift all that
-# follow, without a word.
+# Only names in the client's own table of variables: an unknown one would silently shift all that
+# follow.
 _VARIABLES = (
     "timestamp",
     "actual_q",
@@ -24,27 +24,27 @@ _VARIABLES = (
     "robot_status_bits",
     "safety_status_bits",
 )
-# What newer controllers report, and from which version on, by major version.
-_LOAD = ("payload", "payload_cog")
-_REPORTS_LOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
-# The arm's motion is slow beside it, the computer's load is small.
+# Variables of newer controllers, and the first version, by major version.
+_PAYLOAD = ("payload", "payload_cog")
+_REPORTS_PAYLOAD = {3: (3, 11, 0), 5: (5, 5, 1)}
+# Fast compared with the arm's motion, at a small load of the computer.
 _RATE_HZ = 125.0
-# A controller sends every 8 ms; after this silence it is gone [s].
+# Silence after which a controller, which sends every 8 ms, counts as lost [s].
 _SILENCE_S = 0.8
 _POLL_S = 0.0005
-# For how long the shortest delay between controller and here is remembered [s]: clocks drift by
-# less than a millisecond in it.
+# Time over which the shortest delay from the controller is taken [s]: clocks drift by less than a
+# millisecond in it.
 _DELAYS_S = 10.0
 
 
 class StateStream:
-    """States in the order of their arrival.
+    """States of a controller in the order of arrival.
 
     Args:
         library: The module `rtde_receive`.
         host: The controller's address.
         version: PolyScope's version.
-        rate_hz: How many states a second are asked for.
+        rate_hz: Requested states per second.
     """
 
     def __init__(
@@ -55,8 +55,8 @@ class StateStream:
         rate_hz: float = _RATE_HZ,
     ) -> None:
         self._host = host
-        self.reports_load = version >= _REPORTS_LOAD[version[0]]
-        names = [*_VARIABLES, *(_LOAD if self.reports_load else ())]
+        self.reports_payload = version >= _REPORTS_PAYLOAD[version[0]]
+        names = [*_VARIABLES, *(_PAYLOAD if self.reports_payload else ())]
         try:
             self.client: Any = library.RTDEReceiveInterface(host, rate_hz, names)
         except RuntimeError as error:
@@ -69,7 +69,7 @@ class StateStream:
 
     @property
     def alive(self) -> bool:
-        """Whether states come in."""
+        """Whether states arrive."""
         stamp = self.client.getTimestamp()
         if stamp != self._newest:
             self._newest = stamp
@@ -77,7 +77,7 @@ class StateStream:
         return bool(self.client.isConnected()) and self._silence.read() < _SILENCE_S
 
     def check(self) -> None:
-        """Checks that states come in.
+        """Checks that states arrive.
 
         Raises:
             DriverError: None came for 0.8 s, or the connection is closed.
@@ -100,10 +100,10 @@ class StateStream:
         """Waits for a state that is sent after the call.
 
         Returns:
-            The controller's stamp of it [s].
+            The controller's timestamp [s].
 
         Raises:
-            DriverError: None comes.
+            DriverError: None arrives.
         """
         before = self.client.getTimestamp()
         while (stamp := float(self.client.getTimestamp())) == before:
@@ -118,13 +118,13 @@ class StateStream:
         return stamp
 
     def host_time(self, stamp: float) -> float:
-        """Puts a stamp of the controller on the monotonic clock [s].
+        """Converts a controller timestamp to the monotonic clock, by the shortest recent delay [s].
 
-        A state may be noticed late, never early: the shortest delay of late is the best.
+        A state may be noticed late, but never early.
         """
         return stamp + min(delay for _, delay in self._delays)
 
     @property
     def safety(self) -> Safety:
-        """Whether the safety system lets it move."""
+        """State of the safety system."""
         return safety_of(int(self.client.getSafetyStatusBits()))

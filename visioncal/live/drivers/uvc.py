@@ -19,38 +19,38 @@ from visioncal.live.drivers.newest import Arrival, Newest
 from visioncal.live.drivers.protocols import DeviceSetup, Frame
 from visioncal.vision.finders.imaging import decode_image
 
-# Some cameras take their time for the first picture [s].
+# Timeout of the first picture [s].
 _OPENING_S = 5.0
-# How long a stream may take to open, and for a picture [ms].
+# Timeouts of opening a stream, and of a picture [ms].
 _OPEN_MS, _READ_MS = 5000, 1500
-# Streams whose pictures carry the camera's own times.
-_TIMED = ("rtsp", "rtsps", "rtmp", "srt")
-# V4L2's word for exposure that the user sets, and its unit [s].
+# Streams whose pictures carry the camera's own timestamps.
+_TIMESTAMPED = ("rtsp", "rtsps", "rtmp", "srt")
+# V4L2's value for manual exposure, and its unit [s].
 _MANUAL_EXPOSURE = 1.0
 _EXPOSURE_UNIT_S = 1e-4
-# What a driver says is a time of this host's clock where it lies so little in the past [s].
+# A driver's timestamp no older than this is taken as one of this host's clock [s].
 _RECENT_S = 10.0
-# The clocks of a camera and of this host may run apart by so much.
+# Greatest relative drift between the clocks of a camera and of this host.
 _DRIFT = 1e-4
 
 
 class UvcCamera:
-    """A camera device through OpenCV's VideoCapture, or a stream of JPEG files over HTTP.
+    """Camera device through OpenCV's VideoCapture, or a stream of JPEG files over HTTP.
 
-    What is asked for is set where the camera can; `settings` are what it then reports.
-    Autofocus, which would move the intrinsics, is switched off. Exposure that is not wished stays
-    as the camera has it, which is automatic for most. All that comes is read at once, so that no
-    old picture waits in a buffer; of a video file every picture counts.
+    Requested settings are set where the camera supports them; `settings` are what it then reports.
+    Autofocus, which would change the intrinsics, is switched off. Exposure stays as the camera has
+    it unless requested, which is automatic for most. All pictures are read at once, so that none
+    gets old in a buffer; of a video file every picture is returned.
 
     Args:
         source: The camera's index, the path of its device, a URL, or a video file.
-        requested: What is asked of it; of a URL, which resolution it is to have.
+        requested: Requested settings; of a URL, the resolution that it must have.
 
     Raises:
-        DriverError: It cannot be opened or gives no picture, or refuses what is wished.
+        DriverError: It cannot be opened, gives no picture, or refuses a requested setting.
     """
 
-    # Such a camera does not report its intrinsics.
+    # Such cameras do not report intrinsics.
     factory: Camera | None = None
 
     def __init__(self, source: int | str, requested: DeviceSetup | None = None) -> None:
@@ -59,17 +59,17 @@ class UvcCamera:
         self._exposure_s = 1e-6 * (requested.exposure_us or 0)
         settings: dict[str, str | float] = {}
         self._feed: Newest[bytes] | Newest[Image] | FilePictures
-        pictures = _multipart(source, requested)
+        pictures = _open_jpeg_stream(source, requested)
         if pictures is not None:
             self._feed = Newest(pictures, self.name)
         else:
-            capture = _opened(source, self.name)
-            settings = _set(capture, requested)
-            # A device has no number of pictures.
+            capture = _open_capture(source, self.name)
+            settings = _configure(capture, requested)
+            # Only a file has a number of pictures.
             if int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0:
                 self._feed = FilePictures(capture, self.name)
             else:
-                is_stream = _scheme(source) in _TIMED
+                is_stream = _scheme(source) in _TIMESTAMPED
                 grabbed = GrabbedPictures(capture, self.name, self._exposure_s, is_stream=is_stream)
                 self._feed = Newest(grabbed, self.name)
         self.settings = MappingProxyType(settings)
@@ -85,19 +85,19 @@ class UvcCamera:
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call, as far as can be known.
 
-        Where the driver knows no times that is the second picture to come after the call; what a
-        camera holds back for longer than one picture is not known. It is stamped when it came,
-        less half its exposure where that is known. Of a video file it is the next picture.
+        Without timestamps from the driver that is the second picture after the call; a delay of
+        more than one picture within the camera remains unknown. The stamp is the time of arrival,
+        minus half the exposure where it is known. Of a video file it is the next picture.
 
         Raises:
-            DriverError: None came, with for how long; or it has another resolution than before.
+            DriverError: None came in time, or it has another resolution than before.
         """
         frame = self._frame(*self._feed.after(time.monotonic(), timeout_s))
         self._check_resolution(frame, self.resolution, "now gives")
         return frame
 
     def close(self) -> None:
-        """Lets go of it; may be called twice."""
+        """Releases the camera; may be called twice."""
         self._feed.close()
 
     def _frame(self, arrival: Arrival, content: Image | bytes) -> Frame:
@@ -123,15 +123,15 @@ class UvcCamera:
 
 
 def _scheme(source: int | str) -> str:
-    """The scheme of a URL; empty for what is none, as a GStreamer pipeline with one in it."""
+    """Scheme of a URL; empty for anything else, such as a GStreamer pipeline that contains one."""
     if isinstance(source, int) or "!" in source.partition("://")[0]:
         return ""
-    scheme, found, _ = source.partition("://")
-    return scheme.lower() if found else ""
+    scheme, separator, _ = source.partition("://")
+    return scheme.lower() if separator else ""
 
 
-def _multipart(source: int | str, requested: DeviceSetup) -> MultipartPictures | None:
-    """The JPEG files of a URL that sends such; None for every other source."""
+def _open_jpeg_stream(source: int | str, requested: DeviceSetup) -> MultipartPictures | None:
+    """Opens a URL that sends JPEG files; None for any other source."""
     if not _scheme(source):
         return None
     url = str(source)
@@ -145,11 +145,11 @@ def _multipart(source: int | str, requested: DeviceSetup) -> MultipartPictures |
     return open_multipart(url) if _scheme(url) in ("http", "https") else None
 
 
-def _opened(source: int | str, name: str) -> cv2.VideoCapture:
+def _open_capture(source: int | str, name: str) -> cv2.VideoCapture:
     if isinstance(source, int) or not _scheme(source):
         capture = cv2.VideoCapture(source)
     else:
-        # Of itself it waits for half a minute, and decoding in n threads keeps n pictures back.
+        # The default timeout is half a minute, and decoding in n threads delays by n pictures.
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS]
         limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS, cv2.CAP_PROP_N_THREADS, 1]
         capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
@@ -166,8 +166,8 @@ def _opened(source: int | str, name: str) -> cv2.VideoCapture:
     return capture
 
 
-def _set(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, str | float]:
-    """Sets what is wished, stops the focus from moving by itself, and asks what came of it."""
+def _configure(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, str | float]:
+    """Sets what is requested, disables autofocus, and reads back the settings."""
     if requested.resolution is not None:
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, requested.resolution[0])
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, requested.resolution[1])
@@ -187,19 +187,19 @@ def _set(capture: cv2.VideoCapture, requested: DeviceSetup) -> dict[str, str | f
         "gain": capture.get(cv2.CAP_PROP_GAIN),
         "rate_hz": capture.get(cv2.CAP_PROP_FPS),
     }
-    # OpenCV says 0 or -1 of what the camera does not have.
+    # OpenCV returns 0 or -1 for settings that the camera does not have.
     return {name: value for name, value in values.items() if math.isfinite(value) and value > 0.0}
 
 
 class GrabbedPictures:
-    """A source of pictures that a device or a stream sends.
+    """Source of the pictures of a device or a stream.
 
     Args:
-        capture: Opened.
-        name: Whose pictures they are, for people.
-        exposure_s: How long they are exposed, where that is known [s].
-        is_stream: Whether the times that it reports are those of a camera's clock, as RTSP has
-            them, and none of this host's.
+        capture: The opened capture.
+        name: Name of the camera in messages.
+        exposure_s: Exposure time; 0 where it is not known [s].
+        is_stream: Whether reported times are of the camera's clock, as with RTSP, rather than of
+            this host's.
     """
 
     def __init__(
@@ -213,60 +213,55 @@ class GrabbedPictures:
         """Waits for the next picture.
 
         Raises:
-            DriverError: There are no more.
+            DriverError: There is none.
         """
         if not self._capture.grab():
-            raise _gone(self._name)
-        came_s = time.monotonic()
+            raise _no_picture_error(self._name)
+        arrived_s = time.monotonic()
         reported_s = 1e-3 * float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
         if self._is_stream:
-            before_s, self._stamp_s = self._stamp_s, self._undelayed(came_s, reported_s)
+            before_s, self._stamp_s = self._stamp_s, self._least_delayed_s(arrived_s, reported_s)
             return Arrival(self._stamp_s, before_s)
-        # Only Linux' V4L2 reports when the kernel had it.
-        if came_s - _RECENT_S < reported_s <= came_s:
+        # Only V4L2 of Linux reports the kernel's timestamp.
+        if arrived_s - _RECENT_S < reported_s <= arrived_s:
             return Arrival(reported_s, reported_s - self._exposure_s)
-        return Arrival(came_s)
+        return Arrival(arrived_s)
 
     def take(self) -> Image:
-        """Decodes the picture that was grabbed last.
+        """Decodes the last grabbed picture.
 
         Raises:
             DriverError: It cannot be decoded.
         """
-        return _retrieved(self._capture, self._name)
+        return _retrieve(self._capture, self._name)
 
     def interrupt(self) -> None:
-        """Does nothing: OpenCV's waiting ends with the next picture, or its own time limit."""
+        """Does nothing: OpenCV's wait ends with the next picture, or its own timeout."""
 
     def close(self) -> None:
-        """Lets go of it."""
+        """Releases the capture."""
         self._capture.release()
 
-    def _undelayed(self, came_s: float, reported_s: float) -> float:
-        """When a picture came that may have waited for its decoding: the least delay counts."""
-        ahead_s = came_s - reported_s
-        # A stream that reports no times, or begins again, is taken as it comes.
-        is_onward = reported_s > self._reported_s
+    def _least_delayed_s(self, arrived_s: float, reported_s: float) -> float:
+        """Arrival time of a picture that may have been delayed, from the least delay so far [s]."""
+        ahead_s = arrived_s - reported_s
+        # Without times, or after a restart of the stream, the time of arrival counts.
+        continues = reported_s > self._reported_s
         drift_s = _DRIFT * (reported_s - self._reported_s)
-        self._ahead_s = min(ahead_s, self._ahead_s + drift_s) if is_onward else ahead_s
+        self._ahead_s = min(ahead_s, self._ahead_s + drift_s) if continues else ahead_s
         self._reported_s = reported_s
         return reported_s + self._ahead_s
 
 
 class FilePictures:
-    """Every picture of a video file, one after the other, each stamped when it is asked for.
-
-    Args:
-        capture: Opened.
-        name: Whose pictures they are, for people.
-    """
+    """All pictures of a video file in order, each stamped when it is requested."""
 
     def __init__(self, capture: cv2.VideoCapture, name: str) -> None:
         self._capture, self._name = capture, name
         self._unread: Image | None = None
 
     def first(self, timeout_s: float) -> tuple[Arrival, Image]:
-        """Returns the first picture, which `after` will return again.
+        """Returns the first picture; `after` returns it again.
 
         Raises:
             DriverError: There is none.
@@ -275,10 +270,10 @@ class FilePictures:
         return arrival, self._unread
 
     def after(self, moment_s: float, timeout_s: float) -> tuple[Arrival, Image]:
-        """Returns the next picture; no moment and no time limit is needed.
+        """Returns the next picture; moment and timeout are ignored.
 
         Raises:
-            DriverError: There is no further one.
+            DriverError: There is none.
         """
         del moment_s, timeout_s
         arrival = Arrival(time.monotonic())
@@ -286,16 +281,15 @@ class FilePictures:
             image, self._unread = self._unread, None
             return arrival, image
         if not self._capture.grab():
-            raise _gone(self._name)
-        return arrival, _retrieved(self._capture, self._name)
+            raise _no_picture_error(self._name)
+        return arrival, _retrieve(self._capture, self._name)
 
     def close(self) -> None:
-        """Lets go of it; may be called twice."""
+        """Releases the file; may be called twice."""
         self._capture.release()
 
 
-def _gone(name: str) -> DriverError:
-    """Words that there are no more pictures."""
+def _no_picture_error(name: str) -> DriverError:
     return DriverError(
         f"The {name} gives no picture: it is unplugged, or at its end.",
         culprits=[name],
@@ -303,8 +297,8 @@ def _gone(name: str) -> DriverError:
     )
 
 
-def _retrieved(capture: cv2.VideoCapture, name: str) -> Image:
+def _retrieve(capture: cv2.VideoCapture, name: str) -> Image:
     read, image = capture.retrieve()
     if not read or image is None:
-        raise _gone(name)
+        raise _no_picture_error(name)
     return np.asarray(image, np.uint8)

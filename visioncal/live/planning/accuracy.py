@@ -1,4 +1,4 @@
-"""How accurate a result is predicted, and wished, to be."""
+"""Predicted and wished accuracy of a result."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.live.planning.information import WEAK_SIGMA
 
-# A sigma over this is the prior's: no data determine it [rad or m].
+# A sigma above this comes from the weak prior alone: no data determine it [rad or m].
 OPEN_SIGMA = 0.25 * WEAK_SIGMA
 
 
 @dataclass(frozen=True)
 class Wish:
-    """The accuracy that is wanted, as standard deviations; None where that does not matter.
+    """Wished accuracy, as standard deviations; None where that does not matter.
 
     Attributes:
-        mm: Of the place [mm].
+        mm: Of the position [mm].
         deg: Of the rotation [deg].
     """
 
@@ -35,23 +35,23 @@ class Wish:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Predicted standard deviations over all worlds, as root mean squares: place and rotation."""
+    """Predicted standard deviations of position and rotation, as root mean squares over worlds."""
 
     mm: float
     deg: float
 
     @classmethod
     def of(cls, place_m2: float, turn_rad2: float) -> "Accuracy":
-        """The accuracy by the sums of the variances of all axes [m^2], [rad^2]."""
+        """The accuracy from the sums of the variances of all axes [m^2], [rad^2]."""
         return cls(1e3 * float(np.sqrt(place_m2)), float(np.rad2deg(np.sqrt(turn_rad2))))
 
     @property
     def is_open(self) -> bool:
-        """Whether a direction is not determined at all; the figures are nothing to go by then."""
+        """Whether a direction is undetermined; the figures are then meaningless."""
         return self.mm > 1e3 * OPEN_SIGMA or self.deg > np.rad2deg(OPEN_SIGMA)
 
     def meets(self, wish: Wish) -> bool:
-        """Whether it is as good as was wished."""
+        """Whether it is at least as good as wished."""
         return (wish.mm is None or self.mm <= wish.mm) and (
             wish.deg is None or self.deg <= wish.deg
         )

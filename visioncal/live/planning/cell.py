@@ -1,4 +1,4 @@
-"""What is known of a cell before it is calibrated, and what its robot must keep away from."""
+"""A cell to plan for: guesses of what is unknown, limits of the stops, and obstacles."""
 
 from dataclasses import dataclass, field, replace
 
@@ -15,32 +15,31 @@ from visioncal.robot.bodies import Body, arm_bodies, capsule
 from visioncal.robot.collision import Collisions
 from visioncal.vision.targets import corner_positions, extent_m
 
-# Beyond this angle a printed board is seen from its edge [rad].
+# Greatest angle between the line of sight and a board's normal [rad].
 _STEEPEST_RAD = 1.4
-# A matrix that was typed with three digits is this far from a rotation.
+# Deviation from a rotation of a matrix that was typed with three digits.
 _ROTATION_TOLERANCE = 1e-3
-# What well-kept arms and cameras repeat to, where nothing is known of it [rad, m and px].
+# Noise of well-kept arms and cameras, where none is stated [rad, m and px].
 TYPICAL_NOISE, TYPICAL_PX = Noise.of_robot(5e-5, 3e-5), 0.1
-# A calibrated cell may have been touched since, by about this [rad and m].
+# Least sigmas of a calibrated cell, in which somebody may have touched something since [rad and m].
 _TOUCHED_RAD, _TOUCHED_M = 5e-3, 2e-3
-# A camera with its lens and plug, as a box about its housing [m].
+# Box around a camera with its lens and plug, and how far its centre is behind the lens [m].
 _CAMERA_M, _CAMERA_BEHIND_M = np.array([0.1, 0.1, 0.1]), 0.03
-# The plate under a board, and how far it reaches beyond the print [m].
+# Thickness of the plate under a board, and its rim around the print [m].
 _PLATE_M, _RIM_M = 0.01, 0.02
-# What holds the camera or the board on the flange [m].
+# Radius of the holder of the camera or the board on the flange [m].
 _HOLDER_RADIUS_M = 0.02
-# Things stand where they are guessed to within so many standard deviations.
-_SURELY = 2.0
+# Standard deviations of the guesses that are added to the clearance.
+_KEEP_OFF_SIGMAS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Something in the cell that the arm must not touch.
+    """A box-shaped obstacle.
 
     Attributes:
-        name: What it is, for messages.
-        base_from_box: (4, 4) the frame of its centre [m].
-        size_m: (3,) its full lengths along that frame's axes [m].
+        base_from_box: (4, 4) frame at its centre [m].
+        size_m: (3,) full lengths along that frame's axes [m].
     """
 
     name: str
@@ -60,14 +59,13 @@ class Box:
 
 @dataclass(frozen=True)
 class Limits:
-    """What every planned stop, and every way between two of them, keeps.
+    """Limits of every planned stop, and of every path between two of them.
 
     Attributes:
-        joint_margin_rad: Distance of the joints from their limits [rad]; as many metres for a
-            prismatic joint.
+        joint_margin_rad: Distance of the joints from their limits [rad]; [m] for a prismatic joint.
         distance_m: Least and greatest distance of the camera from the board's centre [m]. None
-            takes distances at which the board fills the image well, and stays in it although the
-            guesses are wrong.
+            takes distances at which the board fills the image well, and stays in it within the
+            uncertainty of the guesses.
         focus_m: Least and greatest depth at which the image is sharp [m]; None for any.
         tilt_rad: Greatest angle between the line of sight and the board's normal [rad].
         edge_px: Distance of the board from the image's edge [px].
@@ -104,26 +102,20 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class PlanCell:
-    """A cell whose robot is to be moved: its parts, rough guesses of what is unknown, limits.
+    """A cell to plan for: its parts, rough guesses of the unknown edges, and limits.
 
     Attributes:
-        mount: Where the camera is.
-        robot: The arm.
-        camera: The intrinsics.
-        target: The board.
         x: (4, 4) guess of `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
         z: (4, 4) guess of `base_from_target` (eye-in-hand) or `flange_from_target` (eye-to-hand).
-        sigma_rad: How well the rotations of both are known: one standard deviation per axis [rad].
+        sigma_rad: Standard deviation of both rotations, per axis [rad].
         sigma_m: The same for their translations [m].
-        noise: How well the robot stands where it says that it does.
+        noise: Noise of the robot's poses.
         pixel_px: Noise of a corner, per axis [px].
-        limits: What every stop and every way between two of them keeps.
-        boxes: What else stands in the cell.
-        covariance: (12, 12) covariance of both edges together (rotation, translation; right
-            perturbations), where recorded stops determine it: then both sigmas are typical of it.
-            None where the sigmas say all.
-        shown_m: At which distances, from the least to the greatest, the board has been seen already
-            [m]; None where it has not. They are possible, whether it fills the image there or not.
+        covariance: (12, 12) joint covariance of both edges (rotation, translation; right
+            perturbations), where recorded stops determine it; both sigmas are then typical of it.
+            None where the sigmas are all that is known.
+        shown_m: Least and greatest distance at which the board has been observed [m], allowed
+            whether it fills the image there or not; None where it has not been.
     """
 
     mount: Mount
@@ -158,14 +150,7 @@ class PlanCell:
                 )
 
     def cam_from_target(self, q: FloatArray) -> FloatArray:
-        """Predicts where the board is seen, if the guesses are right.
-
-        Args:
-            q: (k, n) joint angles [rad].
-
-        Returns:
-            (k, 4, 4) `cam_from_target` [m].
-        """
+        """Predicts (k, 4, 4) `cam_from_target` [m] at (k, n) joint angles [rad] by the guesses."""
         return self.seen_from(self.robot.base_from_flange(q))
 
     def seen_from(self, base_from_flange: FloatArray) -> FloatArray:
@@ -175,21 +160,13 @@ class PlanCell:
         return np.asarray(invert(self.x) @ base_from_flange @ self.z)
 
     def flange_at(self, cam_from_target: FloatArray) -> FloatArray:
-        """Where the flange must be to see the board so: (k, 4, 4) `base_from_flange` [m]."""
+        """Poses (k, 4, 4) `base_from_flange` for views (k, 4, 4) `cam_from_target` [m]."""
         if self.mount == "eye-in-hand":
             return np.asarray(self.z @ invert(cam_from_target) @ invert(self.x))
         return np.asarray(self.x @ cam_from_target @ invert(self.z))
 
     def guesses(self, count: int, seed: int) -> tuple["PlanCell", ...]:
-        """Draws cells as they may really be: both edges within what is known of them.
-
-        Args:
-            count: How many.
-            seed: Of the draws; the same seed gives the same cells.
-
-        Returns:
-            Cells whose `x` and `z` are moved on the right by normal twists.
-        """
+        """Draws cells from the uncertainty of both edges, perturbed on the right."""
         rng = np.random.default_rng(seed)
         draws = rng.standard_normal((count, 12))
         if self.covariance is None:
@@ -203,12 +180,12 @@ class PlanCell:
 
 def _check_pose(what: str, pose: FloatArray) -> None:
     pose = np.asarray(pose)
-    sound = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
-    if sound:
+    valid = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
+    if valid:
         rotation = pose[:3, :3]
-        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        sound = bool(off < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0.0)
-    if not sound:
+        deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        valid = bool(deviation < _ROTATION_TOLERANCE and np.linalg.det(rotation) > 0.0)
+    if not valid:
         raise DataError(
             f"{what}: a 4 x 4 matrix of a rotation and a translation [m] is needed.",
             culprits=[what],
@@ -225,15 +202,9 @@ def cell_of_calibration(
 ) -> PlanCell:
     """Takes a calibrated cell as the guess for another calibration of it.
 
-    Both edges are trusted as far as they are known, but not beyond a millimetre or two: the reason
-    for another calibration may be that somebody touched the camera or the board.
-
-    Args:
-        calibration: The result; its arm is taken as far as it is calibrated.
-        target: The board, which a calibration does not keep.
-        limits: What the stops must keep.
-        boxes: What else stands in the cell.
-        robot: The arm, where the calibration has none.
+    The edges' sigmas are those of the result, but at least a millimetre or two: the reason for
+    another calibration may be that somebody touched the camera or the board. The robot is used
+    where the calibration has none.
 
     Raises:
         DataError: The calibration has no robot or no camera.
@@ -257,7 +228,7 @@ def cell_of_calibration(
     sigma_m = max(1e-3 * x.sigma_mm, 1e-3 * z.sigma_mm) / np.sqrt(3.0)
     sigma_rad = np.deg2rad(max(x.sigma_deg, z.sigma_deg)) / np.sqrt(3.0)
     noise, pixel_px = _noise(calibration)
-    work = calibration.budget
+    budget = calibration.budget
     return PlanCell(
         calibration.mount,
         arm,
@@ -271,40 +242,35 @@ def cell_of_calibration(
         pixel_px,
         limits,
         boxes,
-        shown_m=None if work is None else (work.distance_m, work.distance_m),
+        shown_m=None if budget is None else (budget.distance_m, budget.distance_m),
     )
 
 
 def _noise(calibration: Calibration) -> tuple[Noise, float]:
-    found = calibration.noise
     noise = robot_noise(calibration)
-    # A few stops may show less than there is by chance.
-    at_least = np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots)
-    return replace(noise, robots=at_least), found.get("pixel_px", TYPICAL_PX)
+    # Few stops may underestimate the noise by chance.
+    floored = np.maximum(noise.robots, 0.5 * TYPICAL_NOISE.robots)
+    return replace(noise, robots=floored), calibration.noise.get("pixel_px", TYPICAL_PX)
 
 
 def collisions_of(cell: PlanCell) -> Collisions:
-    """Prepares the distances of a cell.
+    """Collision model of a cell: the arm, what it carries, and obstacles.
 
-    What is only guessed, the camera and the board, is kept away from by what the guess may be off,
-    besides the clearance.
-
-    Returns:
-        The distances between the arm, what it carries, and what stands around it.
+    The uncertainty of the guessed camera and board is added to their clearance.
     """
     hand = cell.robot.joint_count
     in_hand = cell.mount == "eye-in-hand"
     flange = cell.robot.chain.placements[-1]
-    held, stands = (cell.x, cell.z) if in_hand else (cell.z, cell.x)
-    unsure_m = _SURELY * (cell.sigma_m + cell.sigma_rad * 0.5 * board_size_m(cell.target))
-    held_body, standing_body = (_camera, _board) if in_hand else (_board, _camera)
+    held, fixed = (cell.x, cell.z) if in_hand else (cell.z, cell.x)
+    unsure_m = _KEEP_OFF_SIGMAS * (cell.sigma_m + cell.sigma_rad * 0.5 * board_size_m(cell.target))
+    held_body, fixed_body = (_camera, _board) if in_hand else (_board, _camera)
     carried = held_body(cell.target, hand, flange @ held, unsure_m)
     middle = carried.link_from_body[:3, 3]
     bodies = [
         *arm_bodies(cell.robot),
         capsule("holder", hand, flange[:3, 3], middle, _HOLDER_RADIUS_M, unsure_m=unsure_m),
         carried,
-        standing_body(cell.target, 0, stands, unsure_m),
+        fixed_body(cell.target, 0, fixed, unsure_m),
         *(Body(box.name, 0, "box", box.size_m, box.base_from_box) for box in cell.boxes),
     ]
     return Collisions(cell.robot, bodies, cell.limits.clearance_m, cell.limits.floor_m)

@@ -1,7 +1,7 @@
-"""The predicted information of a stop, by the estimator's own derivatives and priors.
+"""Predicted information of candidate stops, with the estimator's own Jacobians and priors.
 
-A stop's corners are predicted, compressed as seen ones are, and joined with the noise of the robot;
-what comes out is the information that the joint fit would have of it.
+A stop's corners are predicted, compressed as detected ones are, and combined with the robot's
+noise; the result is the information that the joint fit would get from the stop.
 """
 
 from collections.abc import Sequence
@@ -39,16 +39,16 @@ from visioncal.robot import Robot
 from visioncal.vision.camera import project
 from visioncal.vision.targets import FOUND_IN_PART, corner_positions
 
-# Worlds over which a plan is made: the guess, and some drawn from what is known of it.
+# Number of cells over which a plan is averaged: the guess, and draws from its uncertainty.
 WORLDS = 4
-# A calibration takes nothing from the guesses: what is assumed of the edges beforehand only keeps
-# the information invertible [rad and m], for directions that the stops leave open.
+# A calibration does not use the guesses. This weak prior on the edges only keeps the information
+# invertible [rad and m] in directions that the stops do not determine.
 WEAK_SIGMA = 0.2
-# What an edge's component is counted in where unknowns of different kinds are compared.
+# Units of an edge's components where unknowns of different kinds are compared [rad and m].
 _EDGE_UNITS: FloatArray = np.tile(np.repeat([1e-3, 5e-4], 3), 2)
-# Postures that are tried for a declared workspace, and how many of those in it stand for it.
+# Postures drawn for a declared workspace, and the most of those inside it that are used.
 _TRIED, _POSTURES = 8000, 400
-# A ChArUco board that the image cuts is found with so many corners.
+# Least number of corners with which a partly visible ChArUco board is detected.
 _FEWEST_CORNERS = 6
 
 
@@ -57,20 +57,18 @@ class RecordedStops:
     """Stops that were recorded already.
 
     Attributes:
-        problem: The stops, without errors of the arm. Of its effects, what lens and boards leave
-            open comes first.
-        edges: Those of the problem: the camera's, that of the board that is planned for, and those
-            of further boards.
-        free: Lens and boards as the views see them.
+        problem: The stops, without errors of the arm. Its first effect is lens and boards.
+        edges: Edges of the problem: the camera's, the planned board's, then further boards'.
+        free: Free parameters of lens and boards.
         q: (s, n) joint angles of the stops [rad]; None where they are not known.
-        noise: Of the robot at the stops.
-        first_corner: The number of the first corner of the board that is planned for.
-        arm: Errors that follow the arm's posture, at the stops; None where the stops show none.
-        inflation: By how much larger their noise's variance counts than they show alone.
-        beside: (12, c) by how much the edges are off beside that, for c independent errors of one:
-            of an arm without joint angles, which more stops do not change.
-        held: (k, c) gradient of what the views share and a fit holds: how the stops pull at it.
-            Further stops are expected to pull no more than by noise.
+        noise: Noise of the robot at the stops.
+        first_corner: Number of the first corner of the planned board.
+        arm: Posture-dependent errors of the arm at the stops; None where the stops show none.
+        inflation: Factor on the noise variance.
+        edge_error_root: (12, c) root of the covariance of the edges' further errors, those of an
+            arm without joint angles. More stops do not reduce them.
+        held: (k, c) gradient at shared parameters that a fit holds. Further stops are expected to
+            add nothing but noise to it.
     """
 
     problem: Problem
@@ -81,41 +79,41 @@ class RecordedStops:
     first_corner: int = 0
     arm: ArmErrors | None = None
     inflation: float = 1.0
-    beside: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
+    edge_error_root: FloatArray = field(default_factory=lambda: np.zeros((12, 0)))
     held: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def shared(self) -> FloatArray:
         """(k, k) information on what the views share, from corners and priors."""
-        return _of_effects(self.problem)
+        return _effect_information(self.problem)
 
     def edges_in(self, cell: PlanCell) -> FloatArray:
-        """The edges where a cell is guessed to be; further boards go with the one planned for."""
+        """Edges of the guessed cell; further boards keep their pose relative to the planned one."""
         boards = cell.z @ invert(self.edges[1]) @ self.edges[1:]
         return np.concatenate([cell.x[None], boards])
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """The information of k candidates on p unknowns if a cell is as it is guessed to be.
+    """Information of k candidates on p unknowns, for one possible cell.
 
-    Unknown are x, z, uncertain values of lens and board, and the arm's errors, in this order.
+    The unknowns are x, z, free parameters of lens and board, and errors of the arm, in this order.
 
     Attributes:
-        factors: (k, 6, p) the squares of each stop's are its information.
-        prior: (p, p) what is known beforehand.
-        recorded: (p, p) information of the stops that are recorded.
-        counted: (p, p) of which the trace with the covariance is the variance that counts: of a
-            place, as a mean over where it matters [m^2].
-        place: (p, p) the same for the place that the accuracy is stated of [m^2].
+        factors: (k, 6, p) whitened Jacobian F of each stop; F^T F is its information.
+        prior: (p, p) prior information.
+        recorded: (p, p) information of the recorded stops.
+        counted: (p, p) weight W such that trace(W C) is the variance to be minimised with a
+            covariance C: of a position, as a mean over where it matters [m^2].
+        place: (p, p) the same for the position whose accuracy is reported [m^2].
         turn: (p, p) the same for the rotation [rad^2].
-        units: (p,) what one unit of each unknown is where different ones are compared.
-        looks: How many of the unknowns are of lens and boards; they stand behind the edges.
-        misfit: (k, 6, a) how residuals at each stop move, in sigmas of noise, with errors of the
-            arm that a fit takes for noise, in sigmas of theirs, and with lens and boards that it
-            holds.
-        gradient: (p, a) how the recorded stops' gradient moves with them.
-        held: How many of these are of lens and boards; they stand last.
+        units: (p,) unit of each unknown where unknowns of different kinds are compared.
+        lens_board_count: Number of unknowns of lens and boards; they come after the edges.
+        unestimated: (k, 6, a) whitened Jacobian of each stop in parameters that a fit does not
+            estimate: arm errors that it treats as noise, in their sigmas, and held parameters of
+            lens and boards.
+        gradient: (p, a) the same of the recorded stops' gradient.
+        held: How many of these parameters are of lens and boards; they come last.
     """
 
     factors: FloatArray
@@ -125,14 +123,14 @@ class World:
     place: FloatArray
     turn: FloatArray
     units: FloatArray
-    looks: int
-    misfit: FloatArray
+    shared_count: int
+    unestimated: FloatArray
     gradient: FloatArray
     held: int
 
-    def with_known_looks(self) -> "World":
-        """Returns the world as it is where lens and board are known exactly."""
-        kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.looks))
+    def with_known_lens_board(self) -> "World":
+        """Returns the same world with lens and board known exactly."""
+        kept = np.delete(np.arange(len(self.prior)), 12 + np.arange(self.shared_count))
         block = np.ix_(kept, kept)
         of_arm = slice(self.gradient.shape[1] - self.held)
         return World(
@@ -144,22 +142,24 @@ class World:
             self.turn[block],
             self.units[kept],
             0,
-            self.misfit[:, :, of_arm],
+            self.unestimated[:, :, of_arm],
             self.gradient[kept, of_arm],
             0,
         )
 
-    def without_misfit(self) -> "World":
-        """Returns the world as it is where a fit takes no errors of the arm for noise."""
+    def without_unestimated_arm(self) -> "World":
+        """Returns the same world without arm errors that a fit treats as noise."""
         of_held = slice(self.gradient.shape[1] - self.held, None)
-        return replace(self, misfit=self.misfit[:, :, of_held], gradient=self.gradient[:, of_held])
+        return replace(
+            self, unestimated=self.unestimated[:, :, of_held], gradient=self.gradient[:, of_held]
+        )
 
     def covariance(self, rows: Sequence[int] | IntArray | Mask) -> FloatArray:
-        """Covariance (p, p) of the unknowns from some candidates and what is recorded."""
+        """Covariance (p, p) of the unknowns from some candidates and the recorded stops."""
         taken = self.factors[rows]
         fitted = covariance_from(self.prior + self.recorded + gram(taken, taken))
-        off = fitted @ (self.gradient + gram(taken, self.misfit[rows]))
-        return np.asarray(fitted + off @ off.T)
+        bias = fitted @ (self.gradient + gram(taken, self.unestimated[rows]))
+        return np.asarray(fitted + bias @ bias.T)
 
 
 def worlds_of(
@@ -170,19 +170,13 @@ def worlds_of(
     recorded: RecordedStops | None = None,
     workspace: Box | None = None,
 ) -> tuple[World, ...]:
-    """Predicts the information of candidates, in each of some cells.
+    """Predicts the information of candidates with joints (k, n) [rad] in each possible cell.
 
-    Args:
-        cells: The cell as it is guessed to be, and as it may be.
-        purpose: What the stops are for.
-        q: (k, n) joint angles of the candidates [rad].
-        recorded: What was recorded already.
-        workspace: Where the arm's place counts: its postures that bring what it carries into this
-            box; None for all of them.
+    The arm's accuracy counts within the workspace, or all of its reach for None.
 
     Raises:
-        DataError: The workspace holds no posture, or joint angles of what was recorded are needed
-            and not known.
+        DataError: The workspace holds no posture, or joint angles of recorded stops are needed and
+            not known.
     """
     with one_blas_thread():
         return tuple(_world(cell, purpose, q, recorded, workspace) for cell in cells)
@@ -191,40 +185,37 @@ def worlds_of(
 def stop_factors(
     cell: PlanCell, purpose: Purpose, q: FloatArray, recorded: RecordedStops | None = None
 ) -> FloatArray:
-    """Predicts the information of stops.
+    """Whitened Jacobian F (k, 6, p + a) of stops with joints (k, n) [rad]; F^T F is information.
 
-    Args:
-        cell: The cell, taken as it is guessed to be.
-        purpose: What is unknown.
-        q: (k, n) joint angles [rad].
-        recorded: Information on lens and board; None where they are as stated, the board's size
-            being open by as much as is stated.
-
-    Returns:
-        (k, 6, p + a) whose squares are the information of each stop; zero where the board is not
-        seen. Errors of the arm that a fit takes for noise come last.
+    It is zero where the board is not seen. Errors of the arm that a fit treats as noise come last.
+    Lens and board are those of the recorded stops; without any, the stated ones, with the stated
+    uncertainty of the board's size.
     """
     free = stated(cell) if recorded is None else recorded.free
     poses = cell.cam_from_target(q)
-    stack, seen = _predicted(cell, poses, 0 if recorded is None else recorded.first_corner)
-    known = free.information if recorded is None else recorded.shared
-    # Nothing else of what is shared moves a stop that stands still.
-    elsewhere = np.zeros((int(seen.sum()), 6, len(known) - len(free.columns)))
-    factors = np.zeros((len(q), 6, 12 + len(known) + _arm_size(cell.robot, purpose, recorded)))
+    stack, seen = _predicted_corners(cell, poses, 0 if recorded is None else recorded.first_corner)
+    information = free.information if recorded is None else recorded.shared
+    # The other shared parameters do not affect a stop at which the arm stands still.
+    others = np.zeros((int(seen.sum()), 6, len(information) - len(free.columns)))
+    factors = np.zeros(
+        (len(q), 6, 12 + len(information) + _arm_size(cell.robot, purpose, recorded))
+    )
     if seen.any():
-        found = compress(stack, free.basis, free.appearance, poses[seen])
+        compressed = compress(stack, free.basis, free.appearance, poses[seen])
         flange = cell.robot.base_from_flange(q[seen])
+        jacobian = np.concatenate([compressed.by_shared[:, :, free.columns], others], axis=2)
+        prior = Knowledge(information, np.zeros(len(information)))
         problem = chain(
             cell.mount,
             flange,
             poses[seen],
-            floored_sigma_px(cell.pixel_px) ** 2 * covariance_from(found.information),
-            effects=[_effect(known, [found.by_shared[:, :, free.columns], elsewhere])],
+            floored_sigma_px(cell.pixel_px) ** 2 * covariance_from(compressed.information),
+            effects=[Effect.free("lens and boards", prior, jacobian)],
         )
         arm = None if recorded is None else recorded.arm
         if arm is not None:
             arm = replace(arm, basis=link_basis(cell.robot, q[seen]))
-        problem = _erring(cell, purpose, problem, q[seen], arm)
+        problem = _with_arm_errors(cell, purpose, problem, q[seen], arm)
         state = State(np.stack([cell.x, cell.z]), problem.start_values)
         linear = problem.linear(state, ideal=True)
         root = np.linalg.cholesky(problem.total_covariance(linear, cell.noise))
@@ -235,33 +226,33 @@ def stop_factors(
 def place_sigmas(
     cell: PlanCell, purpose: Purpose, covariance: FloatArray, workspace: Box | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Predicts how surely the arm's places are known all over its workspace.
+    """Predicts the arm's position uncertainty over its workspace.
 
     Args:
-        cell: The cell, taken as it is guessed to be.
-        purpose: What is unknown; one that judges the workspace.
-        covariance: (p, p) covariance of the unknowns, as `World.covariance` has it.
-        workspace: The part of it that counts; None for all.
+        cell: The cell, as guessed.
+        purpose: One that judges the workspace.
+        covariance: (p, p) covariance of the unknowns, from `World.covariance`.
+        workspace: Region that counts; None for all.
 
     Returns:
-        (w, 3) places of what the arm carries, in the base [m], and their (w,) standard deviations
-        as a whole, roots of the covariances' traces [m].
+        (w, 3) positions of what the arm carries, in the base [m], and their (w,) standard
+        deviations, roots of the covariances' traces [m].
     """
-    at = _inside(cell, workspace)
-    jacobian = _workspace_jacobian(cell, purpose, at)
+    q = _workspace_postures(cell, workspace)
+    jacobian = _workspace_jacobian(cell, purpose, q)
     arm = jacobian.shape[2] - 12
     rows = np.concatenate([np.arange(12), np.arange(len(covariance) - arm, len(covariance))])
     inner = covariance[np.ix_(rows, rows)]
-    carried = cell.robot.base_from_flange(at) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
+    carried = cell.robot.base_from_flange(q) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
     return carried[:, :3, 3], np.sqrt(np.einsum("wij,jk,wik->w", jacobian, inner, jacobian))
 
 
 def stated(cell: PlanCell) -> LensBoardParameters:
-    """Lens and board as they are stated, the board's size being open by as much as is stated."""
+    """Stated lens and board; the board's size is free within its stated uncertainty."""
     positions = corner_positions(cell.target)
     shape = board_prior(cell.target)
     look = Appearance(cell.camera, np.zeros(len(shape)))
-    # The places of a rig's points are taken for what its table says.
+    # The positions of a rig's points are taken as exact.
     sized = np.array([] if cell.target.kind == "points" else [SCALE], dtype=np.int64)
     return LensBoardParameters(
         look,
@@ -283,47 +274,48 @@ def _world(
 ) -> World:
     shared = stated(cell).information if recorded is None else recorded.shared
     factors = stop_factors(cell, purpose, q, recorded)
-    looks, sigma, arm = len(shared), _sigma(purpose), _arm_size(cell.robot, purpose, recorded)
+    shared_count, sigma = len(shared), _arm_sigma(purpose)
+    arm = _arm_size(cell.robot, purpose, recorded)
     inflation = 1.0
     if recorded is not None and not purpose.blocks:
         inflation = recorded.inflation
         if recorded.arm is not None:
-            # Those that a fit takes for noise are no unknowns.
+            # Errors that a fit treats as noise are not unknowns.
             arm *= recorded.arm.is_estimated
     weak = np.full(12, max(WEAK_SIGMA, cell.sigma_rad, cell.sigma_m) ** -2.0)
     prior = block_diag(np.diag(weak), shared, sigma**-2.0 * np.eye(arm)) / inflation
-    size, every = len(prior), factors.shape[2]
-    known = np.zeros((every, every))
+    size, all_columns = len(prior), factors.shape[2]
+    recorded_information = np.zeros((all_columns, all_columns))
     if recorded is not None:
-        known = _recorded_information(cell, purpose, recorded)
-    scale = np.ones(every)
+        recorded_information = _recorded_information(cell, purpose, recorded)
+    scale = np.ones(all_columns)
     scale[:size] = inflation**-0.5
-    factors, known = scale * factors, np.outer(scale, scale) * known
-    of_looks = np.sqrt(np.diag(covariance_from(shared))) if looks else np.zeros(0)
-    units = np.concatenate([_EDGE_UNITS, of_looks, np.full(arm, sigma)])
+    factors, recorded_information = scale * factors, np.outer(scale, scale) * recorded_information
+    shared_sigmas = np.sqrt(np.diag(covariance_from(shared))) if shared_count else np.zeros(0)
+    units = np.concatenate([_EDGE_UNITS, shared_sigmas, np.full(arm, sigma)])
     if purpose.judged == "sight":
-        judged = _of_sight(cell, arm, q)
+        weights = _sight_weights(cell, arm, q)
     else:
-        judged = _of_workspace(cell, purpose, workspace)
-    counted, place, turn = (_widened(array, looks) for array in judged)
-    misfit, gradient, held = factors[:, :, size:], known[:size, size:], 0
+        weights = _workspace_weights(cell, purpose, workspace)
+    counted, place, turn = (_padded(array, shared_count) for array in weights)
+    misfit, gradient, held = factors[:, :, size:], recorded_information[:size, size:], 0
     if recorded is not None and not purpose.blocks:
-        beside, held = recorded.beside, recorded.held.shape[1]
-        pull = np.zeros((size, held))
-        pull[12 : 12 + len(recorded.held)] = -recorded.held / inflation
-        further = (prior + known[:size, :size])[:, :12] @ beside
-        gradient = np.hstack([gradient, further, pull])
-        still = np.zeros((*factors.shape[:2], held))
-        misfit = np.concatenate([misfit, factors[:, :, :12] @ beside, still], axis=2)
+        error_root, held = recorded.edge_error_root, recorded.held.shape[1]
+        held_gradient = np.zeros((size, held))
+        held_gradient[12 : 12 + len(recorded.held)] = -recorded.held / inflation
+        edge_gradient = (prior + recorded_information[:size, :size])[:, :12] @ error_root
+        gradient = np.hstack([gradient, edge_gradient, held_gradient])
+        zeros = np.zeros((*factors.shape[:2], held))
+        misfit = np.concatenate([misfit, factors[:, :, :12] @ error_root, zeros], axis=2)
     return World(
         factors[:, :, :size],
         prior,
-        known[:size, :size],
+        recorded_information[:size, :size],
         counted,
         place,
         turn,
         units,
-        looks,
+        shared_count,
         misfit,
         gradient,
         held,
@@ -331,7 +323,7 @@ def _world(
 
 
 def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedStops) -> FloatArray:
-    """(p + a, p + a) of the stops and of what was measured by hand, known effects aside."""
+    """Information (p + a, p + a) of recorded stops and hand measurements, without priors."""
     q = recorded.q
     if q is None and purpose.blocks:
         raise DataError(
@@ -340,26 +332,26 @@ def _recorded_information(cell: PlanCell, purpose: Purpose, recorded: RecordedSt
             next_step="Record q1_rad ..., or plan without the recorded session.",
         )
     stops = len(next(iter(recorded.problem.poses.values())))
-    at = np.zeros((stops, cell.robot.joint_count)) if q is None else q
-    problem = _erring(cell, purpose, recorded.problem, at, recorded.arm)
+    joints = np.zeros((stops, cell.robot.joint_count)) if q is None else q
+    problem = _with_arm_errors(cell, purpose, recorded.problem, joints, recorded.arm)
     state = State(recorded.edges_in(cell), problem.start_values)
-    found = fisher_information(problem, state, recorded.noise)
+    information = fisher_information(problem, state, recorded.noise)
     edges = 6 * len(problem.unknown)
-    found[edges:, edges:] -= _of_effects(problem)
-    # Further boards lie anywhere: what is left once they are eliminated is known of all else.
+    information[edges:, edges:] -= _effect_information(problem)
+    # Schur complement: the poses of further boards are eliminated.
     further = slice(12, edges)
-    cross = np.delete(found[further], further, axis=1)
-    taken = cross.T @ np.linalg.solve(found[further, further], cross)
-    return np.delete(np.delete(found, further, axis=0), further, axis=1) - taken
+    cross = np.delete(information[further], further, axis=1)
+    eliminated = cross.T @ np.linalg.solve(information[further, further], cross)
+    return np.delete(np.delete(information, further, axis=0), further, axis=1) - eliminated
 
 
-def _erring(
+def _with_arm_errors(
     cell: PlanCell, purpose: Purpose, problem: Problem, q: FloatArray, arm: ArmErrors | None
 ) -> Problem:
-    """The problem with errors of the arm: those that a purpose is about, or that stops show."""
+    """Adds errors of the arm to a problem: the purpose's, or those that the stops show."""
     if purpose.blocks:
-        basis = _model(cell.robot, purpose).basis(q)
-        arm = ArmErrors(basis, _sigma(purpose), 0.0, of_links=True)
+        basis = _arm_model(cell.robot, purpose).basis(q)
+        arm = ArmErrors(basis, _arm_sigma(purpose), 0.0, of_links=True)
     elif arm is not None:
         arm = replace(arm, basis=arm.sigma * arm.basis, sigma=1.0)
     if arm is None:
@@ -367,19 +359,14 @@ def _erring(
     return problem.with_effects([*problem.effects, arm.effect(problem.robots[0])])
 
 
-def _of_effects(problem: Problem) -> FloatArray:
-    """(k, k) what is known of a problem's effects beforehand."""
-    known = (effect.known.information for effect in problem.effects)
-    return np.asarray(block_diag(np.zeros((0, 0)), *known))
+def _effect_information(problem: Problem) -> FloatArray:
+    """Prior information (k, k) of a problem's effects."""
+    priors = (effect.known.information for effect in problem.effects)
+    return np.asarray(block_diag(np.zeros((0, 0)), *priors))
 
 
-def _effect(known: FloatArray, moved: list[FloatArray]) -> Effect:
-    beforehand = Knowledge(known, np.zeros(len(known)))
-    return Effect.free("lens and boards", beforehand, np.concatenate(moved, axis=2))
-
-
-def _model(robot: Robot, purpose: Purpose) -> ArmModel:
-    sigma = _sigma(purpose)
+def _arm_model(robot: Robot, purpose: Purpose) -> ArmModel:
+    sigma = _arm_sigma(purpose)
     weights = {name: block / sigma for name, block in purpose.blocks.items()}
     model = ArmModel(robot, np.eye(4), weights, np.zeros(_arm_size(robot, purpose)))
     if COMPLIANCE not in weights:
@@ -394,20 +381,22 @@ def _model(robot: Robot, purpose: Purpose) -> ArmModel:
     return model.loaded(postures(robot))
 
 
-def _sigma(purpose: Purpose) -> float:
-    """What the arm's unknowns are counted in: the first block's size [rad]."""
+def _arm_sigma(purpose: Purpose) -> float:
+    """Unit of the arm's unknowns: the first block's prior sigma [rad]."""
     return next(iter(purpose.blocks.values()), 1.0)
 
 
 def _arm_size(robot: Robot, purpose: Purpose, recorded: RecordedStops | None = None) -> int:
-    """How many errors of the arm `_erring` adds."""
+    """Number of errors of the arm that `_with_arm_errors` adds."""
     if purpose.blocks or recorded is None or recorded.arm is None:
         return sum(block_size(name, robot.joint_count) for name in purpose.blocks)
     return int(recorded.arm.basis.shape[2])
 
 
-def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[CornerStack, Mask]:
-    """The corners at (k, 4, 4) poses as they would be found, and which of these show the board."""
+def _predicted_corners(
+    cell: PlanCell, poses: FloatArray, first_corner: int
+) -> tuple[CornerStack, Mask]:
+    """Predicted corners at (k, 4, 4) poses, and the mask of poses that show the board."""
     positions = corner_positions(cell.target)
     points = positions @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
     px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
@@ -415,87 +404,90 @@ def _predicted(cell: PlanCell, poses: FloatArray, first_corner: int) -> tuple[Co
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
     in_part = cell.target.kind in FOUND_IN_PART or cell.target.point_tags
     fewest = min(_FEWEST_CORNERS, len(positions)) if in_part else len(positions)
-    seen = visible.sum(axis=1) >= fewest
-    view, corner = np.nonzero(visible[seen])
-    counts = visible[seen].sum(axis=1)
+    shows = visible.sum(axis=1) >= fewest
+    view, corner = np.nonzero(visible[shows])
+    counts = visible[shows].sum(axis=1)
     stack = CornerStack(
-        tuple(np.flatnonzero(seen).tolist()),
+        tuple(np.flatnonzero(shows).tolist()),
         (0.0,) * len(counts),
         np.cumsum(counts) - counts,
         view,
         first_corner + corner,
         positions[corner],
-        px[seen][view, corner],
+        px[shows][view, corner],
     )
-    return stack, seen
+    return stack, shows
 
 
-def _of_sight(cell: PlanCell, arm: int, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What counts of x: the camera's own place, and as much the places that it looks at."""
-    # A point that it sees comes out wrong by the offset's error and by the rotation's at the
-    # point's distance, wherever the arm stands.
+def _sight_weights(
+    cell: PlanCell, arm: int, q: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weights for x: half the camera's position, half the points that it observes."""
+    # An observed point is off by the error of the offset and by that of the rotation times the
+    # point's distance, at any posture of the arm.
     middle = corner_positions(cell.target).mean(axis=0)
-    looked_at = cell.cam_from_target(q) @ [*middle, 1.0]
-    place, turn, there = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
-    place[:, :, 3:6] = there[:, :, 3:6] = turn[:, :, :3] = np.eye(3)
-    there[:, :, :3] = -skew(looked_at[:, :3])
-    return (_mean_square(place) + _mean_square(there)) / 2, _mean_square(place), _mean_square(turn)
+    observed = cell.cam_from_target(q) @ [*middle, 1.0]
+    position, rotation, point = (np.zeros((len(q), 3, 12 + arm)) for _ in range(3))
+    position[:, :, 3:6] = point[:, :, 3:6] = rotation[:, :, :3] = np.eye(3)
+    point[:, :, :3] = -skew(observed[:, :3])
+    of_position = _mean_square(position)
+    return (of_position + _mean_square(point)) / 2, of_position, _mean_square(rotation)
 
 
-def _of_workspace(
+def _workspace_weights(
     cell: PlanCell, purpose: Purpose, workspace: Box | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What counts of what the arm carries: its place seen from what stands still."""
-    at = _inside(cell, workspace)
-    place = _mean_square(_workspace_jacobian(cell, purpose, at))
-    turn = _mean_square(_arm_jacobian(cell, purpose, at)[2][:, :3])
-    return place, place, turn
+    """Weights for the pose of what the arm carries, relative to what is fixed in the base."""
+    q = _workspace_postures(cell, workspace)
+    position = _mean_square(_workspace_jacobian(cell, purpose, q))
+    rotation = _mean_square(_arm_jacobian(cell, purpose, q)[2][:, :3])
+    return position, position, rotation
 
 
-def _workspace_jacobian(cell: PlanCell, purpose: Purpose, at: FloatArray) -> FloatArray:
-    """(w, 3, 12 + a) how the places of what the arm carries move with edges and arm."""
-    pair, poses, jacobian = _arm_jacobian(cell, purpose, at)
+def _workspace_jacobian(cell: PlanCell, purpose: Purpose, q: FloatArray) -> FloatArray:
+    """Jacobian (w, 3, 12 + a) of the carried positions in edges and errors of the arm."""
+    pair, poses, jacobian = _arm_jacobian(cell, purpose, q)
     return pair.place_jacobian(poses, jacobian, corner_positions(cell.target).mean(axis=0))
 
 
 def _arm_jacobian(
-    cell: PlanCell, purpose: Purpose, at: FloatArray
+    cell: PlanCell, purpose: Purpose, q: FloatArray
 ) -> tuple[ArmPair, FloatArray, FloatArray]:
-    """The camera and the board, and their (w, 4, 4) poses with slopes (w, 6, 12 + a)."""
-    model, flange = _model(cell.robot, purpose), cell.robot.base_from_flange(at)
-    problem = chain(cell.mount, flange[:1], cell.cam_from_target(at[:1]))
+    """Camera-board pair, with its (w, 4, 4) poses and their Jacobian (w, 6, 12 + a)."""
+    model, flange = _arm_model(cell.robot, purpose), cell.robot.base_from_flange(q)
+    problem = chain(cell.mount, flange[:1], cell.cam_from_target(q[:1]))
     pair = ArmPair.of(problem, State(np.stack([cell.x, cell.z]), np.zeros(0)), problem.robots[0])
-    return pair, *pair.jacobian(flange, model.basis(at))
+    return pair, *pair.jacobian(flange, model.basis(q))
 
 
-def _inside(cell: PlanCell, workspace: Box | None) -> FloatArray:
-    """(w, n) postures that stand for the workspace."""
+def _workspace_postures(cell: PlanCell, workspace: Box | None) -> FloatArray:
+    """Postures (w, n) that sample the workspace [rad]."""
     if workspace is None:
         return postures(cell.robot)
-    at = postures(cell.robot, _TRIED)
-    carried = cell.robot.base_from_flange(at) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
-    there = (invert(workspace.base_from_box) @ carried)[:, :3, 3]
-    within = np.all(np.abs(there) <= np.asarray(workspace.size_m) / 2, axis=1)
+    q = postures(cell.robot, _TRIED)
+    carried = cell.robot.base_from_flange(q) @ (cell.x if cell.mount == "eye-in-hand" else cell.z)
+    position = (invert(workspace.base_from_box) @ carried)[:, :3, 3]
+    within = np.all(np.abs(position) <= np.asarray(workspace.size_m) / 2, axis=1)
     if not within.any():
         raise DataError(
-            f"workspace {workspace.name}: none of {len(at)} postures all over the {cell.robot.name}"
+            f"workspace {workspace.name}: none of {len(q)} postures all over the {cell.robot.name}"
             "'s reach brings what it carries into the box.",
             culprits=[f"workspace {workspace.name}"],
             next_step="Give its centre in the base frame and its full lengths [m].",
         )
-    return at[within][:_POSTURES]
+    return q[within][:_POSTURES]
 
 
 def _mean_square(jacobian: FloatArray) -> FloatArray:
-    """Mean over m of slopes^T slopes: (m, 3, p) to (p, p)."""
+    """Mean over m of J^T J: (m, 3, p) to (p, p)."""
     rows = jacobian.reshape(-1, jacobian.shape[2])
     return np.asarray(rows.T @ rows / len(jacobian))
 
 
-def _widened(square: FloatArray, looks: int) -> FloatArray:
-    """Puts columns of zeros for lens and board behind those of the edges."""
-    size = len(square) + looks
+def _padded(square: FloatArray, shared_count: int) -> FloatArray:
+    """Inserts rows and columns of zeros for lens and board after those of the edges."""
+    size = len(square) + shared_count
     wide = np.zeros((size, size))
-    rows = np.concatenate([np.arange(12), np.arange(12 + looks, size)])
+    rows = np.concatenate([np.arange(12), np.arange(12 + shared_count, size)])
     wide[np.ix_(rows, rows)] = square
     return wide

@@ -8,24 +8,24 @@ from visioncal.live.planning.accuracy import Accuracy
 from visioncal.live.planning.needed import NeedPlanned, words_of
 from visioncal.live.planning.plan import Plan
 
-# More stops are no help where this many times the error is the board's.
+# The board's size limits a plan if knowing it exactly would reduce the error by this factor.
 _LIMITED = 1.5
 
 
-def accuracy_words(found: Accuracy) -> str:
-    """Says what is predicted: `0.12 mm and 0.02 deg`."""
-    if found.is_open:
+def accuracy_words(accuracy: Accuracy) -> str:
+    """States an accuracy: `0.12 mm and 0.02 deg`."""
+    if accuracy.is_open:
         return "not determined"
-    return mm_and_deg(found.mm, found.deg)
+    return mm_and_deg(accuracy.mm, accuracy.deg)
 
 
-def need_words(found: NeedPlanned) -> str:
-    """Says what is predicted of picks: `97 % of picks land within 0.3 mm`."""
-    return f"{percent(found.probability)} of picks land within {words_of(found.need)}"
+def need_words(prediction: NeedPlanned) -> str:
+    """States the prediction for picks: `97 % of picks land within 0.3 mm`."""
+    return f"{percent(prediction.probability)} of picks land within {words_of(prediction.need)}"
 
 
 def summary_of(plan: Plan) -> str:
-    """Says in a sentence what a plan gives."""
+    """Summarises a plan in a sentence."""
     count, design = len(plan.stops), plan.design
     stops = counted(count, "stop")
     wanted = f"{plan.request.purpose.errors}, predicted sigma"
@@ -40,7 +40,7 @@ def summary_of(plan: Plan) -> str:
 
 
 def looks_note(plan: Plan) -> str:
-    """Says that more stops would not help where lens or board limit a plan; else nothing."""
+    """States that lens or board limit a plan, so that more stops would not help; else empty."""
     best, exact = plan.design.best, plan.design.best_look
     if best.is_open or best.mm < _LIMITED * exact.mm:
         return ""
@@ -52,16 +52,16 @@ def looks_note(plan: Plan) -> str:
 
 
 def plan_words(plan: MotionPlan) -> tuple[str, ...]:
-    """The quality of a plan and what it uses, in sentences."""
-    found = plan.excitation
-    condition, random = found.condition, found.random
+    """States the quality of a plan and what it uses of the limits, in sentences."""
+    motion = plan.excitation
+    condition, random = motion.condition, motion.random
     words = [
-        f"exciting motion of {found.request.period_s:g} s: condition {condition.weighted:.1f} for "
-        f"{found.base.rank} base parameters (random motions: {random.weighted:.0f})",
+        f"exciting motion of {motion.request.period_s:g} s: condition {condition.weighted:.1f} for "
+        f"{motion.base.rank} base parameters (random motions: {random.weighted:.0f})",
         "joints weighted by their greatest torques, columns of unit length; unweighted "
         f"{condition.scaled:.1f} (random: {random.scaled:.0f}), raw {condition.raw:.0f} (random: "
         f"{random.raw:.0f})",
-        f"it uses {_used(found.kept)}",
+        f"it uses {_used(motion.kept)}",
     ]
     if plan.sweeps is not None:
         words += [_sweeps(plan.sweeps), f"they use {_used(plan.sweeps.kept)}"]
@@ -69,11 +69,11 @@ def plan_words(plan: MotionPlan) -> tuple[str, ...]:
 
 
 def plan_warnings(plan: MotionPlan) -> tuple[str, ...]:
-    """What the reader must know before the plan is driven."""
-    found = [f"not checked: {name}" for name in plan.allowed.unchecked]
+    """Warnings to read before the plan is driven."""
+    warnings = [f"not checked: {name}" for name in plan.allowed.unchecked]
     if plan.sweeps is not None and plan.sweeps.left_out:
-        found.append(f"too little room to sweep {some_of(plan.sweeps.left_out)}")
-    return tuple(found)
+        warnings.append(f"too little room to sweep {some_of(plan.sweeps.left_out)}")
+    return tuple(warnings)
 
 
 def _used(kept: Kept) -> str:

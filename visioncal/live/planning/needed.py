@@ -1,9 +1,9 @@
-"""How likely picks land within a need after a plan, and what is in the way where they do not.
+"""Predicted probability that picks land within a tolerance after a plan, and what limits it.
 
-A pick as the verdict has it (`calibration.stages.need`): the camera looks at a thing as a stop
-looks at its target, and the robot goes there. Counted are the camera's pose and the noise of the
-flange at the look, where it carries the camera, and at the pick. The error of detecting the thing
-is not.
+A pick is that of the verdict (`calibration.stages.need`): the camera observes an object as a stop
+observes its target, and the robot goes there. Included are the errors of the camera's pose and the
+noise of the flange at the pick, and at the observation where the flange carries the camera. The
+error of detecting the object is not.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ from visioncal.live.planning.cell import PlanCell
 from visioncal.live.planning.information import World
 from visioncal.vision.targets import corner_positions
 
-# So many of all candidates stand for the places where things are looked at.
+# Number of candidates that sample the poses at which objects are observed.
 _LOOKS = 40
-# Stops that add less to the chance in all are not worth taking.
+# Stops that together add less to the probability are not worth taking.
 _NEARLY = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Picking:
-    """The candidates of a plan, as far as picks depend on them.
+    """Picks after a calibration from some candidates of a plan.
 
     Attributes:
-        cells: The cell as it is guessed to be, and as it may be.
+        cells: The guessed cell, and draws from its uncertainty.
         worlds: The candidates' information in each of these.
-        q: (k, n) their joint angles [rad].
-        need: How near picks have to come.
+        q: (k, n) joint angles of the candidates [rad].
+        need: Tolerance of the picks.
     """
 
     cells: Sequence[PlanCell]
@@ -44,29 +44,29 @@ class Picking:
     need: Need
 
     def chance(self, rows: IntArray, *, without: str = "") -> float:
-        """The chance that a pick lands within the need, calibrated from some candidates.
+        """Probability that a pick lands within tolerance, calibrated from some candidates.
 
         Args:
             rows: (m,) the candidates.
-            without: What is taken for exact: `looks` (lens and board), `arm` (errors with its
-                posture) or `noise` (of the robot at look and pick).
+            without: What is taken as exact: `looks` (lens and board), `arm` (posture-dependent
+                errors) or `noise` (of the robot at observation and pick).
         """
         turn_rad = np.inf if self.need.deg is None else float(np.deg2rad(self.need.deg))
         shift_m = np.inf if self.need.mm is None else 1e-3 * self.need.mm
         q = self.q[np.linspace(0, len(self.q) - 1, min(_LOOKS, len(self.q))).astype(np.int64)]
-        found = []
+        chances = []
         for cell, world in zip(self.cells, self.worlds, strict=True):
-            known = {"looks": world.with_known_looks, "arm": world.without_misfit}
-            sure = known.get(without, lambda world=world: world)()
+            exact = {"looks": world.with_known_lens_board, "arm": world.without_unestimated_arm}
+            assumed = exact.get(without, lambda world=world: world)()
             noise = np.repeat(cell.noise.robots[0], 3) ** 2 * (without != "noise")
-            spreads = _spreads(cell, sure.covariance(rows)[:6, :6], noise, q)
-            found.append(chance_within(spreads, turn_rad, shift_m))
-        return float(np.mean(found))
+            covariances = _pick_covariances(cell, assumed.covariance(rows)[:6, :6], noise, q)
+            chances.append(chance_within(covariances, turn_rad, shift_m))
+        return float(np.mean(chances))
 
     def fewest(self, rows: IntArray) -> int:
-        """How many of some candidates in their order are enough, or nearly as good as all."""
+        """Least number of the first candidates that are enough, or nearly as good as all."""
         share = self.share_of(rows)
-        # Each stop tells more: the least number is found by halves.
+        # The probability rises with each stop: bisection.
         least, most = 0, len(rows)
         while least < most:
             middle = (least + most) // 2
@@ -77,20 +77,19 @@ class Picking:
         return least
 
     def share_of(self, rows: IntArray) -> float:
-        """The chance that is to be reached: what is needed, or nearly what some candidates give."""
+        """Probability to reach: the required one, or nearly that of some candidates."""
         return min(NeedLimits.probability[0], self.chance(rows) - _NEARLY)
 
 
 @dataclass(frozen=True)
 class NeedPlanned:
-    """What is predicted of picks.
+    """Predicted probability that picks land within tolerance.
 
     Attributes:
-        need: How near they have to come.
-        before: The chance that one does without the planned stops.
+        before: Probability without the planned stops.
         probability: The same with them.
         best: The same with all candidates.
-        limits: What is in the way, in words; empty where the need is met.
+        limits: What limits it, in words; empty where the need is met.
     """
 
     need: Need
@@ -101,18 +100,12 @@ class NeedPlanned:
 
     @property
     def met(self) -> bool:
-        """Whether they come as near as they have to."""
+        """Whether the probability is high enough."""
         return self.probability >= NeedLimits.probability[0]
 
 
 def need_planned(picking: Picking, rows: IntArray, count: int) -> NeedPlanned:
-    """Predicts picks after a plan, and says what is in the way.
-
-    Args:
-        picking: The candidates.
-        rows: (m,) those that were chosen.
-        count: How many stops were allowed.
-    """
+    """Predicts picks after a plan of at most `count` stops (m,), and states what limits them."""
     every, least = np.arange(len(picking.q)), NeedLimits.probability[0]
     probability, best = picking.chance(rows), picking.chance(every)
     words = ""
@@ -122,12 +115,12 @@ def need_planned(picking: Picking, rows: IntArray, count: int) -> NeedPlanned:
         if best >= least:
             words += f"More than {count} stops are needed: all candidates give {percent(best)}."
         else:
-            words += f"All candidates together give {percent(best)}. {_in_the_way(picking, every)}"
+            words += f"All candidates together give {percent(best)}. {_main_limit(picking, every)}"
     return NeedPlanned(picking.need, picking.chance(rows[:0]), probability, best, words)
 
 
 def words_of(need: Need) -> str:
-    """A need in words: `0.3 mm and 0.1 deg`."""
+    """States a tolerance in words: `0.3 mm and 0.1 deg`."""
     return " and ".join(
         f"{figure(value)} {unit}"
         for value, unit in ((need.mm, "mm"), (need.deg, "deg"))
@@ -139,7 +132,7 @@ def check_need(need: Need, judged: str) -> None:
     """Refuses a need that a plan cannot be made for.
 
     Raises:
-        DataError: A number is not above zero, or stops are not to determine the camera's pose.
+        DataError: A number is not above zero, or the stops are not for the camera's pose.
     """
     for name, value in (("mm", need.mm), ("deg", need.deg)):
         if value is not None and not 0.0 < value < np.inf:
@@ -155,40 +148,38 @@ def check_need(need: Need, judged: str) -> None:
         )
 
 
-def _spreads(
+def _pick_covariances(
     cell: PlanCell, covariance: FloatArray, noise: FloatArray, q: FloatArray
 ) -> FloatArray:
-    """(k, 6, 6) of picks of things where the target is seen at (k, n) postures.
+    """Covariances (k, 6, 6) of picks of objects at the target's poses from (k, n) postures [rad].
 
-    All in the axes of what carries the camera: the flange, or the base.
-
-    Args:
-        cell: The cell.
-        covariance: (6, 6) of the camera's pose, a right perturbation.
-        noise: (6,) variances of the flange.
-        q: The postures [rad].
+    All are in the axes of what carries the camera: the flange, or the base. The covariance (6, 6)
+    is that of the camera's pose, a right perturbation; the noise (6,) is variances of the flange.
     """
     middle = corner_positions(cell.target).mean(axis=0)
-    seen = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
+    points = (cell.cam_from_target(q) @ [*middle, 1.0])[:, :3]
     turn = cell.x[:3, :3]
-    by_camera = _levers(seen)
-    by_camera[:, :3], by_camera[:, 3:] = turn @ by_camera[:, :3], turn @ by_camera[:, 3:]
-    spreads = by_camera @ covariance @ np.swapaxes(by_camera, 1, 2) + np.diag(noise)
+    jacobian = _point_jacobians(points)
+    jacobian[:, :3], jacobian[:, 3:] = (
+        turn @ jacobian[:, :3],
+        turn @ jacobian[:, 3:],
+    )
+    covariances = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + np.diag(noise)
     if cell.mount == "eye-in-hand":
-        by_flange = _levers(seen @ turn.T + cell.x[:3, 3])
-        spreads = spreads + (by_flange * noise) @ np.swapaxes(by_flange, 1, 2)
-    return np.asarray(spreads)
+        flange_jacobian = _point_jacobians(points @ turn.T + cell.x[:3, 3])
+        covariances = covariances + (flange_jacobian * noise) @ np.swapaxes(flange_jacobian, 1, 2)
+    return np.asarray(covariances)
 
 
-def _levers(points: FloatArray) -> FloatArray:
-    """(k, 6, 6) how things at (k, 3) points turn and move with the frame they are given in."""
-    found = np.tile(np.eye(6), (len(points), 1, 1))
-    found[:, 3:, :3] = -skew(points)
-    return found
+def _point_jacobians(points: FloatArray) -> FloatArray:
+    """Jacobians (k, 6, 6) of poses at (k, 3) points in the pose of the frame that carries them."""
+    jacobians = np.tile(np.eye(6), (len(points), 1, 1))
+    jacobians[:, 3:, :3] = -skew(points)
+    return jacobians
 
 
-# What may be in the way, and what helps.
-_WAYS_OUT = {
+# Possible limits, each with its remedy.
+_REMEDIES = {
     "looks": (
         "the uncertainty of the board's size and the lens",
         "measure the print over many squares, and state its square_sigma_m",
@@ -205,11 +196,11 @@ _WAYS_OUT = {
 }
 
 
-def _in_the_way(picking: Picking, every: IntArray) -> str:
-    """What would help most, and whether that would be enough."""
-    without = {name: picking.chance(every, without=name) for name in _WAYS_OUT}
+def _main_limit(picking: Picking, every: IntArray) -> str:
+    """States the most important limit, and whether removing it would be enough."""
+    without = {name: picking.chance(every, without=name) for name in _REMEDIES}
     most = max(without, key=lambda index: without[index])
-    cause, advice = _WAYS_OUT[most]
+    cause, advice = _REMEDIES[most]
     words = f"is {cause} ({percent(without[most])} without it): {advice}."
     if without[most] >= NeedLimits.probability[0]:
         return f"In the way {words}"

@@ -1,4 +1,4 @@
-"""The way from stop to stop: in a short order, and clear of everything all along."""
+"""Path planning through the stops: a short order, with collision-free paths in joint space."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,22 +10,22 @@ from visioncal.core.types import FloatArray
 from visioncal.live.planning.cell import PlanCell, collisions_of
 from visioncal.robot.collision import Collisions
 
-# Exchanges gain at least this [rad]; a tour is improved over and over at most so many times.
+# Least gain of a reversal [rad], and the most passes over a tour.
 _GAIN_RAD, _ROUNDS = 1e-9, 50
-# Places at which a stop that was left aside is tried again, the nearest first.
+# Nearest stops beside which a postponed stop is tried again.
 _PLACES = 3
-# A tour that leads to fewer of the stops is begun at another one, so many times.
-_MOST, _BEGINNINGS = 0.5, 3
-# Draws before a search is given up, and how far one step of it goes [rad].
+# A tour that reaches no more than this share of the stops is started at another one, this often.
+_MOST, _STARTS = 0.5, 3
+# Draws per search, and the length of one step [rad].
 _DRAWS, _STEP_RAD = 120, 0.7
-# After so many searches in vain, ways are straight or none.
-_IN_VAIN = 60
-# How far a detour may leave the box of both postures [rad].
+# After this many failed searches only straight paths are tried.
+_MOST_FAILED = 60
+# How far a detour may leave the joint box of both postures [rad].
 _ASIDE_RAD = 1.5
 
 
 class Detours:
-    """Finds ways between postures on which nothing comes too near to anything."""
+    """Planner of collision-free paths between postures."""
 
     def __init__(self, cell: PlanCell, collisions: Collisions, seed: int) -> None:
         """Prepares the search for a cell."""
@@ -34,31 +34,26 @@ class Detours:
         self._upper = cell.robot.upper_rad - margin
         self._collisions = collisions
         self._rng = np.random.default_rng(seed)
-        self._in_vain = 0
+        self._failed_searches = 0
 
-    def way(self, start: FloatArray, end: FloatArray) -> FloatArray | int:
-        """Finds a way: straight, or around what is in between.
-
-        Args:
-            start: (n,) joint angles [rad].
-            end: (n,) joint angles [rad].
+    def path(self, start: FloatArray, end: FloatArray) -> FloatArray | int:
+        """Finds a path between joint angles (n,) [rad]: straight in joint space, or a detour.
 
         Returns:
-            The postures (j, n) between which the joints move evenly, without the ends; or, where no
-            way was found, the pair of bodies that the straight one brings together, as
-            `Collisions.names` counts them.
+            Via postures (j, n), without the ends; or, where no path was found, the index in
+            `Collisions.names` of the pair of bodies that collides on the straight one.
         """
         blocked = self._collisions.on_the_way(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
-        found = self._around(start, end) if self._in_vain < _IN_VAIN else None
-        if found is None:
-            self._in_vain += 1
+        detour = self._rrt_connect(start, end) if self._failed_searches < _MOST_FAILED else None
+        if detour is None:
+            self._failed_searches += 1
             return blocked
-        return self._straightened(found)[1:-1]
+        return self._shortcut(detour)[1:-1]
 
-    def _around(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
-        """Two trees that grow towards draws and one another (Kuffner and LaValle 2000).
+    def _rrt_connect(self, start: FloatArray, end: FloatArray) -> FloatArray | None:
+        """RRT-Connect: two trees grow towards draws and each other (Kuffner and LaValle 2000).
 
         Returns:
             (j, n) postures from start to end; None where the trees did not meet.
@@ -74,72 +69,76 @@ class Detours:
             met = self._grow(far, near.postures[grown], steps=_DRAWS)
             if met is not None and np.array_equal(far.postures[met], near.postures[grown]):
                 halves = [near.to_root(grown)[::-1], far.to_root(met)[1:]]
-                way = np.vstack(halves)
-                return way if near is trees[0] else way[::-1]
+                path = np.vstack(halves)
+                return path if near is trees[0] else path[::-1]
         return None
 
     def _grow(self, tree: "_PostureTree", goal: FloatArray, steps: int) -> int | None:
-        """Grows a tree towards a posture, until something is in the way: its last new place."""
+        """Grows a tree towards a posture until it is blocked; returns its last new node."""
         place, new = tree.nearest(goal), None
         for _ in range(steps):
-            left = goal - tree.postures[place]
-            far = float(np.linalg.norm(left))
-            if far == 0.0:
+            difference = goal - tree.postures[place]
+            distance = float(np.linalg.norm(difference))
+            if distance == 0.0:
                 return place
-            posture = goal if far <= _STEP_RAD else tree.postures[place] + left * (_STEP_RAD / far)
+            posture = (
+                goal
+                if distance <= _STEP_RAD
+                else tree.postures[place] + difference * (_STEP_RAD / distance)
+            )
             if self._collisions.on_the_way(tree.postures[place], posture) >= 0:
                 break
             place = new = tree.add(posture, place)
         return new
 
-    def _straightened(self, way: FloatArray) -> FloatArray:
-        """Leaves out postures between which a straight way is clear."""
-        kept, at = [0], 0
-        while at < len(way) - 1:
-            ahead = range(len(way) - 1, at + 1, -1)
+    def _shortcut(self, path: FloatArray) -> FloatArray:
+        """Removes postures that a straight path can skip."""
+        kept, last = [0], 0
+        while last < len(path) - 1:
+            ahead = range(len(path) - 1, last + 1, -1)
             clear = (
-                index for index in ahead if self._collisions.on_the_way(way[at], way[index]) < 0
+                index for index in ahead if self._collisions.on_the_way(path[last], path[index]) < 0
             )
-            at = next(clear, at + 1)
-            kept.append(at)
-        return np.asarray(way[kept])
+            last = next(clear, last + 1)
+            kept.append(last)
+        return np.asarray(path[kept])
 
 
 class _PostureTree:
-    """Postures that can be reached from the first of them."""
+    """Tree of postures that can be reached from its root."""
 
     def __init__(self, root: FloatArray) -> None:
         self.postures = [root]
         self._parents = [0]
 
     def add(self, posture: FloatArray, parent: int) -> int:
-        """Adds a posture behind another one, and returns its place."""
+        """Adds a posture after its parent, and returns its index."""
         self.postures.append(posture)
         self._parents.append(parent)
         return len(self.postures) - 1
 
     def nearest(self, goal: FloatArray) -> int:
-        """The place of the posture nearest to one."""
+        """Index of the posture nearest to a goal."""
         return int(np.linalg.norm(np.array(self.postures) - goal, axis=1).argmin())
 
     def to_root(self, place: int) -> FloatArray:
-        """The postures (j, n) from a place to the root."""
-        way = [place]
-        while way[-1]:
-            way.append(self._parents[way[-1]])
-        return np.array([self.postures[index] for index in way])
+        """Postures (j, n) from a node to the root."""
+        path = [place]
+        while path[-1]:
+            path.append(self._parents[path[-1]])
+        return np.array([self.postures[index] for index in path])
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """The way through the stops. Between two postures all joints move evenly, in a straight line.
+    """Path through the stops, straight in joint space between its postures.
 
     Attributes:
-        order: (k,) rows of the stops in their given order.
-        segments: The postures (j, n) that are passed on the way to each stop, j often 0; the first
-            is from the start where one was given, and absent otherwise.
-        length_rad: How far the joints travel altogether, as the sum of the ways' norms.
-        unreachable: The rows that no safe way was found to, and what is in the way.
+        order: (k,) rows of the stops in driving order.
+        segments: Via postures (j, n) before each stop, j often 0; the first is from the start where
+            one was given, and absent otherwise.
+        length_rad: Length of the path, as the sum of its segments' norms.
+        unreachable: Rows to which no safe path was found, with the pair of bodies that collides.
     """
 
     order: tuple[int, ...]
@@ -149,22 +148,22 @@ class Route:
 
 
 def ordered(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:
-    """Orders stops so that the joints travel little, and finds a clear way between them.
+    """Orders stops for a short path of the joints, and finds collision-free segments.
 
-    The order is that of nearest neighbours, improved by reversals (Croes 1958, 2-opt). Each way is
-    a straight line of the joints, or a detour where something is in between.
+    The order is that of nearest neighbours, improved by reversals (Croes 1958, 2-opt). Each segment
+    is straight in joint space, or a detour around obstacles.
 
     Args:
         cell: The cell.
-        start_q: (n,) where the arm stands before [rad]; None to begin at any stop.
-        q: (k, n) joint angles of the stops [rad], each clear as `candidates` gives them.
-        seed: Of the detours.
+        start_q: (n,) joint angles of the arm before [rad]; None to begin at any stop.
+        q: (k, n) joint angles of the stops [rad], free of collisions as from `candidates`.
+        seed: Random seed of the detours.
 
     Returns:
-        The way. Stops that cannot be reached safely are left out and named.
+        The path. Stops that cannot be reached safely are left out and named.
 
     Raises:
-        DataError: The start is nearer to something than the clearance allows.
+        DataError: The start violates the clearance.
     """
     collisions = collisions_of(cell)
     if start_q is not None:
@@ -172,7 +171,7 @@ def ordered(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int
     detours = Detours(cell, collisions, seed)
     best: _Tour | None = None
     first = int(np.linalg.norm(q - np.median(q, axis=0), axis=1).argmax()) if len(q) else 0
-    for _ in range(1 if start_q is not None else _BEGINNINGS):
+    for _ in range(1 if start_q is not None else _STARTS):
         order = _short_order(start_q, q, first)
         tour = _Tour(detours, start_q, q)
         tour.walk(order)
@@ -202,90 +201,90 @@ def _check_start(cell: PlanCell, collisions: Collisions, start_q: FloatArray) ->
 
 
 class _Tour:
-    """A way that grows from stop to stop."""
+    """Path that is extended stop by stop."""
 
     def __init__(self, detours: Detours, start_q: FloatArray | None, q: FloatArray) -> None:
         self.order: list[int] = []
         self._detours, self._start, self._q = detours, start_q, q
-        # The way to each stop of the order; that to the first is None where there is no start.
-        self._ways: list[FloatArray | None] = []
+        # Path to each stop of the order; None for the first where there is no start.
+        self._paths: list[FloatArray | None] = []
         self._blocked: dict[int, int] = {}
 
     def walk(self, order: Sequence[int]) -> None:
-        """Goes to all stops in an order, and comes back to those that were not reached at first."""
-        aside = [row for row in order if not self._insert(row, len(self.order))]
-        for row in aside:
-            away = [float(np.linalg.norm(self._q[index] - self._q[row])) for index in self.order]
-            # Behind its nearest neighbours, or before them.
-            places = [place + after for place in np.argsort(away)[:_PLACES] for after in (1, 0)]
+        """Inserts stops in an order, and tries those again that were not reached at first."""
+        postponed = [row for row in order if not self._insert(row, len(self.order))]
+        for row in postponed:
+            apart = [float(np.linalg.norm(self._q[index] - self._q[row])) for index in self.order]
+            # After its nearest neighbours, or before them.
+            places = [place + after for place in np.argsort(apart)[:_PLACES] for after in (1, 0)]
             any(self._insert(row, int(place)) for place in dict.fromkeys(places))
 
     def route(self, collisions: Collisions) -> Route:
-        """The way as it is handed out."""
-        segments = tuple(way for way in self._ways if way is not None)
+        """The finished path."""
+        segments = tuple(path for path in self._paths if path is not None)
         length = 0.0
-        for place, way in enumerate(self._ways):
-            before = self._before(place)
-            if before is not None and way is not None:
-                postures = np.vstack([before, way, self._q[self.order[place]]])
+        for place, path in enumerate(self._paths):
+            previous = self._before(place)
+            if previous is not None and path is not None:
+                postures = np.vstack([previous, path, self._q[self.order[place]]])
                 length += float(np.linalg.norm(np.diff(postures, axis=0), axis=1).sum())
         missing = [row for row in self._blocked if row not in self.order]
         words = {row: " and ".join(collisions.names[self._blocked[row]]) for row in missing}
         return Route(tuple(self.order), segments, length, words)
 
     def _insert(self, row: int, place: int) -> bool:
-        """Goes to a stop at a place of the order, if there are ways to it and from it."""
-        before, goal = self._before(place), self._q[row]
-        way = None if before is None else self._way(before, goal, row)
-        if before is not None and way is None:
+        """Inserts a stop at a place of the order if there are paths to it and from it."""
+        previous, goal = self._before(place), self._q[row]
+        path = None if previous is None else self._path(previous, goal, row)
+        if previous is not None and path is None:
             return False
         if place < len(self.order):
-            onward = self._way(goal, self._q[self.order[place]], row)
-            if onward is None:
+            next_way = self._path(goal, self._q[self.order[place]], row)
+            if next_way is None:
                 return False
-            self._ways[place] = onward
+            self._paths[place] = next_way
         self.order.insert(place, row)
-        self._ways.insert(place, way)
+        self._paths.insert(place, path)
         return True
 
-    def _way(self, start: FloatArray, end: FloatArray, row: int) -> FloatArray | None:
-        found = self._detours.way(start, end)
-        if isinstance(found, int):
-            self._blocked[row] = found
+    def _path(self, start: FloatArray, end: FloatArray, row: int) -> FloatArray | None:
+        path = self._detours.path(start, end)
+        if isinstance(path, int):
+            self._blocked[row] = path
             return None
-        return found
+        return path
 
     def _before(self, place: int) -> FloatArray | None:
-        """The posture before a place of the order; None before the first where none is given."""
+        """Posture before a place of the order; None at the start where none is given."""
         return self._q[self.order[place - 1]] if place else self._start
 
 
 def _short_order(start_q: FloatArray | None, q: FloatArray, first: int) -> list[int]:
-    """An order in which the joints travel little: nearest neighbours, improved by reversals."""
+    """Order with a short path of the joints: nearest neighbours, improved by reversals."""
     points = q if start_q is None else np.vstack([q, start_q])
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
     order = [first if start_q is None else len(q)]
-    left = set(range(len(q))) - set(order)
-    while left:
-        here = order[-1]
-        order.append(min(left, key=lambda row: apart[here, row]))
-        left.remove(order[-1])
+    remaining = set(range(len(q))) - set(order)
+    while remaining:
+        last = order[-1]
+        order.append(min(remaining, key=lambda row: distance[last, row]))
+        remaining.remove(order[-1])
     tour = np.array(order)
     for _ in range(_ROUNDS):
-        if not _reversed(tour, apart):
+        if not _improve_by_reversals(tour, distance):
             break
     return [int(row) for row in tour if row < len(q)]
 
 
-def _reversed(tour: FloatArray, apart: FloatArray) -> bool:
-    """Reverses parts of an open tour, in place, where that makes it shorter; its start stays."""
+def _improve_by_reversals(tour: FloatArray, distance: FloatArray) -> bool:
+    """Reverses parts of an open tour in place (2-opt) where that shortens it; its start stays."""
     gained = False
     for i in range(1, len(tour) - 1):
-        # Reversing i..j changes the ways into i and out of j; at the end there is none.
+        # Reversing i..j changes the segments into i and out of j; there is none out of the end.
         ends = tour[i + 1 :]
         after = np.append(tour[i + 2 :], -1)
-        onward = np.where(after >= 0, apart[ends, after] - apart[tour[i], after], 0.0)
-        gain = apart[tour[i - 1], tour[i]] - apart[tour[i - 1], ends] + onward
+        onward = np.where(after >= 0, distance[ends, after] - distance[tour[i], after], 0.0)
+        gain = distance[tour[i - 1], tour[i]] - distance[tour[i - 1], ends] + onward
         j = int(gain.argmax())
         if gain[j] > _GAIN_RAD:
             tour[i : i + 2 + j] = tour[i : i + 2 + j][::-1].copy()

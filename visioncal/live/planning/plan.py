@@ -1,4 +1,4 @@
-"""A plan: which stops the robot takes, in which order, what is predicted of them; next stops."""
+"""A plan: the chosen stops, their order, and the accuracy predicted after each."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,36 +25,32 @@ from visioncal.live.planning.purposes import Purpose
 from visioncal.live.planning.recorded import Begun
 from visioncal.robot import Robot
 
-# Stops without a safe way to them are chosen anew so often: an arm that folds far back needs up to
-# six rounds for 8 to 30 stops.
+# Most rounds in which stops without a safe path are replaced: an arm that folds far back needs up
+# to six for 8 to 30 stops.
 _ROUNDS = 12
 
-# A direction this close to the optical axis is called by it; another axis is named besides where
-# the direction has this share of it.
+# Cosine above which a rotation axis is named after the optical axis, and the component from which a
+# second axis is named.
 _NEARLY_AXIS, _ASIDE = 0.95, 0.4
-# Smaller turns from a stop that is there are no new direction [rad].
+# A rotation from an earlier stop smaller than this is called a shift [rad].
 _TURN_RAD = 0.17
-# What takes less than a hundredth off an error gets no figure.
+# An error of which more than this share remains is reduced "little".
 _LITTLE_SHARE = 0.99
-# What a rotation counts beside an offset: its effect at this distance [m].
+# Distance at which a rotation error is compared with an offset error [m].
 _LEVER_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
-    """What is asked of a plan.
+    """Request for a plan.
 
     Attributes:
-        purpose: What the stops are for.
-        count: The most stops.
-        criterion: What makes stops good.
-        wish: The accuracy at which fewer are enough; None for none.
-        need: How near picks have to come, at which fewer are enough; None for none.
-        candidates: From how many possible stops they are chosen.
-        workspace: Where the arm's place counts; None for all of its reach.
-        start_q: (n,) joint angles where the arm stands now [rad]; None where that is not known, and
-            the way to the first stop is not looked at.
-        seed: Of everything random.
+        count: Most stops.
+        wish: Accuracy at which fewer stops are enough; None for none.
+        need: Tolerance of picks at which fewer are enough; None for none.
+        workspace: Region in which the arm's accuracy counts; None for all of its reach.
+        start_q: (n,) present joint angles of the arm [rad]; None where they are not known, and the
+            path to the first stop is not checked.
     """
 
     purpose: Purpose
@@ -70,19 +66,18 @@ class PlanRequest:
 
 @dataclass(frozen=True, eq=False)
 class PlannedStop:
-    """One stop.
+    """A planned stop.
 
     Attributes:
-        view: The number of the view to be taken there.
+        view: Number of the view to be taken there.
         q: (n,) joint angles [rad].
-        via: (j, n) postures between the stop before and this one, each reached on a straight way
-            in joint space [rad].
-        base_from_flange: (4, 4) where the flange is, by the robot's model [m].
-        cam_from_target: (4, 4) how the board is seen if the guesses are right [m].
-        seen: In which share of what the cell may be the whole board is in the image.
-        rank: 1 for the most informative stop, 2 for the most informative besides it, ...
-        words: What it is good for.
-        before: What is predicted of the stops of lower rank, and of what was recorded.
+        via: (j, n) via postures after the previous stop, connected straight in joint space [rad].
+        base_from_flange: (4, 4) flange, by the robot's model [m].
+        cam_from_target: (4, 4) board in the camera if the guesses are right [m].
+        seen: Share of the uncertain cell's draws in which the whole board is in the image.
+        rank: 1 for the most informative stop, 2 for the next, ...
+        words: What the stop contributes.
+        before: Accuracy predicted with the recorded stops and those of lower rank number.
         after: The same with this one.
     """
 
@@ -100,24 +95,20 @@ class PlannedStop:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Stops in the order in which the robot drives to them.
+    """A plan.
 
     Attributes:
-        cell: What they are planned for.
-        request: What was asked.
-        stops: The stops.
-        design: What is predicted of them.
-        length_rad: How far the joints travel in all, as the sum of the ways' norms [rad].
-        begun: What was recorded already; None for nothing.
-        found: How many possible stops they were chosen from.
-        lost: What kept how many tries from being possible.
-        in_the_way: What kept stops from being driven to, one for each that was exchanged for
-            another.
-        shortfall: Why the wished accuracy, or the need, is not met, in words; empty where it is or
-            none was wished.
-        need: What is predicted of picks; None where nothing is needed.
-        map_m: (w, 3) places all over the workspace, in the base [m]; empty where the purpose does
-            not judge it.
+        design: The chosen candidates and the accuracy predicted with them.
+        length_rad: Length of the path, as the sum of its segments' norms [rad].
+        begun: The session to which the stops are added; None for none.
+        found: Number of candidates.
+        lost: Number of tries that each limit rejected.
+        in_the_way: What blocked stops that were replaced, one entry for each.
+        shortfall: Why the wished accuracy, or the need, is not met, in words; empty where it is met
+            or there is none.
+        need: Prediction for picks; None where there is no need.
+        map_m: (w, 3) positions all over the workspace, in the base [m]; empty where the purpose
+            does not judge it.
         map_sigma_m: (w,) predicted standard deviations there [m].
     """
 
@@ -144,42 +135,42 @@ def make_plan(
     begun: Begun | None = None,
     progress: Progress | None = None,
 ) -> Plan:
-    """Chooses stops, orders them, and says what each is good for.
+    """Chooses stops, orders them, and states what each contributes.
 
     Args:
-        cell: The cell as it is guessed to be.
-        request: What is asked.
-        begun: What was recorded already, to which the stops are added; its cell is `cell`.
-        progress: Told of long work.
+        cell: The cell, as guessed.
+        request: The request.
+        begun: Session to which the stops are added; its cell is `cell`.
+        progress: Called during long work.
 
     Raises:
-        DataError: The cell allows too few stops, or none has a safe way to another.
+        DataError: The cell allows too few stops, or none has a safe path to another.
     """
-    progress = progress or _silent
+    progress = progress or (lambda *_: None)
     if request.need is not None:
         check_need(request.need, request.purpose.judged)
-    # Where a recorded cell allows few stops, as before a fixed camera, these are the ones to add.
+    # A recorded cell may allow few stops, such as one with a fixed camera; these are added.
     least = None if begun is None else min(request.count, request.candidates)
-    found = candidates(cell, request.candidates, request.seed, progress, least=least)
+    stops = candidates(cell, request.candidates, request.seed, progress, least=least)
     progress("information", 0, 1)
     cells = (cell, *cell.guesses(WORLDS - 1, request.seed))
     worlds = worlds_of(
         cells,
         request.purpose,
-        found.q,
+        stops.q,
         recorded=None if begun is None else begun.recorded,
         workspace=request.workspace,
     )
     progress("choice", 0, 1)
-    planning = _Planning(cells, request, found, worlds, begun)
-    design, route, in_the_way = planning.with_a_way(progress)
-    map_m, map_sigma_m = planning.mapped(design)
-    needed = None
+    planning = _Planning(cells, request, stops, worlds, begun)
+    design, route, in_the_way = planning.drivable_design(progress)
+    map_m, map_sigma_m = planning.sigma_map(design)
+    need = None
     if request.need is not None:
-        picking = Picking(cells, worlds, found.q, request.need)
-        needed = need_planned(picking, design.rows, request.count)
-    missing = [] if request.wish is None else [shortfall(design, request.wish, request.count)]
-    missing += [] if needed is None else [needed.limits]
+        picking = Picking(cells, worlds, stops.q, request.need)
+        need = need_planned(picking, design.rows, request.count)
+    shortfalls = [] if request.wish is None else [shortfall(design, request.wish, request.count)]
+    shortfalls += [] if need is None else [need.limits]
     return Plan(
         cell,
         request,
@@ -187,26 +178,25 @@ def make_plan(
         design,
         route.length_rad,
         begun,
-        len(found),
-        found.lost,
+        len(stops),
+        stops.lost,
         in_the_way,
-        " ".join(name for name in missing if name),
+        " ".join(name for name in shortfalls if name),
         map_m,
         map_sigma_m,
-        needed,
+        need,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Planning:
-    """By what stops are chosen.
+    """Inputs of the choice of stops.
 
     Attributes:
-        cells: The cell as it is guessed to be, and some of what else it may be.
-        request: What is asked.
+        cells: The guessed cell, and draws from its uncertainty.
         found: The candidates.
         worlds: Their information in each of the cells.
-        begun: What was recorded already; None for nothing.
+        begun: Session to which the stops are added; None for none.
     """
 
     cells: tuple[PlanCell, ...]
@@ -217,32 +207,32 @@ class _Planning:
 
     @property
     def recorded(self) -> int:
-        """How many stops were recorded already."""
+        """Number of stops that were recorded already."""
         return 0 if self.begun is None else len(self.begun.views)
 
-    def with_a_way(self, progress: Progress) -> tuple[Design, Route, tuple[str, ...]]:
-        """Chooses stops that can be driven to one after the other.
+    def drivable_design(self, progress: Progress) -> tuple[Design, Route, tuple[str, ...]]:
+        """Chooses stops that a safe path connects.
 
         Returns:
-            The design, the way through it, and what kept stops from being driven to.
+            The design, the path through it, and what blocked the stops that were replaced.
         """
-        left = np.arange(len(self.found.q))
-        given_up: list[str] = []
-        for turn in range(_ROUNDS):
-            design = self._enough(left)
-            progress("path", turn, _ROUNDS)
+        remaining = np.arange(len(self.found.q))
+        blockers: list[str] = []
+        for attempt in range(_ROUNDS):
+            design = self._smallest_design(remaining)
+            progress("path", attempt, _ROUNDS)
             q = self.found.q[design.rows]
             route = ordered(self.cells[0], self.request.start_q, q, self.request.seed)
             if not route.unreachable:
-                return design, route, tuple(given_up)
-            given_up += route.unreachable.values()
-            lost = design.rows[list(route.unreachable)]
-            reached = np.setdiff1d(design.rows, lost)
-            if turn and len(reached):
-                # One by one they would be exchanged for others of the same part of the workspace.
-                lost = self._nearer(left, lost, reached)
-            left = np.setdiff1d(left, lost)
-        obstacles = tuple(dict.fromkeys(given_up))
+                return design, route, tuple(blockers)
+            blockers += route.unreachable.values()
+            unreachable = design.rows[list(route.unreachable)]
+            reached = np.setdiff1d(design.rows, unreachable)
+            if attempt and len(reached):
+                # Otherwise each would be replaced by another in the same part of the workspace.
+                unreachable = self._nearer_to_lost(remaining, unreachable, reached)
+            remaining = np.setdiff1d(remaining, unreachable)
+        obstacles = tuple(dict.fromkeys(blockers))
         raise DataError(
             f"plan: no safe way through {self.request.count} stops was found in {_ROUNDS} choices; "
             f"in the way were {some_of(list(obstacles))}.",
@@ -250,44 +240,45 @@ class _Planning:
             next_step="Make room around the arm, lower the clearance, or ask for fewer stops.",
         )
 
-    def _nearer(self, left: IntArray, lost: IntArray, reached: IntArray) -> IntArray:
-        """The candidates, of some, whose joints are nearer to lost stops than to any reached."""
+    def _nearer_to_lost(self, remaining: IntArray, lost: IntArray, reached: IntArray) -> IntArray:
+        """Remaining candidates whose joints are nearer to lost stops than to any reached one."""
+        q = self.found.q
         to_lost, to_reached = (
-            np.linalg.norm(self.found.q[left][:, None] - self.found.q[rows], axis=2).min(axis=1)
+            np.linalg.norm(q[remaining][:, None] - q[rows], axis=2).min(axis=1)
             for rows in (lost, reached)
         )
-        return np.asarray(left[to_lost < to_reached])
+        return np.asarray(remaining[to_lost < to_reached])
 
-    def _enough(self, left: IntArray) -> Design:
-        """The fewest of some candidates that meet wish and need, or as many as are allowed."""
+    def _smallest_design(self, rows: IntArray) -> Design:
+        """Design with the fewest stops that meet wish and need, or as many as are allowed."""
         request, needed_stops = self.request, CalibrationLimits.stops[0]
         worlds = tuple(
-            replace(world, factors=world.factors[left], misfit=world.misfit[left])
+            replace(world, factors=world.factors[rows], unestimated=world.unestimated[rows])
             for world in self.worlds
         )
 
-        def of(count: int) -> Design:
+        def design_of(count: int) -> Design:
             return chosen(worlds, count, criterion=request.criterion, wish=request.wish)
 
-        design = of(request.count)
+        design = design_of(request.count)
         if not len(design.rows):
-            raise _needless(design)
+            raise _wish_met_error(design)
         if request.need is not None:
-            picking = Picking(self.cells, worlds, self.found.q[left], request.need)
+            picking = Picking(self.cells, worlds, self.found.q[rows], request.need)
             fewest, share = picking.fewest(design.rows), picking.share_of(design.rows)
             if fewest == 0 and self.recorded >= needed_stops:
-                raise _met(request.need, picking.chance(design.rows[:0]))
-            # Few stops tell what they determine, and not whether one of them is wrong.
+                raise _need_met_error(request.need, picking.chance(design.rows[:0]))
+            # Fewer stops may be informative enough, but would not reveal an outlier among them.
             fewest = max(fewest, needed_stops - self.recorded)
-            # The first of many stops are not the best of few, which may be enough where one less
-            # is not.
+            # The first stops of a large design are not the best small design, which may need one
+            # stop less.
             for count in range(max(fewest - 1, 1), len(design.rows)):
-                smaller = of(count)
+                smaller = design_of(count)
                 enough = count >= needed_stops - self.recorded
                 if enough and picking.chance(smaller.rows) >= share:
                     design = smaller
                     break
-        return replace(design, rows=left[design.rows])
+        return replace(design, rows=rows[design.rows])
 
     def stops(self, design: Design, route: Route) -> tuple[PlannedStop, ...]:
         """The stops in driving order."""
@@ -297,7 +288,7 @@ class _Planning:
         numbers[list(route.order)] = first + np.arange(len(design.rows))
         names = [f"view {number}" for number in numbers]
         purpose, world = self.request.purpose, self.worlds[0]
-        said = tuple(helps(cell, purpose, found.q, world, design, names, begun=begun))
+        contributions = tuple(helps(cell, purpose, found.q, world, design, names, begun=begun))
         q = found.q[design.rows]
         flange = cell.robot.base_from_flange(q)
         segments = route.segments
@@ -305,22 +296,22 @@ class _Planning:
             segments = (np.zeros((0, q.shape[1])), *segments)
         return tuple(
             PlannedStop(
-                int(numbers[at]),
-                q[at],
+                int(numbers[row]),
+                q[row],
                 via,
-                flange[at],
-                found.cam_from_target[design.rows[at]],
-                float(found.seen[design.rows[at]]),
-                at + 1,
-                said[at],
-                design.history[at],
-                design.history[at + 1],
+                flange[row],
+                found.cam_from_target[design.rows[row]],
+                float(found.seen[design.rows[row]]),
+                row + 1,
+                contributions[row],
+                design.history[row],
+                design.history[row + 1],
             )
-            for at, via in zip(route.order, segments, strict=True)
+            for row, via in zip(route.order, segments, strict=True)
         )
 
-    def mapped(self, design: Design) -> tuple[FloatArray, FloatArray]:
-        """Places (w, 3) all over the workspace, and (w,) their sigmas, if these count [m]."""
+    def sigma_map(self, design: Design) -> tuple[FloatArray, FloatArray]:
+        """Positions (w, 3) over the workspace with their (w,) sigmas [m]; empty if not judged."""
         request = self.request
         if request.purpose.judged != "workspace" or design.predicted.is_open:
             return np.zeros((0, 3)), np.zeros(0)
@@ -328,7 +319,7 @@ class _Planning:
         return place_sigmas(self.cells[0], request.purpose, covariance, request.workspace)
 
 
-def _met(need: Need, before: float) -> DataError:
+def _need_met_error(need: Need, before: float) -> DataError:
     return DataError(
         f"plan: by what was recorded, {percent(before)} of picks land within {words_of(need)}; "
         "no stop needs to be added.",
@@ -336,17 +327,13 @@ def _met(need: Need, before: float) -> DataError:
     )
 
 
-def _needless(design: Design) -> DataError:
-    found = design.before
+def _wish_met_error(design: Design) -> DataError:
+    before = design.before
     return DataError(
         "plan: the wish is met by what was recorded, which predicts "
-        f"{mm_and_deg(found.mm, found.deg)}; no stop needs to be added.",
+        f"{mm_and_deg(before.mm, before.deg)}; no stop needs to be added.",
         next_step="Wish for more, or leave the wish out to see what further stops would give.",
     )
-
-
-def _silent(_: str, __: int, ___: int) -> None:
-    """Tells nobody."""
 
 
 def helps(
@@ -359,101 +346,99 @@ def helps(
     *,
     begun: Begun | None = None,
 ) -> Iterator[str]:
-    """Says what each chosen stop is good for, those before it being taken.
+    """States what each chosen stop contributes, given those before it and the recorded ones.
 
-    Args:
-        cell: The cell as it is guessed to be.
-        purpose: What the stops are for.
-        q: (k, n) joint angles of the candidates [rad].
-        world: The candidates' information if the guesses are right.
-        design: Which of them are chosen.
-        names: What to call the chosen ones, in their order.
-        begun: What was recorded already; None for nothing.
+    The candidates have joints (k, n) [rad] and their information in `world` if the guesses are
+    right; `names` are those of the chosen ones, in their order.
     """
-    there, known = np.zeros((0, 4, 4)), []
+    earlier_poses, earlier_names = np.zeros((0, 4, 4)), []
     if begun is not None:
-        there = next(iter(begun.recorded.problem.poses.values()))
-        known = [f"view {view}" for view in begun.views]
+        earlier_poses = next(iter(begun.recorded.problem.poses.values()))
+        earlier_names = [f"view {view}" for view in begun.views]
     poses = cell.robot.base_from_flange(q[design.rows])
     before = world.covariance([])
     for place in range(len(design.rows)):
         after = world.covariance(design.rows[: place + 1])
-        motion = _motion(cell, there, poses[place], known)
-        effect = _effect(cell, purpose, before, after, design.history[place : place + 2])
+        motion = _motion_words(cell, earlier_poses, poses[place], earlier_names)
+        effect = _effect_words(cell, purpose, before, after, design.history[place : place + 2])
         yield f"{motion}: {effect}"
-        there = np.concatenate([there, poses[place][None]])
-        known = [*known, names[place]]
+        earlier_poses = np.concatenate([earlier_poses, poses[place][None]])
+        earlier_names = [*earlier_names, names[place]]
         before = after
 
 
-def _motion(cell: PlanCell, there: FloatArray, pose: FloatArray, names: Sequence[str]) -> str:
-    """How a stop differs from the one whose direction is nearest."""
-    if not len(there):
+def _motion_words(
+    cell: PlanCell, earlier_poses: FloatArray, pose: FloatArray, names: Sequence[str]
+) -> str:
+    """Describes a stop's motion from the earlier stop with the nearest orientation."""
+    if not len(earlier_poses):
         return "begin here"
-    turns = Rotation.from_matrix((invert(there) @ pose)[:, :3, :3]).as_rotvec()
-    angles = np.linalg.norm(turns, axis=1)
+    rotations = Rotation.from_matrix((invert(earlier_poses) @ pose)[:, :3, :3]).as_rotvec()
+    angles = np.linalg.norm(rotations, axis=1)
     nearest = int(np.argmin(angles))
     if angles[nearest] < _TURN_RAD:
-        shift = 1e2 * float(np.linalg.norm(pose[:3, 3] - there[nearest, :3, 3]))
+        shift = 1e2 * float(np.linalg.norm(pose[:3, 3] - earlier_poses[nearest, :3, 3]))
         return f"shift by {shift:.0f} cm from {names[nearest]}"
-    axis = turns[nearest] / angles[nearest]
+    axis = rotations[nearest] / angles[nearest]
     degrees = f"by {np.rad2deg(angles[nearest]):.0f} deg from {names[nearest]}"
     flange_from_cam = cell.x
     if cell.mount == "eye-to-hand":
-        flange_from_cam = invert(there[nearest]) @ cell.x
+        flange_from_cam = invert(earlier_poses[nearest]) @ cell.x
     if abs(axis @ flange_from_cam[:3, 2]) > _NEARLY_AXIS:
         return f"turn about the optical axis {degrees}"
     verb = "turn" if abs(axis[2]) > np.linalg.norm(axis[:2]) else "tilt"
-    return f"{verb} about the tool's {_axes(axis)} {degrees}"
+    return f"{verb} about the tool's {_axis_words(axis)} {degrees}"
 
 
-def _effect(
+def _effect_words(
     cell: PlanCell,
     purpose: Purpose,
     before: FloatArray,
     after: FloatArray,
     history: Sequence[Accuracy],
 ) -> str:
-    """What a stop helps: `history` is the accuracy without it and with it."""
+    """Describes a stop's effect; `history` is the accuracy without it and with it."""
     if purpose.judged == "sight":
-        return _edge_effect(before, after)
-    then, now = (1e-3 * accuracy.mm for accuracy in history)
+        return _edge_effect_words(before, after)
+    sigma_before, sigma_after = (1e-3 * accuracy.mm for accuracy in history)
     joint = _joint_determined(cell.robot, purpose, np.diag(before - after))
-    change = _change("the error over the workspace", then, now, is_rotation=False)
+    change = _change_words(
+        "the error over the workspace", sigma_before, sigma_after, is_rotation=False
+    )
     return f"{change}; most information on {joint}"
 
 
 def _joint_determined(robot: Robot, purpose: Purpose, drops: FloatArray) -> str:
-    """Which joint's errors (p,) lessened variances are of."""
+    """Joint whose errors' variances drop most, from the (p,) drops of all unknowns."""
     count = robot.joint_count
-    by_joint, left = np.zeros(count), drops
+    by_joint, remaining = np.zeros(count), drops
     for name in reversed(tuple(purpose.blocks)):
-        left, block = np.split(left, [len(left) - block_size(name, count)])
-        # Links have six values each, one after the other; of functions, each joint has one.
-        whole = block.reshape(count, -1) if name == "links" else block.reshape(-1, count).T
-        by_joint += whole.sum(axis=1)
+        remaining, block = np.split(remaining, [len(remaining) - block_size(name, count)])
+        # Values of links are grouped by joint, six each; other blocks are grouped by function.
+        values = block.reshape(count, -1) if name == "links" else block.reshape(-1, count).T
+        by_joint += values.sum(axis=1)
     return robot.joint_names[int(np.argmax(by_joint))]
 
 
-def _edge_effect(before: FloatArray, after: FloatArray) -> str:
-    """The component of x that a stop helps most, along or about the camera's axes."""
+def _edge_effect_words(before: FloatArray, after: FloatArray) -> str:
+    """Describes the component of x that improves most, along or about the camera's axes."""
     drops = np.diag(before - after)[:6] * np.repeat([_LEVER_M**2, 1.0], 3)
-    at = int(np.argmax(drops))
-    axis = ("the image's x", "the image's y", "the optical axis")[at % 3]
-    words = f"the error {'about' if at < 3 else 'along'} {axis}"
-    then, now = (float(np.sqrt(array[at, at])) for array in (before, after))
-    return _change(words, then, now, is_rotation=at < 3)
+    component = int(np.argmax(drops))
+    axis = ("the image's x", "the image's y", "the optical axis")[component % 3]
+    words = f"the error {'about' if component < 3 else 'along'} {axis}"
+    sigma_was, sigma_is = (float(np.sqrt(array[component, component])) for array in (before, after))
+    return _change_words(words, sigma_was, sigma_is, is_rotation=component < 3)
 
 
-def _change(what: str, then: float, now: float, *, is_rotation: bool) -> str:
-    """Says how a sigma [m or rad] falls."""
+def _change_words(what: str, before: float, after: float, *, is_rotation: bool) -> str:
+    """Describes the drop of a sigma [m or rad]."""
     unit, scale = ("deg", float(np.rad2deg(1.0))) if is_rotation else ("mm", 1e3)
-    if now > OPEN_SIGMA:
+    if after > OPEN_SIGMA:
         return f"a beginning; {what} is not determined yet"
-    if then > OPEN_SIGMA:
-        return f"determines what was open; {what} is now {figure(now * scale)} {unit}"
-    figures = f"({figure(then * scale)} -> {figure(now * scale)} {unit})"
-    share = now / then
+    if before > OPEN_SIGMA:
+        return f"determines what was open; {what} is now {figure(after * scale)} {unit}"
+    figures = f"({figure(before * scale)} -> {figure(after * scale)} {unit})"
+    share = after / before
     if share > _LITTLE_SHARE:
         return f"takes little off {what} {figures}"
     if share > 0.72:
@@ -469,7 +454,7 @@ def _change(what: str, then: float, now: float, *, is_rotation: bool) -> str:
     return f"cuts {what} {1 / share:.0f}-fold {figures}"
 
 
-def _axes(axis: FloatArray) -> str:
-    """Names a unit vector by one axis, or by the two that it lies between."""
+def _axis_words(axis: FloatArray) -> str:
+    """Names a unit vector after one axis, or the two that it lies between."""
     first, second = np.argsort(-np.abs(axis))[:2].tolist()
     return "xyz"[first] + (f" and {'xyz'[second]}" if abs(axis[second]) > _ASIDE else "")

@@ -1,4 +1,4 @@
-"""A plan of stops, or of motions, as it is drawn."""
+"""Content of the preview of a plan of stops, or of motions."""
 
 import numpy as np
 
@@ -9,12 +9,12 @@ from visioncal.live.planning.plan import Plan, PlannedStop
 from visioncal.present.recording.arm import Obstacle
 from visioncal.present.recording.preview import MotionPart, MotionPreview, Preview, PreviewStop
 
-# Samples a second that are drawn: sweeps are long, and slow.
+# Drawn samples per second: sweeps are long, and slow.
 _EXCITATION_HZ, _SWEEPS_HZ = 20.0, 5.0
 
 
 def preview_of(plan: Plan, name: str) -> Preview:
-    """What is drawn of a plan, under a name."""
+    """Builds the preview of a plan under a name."""
     cell = plan.cell
     history = [np.nan if accuracy.is_open else accuracy.mm for accuracy in plan.design.history]
     return Preview(
@@ -72,7 +72,7 @@ def _plan_note(plan: Plan, name: str) -> str:
 
 
 def motion_preview(plan: MotionPlan) -> MotionPreview:
-    """What is drawn of a plan."""
+    """Builds the preview of a plan of motions."""
     allowed, excitation = plan.allowed, plan.excitation
     parts = [_part(plan, "excitation", excitation.series.sampled(_EXCITATION_HZ))]
     if plan.sweeps is not None:

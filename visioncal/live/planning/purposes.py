@@ -1,7 +1,4 @@
-"""What stops are planned for: which unknowns they should determine, and which errors count.
-
-A later stage registers its purpose by one more entry of `PURPOSES`.
-"""
+"""Purposes of a plan: which unknowns the stops should determine, and which errors count."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,23 +8,21 @@ from typing import Literal, TypeAlias
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 
-# Errors of a point that the camera sees, or of what the arm carries all over its workspace.
+# Errors of a point that the camera observes, or of what the arm carries all over its workspace.
 Judged: TypeAlias = Literal["sight", "workspace"]
 
 
 @dataclass(frozen=True)
 class Purpose:
-    """What stops are planned for.
-
-    Both edges are unknown for any purpose.
+    """Purpose of a plan. Both edges are unknown for any purpose.
 
     Attributes:
         name: Its name, as a user gives it.
-        blocks: The arm's errors that are unknown too (see `ArmModel`), with the standard deviation
-            that is known of them beforehand [rad]; lengths are off by 0.5 m times as much.
         judged: Which errors count.
         errors: What they are, in words.
-        stops: How many a plan of its own has; with more, each adds little.
+        stops: Default number of stops of a plan that adds to no session.
+        blocks: Unknown errors of the arm (see `ArmModel`) with their prior standard deviation
+            [rad]; that of lengths is 0.5 m times as much.
     """
 
     name: str
@@ -37,14 +32,14 @@ class Purpose:
     blocks: Mapping[str, float] = field(default_factory=dict)
 
 
-# Where the robot finds what the camera sees is the camera's edge alone; the target's is scaffold.
+# Picks depend on the camera's edge alone; the target's is a nuisance parameter.
 _HAND_EYE = Purpose("hand-eye", "sight", "the camera's pose", 12)
 _OFFSETS = Purpose(
     "offsets",
     "workspace",
     "the arm's place all over its workspace",
     20,
-    # A lost encoder is set again by eye, to about this.
+    # A lost encoder zero is set again by eye to about this.
     {"offsets": 2e-3},
 )
 _KINEMATICS = Purpose(
@@ -52,7 +47,7 @@ _KINEMATICS = Purpose(
     "workspace",
     "the arm's place all over its workspace",
     30,
-    # Arms come off by 1 mrad and 0.5 mm a link.
+    # Arms deviate by 1 mrad and 0.5 mm per link.
     {"links": 1e-3},
 )
 _ELASTIC = Purpose(
@@ -60,7 +55,7 @@ _ELASTIC = Purpose(
     "workspace",
     "the bending arm's place all over its workspace",
     30,
-    # A cobot's joints yield by 10 mrad to the arm's own weight where that turns them most.
+    # A cobot's joints deflect by 10 mrad under the greatest torque of the arm's own weight.
     {"links": 1e-3, "compliance": 1e-2},
 )
 PURPOSES: Mapping[str, Purpose] = MappingProxyType(
@@ -69,14 +64,10 @@ PURPOSES: Mapping[str, Purpose] = MappingProxyType(
 
 
 def purpose_of(name: str, culprit: str = "purpose") -> Purpose:
-    """Finds a purpose.
-
-    Args:
-        name: Its name.
-        culprit: Where it was named, for the error.
+    """Finds a purpose by its name.
 
     Raises:
-        DataError: There is none of that name.
+        DataError: There is no purpose of that name; the culprit is where it was given.
     """
     if name not in PURPOSES:
         raise DataError(

@@ -1,4 +1,4 @@
-"""Reads the plan.json that `planning.written` writes: the stops to drive to, and their cell."""
+"""Reader of the plan.json that `planning.written` writes: the stops and their cell."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ class Stop:
     """A stop to drive to.
 
     Attributes:
-        view: The number of the view to be taken there.
+        view: Number of the view to be taken there.
         q: (n,) joint angles [rad].
-        via: (j, n) postures on the way from the stop before [rad].
-        words: What it is good for.
+        via: (j, n) via postures after the previous stop [rad].
+        words: What it contributes.
     """
 
     view: int
@@ -46,15 +46,13 @@ class Stop:
 
 @dataclass(frozen=True, eq=False)
 class PlanFile:
-    """A plan as it was written.
+    """A plan read from its file.
 
     Attributes:
-        cell: What it is for.
-        purpose: What its stops should determine.
-        stops: In the order in which the robot drives to them.
-        start_q: (n,) where the arm was to stand before [rad]; None where that was not said, and the
-            way to the first stop was not looked at.
-        digest: Of what went into the plan.
+        stops: In driving order.
+        start_q: (n,) joint angles before the first stop [rad]; None where they were not stated, and
+            the path to the first stop was not checked.
+        digest: SHA-256 of the plan's inputs.
     """
 
     cell: PlanCell
@@ -65,13 +63,10 @@ class PlanFile:
 
 
 def read_plan(path: Path | str) -> PlanFile:
-    """Reads a plan.
-
-    Args:
-        path: The plan.json, or the folder that it was written to.
+    """Reads a plan from its plan.json, or from the folder of it.
 
     Raises:
-        DataError: There is none, or it is no plan, with what is wrong.
+        DataError: There is none, or it is not a valid plan.
     """
     path = Path(path)
     file = path / _FILE if path.is_dir() else path
@@ -125,7 +120,7 @@ def _cell(content: Mapping[str, Any]) -> PlanCell:
         name: tuple(value) if isinstance(value, list) else value
         for name, value in content["limits"].items()
     }
-    # A cell without a floor has none in its file either, where the default is the base's height.
+    # A cell without a floor has no entry for it, whereas the default is a floor at height zero.
     limits.setdefault("floor_m", None)
     covariance = guesses.get("covariance")
     return PlanCell(
@@ -162,17 +157,17 @@ def _camera(lens: Mapping[str, Any]) -> Camera:
 
 
 def _target(content: Mapping[str, Any]) -> Target:
-    """The board, under the name that it has where it comes with visioncal."""
-    named = target_from_document(content, "board")
+    """Reads the board; one that comes with visioncal gets its name."""
+    target = target_from_document(content, "board")
     for name in target_names():
         shipped = load_target(name)
-        if target_document(shipped) == target_document(named):
+        if target_document(shipped) == target_document(target):
             return shipped
-    return named
+    return target
 
 
 def _array(values: object, shape: tuple[int, ...]) -> FloatArray:
-    """An array of finite numbers in a shape."""
+    """Checked array of finite numbers in a shape; -1 for any length."""
     array = np.array(values, dtype=float)
     if not np.isfinite(array).all():
         raise ValueError("a number that is not finite")

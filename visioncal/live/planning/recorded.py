@@ -1,4 +1,4 @@
-"""The start of a plan that adds to a session: what the session determines so far."""
+"""Start of a plan that adds stops to a session: what the session determines already."""
 
 from dataclasses import dataclass, field, replace
 
@@ -30,21 +30,21 @@ from visioncal.robot import Robot
 from visioncal.session import Session, frame_name
 from visioncal.vision.targets import extent_m, first_corners
 
-# Without a guess, what is mounted on the flange is about so far from it, per axis [m].
+# Without a guess, prior sigma of the mounted camera's or board's offset, per axis [m].
 _MOUNTED_M = 0.1
-# Stops cannot be found for edges that are known no better [rad and m].
+# Edges with larger sigmas are too uncertain to plan stops [rad and m].
 _TOO_VAGUE_RAD, _TOO_VAGUE_M = 0.5, 0.5
-# No arm repeats better; a few stops may show less by chance [rad and m].
+# Lower bound of a robot's noise; few stops may show less by chance [rad and m].
 _LEAST_NOISE = Noise.of_robot(2e-5, 1e-5)
-# What well-kept arms repeat to, where nothing has been seen of it [rad and m].
+# Noise of a well-kept arm, where it was not observed [rad and m].
 _TYPICAL = Noise.of_robot(5e-5, 3e-5)
-# Newton's steps to the nearest edges; the problem is as good as linear.
+# Newton steps; the problem is nearly linear.
 _STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class RoughEdges:
-    """Rough guesses of both edges (4, 4), and how well they are known, per axis [rad and m]."""
+    """Rough guesses of both edges (4, 4) [m], with sigmas per axis [rad and m]."""
 
     x: FloatArray
     z: FloatArray
@@ -68,7 +68,7 @@ class Begun:
         cell: The cell as far as the session determines it.
         recorded: The session's information.
         refusal: Why the session alone gives no result; empty where it does.
-        views: The number of the first view of each stop.
+        views: Number of the first view of each stop.
     """
 
     cell: PlanCell
@@ -79,7 +79,7 @@ class Begun:
 
 @dataclass(frozen=True, eq=False)
 class SoFar:
-    """What is known of a session, and why no more."""
+    """Run of a session as far as its stages succeed, and the reason why they end early."""
 
     known: RunState
     refusal: str = field(default="")
@@ -91,117 +91,115 @@ def so_far(session: Session, *, progress: Progress | None = None) -> SoFar:
     Raises:
         DataError: The input is wrong or shows no target.
     """
-    known = RunState(session, progress, level="hand-eye")
-    for at, stage in enumerate(STAGES):
+    run = RunState(session, progress, level="hand-eye")
+    for index, stage in enumerate(STAGES):
         if progress is not None:
-            progress(stage.name, at, len(STAGES))
+            progress(stage.name, index, len(STAGES))
         try:
-            known = stage.run(known)
+            run = stage.run(run)
         except DegenerateError as error:
-            return SoFar(known, error.message)
-    return SoFar(known)
+            return SoFar(run, error.message)
+    return SoFar(run)
 
 
 def begin(
-    found: SoFar,
+    partial: SoFar,
     *,
     guess: RoughEdges | None = None,
     limits: Limits | None = None,
     boxes: tuple[Box, ...] = (),
 ) -> Begun:
-    """Puts a session as the start of a plan.
+    """Prepares a session as the start of a plan.
 
-    Where the stops leave a direction open, the edges are those nearest to the guess among all that
-    the stops allow; without a guess, those by which what is mounted is nearest to the flange.
+    In directions that the stops leave undetermined, the edges are those nearest to the guess;
+    without a guess, those with the mounted camera or board nearest to the flange.
 
     Args:
-        found: What is known of the session.
-        guess: What is known of the edges besides.
-        limits: What the added stops must keep.
-        boxes: What else stands in the cell.
+        partial: The session, calibrated as far as it goes.
+        guess: Rough guesses of the edges.
+        limits: Limits of the added stops.
+        boxes: Obstacles in the cell.
 
     Raises:
         DataError: The session lacks a robot's model, a camera or a board, or has too few
-            views to begin without a guess.
+            views to start without a guess.
     """
-    known = found.known
-    robot, targets = known.robot, tuple(known.session.boards.values())
-    if robot is None or not targets or known.pixel_px is None or not known.scenes:
-        raise _missing(known)
+    run = partial.known
+    robot, targets = run.robot, tuple(run.session.boards.values())
+    if robot is None or not targets or run.pixel_px is None or not run.scenes:
+        raise _missing_input_error(run)
     with one_blas_thread():
-        begun = _guessed(known, guess) if known.fit is None else _fitted(known, known.fit)
-        edges, covariance = _nearest(
-            begun.problem, begun.state, begun.noise, known.session.mount, guess
+        start = _start_from_guess(run, guess) if run.fit is None else _start_from_fit(run, run.fit)
+        edges, covariance = _posterior_edges(
+            start.problem, start.state, start.noise, run.session.mount, guess
         )
     sigmas = np.sqrt(np.diag(covariance).reshape(2, 2, 3).mean(axis=(0, 2)))
     if sigmas[0] > _TOO_VAGUE_RAD or sigmas[1] > _TOO_VAGUE_M:
-        raise _too_vague(known, len(begun.views))
+        raise _too_vague_error(run, len(start.views))
     cell = PlanCell(
-        known.session.mount,
-        _arm(begun.arm, robot),
-        begun.free.appearance.camera,
-        targets[begun.board],
+        run.session.mount,
+        _arm(start.arm, robot),
+        start.free.appearance.camera,
+        targets[start.board],
         edges[0],
         edges[1],
         float(sigmas[0]),
         float(sigmas[1]),
-        begun.noise,
-        known.pixel_px,
+        start.noise,
+        run.pixel_px,
         limits or Limits(),
         boxes,
         covariance,
     )
-    cell = replace(cell, shown_m=_shown_m(cell, begun.problem))
-    first_corner = int(first_corners(targets)[begun.board])
-    recorded = _recorded(known, begun, edges, first_corner)
-    return Begun(cell, recorded, found.refusal, begun.views)
+    cell = replace(cell, shown_m=_board_distances_m(cell, start.problem))
+    first_corner = int(first_corners(targets)[start.board])
+    recorded = _recorded_stops(run, start, edges, first_corner)
+    return Begun(cell, recorded, partial.refusal, start.views)
 
 
-def _shown_m(cell: PlanCell, problem: Problem) -> tuple[float, float]:
-    """The least and the greatest distance at which stops show the board that is planned for."""
+def _board_distances_m(cell: PlanCell, problem: Problem) -> tuple[float, float]:
+    """Least and greatest distance at which stops show the planned board [m]."""
     _, board, *_ = problem.unknown
-    shows = np.array(problem.observations.observed) == board
-    flange = problem.poses[problem.robots[0]][problem.observations.stops[shows]]
+    of_board = np.array(problem.observations.observed) == board
+    flange = problem.poses[problem.robots[0]][problem.observations.stops[of_board]]
     low, high = extent_m(cell.target)
-    seen, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
-    away = np.linalg.norm(seen[:, :3, :3] @ centre + seen[:, :3, 3], axis=1)
-    return float(away.min()), float(away.max())
+    poses, centre = cell.seen_from(flange), np.append(0.5 * (low + high), 0.0)
+    distance = np.linalg.norm(poses[:, :3, :3] @ centre + poses[:, :3, 3], axis=1)
+    return float(distance.min()), float(distance.max())
 
 
-def _recorded(
-    known: RunState, begun: "_RecordedStart", edges: FloatArray, first_corner: int
+def _recorded_stops(
+    run: RunState, start: "_RecordedStart", edges: FloatArray, first_corner: int
 ) -> RecordedStops:
-    """The session's information, at the edges where the plan takes them to be."""
-    arm, misfits = begun.arm, () if known.answer is None else known.answer.misfits.values()
+    """The session's information at the plan's edges."""
+    arm, misfits = start.arm, () if run.answer is None else run.answer.misfits.values()
     alike = [misfit.alike for misfit in misfits if misfit.alike is not None]
     factors = (neighbours.factor for neighbours in alike if neighbours.is_significant)
     return RecordedStops(
-        begun.problem,
+        start.problem,
         edges,
-        begun.free,
+        start.free,
         arm.joints_rad,
-        begun.noise,
+        start.noise,
         first_corner,
-        # Of few stops, sizes of errors that noise alone explains are mostly chance.
+        # With few stops, error sizes that noise alone explains are mostly chance.
         arm.errors if arm.is_modelled and arm.errors and arm.errors.is_likely else None,
         max(factors, default=1.0),
-        _beside_noise(known, begun),
-        _held_pull(known, begun.problem),
+        _edge_error_root(run, start),
+        _held_gradient(run, start.problem),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _RecordedStart:
-    """What a session determines.
+    """Problem of the recorded stops.
 
     Attributes:
-        problem: Its s stops, without errors of the arm; the board that is planned for comes first.
-        state: Where to begin.
-        noise: Of the robot at the stops.
-        free: Lens and boards as the views see them.
-        arm: The robot's arm at the stops.
-        board: Which of the session's boards is planned for: the one in the most views.
-        views: (s,) the first view of each stop.
+        problem: The s stops, without errors of the arm; the planned board comes first.
+        noise: Noise of the robot at the stops.
+        free: Free parameters of lens and boards.
+        board: Index of the planned board: the one in the most views.
+        views: (s,) first view of each stop.
     """
 
     problem: Problem
@@ -213,29 +211,29 @@ class _RecordedStart:
     views: tuple[int, ...]
 
 
-def _fitted(known: RunState, solved: Solved) -> _RecordedStart:
-    """What the fit of a session determines, even where that leaves a direction open."""
+def _start_from_fit(run: RunState, solved: Solved) -> _RecordedStart:
+    """Recorded stops of a session with a fit, even if that leaves a direction undetermined."""
     if solved.seen is None:
-        raise _missing(known)
-    part, arm = solved.part, known.robot_arm
+        raise _missing_input_error(run)
+    part, arm = solved.part, run.robot_arm
     observed = part.observations.observed
-    most = max(dict.fromkeys(observed), key=observed.count)
+    planned = max(dict.fromkeys(observed), key=observed.count)
     stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
     frames = part.frames(solved.agreed.fit.state)
-    # The arm's own errors are the purpose's business: they are put in again with its priors.
+    # Errors of the arm are added again with the purpose's priors.
     bare = part.with_effects(
         [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]
     )
-    seen_at = np.isin(np.arange(len(arm.stood)), stops)
+    kept_stops = np.isin(np.arange(len(arm.stood)), stops)
     camera, *boards = part.unknown
     order = [branch for branch in part.tree.branches if branch not in part.unknown]
-    order += [camera, most, *(board for board in boards if board != most)]
+    order += [camera, planned, *(board for board in boards if board != planned)]
     problem = replace(
         bare,
         tree=replace(part.tree, branches={name: part.tree.branches[name] for name in order}),
         poses={name: pose[stops] for name, pose in part.poses.items()},
         observations=replace(part.observations, stops=of),
-        effects=tuple(effect.of_stops(seen_at) for effect in bare.effects),
+        effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
     ).merged()
     noise = solved.agreed.fit.noise
     return _RecordedStart(
@@ -244,95 +242,87 @@ def _fitted(known: RunState, solved: Solved) -> _RecordedStart:
         replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
         free_of(solved.seen),
         arm.at(stops),
-        tuple(frame_name("target", board) for board in known.session.boards).index(most),
-        tuple(known.used[index] for index in first.tolist()),
+        tuple(frame_name("target", board) for board in run.session.boards).index(planned),
+        tuple(run.used[index] for index in first.tolist()),
     )
 
 
-def _guessed(known: RunState, guess: RoughEdges | None) -> _RecordedStart:
-    """What stops too few for a fit determine, beside a guess."""
-    looked = ObservedPoses.of(known)
-    views = [
-        pose
-        for pose in known.poses
-        if pose in known.base_from_flange and pose not in known.held_back
-    ]
+def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart:
+    """Recorded stops of a session with too few for a fit, from a guess."""
+    observed = ObservedPoses.of(run)
+    posed = run.base_from_flange
+    views = [view for view in run.poses if view in posed and view not in run.held_back]
     if guess is None or not views:
-        raise _too_vague(known, len(views))
-    shown = [known.poses[view].board for view in views]
+        raise _too_vague_error(run, len(views))
+    shown = [run.poses[view].board for view in views]
     board = max(dict.fromkeys(shown), key=shown.count)
-    mine = [view for view in sorted(views) if known.poses[view].board == board]
-    looked = replace(looked, boards=(board,), used=tuple(mine))
-    looked = replace(looked, frames=looked.framed(np.stack([guess.x, guess.z])))
-    robot = robot_part(looked.arm_at(mine).poses, known.session.mount)
-    target = tuple(known.session.boards.values())[board]
+    chosen = [view for view in sorted(views) if run.poses[view].board == board]
+    observed = replace(observed, boards=(board,), used=tuple(chosen))
+    observed = replace(observed, frames=observed.framed(np.stack([guess.x, guess.z])))
+    robot = robot_part(observed.arm_at(chosen).poses, run.session.mount)
+    target = tuple(run.session.boards.values())[board]
     poses = [
-        choose_by(known.poses[index], pose, target)
-        for index, pose in zip(mine, invert(robot @ guess.x) @ guess.z, strict=True)
+        choose_by(run.poses[index], pose, target)
+        for index, pose in zip(chosen, invert(robot @ guess.x) @ guess.z, strict=True)
     ]
-    ((frame, scene),) = known.scenes.items()
-    problem, alone = looked.posed(poses).problem(mine), np.ones(len(mine), dtype=bool)
-    looks = FramesSide(problem, alone, mine, {}).looks({frame: scene}, {frame: poses})
-    looked = replace(looked, free=free_of(looks.seen(looks.first))).posed(poses)
-    problem = looked.problem(mine).merged()
+    ((frame, scene),) = run.scenes.items()
+    problem, alone = observed.posed(poses).problem(chosen), np.ones(len(chosen), dtype=bool)
+    looks = FramesSide(problem, alone, chosen, {}).looks({frame: scene}, {frame: poses})
+    observed = replace(observed, free=free_of(looks.seen(looks.first))).posed(poses)
+    problem = observed.problem(chosen).merged()
     return _RecordedStart(
         problem,
-        problem.start(looked.frames),
+        problem.start(observed.frames),
         _TYPICAL,
-        looked.free or free_of(looks.seen(looks.first)),
-        looked.arm_at_stops,
+        observed.free or free_of(looks.seen(looks.first)),
+        observed.arm_at_stops,
         board,
-        tuple(looked.first_of_stops(mine)),
+        tuple(observed.first_of_stops(chosen)),
     )
 
 
-def _held_pull(known: RunState, problem: Problem) -> FloatArray:
-    """(k, 1) how the stops pull at what is held of lens and boards, as their gradient, if it is."""
-    if known.answer is None:
+def _held_gradient(run: RunState, problem: Problem) -> FloatArray:
+    """Gradient (k, 1) at held parameters of lens and boards, if any."""
+    if run.answer is None:
         return np.zeros((0, 0))
-    fitted, state, noise = known.answer.problem, known.answer.state, known.answer.noise
-    pull = normal_equations(fitted, state, noise)[1] * (fitted.counted & ~fitted.moving)
-    columns = [fitted.effect_columns[effect.name] for effect in problem.effects]
-    return np.concatenate([np.zeros(0), *(pull[column.start : column.stop] for column in columns)])[
-        :, None
-    ]
+    fitted, state, noise = run.answer.problem, run.answer.state, run.answer.noise
+    gradient = normal_equations(fitted, state, noise)[1] * (fitted.counted & ~fitted.moving)
+    columns = (fitted.effect_columns[effect.name] for effect in problem.effects)
+    parts = [np.zeros(0), *(gradient[column.start : column.stop] for column in columns)]
+    return np.concatenate(parts)[:, None]
 
 
-def _beside_noise(known: RunState, begun: "_RecordedStart") -> FloatArray:
-    """(12, c) how the edges err by what an arm does wrong whose joints are not known, if any."""
-    if known.answer is None or begun.arm.is_modelled or "arm" not in known.answer.beside:
+def _edge_error_root(run: RunState, start: "_RecordedStart") -> FloatArray:
+    """Root (12, c) of the edges' covariance from errors of an arm without joint angles, if any."""
+    if run.answer is None or start.arm.is_modelled or "arm" not in run.answer.beside:
         return np.zeros((12, 0))
-    names = tuple(begun.problem.unknown)[:2]
-    columns = [
-        np.arange(item.start, item.stop) for item in map(known.solved.problem.edge_columns, names)
-    ]
-    at = np.concatenate(columns)
-    values, vectors = np.linalg.eigh(known.answer.beside["arm"][np.ix_(at, at)])
+    columns = map(run.solved.problem.edge_columns, tuple(start.problem.unknown)[:2])
+    index = np.concatenate([np.arange(column.start, column.stop) for column in columns])
+    values, vectors = np.linalg.eigh(run.answer.beside["arm"][np.ix_(index, index)])
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0])
 
 
 def _arm(arm: RobotArm, robot: Robot) -> Robot:
-    """The arm up to the frame of the reported poses, as far as it is calibrated."""
+    """Robot up to the frame of the reported poses, calibrated where possible."""
     if arm.model is not None:
         return arm.model.robot
     return robot if arm.joints_rad is None else ArmModel.of(robot, arm.joints_rad, arm.poses).robot
 
 
-def _nearest(
+def _posterior_edges(
     problem: Problem, state: State, noise: Noise, mount: Mount, guess: RoughEdges | None
 ) -> tuple[FloatArray, FloatArray]:
-    """The likeliest edges with what is known beforehand, and the covariance (12, 12) of two."""
-    # These are the camera's and that of the board that is planned for.
+    """Posterior edges with the prior, and the covariance (12, 12) of camera and planned board."""
     weights = np.zeros((problem.size, problem.size))
-    weights[:12, :12] = np.diag(_weights(mount, guess))
+    weights[:12, :12] = np.diag(_prior_weights(mount, guess))
     for _ in range(_STEPS):
         information, gradient = normal_equations(problem, state, noise)
-        away = np.zeros(problem.size)
-        away[:12] = _away(state.edges[:2], guess)
+        distance = np.zeros(problem.size)
+        distance[:12] = _prior_residual(state.edges[:2], guess)
         step = -covariance_among(information + weights, problem.moving) @ (
-            gradient + weights @ away
+            gradient + weights @ distance
         )
-        # What is shared has settled before; it may follow, but it does not move.
+        # Shared parameters have converged before; they are marginalised, but not moved.
         step[6 * len(state.edges) :] = 0.0
         state = state.moved(step)
     covariance = covariance_among(
@@ -341,7 +331,7 @@ def _nearest(
     return state.edges, covariance[:12, :12]
 
 
-def _weights(mount: Mount, guess: RoughEdges | None) -> FloatArray:
+def _prior_weights(mount: Mount, guess: RoughEdges | None) -> FloatArray:
     if guess is not None:
         return np.tile(np.repeat([guess.sigma_rad**-2.0, guess.sigma_m**-2.0], 3), 2)
     weights = np.full((2, 2, 3), 1e-6)
@@ -349,16 +339,16 @@ def _weights(mount: Mount, guess: RoughEdges | None) -> FloatArray:
     return weights.ravel()
 
 
-def _away(edges: FloatArray, guess: RoughEdges | None) -> FloatArray:
-    """(12,) steps from what is known beforehand to the edges (2, 4, 4)."""
+def _prior_residual(edges: FloatArray, guess: RoughEdges | None) -> FloatArray:
+    """Twists (12,) from the prior to the edges (2, 4, 4)."""
     if guess is not None:
         return np.asarray(log(invert(np.stack([guess.x, guess.z])) @ edges).ravel())
     local = [edge[:3, :3].T @ edge[:3, 3] for edge in edges]
     return np.concatenate([np.zeros(3), local[0], np.zeros(3), local[1]])
 
 
-def _missing(known: RunState) -> DataError:
-    session, missing = known.session, []
+def _missing_input_error(run: RunState) -> DataError:
+    session, missing = run.session, []
     if session.mount == "instrument":
         return DataError(
             f"session {session.name!r} is of an instrument; stops are planned for cameras that see "
@@ -367,27 +357,27 @@ def _missing(known: RunState) -> DataError:
             next_step="Choose stops that turn the flange by 30 degrees or more about two axes, all "
             "over the workspace.",
         )
-    if known.robot is None:
+    if run.robot is None:
         missing.append("a model of its robot, which says where the arm reaches")
     if not session.boards:
         missing.append("a board (target)")
-    if known.pixel_px is None or not known.scenes:
+    if run.pixel_px is None or not run.scenes:
         missing.append("images of the board")
     return DataError(
         f"session {session.name!r}: stops cannot be added to it without {' and '.join(missing)}.",
         culprits=[f"session {session.name!r}"],
         next_step="Name the arm in session.toml ([robot] model), or by --robot; that of a whole "
         "cell in its own table, as model in [robots.a]."
-        if known.robot is None
+        if run.robot is None
         else "",
     )
 
 
-def _too_vague(known: RunState, stops: int) -> DataError:
+def _too_vague_error(run: RunState, stops: int) -> DataError:
     return DataError(
-        f"session {known.session.name!r}: its {counted(stops, 'usable stop')} of "
+        f"session {run.session.name!r}: its {counted(stops, 'usable stop')} of "
         "the robot do not show where camera and board are, not even roughly.",
-        culprits=[f"session {known.session.name!r}"],
+        culprits=[f"session {run.session.name!r}"],
         next_step="Give rough guesses of both, in mm and degrees: --cam 'X Y Z RX RY RZ' --board "
         "'X Y Z RX RY RZ'.",
     )

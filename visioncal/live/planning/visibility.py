@@ -1,4 +1,4 @@
-"""From where a board is seen: views drawn around it, what shades them, guesses that show it."""
+"""Views of a board: sampling, the camera's field of view, uncertain guesses and occlusion."""
 
 from dataclasses import dataclass, replace
 
@@ -14,52 +14,48 @@ from visioncal.robot.bodies import Body, arm_bodies
 from visioncal.vision.camera import normalise, project_with_jacobian
 from visioncal.vision.targets import extent_m
 
-# How large the board is drawn: the image's half short side over half the print's diagonal.
+# Range of distances, relative to that at which the print's half diagonal fills the image's half
+# short side.
 _NEAREST, _FARTHEST = 0.75, 1.6
-# What tilt leaves of a board's short side, and how many standard deviations of where it is in the
-# image are left free around it.
-_FORESHORTENED, _DOUBTED = 0.8, 2.0
-# How far draws reach beyond the distances that turned out well.
+# Share of a board's short side that tilt leaves, and the margin around it in standard deviations of
+# its position in the image.
+_FORESHORTENED, _MARGIN_SIGMAS = 0.8, 2.0
+# Factor by which draws extend the range of distances found useful.
 _WIDER = 1.05
-# The guesses are off by less than so many standard deviations, and a plan goes no farther than so
-# many times the distance at which the board would fill the image.
+# Largest error of the guesses in standard deviations, and the greatest distance relative to that at
+# which the board fills the image.
 _SURELY, _NEVER_BEYOND = 2.2, 6.0
-# How many cells stand for what may really be, how many of them are looked at before those that are
-# out of the question are left out, and how many points stand for a side of the print.
-_GUESSES, _LOOKED_AT, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
-# By so many rays through each side of the image the distance is found at which the board fills it.
+# Draws of the uncertain cell, the numbers of them after which hopeless poses are dropped, and the
+# corners and points per side of the print.
+_GUESSES, _CHECKED, _CORNERS, _SIDE_POINTS = 100, (5, 15, 40, 100), 4, 2
+# Rays through each side of the image for the distance at which the board fills it.
 _BORDER_RAYS = 9
-# A lens that sees no more than this to its side, in a distance of one, is none.
+# Least half width of the field of view at unit distance.
 _NARROWEST = 1e-4
-# Rays along each side of the image, and the share by which planes keep off what lies between them.
-_RAYS, _OFF = 33, 2e-3
+# Rays along each side of the image, and the relative margin of the planes for what lies between.
+_RAYS, _PLANE_MARGIN = 33, 2e-3
 
-# A line of sight may end on a box, as on the table that a board lies on: it is free up to here.
-_LIES_ON, _TINY = 0.99, 1e-12
+# A line of sight may end on a box, such as the table under a board: only this share must be free.
+_FREE_SHARE, _TINY = 0.99, 1e-12
 
 
 class Window:
-    """The part of space that a camera has in its image.
+    """Field of view of a camera.
 
-    A lens bends the image's sides. Points between four planes within the bent sides are in the
-    image, points beyond four planes around them are not; only points in between need be projected.
+    A lens bends the image's sides. Points within four inner planes are in the image, points beyond
+    four outer planes are not; only points in between need be projected.
     """
 
     def __init__(self, camera: Camera, edge_px: float) -> None:
-        """Prepares the planes.
-
-        Args:
-            camera: The intrinsics.
-            edge_px: How far points stay from the image's edge [px].
-        """
+        """Prepares the planes for points that stay `edge_px` from the image's edge [px]."""
         self._camera, self._edge_px = camera, edge_px
-        whole = _border_tangents(camera, 0.0, _RAYS)
-        # Tangents of rays are shorter; beyond, a lens model may fold back into the image.
-        self._rays_within = float(np.nanmax(np.linalg.norm(whole, axis=-1))) * (1.0 + 1e-6)
+        border = _border_tangents(camera, 0.0, _RAYS)
+        # Beyond these tangents a lens model may fold back into the image.
+        self._largest_tangent = float(np.nanmax(np.linalg.norm(border, axis=-1))) * (1.0 + 1e-6)
         self._inner, self._outer = _planes(_border_tangents(camera, edge_px, _RAYS))
 
     def holds(self, points_cam: FloatArray) -> Mask:
-        """Whether all of (..., p, 3) points in the camera's frame are in the image (...)."""
+        """Whether all of (..., p, 3) points in the camera frame are in the image (...)."""
         inside = _between(self._inner, points_cam)
         doubtful = ~inside & _between(self._outer, points_cam)
         if doubtful.any():
@@ -68,9 +64,9 @@ class Window:
 
     def _projected(self, points_cam: FloatArray) -> Mask:
         flat = points_cam.reshape(-1, 3)
-        straight = np.linalg.norm(flat[:, :2], axis=1) < self._rays_within * flat[:, 2]
+        valid = np.linalg.norm(flat[:, :2], axis=1) < self._largest_tangent * flat[:, 2]
         px = np.full((len(flat), 2), -np.inf)
-        px[straight] = project_with_jacobian(self._camera, flat[straight], lens=False).px
+        px[valid] = project_with_jacobian(self._camera, flat[valid], lens=False).px
         high = np.array(self._camera.resolution) - 1.0 - self._edge_px
         good = ((px >= self._edge_px) & (px <= high)).all(axis=1)
         return np.asarray(good.reshape(points_cam.shape[:-1]).all(axis=-1))
@@ -88,16 +84,16 @@ def _border_tangents(camera: Camera, edge_px: float, rays: int) -> FloatArray:
 
 
 def _planes(tangents: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Normals (4, 3) of the planes within and around the sides; points between have no negative."""
+    """Normals (4, 3) of the inner and of the outer planes; points between have no negative sign."""
     if np.isnan(tangents).any():
-        # A lens without rays to its corners: no point is surely inside, and any before it may be.
+        # A lens without rays to its corners: no point is surely inside, any in front may be.
         ahead, aside = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
         return np.array([ahead, -ahead, aside, -aside]), np.array([ahead] * 4)
     top, bottom, left, right = tangents
-    off = _OFF * np.ptp(tangents.reshape(-1, 2), axis=0)
+    margin = _PLANE_MARGIN * np.ptp(tangents.reshape(-1, 2), axis=0)
     inner = [left[:, 0].max(), right[:, 0].min(), top[:, 1].max(), bottom[:, 1].min()]
     outer = [left[:, 0].min(), right[:, 0].max(), top[:, 1].min(), bottom[:, 1].max()]
-    inward = np.array([off[0], -off[0], off[1], -off[1]])
+    inward = np.array([margin[0], -margin[0], margin[1], -margin[1]])
     return _normals(np.array(inner) + inward), _normals(np.array(outer) - inward)
 
 
@@ -115,16 +111,15 @@ def _between(normals: FloatArray, points: FloatArray) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class CameraAim:
-    """A camera that looks at a board.
+    """Views of a board by a camera.
 
     Attributes:
-        cell: The cell, as it is guessed.
-        distance_m: Least and greatest distance between camera and board's centre [m].
-        outline: (p, 3) points around the print, its corners first, in the target's frame [m].
-        centre: (3,) the print's centre [m].
-        window: The part of space that is in the image.
-        x: (g, 4, 4) draws of the guessed edge x.
-        z: (g, 4, 4) draws of the guessed edge z.
+        distance_m: Least and greatest distance between camera and board centre [m].
+        outline: (p, 3) points around the print, its corners first, in the target frame [m].
+        centre: (3,) centre of the print [m].
+        window: Field of view.
+        x: (g, 4, 4) draws of the uncertain edge x.
+        z: (g, 4, 4) draws of the uncertain edge z.
     """
 
     cell: PlanCell
@@ -138,9 +133,8 @@ class CameraAim:
     def draw(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draws views of the board.
 
-        The camera lies on a cap around the board's normal, uniform on its area, and is turned any
-        way about its line of sight; the board's centre is anywhere in the image where the board has
-        room.
+        The camera is uniform on a spherical cap around the board's normal and turned at random
+        about its line of sight; the board's centre is anywhere in the image where the board fits.
 
         Returns:
             (count, 4, 4) `cam_from_target` [m].
@@ -150,12 +144,12 @@ class CameraAim:
         azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
         distance = rng.uniform(*self.distance_m, size=(count, 1))
         middle = 0.5 * (np.array(camera.resolution) - 1.0)
-        room = np.maximum(middle - limits.edge_px - self._taken_px(distance), 0.0)
+        room = np.maximum(middle - limits.edge_px - self._occupied_px(distance), 0.0)
         aim = middle + rng.uniform(-1.0, 1.0, (count, 2)) * room
         plane = np.nan_to_num(normalise(camera, aim))
         ray = np.column_stack([plane, np.ones(count)])
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        # The target's z leaves the camera. The turn that takes z to the ray comes last.
+        # The target's z points away from the camera. The rotation that takes z to the ray is last.
         spun = Rotation.from_euler("ZXZ", np.column_stack([roll, tilt, azimuth]))
         across = np.cross([0.0, 0.0, 1.0], ray)
         sine = np.linalg.norm(across, axis=1, keepdims=True)
@@ -164,19 +158,19 @@ class CameraAim:
         rotation = np.asarray((turn * spun).as_matrix())
         return compose(rotation, distance * ray - rotation @ self.centre)
 
-    def _taken_px(self, distance_m: FloatArray) -> FloatArray:
-        """How much of the image's half sides a board (k, 1) takes at least, with some doubt [px].
+    def _occupied_px(self, distance_m: FloatArray) -> FloatArray:
+        """Least half size (k, 1) of the board in the image, with a margin for uncertainty [px].
 
-        A drawn view need not show the board; this only saves drawing many that cannot.
+        A drawn view need not show the board; this only avoids drawing many that cannot.
         """
         cell = self.cell
         low, high = extent_m(cell.target)
         across = _FORESHORTENED * 0.5 * float((high - low).min())
-        doubt = _DOUBTED * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance_m, cell.sigma_rad)
+        doubt = _MARGIN_SIGMAS * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance_m, cell.sigma_rad)
         return np.asarray(cell.camera.matrix[:2].mean() * (across / distance_m + doubt))
 
     def nearer_to(self, cam_from_target: FloatArray) -> "CameraAim":
-        """The same, drawing distances like those of (k, 4, 4) views that turned out well."""
+        """Restricts the distances to those of (k, 4, 4) good views."""
         distance = self.distances_m(cam_from_target)
         low, high = self.distance_m
         least, most = float(distance.min()) / _WIDER, float(distance.max()) * _WIDER
@@ -187,34 +181,32 @@ class CameraAim:
         return self.window.holds(apply(cam_from_target, self.outline))
 
     def share(self, base_from_flange: FloatArray, wanted: float) -> FloatArray:
-        """In what share of the guesses' draws poses show the whole print.
+        """Share (k,) of the uncertain cell's draws that show the whole print at poses (k, 4, 4).
 
-        Args:
-            base_from_flange: (k, 4, 4) the poses [m].
-            wanted: Where the first draws leave no hope of this share, the others are not looked at.
-
-        Returns:
-            (k,) shares; where the wanted one is not reached, not all may have been counted.
+        Poses that cannot reach the wanted share any more are not evaluated further: theirs is a
+        lower bound.
         """
-        seen = np.zeros(len(base_from_flange))
-        looked, hope = 0, np.arange(len(base_from_flange))
-        for upto in _LOOKED_AT:
-            shows = self._drawn_shows(base_from_flange[hope], slice(looked, upto))
-            seen[hope] += shows.sum(axis=1)
-            looked = upto
-            hope = hope[(_GUESSES - upto + seen[hope]) / _GUESSES >= wanted]
-        share = np.minimum(seen / _GUESSES, np.nextafter(wanted, 0.0))
-        share[hope] = seen[hope] / _GUESSES
+        counts = np.zeros(len(base_from_flange))
+        checked, possible = 0, np.arange(len(base_from_flange))
+        for upto in _CHECKED:
+            shows = self._drawn_shows(base_from_flange[possible], slice(checked, upto))
+            counts[possible] += shows.sum(axis=1)
+            checked = upto
+            possible = possible[(_GUESSES - upto + counts[possible]) / _GUESSES >= wanted]
+        share = np.minimum(counts / _GUESSES, np.nextafter(wanted, 0.0))
+        share[possible] = counts[possible] / _GUESSES
         return share
 
     def _drawn_shows(self, base_from_flange: FloatArray, which: slice) -> Mask:
         in_hand = self.cell.mount == "eye-in-hand"
         flange = invert(base_from_flange) if in_hand else base_from_flange
-        # Its corners do for a share, and sides between them are nearly straight.
+        # The corners are enough for a share: the sides between them are nearly straight.
         outlines = apply(self.z[which], self.outline[:_CORNERS])
         points = apply(flange, outlines.reshape(-1, 3))
-        cam_from_here = invert(self.x[which])
-        return self.window.holds(apply(cam_from_here, points.reshape(len(flange), *outlines.shape)))
+        cam_from_fixed = invert(self.x[which])
+        return self.window.holds(
+            apply(cam_from_fixed, points.reshape(len(flange), *outlines.shape))
+        )
 
     def tilt_rad(self, cam_from_target: FloatArray) -> FloatArray:
         """Angles (k,) between the line of sight to the board's centre and its normal [rad]."""
@@ -237,14 +229,14 @@ class CameraAim:
 
 
 def sight_of(cell: PlanCell, seed: int) -> CameraAim:
-    """Prepares the views of a cell, with draws of what its guesses may really be.
+    """Prepares the views of a cell, with draws from the uncertainty of its guesses.
 
     Raises:
-        DataError: The lens sees nothing, or as good as nothing.
+        DataError: The lens has no field of view, or next to none.
     """
     border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
-    seen = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
-    if not len(seen) or seen.min() < _NARROWEST:
+    tangents = np.abs(border[np.isfinite(border).all(axis=-1)]).max(axis=-1, initial=0.0)
+    if not len(tangents) or tangents.min() < _NARROWEST:
         raise DataError(
             "camera: no ray of this lens reaches the border of its image, or all are parallel: "
             f"matrix is {cell.camera.matrix.tolist()}, distortion "
@@ -266,7 +258,7 @@ def sight_of(cell: PlanCell, seed: int) -> CameraAim:
 
 
 def _distance_m(cell: PlanCell) -> tuple[float, float]:
-    """Distances at which the board fills the image, or has been seen already [m]."""
+    """Distances at which the board fills the image, or has been observed already [m]."""
     near, far = _filling_m(cell)
     if cell.shown_m is None:
         return near, far
@@ -275,8 +267,8 @@ def _distance_m(cell: PlanCell) -> tuple[float, float]:
 
 def _filling_m(cell: PlanCell) -> tuple[float, float]:
     """Distances at which the board fills the image, and stays in it if the guesses are off [m]."""
-    # At a distance d the board is off by the errors of both places, by d times the error of the
-    # camera's direction, and by half its own size times the error of its own.
+    # At a distance d the board is off by the errors of both positions, by d times the error of the
+    # camera's rotation, and by half its own size times the error of its own rotation.
     border = _border_tangents(cell.camera, cell.limits.edge_px, _BORDER_RAYS)
     half = float(np.nanmin(np.abs(border).max(axis=-1)))
     radius = 0.5 * board_size_m(cell.target)
@@ -300,13 +292,12 @@ def _outline(target: Target) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Shade:
-    """Lines of sight from the camera to points of the print, and what may stand in them.
+    """Occlusion of the lines of sight from the camera to points of the print.
 
     Attributes:
-        cell: The cell, as it is guessed.
-        points: (p, 3) the points of the print, in the target's frame [m].
-        parts: The arm's bodies; not those on which camera or board are mounted, which are where
-            they are in every posture.
+        points: (p, 3) the points of the print, in the target frame [m].
+        parts: The arm's bodies, without those on the last link: they carry camera or board, and do
+            not move relative to it.
     """
 
     cell: PlanCell
@@ -320,46 +311,32 @@ class Shade:
         return cls(cell, points, tuple(parts))
 
     def behind_boxes(self, base_from_flange: FloatArray) -> IntArray:
-        """Looks for boxes in the lines of sight.
-
-        Args:
-            base_from_flange: (k, 4, 4) poses [m].
-
-        Returns:
-            (k,) the place of a box that hides a part of the print; -1 where there is none.
-        """
-        starts, ends = self._lines(base_from_flange)
-        found = np.full(len(base_from_flange), -1, dtype=np.int64)
-        for place, box in enumerate(self.cell.boxes):
-            found[_meet_box(starts, ends, box.base_from_box[None], box.size_m)] = place
-        return found
+        """Index (k,) of a box that hides part of the print at flange poses (k, 4, 4); else -1."""
+        starts, ends = self._sight_lines(base_from_flange)
+        blocking = np.full(len(base_from_flange), -1, dtype=np.int64)
+        for index, box in enumerate(self.cell.boxes):
+            blocking[_box_blocks(starts, ends, box.base_from_box[None], box.size_m)] = index
+        return blocking
 
     def behind_arm(self, q: FloatArray) -> IntArray:
-        """Looks for the arm itself in the lines of sight.
-
-        Args:
-            q: (k, n) joint angles [rad].
-
-        Returns:
-            (k,) the place in `parts` of one that hides a part of the print; -1 where there is none.
-        """
+        """Index (k,) in `parts` that hides part of the print at joints (k, n) [rad]; else -1."""
         chain = self.cell.robot.chain
         frames = chain_frames(chain, chain.effective(q))
-        starts, ends = self._lines(frames[:, -1])
-        found = np.full(len(q), -1, dtype=np.int64)
-        for place, part in enumerate(self.parts):
+        starts, ends = self._sight_lines(frames[:, -1])
+        blocking = np.full(len(q), -1, dtype=np.int64)
+        for index, part in enumerate(self.parts):
             body = part.link_from_body[None]
             if part.link:
                 body = frames[:, part.link - 1] @ body
             if part.shape == "box":
-                hidden = _meet_box(starts, ends, body, part.size_m)
+                hidden = _box_blocks(starts, ends, body, part.size_m)
             else:
-                hidden = _meet_tube(starts, ends, body, part.size_m)
-            found[hidden] = place
-        return found
+                hidden = _capsule_blocks(starts, ends, body, part.size_m)
+            blocking[hidden] = index
+        return blocking
 
-    def _lines(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Begins (k or 1, 1, 3) and ends (k or 1, p, 3) of the lines of sight, in the base [m]."""
+    def _sight_lines(self, base_from_flange: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Starts (k or 1, 1, 3) and ends (k or 1, p, 3) of the lines of sight, in the base [m]."""
         cell = self.cell
         in_hand = cell.mount == "eye-in-hand"
         base_from_cam = base_from_flange @ cell.x if in_hand else cell.x[None]
@@ -368,42 +345,41 @@ class Shade:
         return base_from_cam[:, None, :3, 3], ends + base_from_target[:, None, :3, 3]
 
 
-def _meet_box(
+def _box_blocks(
     starts: FloatArray, ends: FloatArray, base_from_box: FloatArray, size_m: FloatArray
 ) -> Mask:
-    """Whether one of the lines (k, p) of a row meets a box at (k or 1, 4, 4)."""
-    # A line meets a box where the spans in which it is between opposite faces overlap (Kay and
-    # Kajiya 1986, slabs).
+    """Whether any of the lines (k, p) of a row intersects a box at (k or 1, 4, 4)."""
+    # Slab method (Kay and Kajiya 1986).
     rotation, middle = base_from_box[:, :3, :3], base_from_box[:, None, :3, 3]
     start, along = (starts - middle) @ rotation, (ends - starts) @ rotation
     along = np.where(along == 0.0, _TINY, along)
     faces = np.stack([(side * size_m - start) / along for side in (-0.5, 0.5)])
     enters, leaves = faces.min(axis=0).max(axis=-1), faces.max(axis=0).min(axis=-1)
-    meets = (enters <= leaves) & (enters < _LIES_ON) & (leaves > 0.0)
-    return np.asarray(meets.any(axis=1))
+    intersects = (enters <= leaves) & (enters < _FREE_SHARE) & (leaves > 0.0)
+    return np.asarray(intersects.any(axis=1))
 
 
-def _meet_tube(
-    starts: FloatArray, ends: FloatArray, base_from_tube: FloatArray, size_m: FloatArray
+def _capsule_blocks(
+    starts: FloatArray, ends: FloatArray, base_from_capsule: FloatArray, size_m: FloatArray
 ) -> Mask:
-    """Whether one of the lines (k, p) of a row meets a tube with round ends at (k or 1, 4, 4)."""
-    # The nearest points of two lines (Ericson 2005, Real-Time Collision Detection, 5.1.9). A line
-    # that begins inside is no line of sight: the camera is beside the tube, whose form is a rough
-    # one.
+    """Whether any of the lines (k, p) of a row intersects a capsule at (k or 1, 4, 4)."""
+    # Closest points of two segments (Ericson 2005, Real-Time Collision Detection, 5.1.9, whose
+    # names a, b, c, e, f are kept). Lines that start inside do not count: the camera is really
+    # beside the link, whose shape is rough.
     radius, length = size_m
-    axis = length * base_from_tube[:, None, :3, 2]
-    foot = base_from_tube[:, None, :3, 3] - 0.5 * axis
-    along, apart = _LIES_ON * (ends - starts), starts - foot
-    far, long = _dot(along, along), max(length**2, _TINY)
-    both, by_line, by_axis = _dot(along, axis), _dot(along, apart), _dot(axis, apart)
-    across = np.maximum(far * long - both**2, _TINY * far * long)
-    at_line = np.clip((both * by_axis - by_line * long) / across, 0.0, 1.0)
-    at_axis = np.clip((both * at_line + by_axis) / long, 0.0, 1.0)
-    at_line = np.clip((both * at_axis - by_line) / far, 0.0, 1.0)
-    between = apart + at_line[..., None] * along - at_axis[..., None] * axis
-    inside = apart - np.clip(by_axis / long, 0.0, 1.0)[..., None] * axis
-    meets = (_dot(between, between) < radius**2) & (_dot(inside, inside) > radius**2)
-    return np.asarray(meets.any(axis=1))
+    axis = length * base_from_capsule[:, None, :3, 2]
+    foot = base_from_capsule[:, None, :3, 3] - 0.5 * axis
+    along, from_foot = _FREE_SHARE * (ends - starts), starts - foot
+    a, e = _dot(along, along), max(length**2, _TINY)
+    b, c, f = _dot(along, axis), _dot(along, from_foot), _dot(axis, from_foot)
+    determinant = np.maximum(a * e - b**2, _TINY * a * e)
+    at_line = np.clip((b * f - c * e) / determinant, 0.0, 1.0)
+    at_axis = np.clip((b * at_line + f) / e, 0.0, 1.0)
+    at_line = np.clip((b * at_axis - c) / a, 0.0, 1.0)
+    between = from_foot + at_line[..., None] * along - at_axis[..., None] * axis
+    inside = from_foot - np.clip(f / e, 0.0, 1.0)[..., None] * axis
+    intersects = (_dot(between, between) < radius**2) & (_dot(inside, inside) > radius**2)
+    return np.asarray(intersects.any(axis=1))
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:

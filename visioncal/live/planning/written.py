@@ -1,4 +1,4 @@
-"""A plan as files: a table of its stops, JSON, and a program for a UR's controller."""
+"""Writers of a plan: table of stops, JSON, and program for a UR controller."""
 
 import csv
 import io
@@ -23,15 +23,12 @@ from visioncal.session.columns import POSE
 from visioncal.vision.targets import target_document
 
 SCHEMA = 1
-# The arm has stopped to tremble before an image is taken [s].
+# Time for vibrations to decay before an image is taken [s].
 _SETTLING_S = 0.5
 
 
 def stops_table(plan: Plan) -> str:
-    """Writes the stops as a views.csv, with names for the images that are to be taken there.
-
-    The poses are those of the robot's model at these joints.
-    """
+    """Writes the stops as a views.csv, with poses by the robot's model and names for the images."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     joints = [f"q{index + 1}_rad" for index in range(plan.cell.robot.joint_count)]
@@ -46,17 +43,12 @@ def stops_table(plan: Plan) -> str:
 
 
 def image_of(stop: PlannedStop) -> str:
-    """The name of the image that is to be taken at a stop."""
+    """Name of the image to be taken at a stop."""
     return f"images/{stop.view:03d}.png"
 
 
 def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
-    """Builds the content of plan.json; what does not apply is absent.
-
-    Args:
-        plan: The plan.
-        source: What the cell was taken from, for people.
-    """
+    """Builds the content of plan.json; `source` tells the reader where the cell comes from."""
     request, design = plan.request, plan.design
     inputs: dict[str, Any] = {
         "cell": _cell_document(plan.cell),
@@ -85,7 +77,7 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         document["wish_met"] = design.met
     if plan.need is not None:
         document["need"] = {
-            **_given(plan.need.need),
+            **_stated_values(plan.need.need),
             "probability": plan.need.probability,
             **({} if plan.begun is None else {"probability_before": plan.need.before}),
             "probability_of_all_candidates": plan.need.best,
@@ -107,8 +99,7 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
 def program_of(plan: Plan) -> str:
     """Writes a program that drives a UR to the stops and waits at each; empty for other arms.
 
-    Between neighbouring postures every joint turns straight to its goal, which is the way that was
-    looked at; corners are not rounded.
+    Between postures it moves straight in joint space, without blending: the path that was checked.
     """
     robot = plan.cell.robot
     if not has_ur_axes(robot):
@@ -159,10 +150,10 @@ def _move(q: FloatArray, words: str) -> str:
     return f"movej([{joints}], a=acceleration, v=speed)  # {words}"
 
 
-def _accuracy(found: Accuracy) -> dict[str, Any]:
-    if found.is_open:
+def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
+    if accuracy.is_open:
         return {"open": True}
-    return {"sigma_mm": found.mm, "sigma_deg": found.deg}
+    return {"sigma_mm": accuracy.mm, "sigma_deg": accuracy.deg}
 
 
 def _stop_document(stop: PlannedStop) -> dict[str, Any]:
@@ -224,10 +215,8 @@ def _box_document(box: Box) -> dict[str, Any]:
     }
 
 
-def _given(asked: Wish | Need) -> dict[str, float]:
-    return {
-        name: getattr(asked, name) for name in ("mm", "deg") if getattr(asked, name) is not None
-    }
+def _stated_values(wish: Wish | Need) -> dict[str, float]:
+    return {name: getattr(wish, name) for name in ("mm", "deg") if getattr(wish, name) is not None}
 
 
 def _request_document(request: PlanRequest) -> dict[str, Any]:
@@ -240,9 +229,9 @@ def _request_document(request: PlanRequest) -> dict[str, Any]:
         "seed": request.seed,
     }
     if wish is not None:
-        document["wish"] = _given(wish)
+        document["wish"] = _stated_values(wish)
     if request.need is not None:
-        document["need"] = _given(request.need)
+        document["need"] = _stated_values(request.need)
     if request.workspace is not None:
         document["workspace"] = _box_document(request.workspace)
     if request.start_q is not None:

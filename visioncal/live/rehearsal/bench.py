@@ -1,4 +1,4 @@
-"""The devices of a rehearsal: simulated, behind the real client libraries; their faults."""
+"""Simulated devices of a rehearsal behind the real client libraries, and fault injection."""
 
 import threading
 import time
@@ -35,30 +35,28 @@ _AT_CONTROLLER: Mapping[str, Fault] = {
     "silent": "freeze",
 }
 _AT_CAMERA: Mapping[str, CameraFault] = {"unplugged": "unplugged", "covered": "covered"}
-_MENDED: Mapping[str, Fault] = {
+_REMEDIES: Mapping[str, Fault] = {
     "protective-stop": "release",
     "emergency-stop": "release",
     "remote-off": "remote-control",
     "silent": "thaw",
 }
-# Faster joints move, slower ones stand [rad/s].
-_MOVES, _STANDS = 0.05, 1e-3
+# Joint speeds above which the arm counts as moving, and below which as stopped [rad/s].
+_MOVING_SPEED, _STOPPED_SPEED = 0.05, 1e-3
 _POLL_S = 0.02
-# A way is under way when this much of it is behind [s].
-_UNDER_WAY_S = 0.2
-# Longer than any way between two stops takes, on a busy computer too [s].
+# Delay of a fault after the start of a motion [s].
+_INTO_MOTION_S = 0.2
+# Longer than any motion between two stops, even on a busy computer [s].
 _PATIENCE_S = 60.0
-# Until an arm stands that was stopped: how long and how finely it is looked at [s].
-_LOOKED_S, _FINE_S = 2.0, 0.01
+# How long and at which interval an arm is observed after a stop [s].
+_OBSERVED_S, _SAMPLING_S = 2.0, 0.01
 
 
 class Bench:
-    """A simulated cell that runs: its controller is another process, its camera draws the truth.
+    """A running simulated cell: its controller is another process, its camera renders the truth.
 
     Attributes:
-        cell: What it is made of.
-        controller: The controller's process.
-        camera: The camera that sees the true arm.
+        camera: The camera that observes the true arm.
         through_depthai: Whether its pictures go through depthai's pipeline.
     """
 
@@ -69,45 +67,46 @@ class Bench:
             DriverError: It does not start.
         """
         self.cell = cell
-        self.controller: SimulatedController = spawn(_standing(cell, start_q))
-        # The camera asks from the pipeline's thread, so it has a connection of its own.
-        self._eyes = TruthClient(self.controller.host)
-        self.camera = RehearsalCamera(cell.truth, self._true_joints, pace=_PACE)
+        self.controller: SimulatedController = spawn(_options_at(cell, start_q))
+        # The camera asks from the pipeline's thread, and needs a connection of its own.
+        self._truth = TruthClient(self.controller.host)
+        self.camera = RehearsalCamera(
+            cell.truth, lambda at_s: self._truth.state(at_s.tolist()).q, pace=_PACE
+        )
         self.through_depthai = _has_depthai()
 
     @contextmanager
     def connected(self) -> Iterator[LiveCell]:
-        """Opens arm and camera as a recording does, and lets go of them.
+        """Opens arm and camera as a recording does, and closes them.
 
         Raises:
             DriverError: One of them cannot be opened.
         """
-        with closing(UrArm(self.controller.host)) as arm, closing(self._device()) as camera:
+        with closing(UrArm(self.controller.host)) as arm, closing(self._open_camera()) as camera:
             yield LiveCell(arm, camera)
 
     def restart(self, q: FloatArray) -> None:
-        """Starts a controller that has died anew, with the arm where it stood [rad]."""
+        """Restarts a controller that has died, with the arm at its last posture [rad]."""
         host = self.controller.host
         self.close()
-        self.controller = spawn(_standing(self.cell, q), host)
-        self._eyes = TruthClient(host)
+        self.controller = spawn(_options_at(self.cell, q), host)
+        self._truth = TruthClient(host)
 
     def close(self) -> None:
         """Ends the controller."""
-        self._eyes.close()
+        self._truth.close()
         self.controller.close()
 
-    def _true_joints(self, at_s: FloatArray) -> FloatArray:
-        return self._eyes.state(at_s.tolist()).q
-
-    def _device(self) -> CameraDevice:
+    def _open_camera(self) -> CameraDevice:
         if not self.through_depthai:
             return self.camera
-        seen = self.camera
-        return HostedOak(seen.frame, seen.resolution, factory=seen.factory, settings=seen.settings)
+        camera = self.camera
+        return HostedOak(
+            camera.frame, camera.resolution, factory=camera.factory, settings=camera.settings
+        )
 
 
-def _standing(cell: RehearsedCell, q: FloatArray) -> ControllerOptions:
+def _options_at(cell: RehearsedCell, q: FloatArray) -> ControllerOptions:
     return replace(cell.controller, q=tuple(np.asarray(q).tolist()))
 
 
@@ -119,13 +118,13 @@ def _has_depthai() -> bool:
 
 
 class FaultInjection:
-    """A watcher that lets a fault happen after so many views.
+    """Watcher that injects a fault after a number of views.
 
-    Those of the controller come while the arm moves, those of the camera when it stands at a stop.
+    Faults of the controller occur during a motion, those of the camera at a stop.
 
     Attributes:
-        injected_s: When it happened, on the monotonic clock [s]; None before.
-        q: (n,) where the arm was then [rad]; empty before.
+        injected_s: Time of the fault on the monotonic clock [s]; None before.
+        q: (n,) joint angles at the fault [rad]; empty before.
     """
 
     def __init__(self, bench: Bench, fault: Faults, after: int) -> None:
@@ -134,30 +133,30 @@ class FaultInjection:
         self.q: FloatArray = np.zeros(0)
 
     def stepped(self, step: CaptureEvent) -> None:
-        """Prepares the fault once so many views were tried."""
+        """Starts the injection once that number of stops was visited."""
         if step.place == self._after:
             threading.Thread(target=self._inject, daemon=True).start()
 
     def stood_after_s(self) -> float | None:
-        """How long the arm still moved after the fault [s].
+        """Time from the fault until the arm stopped [s].
 
-        None where the simulated arm is gone with its controller, or goes on to the next stop.
+        None where the simulated arm ends with its controller, or goes on to the next stop.
         """
         if self.injected_s is None or self._fault in ("link-lost", "covered"):
             return None
-        times = self.injected_s + np.arange(0.0, _LOOKED_S, _FINE_S)
+        times = self.injected_s + np.arange(0.0, _OBSERVED_S, _SAMPLING_S)
         time.sleep(max(0.0, float(times[-1]) - time.monotonic()))
         with closing(TruthClient(self._bench.controller.host)) as truth:
             speeds = np.abs(truth.state(times.tolist()).dq).max(axis=1)
-        moving = np.flatnonzero(speeds > _STANDS)
-        return 0.0 if not len(moving) else _FINE_S * float(moving[-1] + 1)
+        moving = np.flatnonzero(speeds > _STOPPED_SPEED)
+        return 0.0 if not len(moving) else _SAMPLING_S * float(moving[-1] + 1)
 
     def mend(self) -> None:
-        """Does what a person would do in the cell before going on."""
+        """Clears the fault, as a person would do in the cell before going on."""
         if self._fault == "link-lost":
             self._bench.restart(self.q)
-        elif self._fault in _MENDED:
-            self._bench.controller.truth.inject(_MENDED[self._fault])
+        elif self._fault in _REMEDIES:
+            self._bench.controller.truth.inject(_REMEDIES[self._fault])
         else:
             self._bench.camera.fault = "none"
 
@@ -165,7 +164,7 @@ class FaultInjection:
         with closing(TruthClient(self._bench.controller.host)) as truth:
             _wait(truth, moving=True)
             if self._fault in _AT_CONTROLLER:
-                time.sleep(_UNDER_WAY_S)
+                time.sleep(_INTO_MOTION_S)
                 self.q, self.injected_s = truth.state([time.monotonic()]).q[0], time.monotonic()
                 truth.inject(_AT_CONTROLLER[self._fault])
                 return
@@ -175,10 +174,10 @@ class FaultInjection:
 
 
 def _wait(truth: TruthClient, *, moving: bool) -> None:
-    """Waits until the arm moves, or stands."""
-    until = time.monotonic() + _PATIENCE_S
-    while time.monotonic() < until:
+    """Waits until the arm moves, or has stopped."""
+    ends_s = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < ends_s:
         speed = float(np.abs(truth.state([time.monotonic()]).dq).max())
-        if (speed > _MOVES) if moving else (speed < _STANDS):
+        if (speed > _MOVING_SPEED) if moving else (speed < _STOPPED_SPEED):
             return
         time.sleep(_POLL_S)

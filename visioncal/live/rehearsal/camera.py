@@ -1,6 +1,6 @@
-"""The camera of a rehearsal: pictures of a simulated cell, at a camera's pace, of where the arm is.
+"""Camera of a rehearsal: pictures of a simulated cell with the arm's true joints.
 
-It free-runs as a camera does: exposures begin at even times, whether or not anybody asks.
+It free-runs as a real camera does: exposures start at regular times, whether or not requested.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from visioncal.live.drivers.protocols import Frame
 from visioncal.simulation import SimulatedCell
 from visioncal.simulation.live import LiveView
 
-# Moments of an exposure at which the arm is asked for its joints, the beginning and end included.
+# Moments of an exposure at which the arm's joints are read, start and end included.
 _MOMENTS = 5
 
 # Dark, as the inside of a lens cap [grey level].
@@ -28,11 +28,11 @@ Fault = Literal["none", "unplugged", "frozen", "covered"]
 
 @dataclass(frozen=True)
 class Pace:
-    """When a camera takes pictures.
+    """Timing of a camera.
 
     Attributes:
-        rate_hz: Pictures a second.
-        exposure_s: How long each is exposed [s].
+        rate_hz: Pictures per second.
+        exposure_s: Exposure time [s].
     """
 
     rate_hz: float = 15.0
@@ -40,16 +40,16 @@ class Pace:
 
 
 class RehearsalCamera:
-    """A camera device that sees a simulated cell.
+    """Camera device that observes a simulated cell.
 
     Args:
         cell: The cell: its true arm, edges and lens, its board and its noise. Its true arm must be
             the one whose joints are given.
-        true_joints: Tells the arm's true joints, (k, n) [rad], at k past moments of the monotonic
-            clock, (k,) [s]. Where it raises DriverError the arm is taken to stand where it was last
-            known: a camera works on when a controller dies.
-        pace: When it takes pictures.
-        clock: The time.
+        true_joints: Returns the arm's true joints, (k, n) [rad], at k past moments of the monotonic
+            clock, (k,) [s]. After its DriverError the last known joints are used: a camera goes on
+            working when a controller dies.
+        pace: Timing of the pictures.
+        clock: The clock.
     """
 
     def __init__(
@@ -65,13 +65,13 @@ class RehearsalCamera:
         self._true_joints = true_joints
         self._pace = pace or Pace()
         self._clock = clock or HostClock()
-        self._began = self._clock.now()
+        self._start = self._clock.now()
         self._last: tuple[FloatArray, Image] | None = None
         self.fault: Fault = "none"
 
     @property
     def name(self) -> str:
-        """What it is."""
+        """Name in messages."""
         return "simulated camera"
 
     @property
@@ -81,7 +81,7 @@ class RehearsalCamera:
 
     @property
     def factory(self) -> Camera | None:
-        """The intrinsics as the cell states them; None where it states none."""
+        """Stated intrinsics of the cell; None where it states none."""
         return self._cell.stated[""] if self._cell.camera().state_intrinsics else None
 
     @property
@@ -94,31 +94,31 @@ class RehearsalCamera:
         """Returns a picture whose exposure began after the call.
 
         Raises:
-            DriverError: It is unplugged, or the next exposure ends later than that.
+            DriverError: It is unplugged, or the next exposure ends after the timeout.
         """
-        asked = self._clock.now()
+        requested_at = self._clock.now()
         exposure_s, rate_hz = self._pace.exposure_s, self._pace.rate_hz
-        begins = self._began + np.ceil((asked - self._began) * rate_hz) / rate_hz
-        late = begins + exposure_s > asked + timeout_s
-        if late or self.fault == "unplugged":
+        start = self._start + np.ceil((requested_at - self._start) * rate_hz) / rate_hz
+        is_late = start + exposure_s > requested_at + timeout_s
+        if is_late or self.fault == "unplugged":
             self._clock.sleep(timeout_s)
             raise DriverError(
                 f"The {self.name} gave no picture within {timeout_s:g} s.",
                 culprits=[self.name],
                 next_step="Look at its cable and its power, then go on with --resume.",
             )
-        self._clock.sleep(max(begins + exposure_s - asked, 0.0))
-        return Frame(self._taken(begins), begins + 0.5 * exposure_s, exposure_s)
+        self._clock.sleep(max(start + exposure_s - requested_at, 0.0))
+        return Frame(self._picture(start), start + 0.5 * exposure_s, exposure_s)
 
     def close(self) -> None:
-        """Lets go of it; there is nothing to let go of."""
+        """Holds no resources."""
 
-    def _taken(self, begins: float) -> Image:
+    def _picture(self, start: float) -> Image:
         if self.fault == "frozen" and self._last is not None:
             return self._last[1].copy()
         if self.fault == "covered":
             return np.full(self.resolution[::-1], _DARK, dtype=np.uint8)
-        moments = np.linspace(begins, begins + self._pace.exposure_s, _MOMENTS)
+        moments = np.linspace(start, start + self._pace.exposure_s, _MOMENTS)
         try:
             joints = self._true_joints(moments)
         except DriverError:

@@ -1,7 +1,8 @@
-"""A simulated UR controller as a process of its own, for the real client library to talk to.
+"""Simulated UR controller as a process of its own, for the real client library to talk to.
 
-It has to be another process: the client's constructors hold Python's lock while they wait for the
-controller. By hand: `python -m visioncal.live.rehearsal.controller --host 127.0.0.5 --robot ur10e`.
+It must be another process: the client's constructors hold the interpreter lock while they wait for
+the controller. Start one by hand with
+`python -m visioncal.live.rehearsal.controller --host 127.0.0.5 --robot ur10e`.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from visioncal.simulation.arms import ArmErrors
 
 _MODULE = "visioncal.live.rehearsal.controller"
 _READY = b"ready"
-# Starting takes well under a second alone; a busy computer gets much more time.
+# Starting takes well under a second, but much longer on a busy computer.
 _START_S = 60.0
 _END_S = 5.0
 
@@ -38,8 +39,6 @@ class SimulatedController:
 
     Attributes:
         host: The loopback address that it listens on.
-        process: The process.
-        truth: Its truth channel.
     """
 
     host: str
@@ -59,14 +58,10 @@ class SimulatedController:
 
 
 def spawn(options: ControllerOptions | None = None, host: str | None = None) -> SimulatedController:
-    """Starts a simulated controller.
-
-    Args:
-        options: What it is made of; the defaults where None.
-        host: A loopback address, as `127.0.0.2`; one that is free where None.
+    """Starts a simulated controller at a loopback address such as `127.0.0.2`; None for any free.
 
     Raises:
-        DriverError: It does not start, as where a port is taken.
+        DriverError: It does not start, for example because a port is taken.
     """
     options = ControllerOptions() if options is None else options
     host = free_host() if host is None else host
@@ -82,7 +77,7 @@ def spawn(options: ControllerOptions | None = None, host: str | None = None) -> 
 
 
 def free_host() -> str:
-    """A loopback address on which no port of a controller is taken.
+    """Finds a loopback address on which no port of a controller is taken.
 
     Raises:
         DriverError: There is none, as on systems whose loopback is one address only.
@@ -98,11 +93,11 @@ def free_host() -> str:
 
 
 def _hosts() -> Iterator[str]:
-    """Addresses to try; processes begin at different ones."""
+    """Addresses to try; processes start at different ones."""
     first = os.getpid()
     for step in range(200):
-        at = first + 251 * step
-        yield f"127.{at // 62500 % 250 + 2}.{at // 250 % 250 + 2}.{at % 250 + 2}"
+        number = first + 251 * step
+        yield f"127.{number // 62500 % 250 + 2}.{number // 250 % 250 + 2}.{number % 250 + 2}"
 
 
 def _is_free(host: str, port: int) -> bool:
@@ -118,8 +113,8 @@ def _is_free(host: str, port: int) -> bool:
 def _wait(process: subprocess.Popen[bytes], host: str) -> None:
     """Waits until all ports listen."""
     ends_s = time.monotonic() + _START_S
-    while process.stdout is not None and (left_s := ends_s - time.monotonic()) > 0.0:
-        readable, _, _ = select.select([process.stdout], [], [], left_s)
+    while process.stdout is not None and (remaining_s := ends_s - time.monotonic()) > 0.0:
+        readable, _, _ = select.select([process.stdout], [], [], remaining_s)
         line = process.stdout.readline() if readable else b""
         if line.strip() == _READY:
             return
@@ -179,21 +174,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         action="store_true",
         help="end with the standard input, so that no parent that is killed leaves it behind",
     )
-    given = parser.parse_args(arguments)
+    parsed = parser.parse_args(arguments)
     try:
-        options = _read(given.options, robot=given.robot, seed=given.seed)
-        _end_by(ends_with_input=given.until_input_ends)
-        asyncio.run(ControllerServer(options, given.host).run(_say_ready))
+        options = _read(parsed.options, robot=parsed.robot, seed=parsed.seed)
+        _set_end_condition(ends_with_input=parsed.until_input_ends)
+        asyncio.run(ControllerServer(options, parsed.host).run(_say_ready))
     except (DataError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
     return 0
 
 
-def _end_by(*, ends_with_input: bool) -> None:
-    """Chooses what ends the process; it has nothing to save."""
-    # Ctrl-C goes to all processes of a terminal: one that serves another waits for that one's word,
-    # as a real controller does not end with its client.
+def _set_end_condition(*, ends_with_input: bool) -> None:
+    """Chooses what ends the process, which has nothing to save."""
+    # Ctrl-C reaches all processes of a terminal; a controller that serves another process must not
+    # end before its client.
     signal.signal(signal.SIGINT, signal.SIG_IGN if ends_with_input else signal.SIG_DFL)
     if ends_with_input:
         threading.Thread(target=_end_with_input, daemon=True).start()

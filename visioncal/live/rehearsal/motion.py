@@ -1,7 +1,7 @@
-"""How simulated joints move: straight ways with trapezoidal speed, and braking.
+"""Motions of simulated joints: straight paths with a trapezoidal speed profile, and braking.
 
-A motion is a function of time, not a table of ticks: where the joints stand is known at any moment,
-however late the process that simulates them gets the processor.
+A motion is a function of time, not a table of ticks: the joints are defined at any moment, however
+late the simulating process is scheduled.
 """
 
 from collections.abc import Sequence
@@ -14,19 +14,19 @@ from visioncal.core.types import FloatArray
 
 
 class Motion(Protocol):
-    """Joints as a function of the time since the motion began."""
+    """Joints as a function of the time since the start of a motion."""
 
     @property
     def duration_s(self) -> float:
-        """When it ends [s]; from then on, the joints stand."""
+        """Duration [s]; afterwards the joints are at rest."""
 
     def at(self, elapsed_s: float) -> tuple[FloatArray, FloatArray]:
-        """(n,) joint angles [rad] and (n,) speeds [rad/s]."""
+        """Joint angles (n,) [rad] and speeds (n,) [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Joints that stand."""
+    """Joints at rest."""
 
     q: FloatArray
     duration_s: float = 0.0
@@ -38,12 +38,12 @@ class Rest:
 
 @dataclass(frozen=True)
 class Profile:
-    """A way from rest to rest, its speed a trapezoid or, on a short way, a triangle.
+    """Trapezoidal speed profile from rest to rest; a triangle over a short distance.
 
     Attributes:
-        distance: Length of the way [rad or m].
-        speed: Greatest speed.
-        acceleration: Of speeding up and of braking.
+        distance: Length of the path [rad or m].
+        speed: Speed limit.
+        acceleration: Acceleration and deceleration.
     """
 
     distance: float
@@ -52,41 +52,43 @@ class Profile:
 
     @property
     def peak(self) -> float:
-        """The greatest speed that is reached."""
+        """Greatest speed that is reached."""
         return min(self.speed, float(np.sqrt(self.distance * self.acceleration)))
 
     @property
     def duration_s(self) -> float:
-        """How long the way takes [s]."""
+        """Duration [s]."""
         if self.distance == 0.0:
             return 0.0
         return self.distance / self.peak + self.peak / self.acceleration
 
     def at(self, elapsed_s: float) -> tuple[float, float]:
-        """The way that is behind and the speed."""
-        left = self.duration_s - elapsed_s
-        if left <= 0.0:
+        """Distance travelled and speed."""
+        remaining_s = self.duration_s - elapsed_s
+        if remaining_s <= 0.0:
             return self.distance, 0.0
         ramp = self.peak / self.acceleration
         if elapsed_s < ramp:
             return 0.5 * self.acceleration * elapsed_s**2, self.acceleration * elapsed_s
-        if left < ramp:
-            return self.distance - 0.5 * self.acceleration * left**2, self.acceleration * left
+        if remaining_s < ramp:
+            return (
+                self.distance - 0.5 * self.acceleration * remaining_s**2,
+                self.acceleration * remaining_s,
+            )
         return self.peak * (elapsed_s - 0.5 * ramp), self.peak
 
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """Joints on straight lines from posture to posture, in one sweep.
+    """Path of the joints through postures, straight in between, without stops.
 
     Attributes:
-        knots: (k, n) the postures, from the first to the last [rad].
-        places: (k,) how far along the way each lies, from 0 to the profile's distance.
-        profile: The progress along it.
+        knots: (k, n) postures, from the first to the last [rad].
+        distances: (k,) distance along the path of each, from 0 to the profile's distance.
     """
 
     knots: FloatArray
-    places: FloatArray
+    distances: FloatArray
     profile: Profile
 
     @property
@@ -99,20 +101,16 @@ class Way:
         if self.profile.distance == 0.0:
             return self.knots[-1], np.zeros(self.knots.shape[1])
         place, speed = self.profile.at(max(0.0, elapsed_s))
-        after = int(np.clip(np.searchsorted(self.places, place), 1, len(self.places) - 1))
-        span = self.places[after] - self.places[after - 1]
+        after = int(np.clip(np.searchsorted(self.distances, place), 1, len(self.distances) - 1))
+        span = self.distances[after] - self.distances[after - 1]
         slope = (self.knots[after] - self.knots[after - 1]) / span
-        return self.knots[after - 1] + slope * (place - self.places[after - 1]), slope * speed
+        return self.knots[after - 1] + slope * (place - self.distances[after - 1]), slope * speed
 
 
 def joint_way(start: FloatArray, goal: FloatArray, *, speed: float, acceleration: float) -> Way:
-    """All joints together, straight from posture to posture.
+    """Straight path of all joints between postures (n,) [rad].
 
-    Args:
-        start: (n,) from here [rad].
-        goal: (n,) to here [rad].
-        speed: Of the joint that turns farthest [rad/s].
-        acceleration: Likewise [rad/s^2].
+    Speed [rad/s] and acceleration [rad/s^2] are of the joint that travels farthest.
     """
     distance = float(np.abs(goal - start).max())
     return Way(
@@ -125,26 +123,19 @@ def joint_way(start: FloatArray, goal: FloatArray, *, speed: float, acceleration
 def sampled_way(
     knots: Sequence[FloatArray], distance: float, *, speed: float, acceleration: float
 ) -> Way:
-    """A way through postures that lie evenly along it, as those under a straight line of the tool.
-
-    Args:
-        knots: The postures [rad].
-        distance: Length of the way [m].
-        speed: [m/s].
-        acceleration: [m/s^2].
-    """
-    places = np.linspace(0.0, distance, len(knots))
-    return Way(np.array(knots), places, Profile(distance, speed, acceleration))
+    """Path of a length [m] through evenly spaced postures (n,) [rad], at most at a speed [m/s]."""
+    distances = np.linspace(0.0, distance, len(knots))
+    return Way(np.array(knots), distances, Profile(distance, speed, acceleration))
 
 
 @dataclass(frozen=True, eq=False)
 class Brake:
-    """Joints that slow down together, each in its direction.
+    """Joints that brake together in proportion to their speeds.
 
     Attributes:
-        q: (n,) where it begins [rad].
-        dq: (n,) the speeds there [rad/s].
-        deceleration: Of the fastest joint [rad/s^2].
+        q: (n,) joint angles at the start [rad].
+        dq: (n,) speeds at the start [rad/s].
+        deceleration: Deceleration of the fastest joint [rad/s^2].
     """
 
     q: FloatArray
@@ -153,13 +144,13 @@ class Brake:
 
     @property
     def duration_s(self) -> float:
-        """When all joints stand [s]."""
+        """Time until all joints are at rest [s]."""
         return float(np.abs(self.dq).max()) / self.deceleration
 
     def at(self, elapsed_s: float) -> tuple[FloatArray, FloatArray]:
         """(n,) joint angles [rad] and (n,) speeds [rad/s]."""
-        whole = self.duration_s
-        if whole == 0.0:
+        duration_s = self.duration_s
+        if duration_s == 0.0:
             return self.q, np.zeros_like(self.q)
-        share = min(max(elapsed_s, 0.0) / whole, 1.0)
-        return self.q + self.dq * whole * share * (1.0 - 0.5 * share), self.dq * (1.0 - share)
+        share = min(max(elapsed_s, 0.0) / duration_s, 1.0)
+        return self.q + self.dq * duration_s * share * (1.0 - 0.5 * share), self.dq * (1.0 - share)

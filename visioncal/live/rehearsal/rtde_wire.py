@@ -1,4 +1,4 @@
-"""The frames of RTDE, Universal Robots' protocol of states and registers on port 30004.
+"""Frames of RTDE, Universal Robots' protocol of states and registers on port 30004.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". A frame is its whole size
 (uint16), its type (one byte) and its payload; numbers are big-endian.
@@ -14,7 +14,7 @@ from typing import TypeAlias
 RTDE_PORT = 30004
 _HEADER = struct.Struct(">HB")
 HEADER_BYTES = _HEADER.size
-# How each type of a variable is packed, by the names that the protocol has for them.
+# Packing of each type of variable, by the protocol's names.
 _FORMATS = {
     "BOOL": "?",
     "UINT8": "B",
@@ -33,7 +33,7 @@ Value: TypeAlias = float | Sequence[float]
 
 
 class Kind(IntEnum):
-    """What a frame is."""
+    """Type of a frame."""
 
     PROTOCOL = ord("V")
     VERSION = ord("v")
@@ -47,12 +47,10 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Recipe:
-    """Which variables the data frames of one number hold, in order.
+    """Recipe of data frames: their variables, in order.
 
     Attributes:
-        number: The recipe's number, the first byte of its frames.
-        names: The variables.
-        types: Their types.
+        number: Number of the recipe, the first byte of its frames.
     """
 
     number: int
@@ -77,18 +75,18 @@ class Recipe:
         values: dict[str, Value] = {}
         for name, type_name in zip(self.names, self.types, strict=True):
             count = int(_FORMATS[type_name][:-1] or "1")
-            taken, flat = flat[:count], flat[count:]
-            values[name] = tuple(taken) if count > 1 else taken[0]
+            part, flat = flat[:count], flat[count:]
+            values[name] = tuple(part) if count > 1 else part[0]
         return values
 
 
 def frame(kind: Kind, payload: bytes = b"") -> bytes:
-    """Puts the header before a payload."""
+    """Builds a frame from a payload."""
     return _HEADER.pack(HEADER_BYTES + len(payload), kind) + payload
 
 
 def read_header(header: bytes) -> tuple[int, int]:
-    """Reads a header: the type, and how many bytes of payload follow."""
+    """Reads a header: the type, and the size of the payload [B]."""
     size, kind = _HEADER.unpack(header)
     return kind, size - HEADER_BYTES
 

@@ -1,6 +1,6 @@
-"""What the client's control script does on a controller, by commands in registers.
+"""Simulated control script of ur-rtde, which executes commands from registers.
 
-ur-rtde sends a script and then one command at a time: its number in the first integer input, its
+The client sends a script and then one command at a time: its number in the first integer input, its
 arguments in the others. The script answers in its first integer output: 1 ready, 2 done. A command
 stays until the client clears it.
 """
@@ -15,17 +15,17 @@ from visioncal.live.rehearsal.machine import Machine, flange_pose, posture, post
 from visioncal.live.rehearsal.motion import joint_way, sampled_way
 
 READY, DONE = 1, 2
-# Commands that are repeated while they stand, and never done.
+# Commands that repeat while they are set, and are never done.
 _CONTINUOUS = frozenset((6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)))
 _STOP = 255
 _REGISTERS = 48
-# A pause between ticks that a busy computer makes [s].
-_ASLEEP_S = 0.1
+# Time between ticks above which this computer has stalled [s].
+_STALL_S = 0.1
 
 
 @dataclass
 class Registers:
-    """The numbers through which client and script speak."""
+    """Registers through which client and script communicate."""
 
     int_in: list[int] = field(default_factory=lambda: [0] * _REGISTERS)
     double_in: list[float] = field(default_factory=lambda: [0.0] * _REGISTERS)
@@ -42,12 +42,12 @@ class ControlScript:
         self._waiting = False
         self._asynchronous = False
         self._operation, self._writes = 0, 0
-        self._least_hz, self._heard_s, self._ticked_s = 0.0, 0.0, 0.0
+        self._watchdog_hz, self._last_command_s, self._last_tick_s = 0.0, 0.0, 0.0
         self._commands: Mapping[int, Callable[[float], None]] = {
-            1: lambda now_s: self._turn_to(self._goal(), now_s),
+            1: lambda now_s: self._move_joints(self._goal(), now_s),
             2: self._move_joints_to_pose,
-            3: lambda now_s: self._go_to(self._goal(), now_s),
-            4: lambda now_s: self._go_to(tool_pose(machine, self._goal()), now_s),
+            3: lambda now_s: self._move_straight(self._goal(), now_s),
+            4: lambda now_s: self._move_straight(tool_pose(machine, self._goal()), now_s),
             17: self._set_payload,
             29: self._set_tcp,
             30: self._inverse,
@@ -65,29 +65,29 @@ class ControlScript:
         }
 
     def begin(self, now_s: float) -> None:
-        """Starts as the text of the script arrives."""
+        """Starts when the text of the script arrives."""
         if not self._machine.may_move or not self._machine.remote:
             return
         self._machine.program = "playing"
         self._waiting = self._asynchronous = False
-        self._least_hz, self._heard_s = 0.0, now_s
+        self._watchdog_hz, self._last_command_s = 0.0, now_s
         self.registers.int_out[0] = READY
 
     def heard(self, now_s: float) -> None:
-        """Notes that the client wrote its command's register."""
-        self._heard_s = now_s
+        """Resets the watchdog: the client wrote its command register."""
+        self._last_command_s = now_s
 
     def tick(self, now_s: float) -> None:
-        """Does what is due."""
+        """Executes what is due."""
         machine, registers = self._machine, self.registers
-        slept_s, self._ticked_s = now_s - self._ticked_s, now_s
-        if slept_s > _ASLEEP_S:
-            # What came in meanwhile is not read yet: who slept cannot call others silent.
-            self._heard_s = now_s
+        elapsed_s, self._last_tick_s = now_s - self._last_tick_s, now_s
+        if elapsed_s > _STALL_S:
+            # After a stall of this computer, commands may have arrived that are not read yet.
+            self._last_command_s = now_s
         if machine.program != "playing":
             self._finish_asynchronous(now_s)
             return
-        if self._least_hz and now_s - self._heard_s > 1.0 / self._least_hz:
+        if self._watchdog_hz and now_s - self._last_command_s > 1.0 / self._watchdog_hz:
             machine.stop_program(now_s)
             return
         self._finish_asynchronous(now_s)
@@ -121,26 +121,26 @@ class ControlScript:
         if goal is None:
             self._fail(now_s)
         else:
-            self._turn_to(goal, now_s)
+            self._move_joints(goal, now_s)
 
-    def _turn_to(self, goal: FloatArray, now_s: float) -> None:
+    def _move_joints(self, goal: FloatArray, now_s: float) -> None:
         speed, acceleration = self.registers.double_in[6:8]
         q, _ = self._machine.joints(now_s)
         self._machine.start(joint_way(q, goal, speed=speed, acceleration=acceleration), now_s)
-        self._moved(now_s)
+        self._after_start(now_s)
 
-    def _go_to(self, goal: FloatArray, now_s: float) -> None:
+    def _move_straight(self, goal: FloatArray, now_s: float) -> None:
         q, _ = self._machine.joints(now_s)
         knots, distance = postures_to(self._machine, goal, q)
         if not knots:
             self._fail(now_s)
             return
         speed, acceleration = self.registers.double_in[6:8]
-        way = sampled_way(knots, distance, speed=speed, acceleration=acceleration)
-        self._machine.start(way, now_s)
-        self._moved(now_s)
+        path = sampled_way(knots, distance, speed=speed, acceleration=acceleration)
+        self._machine.start(path, now_s)
+        self._after_start(now_s)
 
-    def _moved(self, now_s: float) -> None:
+    def _after_start(self, now_s: float) -> None:
         if self.registers.int_in[1]:
             self._asynchronous = True
             self._operation = (self._operation + 1) % 128
@@ -149,7 +149,7 @@ class ControlScript:
             self._waiting = self._machine.moving(now_s)
 
     def _fail(self, now_s: float) -> None:
-        """A script that asks for what cannot be ends."""
+        """Ends the script, as for an impossible command."""
         self._machine.stop_program(now_s)
 
     def _finish_asynchronous(self, now_s: float) -> None:
@@ -158,7 +158,7 @@ class ControlScript:
             self._signal(running=False)
 
     def _signal(self, *, running: bool) -> None:
-        """Reports the asynchronous motion: how often reported, its number, whether it goes on."""
+        """Reports the asynchronous motion: count of reports, its number, whether it runs."""
         self._writes = (self._writes + 1) % 256
         self.registers.int_out[2] = self._operation << 24 | self._writes << 16 | int(running) << 15
 
@@ -166,7 +166,7 @@ class ControlScript:
         self._machine.brake(now_s, max(self.registers.double_in[0], 0.01))
         self._waiting = self._machine.moving(now_s) and not self.registers.int_in[1]
 
-    # What is set.
+    # Settings.
 
     def _set_payload(self, now_s: float) -> None:  # noqa: ARG002
         self._machine.payload_kg = self.registers.double_in[0]
@@ -176,9 +176,9 @@ class ControlScript:
         self._machine.tcp = self._goal()
 
     def _set_watchdog(self, now_s: float) -> None:
-        self._least_hz, self._heard_s = self.registers.double_in[0], now_s
+        self._watchdog_hz, self._last_command_s = self.registers.double_in[0], now_s
 
-    # What is asked.
+    # Queries.
 
     def _send(self, numbers: FloatArray) -> None:
         self.registers.double_out[: numbers.size] = numbers.tolist()

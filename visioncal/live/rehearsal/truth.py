@@ -1,7 +1,7 @@
-"""A channel beside the controller's own: the arm's true state, and faults to suffer.
+"""Truth channel of a simulated controller: the arm's true state, and fault injection.
 
-One JSON object a line asks, one answers. A simulated camera asks for the truth; a rehearsal injects
-faults. No real controller has such a thing.
+Requests and answers are JSON objects, one a line. A simulated camera reads the truth; a rehearsal
+injects faults. No real controller has such a channel.
 """
 
 import json
@@ -20,7 +20,7 @@ from visioncal.live.rehearsal.motion import joint_way
 
 TRUTH_PORT = 30900
 
-# Stops by the safety system; a hand on the pendant; the controller's own end, or its silence.
+# Safety stops, changes at the pendant, and the controller's end or silence.
 Fault: TypeAlias = Literal[
     "protective-stop",
     "emergency-stop",
@@ -36,11 +36,11 @@ Fault: TypeAlias = Literal[
 
 @dataclass(frozen=True, eq=False)
 class TrueState:
-    """Where the arm really was.
+    """True states of the arm at m moments.
 
     Attributes:
-        q: (m, n) its joints' angles [rad].
-        dq: (m, n) their speeds [rad/s].
+        q: (m, n) joint angles [rad].
+        dq: (m, n) joint speeds [rad/s].
         base_from_flange: (m, 4, 4) by the arm's true geometry [m].
     """
 
@@ -50,39 +50,39 @@ class TrueState:
 
 
 class TruthChannel:
-    """The channel's end at the controller."""
+    """Server side of the channel."""
 
     def __init__(self, machine: Machine, set_frozen: Callable[[bool], None]) -> None:
         self._machine = machine
         self._set_frozen = set_frozen
 
     def answer(self, line: bytes, now_s: float) -> bytes:
-        """Answers one line."""
+        """Answers a request."""
         try:
             reply = self._reply(json.loads(line), now_s)
         except (KeyError, TypeError, ValueError) as error:
             reply = {"error": f"{type(error).__name__}: {error}"}
         return json.dumps(reply).encode() + b"\n"
 
-    def _reply(self, asked: Mapping[str, Any], now_s: float) -> dict[str, Any]:
+    def _reply(self, request: Mapping[str, Any], now_s: float) -> dict[str, Any]:
         machine = self._machine
-        if "at" in asked:
-            states = [machine.true_joints(at) for at in asked["at"]]
+        if "at" in request:
+            states = [machine.true_joints(at) for at in request["at"]]
             return {
                 "q": [q.tolist() for q, _ in states],
                 "dq": [dq.tolist() for _, dq in states],
-                "base_from_flange": [machine.true_flange(at).tolist() for at in asked["at"]],
+                "base_from_flange": [machine.true_flange(at).tolist() for at in request["at"]],
             }
-        if "guide" in asked:
+        if "guide" in request:
             q, _ = machine.joints(now_s)
-            goal = np.array(asked["guide"], dtype=float)
-            speed, acceleration = float(asked["speed"]), float(asked["acceleration"])
+            goal = np.array(request["guide"], dtype=float)
+            speed, acceleration = float(request["speed"]), float(request["acceleration"])
             machine.start(joint_way(q, goal, speed=speed, acceleration=acceleration), now_s)
             return {"ends": machine.ends_s}
-        self._suffer(asked["fault"], now_s)
+        self._apply_fault(request["fault"], now_s)
         return {}
 
-    def _suffer(self, fault: str, now_s: float) -> None:
+    def _apply_fault(self, fault: str, now_s: float) -> None:
         machine = self._machine
         if fault in ("protective-stop", "emergency-stop"):
             machine.trip(fault, now_s)
@@ -98,14 +98,14 @@ class TruthChannel:
         elif fault in ("freeze", "thaw"):
             self._set_frozen(fault == "freeze")
         elif fault == "die":
-            # As a process that is killed: no farewell to anyone.
+            # As a killed process: connections are not shut down.
             os._exit(1)
         else:
             raise ValueError(f"there is no fault {fault!r}")
 
 
 class TruthClient:
-    """The channel's end at those who may know the truth.
+    """Client side of the channel.
 
     Raises:
         DriverError: No simulated controller listens at the host.
@@ -120,7 +120,7 @@ class TruthClient:
         self._file = self._socket.makefile("rb")
 
     def state(self, at_s: Sequence[float]) -> TrueState:
-        """Where the arm was at some moments of the monotonic clock [s] within its memory.
+        """Reads true states at moments of the monotonic clock within the arm's memory [s].
 
         Raises:
             DriverError: The controller is gone.
@@ -129,45 +129,39 @@ class TruthClient:
         return TrueState(*(np.array(reply[name]) for name in ("q", "dq", "base_from_flange")))
 
     def inject(self, fault: Fault) -> None:
-        """Lets the controller suffer a fault; returns as it has happened.
+        """Injects a fault; returns when it has happened.
 
         Raises:
-            DriverError: The controller is gone, other than by this.
+            DriverError: The controller is gone for another reason.
         """
         if fault == "die":
-            # No answer comes; the end of the stream shows that it happened.
+            # There is no answer; the end of the stream shows that it happened.
             self._send({"fault": fault})
             self._file.read()
         else:
             self._ask({"fault": fault})
 
     def guide(self, q: FloatArray, *, speed: float, acceleration: float) -> float:
-        """Leads the arm by hand towards a posture.
+        """Moves the arm to a posture (n,) [rad] as if by hand, and returns the time of arrival [s].
 
-        Args:
-            q: (n,) the posture [rad].
-            speed: Of the joint that turns farthest [rad/s].
-            acceleration: Likewise [rad/s^2].
-
-        Returns:
-            When it will be there, on the monotonic clock [s].
+        Speed [rad/s] and acceleration [rad/s^2] are of the joint that travels farthest.
         """
-        asked = {"guide": q.tolist(), "speed": speed, "acceleration": acceleration}
-        return float(self._ask(asked)["ends"])
+        request = {"guide": q.tolist(), "speed": speed, "acceleration": acceleration}
+        return float(self._ask(request)["ends"])
 
     def close(self) -> None:
-        """Lets go of it."""
+        """Disconnects."""
         self._file.close()
         self._socket.close()
 
-    def _send(self, asked: Mapping[str, Any]) -> None:
+    def _send(self, request: Mapping[str, Any]) -> None:
         try:
-            self._socket.sendall(json.dumps(asked).encode() + b"\n")
+            self._socket.sendall(json.dumps(request).encode() + b"\n")
         except OSError as error:
             raise self._lost(error) from error
 
-    def _ask(self, asked: Mapping[str, Any]) -> dict[str, Any]:
-        self._send(asked)
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        self._send(request)
         try:
             line = self._file.readline()
         except OSError as error:
@@ -176,7 +170,7 @@ class TruthClient:
             raise self._lost("it closed the connection")
         reply: dict[str, Any] = json.loads(line)
         if "error" in reply:
-            raise DriverError(f"The simulated controller refuses {asked}: {reply['error']}.")
+            raise DriverError(f"The simulated controller refuses {request}: {reply['error']}.")
         return reply
 
     def _lost(self, why: object) -> DriverError:

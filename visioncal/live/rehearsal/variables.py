@@ -1,4 +1,4 @@
-"""What a simulated controller reports of itself, by RTDE's names."""
+"""RTDE variables of a simulated controller."""
 
 import math
 import re
@@ -21,13 +21,13 @@ _SAFETY_MODES = {"normal": 1, "protective-stop": 3, "emergency-stop": 7}
 _SAFETY_BITS = {"normal": 1 << 0, "protective-stop": 1 << 2, "emergency-stop": 1 << 6 | 1 << 7}
 _POWER_ON, _PROGRAM_RUNNING, _POWER_BUTTON = 1 << 0, 1 << 1, 1 << 3
 _GRAVITY = 9.81
-# A plausible arm: mass of each link as a share of the whole [1], torque of a motor's ampere after
-# its gear [Nm/A], and what friction takes [A].
+# A plausible arm: total mass [kg], each link's share of it, torque constant after the gear [Nm/A],
+# and friction [A].
 _MASS_KG = {"ur3e": 11.2, "ur5e": 20.6, "ur10e": 33.5}
 _SHARES = np.array([0.20, 0.40, 0.16, 0.09, 0.09, 0.06])
 _TORQUE_PER_A = np.array([13.0, 13.0, 13.0, 9.0, 9.0, 9.0])
 _FRICTION_A = np.array([0.5, 0.5, 0.4, 0.2, 0.2, 0.2])
-# Joints at rest in a room of 23 C end up at these temperatures [C], within half an hour.
+# Final temperatures of joints at rest, room temperature [C], and the time constant [s].
 _WARM_C = np.array([31.0, 32.5, 33.0, 34.5, 35.5, 36.0])
 _ROOM_C, _WARMING_S = 23.0, 1800.0
 
@@ -37,10 +37,8 @@ class Moment:
     """The machine at one moment.
 
     Attributes:
-        machine: The arm.
-        registers: The script's.
         now_s: The moment, on the monotonic clock [s].
-        up_s: How long the controller has been running [s].
+        up_s: Uptime of the controller [s].
     """
 
     machine: Machine
@@ -55,7 +53,7 @@ class Moment:
 
     @cached_property
     def tcp_pose(self) -> tuple[float, ...]:
-        """The tool's pose as the controller reckons it."""
+        """Pose of the tool by the controller's model."""
         return tuple(tool_pose(self.machine, self.joints[0]).tolist())
 
     @cached_property
@@ -68,7 +66,7 @@ class Moment:
         load = origins[-1] + frames[-1, :3, :3] @ self.machine.payload_m
         masses = np.append(_MASS_KG[arm.name] * _SHARES, self.machine.payload_kg)
         levers = np.vstack([centres, load])[None] - origins[:-1, None]
-        # The pull of body k about joint i, for the bodies behind that joint.
+        # Gravity torque of body k about joint i, for the bodies beyond that joint.
         pulls = np.cross(levers, [0.0, 0.0, _GRAVITY])
         torques = np.einsum("ik,k,ikx,ix->i", np.triu(np.ones((6, 7))), masses, pulls, axes)
         friction = _FRICTION_A * np.tanh(self.joints[1] / 0.01)
@@ -95,12 +93,12 @@ def _constant(value: Value) -> _Reader:
     return lambda _: value
 
 
-def _register(kind: str, place: int) -> _Reader:
-    return lambda moment: getattr(moment.registers, f"{kind}_out")[place]
+def _register(kind: str, index: int) -> _Reader:
+    return lambda moment: getattr(moment.registers, f"{kind}_out")[index]
 
 
 def _table() -> dict[str, tuple[str, _Reader]]:
-    """The variables by name: type, and how the value is had."""
+    """Variables by name: type, and reader of the value."""
     six, three = "VECTOR6D", "VECTOR3D"
     table: dict[str, tuple[str, _Reader]] = {
         "timestamp": ("DOUBLE", lambda moment: moment.up_s),
@@ -120,7 +118,7 @@ def _table() -> dict[str, tuple[str, _Reader]]:
         "actual_digital_input_bits": ("UINT64", _constant(0.0)),
         "actual_digital_output_bits": ("UINT64", _constant(0.0)),
     }
-    # What is aimed at is reached at once.
+    # Targets are reached at once.
     for kind in ("actual", "target"):
         table[f"{kind}_q"] = (six, lambda moment: tuple(moment.joints[0].tolist()))
         table[f"{kind}_qd"] = (six, lambda moment: tuple(moment.joints[1].tolist()))
@@ -143,7 +141,7 @@ VARIABLES: Mapping[str, tuple[str, _Reader]] = _table()
 
 
 def input_type(name: str) -> str:
-    """The type of a variable that a client may write; empty where there is none."""
+    """Type of a variable that a client may write; empty for any other name."""
     if name.startswith("input_int_register_"):
         return "INT32"
     if name.startswith("input_double_register_"):
@@ -154,5 +152,5 @@ def input_type(name: str) -> str:
         return "UINT8"
     if re.fullmatch("standard_analog_output_[01]|speed_slider_fraction", name):
         return "DOUBLE"
-    others = {"external_force_torque": "VECTOR6D", "speed_slider_mask": "UINT32"}
-    return others.get(name, "")
+    other_types = {"external_force_torque": "VECTOR6D", "speed_slider_mask": "UINT32"}
+    return other_types.get(name, "")

@@ -1,4 +1,4 @@
-"""The accuracy of a recording of a simulated cell, and of its calibration, by what really is."""
+"""Accuracy of a recording of a simulated cell, and of its calibration, against the truth."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -19,45 +19,43 @@ from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.results import Calibration
 from visioncal.simulation.arms import forward
 
-# One rehearsal in a thousand errs by more although nothing is wrong, with sigmas that much larger:
-# corners of one board err alike by hundredths of a pixel and joints rest beside their encoders,
-# which a covariance of independent noise counts for too little.
-_CHANCE, _LARGER = 1e-3, 1.5
+# False-alarm probability of the chi-square test, and factor on the sigmas: errors of one board's
+# corners are correlated by hundredths of a pixel, and joints deviate from their encoders, which a
+# covariance of independent noise underestimates.
+_CHANCE, _SIGMA_FACTOR = 1e-3, 1.5
 
 
 @dataclass(eq=False)
 class Witness:
-    """A watcher that asks where the arm really was in the middle of each exposure.
+    """Watcher that compares recorded poses with the true ones at the middle of each exposure.
 
     Attributes:
-        bench: The simulated cell.
-        away_mm: How far the flange was from where the recorded joints have the same, true arm, for
-            each view: what moved, and how exactly the arm comes back to a posture [mm].
+        away_mm: Distance of the true flange from that of the true arm at the recorded joints, for
+            each view: residual motion and repeatability [mm].
     """
 
     bench: Bench
     away_mm: list[float] = field(default_factory=list)
 
     def stepped(self, step: CaptureEvent) -> None:
-        """Looks at a view."""
-        found = step.found
-        if not isinstance(found, TakenView) or found.state.q is None:
+        """Compares a view."""
+        view = step.found
+        if not isinstance(view, TakenView) or view.state.q is None:
             return
         with closing(TruthClient(self.bench.controller.host)) as truth:
-            really = truth.state([found.frame.stamp_s]).base_from_flange[0]
-        recorded = forward(self.bench.cell.truth.robot.true_arm, found.state.q[None])[0]
-        self.away_mm.append(pose_difference(recorded, really)[0])
+            true_flange = truth.state([view.frame.stamp_s]).base_from_flange[0]
+        recorded = forward(self.bench.cell.truth.robot.true_arm, view.state.q[None])[0]
+        self.away_mm.append(pose_difference(recorded, true_flange)[0])
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How long the views of a recording took, each on average [s].
+    """Mean durations of the views of a recording [s].
 
     Attributes:
-        views: How many there are.
-        motion_s: The motion alone, by speed and acceleration.
-        driving_s: What it took beyond that, to begin and to end each part of the way.
-        settling_s: Until all stood still.
+        motion_s: Motion, by speed and acceleration.
+        driving_s: Overhead of starting and ending each part of the path.
+        settling_s: Settling of arm and image.
         added_s: Everything else: pictures, detection, checks, writing.
         most_added_s: The same of the slowest view.
     """
@@ -73,19 +71,15 @@ class Pace:
 def pace_of(
     steps: Sequence[CaptureEvent], plan: PlanFile, start_q: FloatArray, options: CaptureOptions
 ) -> Pace:
-    """Tells motion and settling from what a recording adds to them.
+    """Splits the duration of a recording from joints (n,) [rad] into motion, settling and the rest.
 
-    Args:
-        steps: A recording of a plan's stops from the first on, in their order.
-        plan: The stops.
-        start_q: (n,) where the arm stood in the beginning [rad].
-        options: Speed and acceleration.
+    The results are those of the plan's stops from the first on, in order.
     """
-    here, motions = start_q, []
+    q, motions = start_q, []
     for _, stop in zip(steps, plan.stops, strict=False):
-        way = [here, *stop.via, stop.q]
-        motions.append(JointPace.of(options).way_s(way))
-        here = stop.q
+        path = [q, *stop.via, stop.q]
+        motions.append(JointPace.of(options).way_s(path))
+        q = stop.q
     times = [step.times for step in steps]
     motion_s, added = float(np.mean(motions)), [time.worked_s for time in times]
     return Pace(
@@ -100,12 +94,12 @@ def pace_of(
 
 @dataclass(frozen=True)
 class EdgeCheck:
-    """Whether the errors of all edges together are what their covariance lets expect.
+    """Chi-square test of the errors of all edges.
 
     Attributes:
-        chi_square: Their squared length in sigmas.
-        freedom: Of how many numbers.
-        limit: The most that is believed.
+        chi_square: Squared Mahalanobis distance of the errors.
+        freedom: Degrees of freedom.
+        limit: Limit of the test.
     """
 
     chi_square: float
@@ -114,19 +108,16 @@ class EdgeCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether they are believed."""
+        """Whether the errors are consistent with their covariance."""
         return self.chi_square <= self.limit
 
 
 def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> EdgeCheck:
-    """Weighs the errors of all edges by their joint covariance.
-
-    Args:
-        calibration: The result.
-        transforms: (4, 4) true edges by name.
-    """
-    away = np.concatenate(
+    """Tests the errors of all edges against true ones (4, 4) by name, with the joint covariance."""
+    twists = np.concatenate(
         [log(invert(transforms[name]) @ edge.matrix) for name, edge in calibration.edges.items()]
     )
-    squared = float(away @ np.linalg.solve(calibration.joint_covariance, away))
-    return EdgeCheck(squared, away.size, _LARGER**2 * float(chi2_limit(_CHANCE, away.size)))
+    squared = float(twists @ np.linalg.solve(calibration.joint_covariance, twists))
+    return EdgeCheck(
+        squared, twists.size, _SIGMA_FACTOR**2 * float(chi2_limit(_CHANCE, twists.size))
+    )
