@@ -59,15 +59,9 @@ class ArmDynamics:
         return cls(robot, Inertias(parameters[:links].reshape(-1, 10)), friction)
 
     def torques(self, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
-        """Drive torques of a motion, for feedforward control.
+        """Drive torques (m, n) [N m] of a motion, for feedforward control.
 
-        Args:
-            q: (m, n) joint angles [rad].
-            dq: (m, n) their speeds [rad/s].
-            ddq: (m, n) their accelerations [rad/s^2].
-
-        Returns:
-            (m, n) [N m].
+        The motion is as in `robot.torque_regressor`.
 
         Raises:
             DataError: The number of joints differs from the robot's.
@@ -98,11 +92,7 @@ class ArmDynamics:
         return momentum + rotors, rate - self.friction.torques(dq, still)
 
     def carrying(self, body: FloatArray) -> "ArmDynamics":
-        """The arm with a payload on its flange.
-
-        Args:
-            body: (10,) inertial parameters in the flange's frame, in the order of `Inertias`.
-        """
+        """The arm with a payload of (10,) parameters in the flange's frame, as in `Inertias`."""
         values = self.inertias.values.copy()
         values[-1] += moving(self.robot.chain.placements[-1]) @ body
         return replace(self, inertias=Inertias(values))

@@ -65,12 +65,7 @@ class BaseModel:
 
     @classmethod
     def reduce(cls, model: DynamicModel, rng: np.random.Generator | None = None) -> Self:
-        """Finds the base parameters of a model.
-
-        Args:
-            model: The model.
-            rng: Draws the random states; seeded with 0 where None.
-        """
+        """Finds the base parameters of a model, in random states (seed 0 by default)."""
         matrix = _random_regressor(model, rng or np.random.default_rng(0))
         lengths = np.linalg.norm(matrix, axis=0)
         effective = np.flatnonzero(lengths > _RANK * lengths.max())
@@ -84,11 +79,7 @@ class BaseModel:
 
     @classmethod
     def keeping(cls, model: DynamicModel, independent: IntArray) -> Self:
-        """Builds the base model with given independent parameters.
-
-        Args:
-            model: The model.
-            independent: (b,) ascending indices of the parameters that are kept.
+        """Builds the base model that keeps (b,) given independent parameters, in ascending order.
 
         Raises:
             DataError: Their columns are dependent, or do not span the others.
@@ -177,12 +168,9 @@ class Condition:
 
 
 def condition_of(base: BaseModel, motion: JointMotion, weights: FloatArray) -> Condition:
-    """Computes the condition numbers of a motion.
+    """Condition numbers of an evenly sampled motion.
 
-    Args:
-        base: The base parameters.
-        motion: Evenly sampled.
-        weights: (n,) inverse of each joint's torque noise, up to a common factor.
+    The weights (n,) are inverse to each joint's torque noise, up to a common factor.
     """
     rows = base.regressor(motion)
     flat = rows.reshape(-1, base.rank)
@@ -199,15 +187,11 @@ def _unit_columns(rows: FloatArray) -> FloatArray:
 
 
 def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatArray]:
-    """Smooth approximation of the logarithm of the condition number of column-scaled rows.
+    """Smooth approximation of the log condition number of column-scaled rows (r, b).
 
     The greatest and least eigenvalues of the information G are replaced by power means over all of
     them: with sharpness 1 it is half the logarithm of trace(G) trace(G^-1), A-optimality; with more
     it tends to the condition number.
-
-    Args:
-        rows: (r, b).
-        sharpness: Exponent of the means.
 
     Returns:
         The value, and its gradient (r, b) with respect to the rows.

@@ -121,7 +121,11 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         )
     robot = Robot.from_document(document["robot"])
     terms = FrictionTerms(**document["friction"])
-    base = _base(DynamicModel(robot, terms), [str(row["name"]) for row in document["base"]])
+    model = DynamicModel(robot, terms)
+    # `BaseModel.reduce` may keep other parameters: its choice depends on rounding, and so on the
+    # machine.
+    kept = [model.names.index(str(row["name"]).split()[0]) for row in document["base"]]
+    base = BaseModel.keeping(model, np.array(kept, dtype=np.int64))
     size = base.rank + 2 * len(document["stribeck"])
     standard = document.get("standard")
     return {
@@ -152,13 +156,6 @@ def _checked_fields(figures: _Figures, joints: int) -> dict[str, Any]:
             if isinstance(value, np.ndarray) and len(value) != joints:
                 raise ValueError(f"{name} has {len(value)} numbers for {joints} joints")
     return vars(figures)
-
-
-def _base(model: DynamicModel, names: Sequence[str]) -> BaseModel:
-    """The base model that keeps the standard parameters named first."""
-    # `BaseModel.reduce` may keep others: its choice depends on rounding, and so on the machine.
-    kept = [model.names.index(name.split()[0]) for name in names]
-    return BaseModel.keeping(model, np.array(kept, dtype=np.int64))
 
 
 def _stribeck(rows: Sequence[Mapping[str, Any]], terms: FrictionTerms) -> Stribeck:

@@ -68,14 +68,7 @@ class Objective:
     def __init__(
         self, allowed: Allowed, base: BaseModel, weights: FloatArray, harmonics: Harmonics
     ) -> None:
-        """Prepares the samples.
-
-        Args:
-            allowed: The motion's limits.
-            base: The parameters that it is to determine.
-            weights: (n,) inverse of each joint's torque noise.
-            harmonics: Its basis functions.
-        """
+        """Prepares the samples; weights (n,) are the inverse of each joint's torque noise."""
         self.harmonics = harmonics
         self._allowed, self._weights = allowed, weights
         terms = replace(base.model.terms, slow_rad_s=_SPREAD * float(allowed.speed.max()))
@@ -97,15 +90,12 @@ class Objective:
         return Series(self.harmonics, free.reshape(self._allowed.robot.joint_count, -1))
 
     def value(self, free: FloatArray, sharpness: float, price: float) -> tuple[float, FloatArray]:
-        """Smoothed log condition number plus the penalty of exceeded limits.
+        """Smoothed log condition number plus the penalty of exceeded limits, and the gradient (k,).
 
         Args:
             free: (k,) free coefficients of all joints.
             sharpness: Of `smooth_condition`.
             price: Weight of the penalty.
-
-        Returns:
-            The value, and its gradient (k,).
         """
         coefficients = self.series(free).free
         value, by_value = self._condition(coefficients, sharpness, price)

@@ -176,7 +176,11 @@ def allowed_motion(
         share,
     )
     _check_left(allowed)
-    return allowed if payload is None else _carrying(allowed, payload)
+    if payload is None or allowed.inertias is None:
+        return allowed
+    values = allowed.inertias.values.copy()
+    values[-1] += moving(robot.chain.placements[-1]) @ payload
+    return replace(allowed, inertias=Inertias(values))
 
 
 def _check_stated(
@@ -214,14 +218,6 @@ def _check_left(allowed: Allowed) -> None:
                 culprits=[name],
                 next_step="Make the margin smaller (--margin-deg), or mend the limits.",
             )
-
-
-def _carrying(allowed: Allowed, payload: FloatArray) -> Allowed:
-    if allowed.inertias is None:
-        return allowed
-    values = allowed.inertias.values.copy()
-    values[-1] += moving(allowed.robot.chain.placements[-1]) @ payload
-    return replace(allowed, inertias=Inertias(values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,12 +294,7 @@ class Kept:
 
 
 def kept_limits(allowed: Allowed, motion: JointMotion) -> Kept:
-    """Computes the extremes of a motion over its samples.
-
-    Args:
-        allowed: The limits.
-        motion: Densely sampled.
-    """
+    """Computes the extremes of a densely sampled motion."""
     torques = allowed.torques(motion)
     apart_m, nearest, row = _nearest(allowed, motion.q)
     return Kept(

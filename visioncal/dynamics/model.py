@@ -143,14 +143,9 @@ class DynamicModel:
         return links + self.terms.names(self.robot.joint_count)
 
     def regressor(self, motion: JointMotion, columns: IntArray | None = None) -> FloatArray:
-        """Regressor: derivatives of the torques over the parameters.
+        """Regressor (m, n, c) of the torques at m times.
 
-        Args:
-            motion: At m times.
-            columns: (c,) ascending indices of the parameters; all where None.
-
-        Returns:
-            (m, n, c) [N m for a unit of each].
+        Columns are (c,) ascending indices of the parameters, or all where None.
 
         Raises:
             DataError: The number of joints differs from the arm's.

@@ -88,10 +88,7 @@ def external_torques(
 ) -> FloatArray:
     """External torques on the joints during a recorded motion; see `MomentumObserver`.
 
-    Args:
-        arm: The arm with its payload.
-        measured: The motion and the drive torques; accelerations are not used.
-        gain_per_s: As for `MomentumObserver`.
+    Accelerations are not used.
 
     Returns:
         (m, n) positive in the joints' sense [N m]; zero at the first sample.

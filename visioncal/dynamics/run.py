@@ -185,15 +185,9 @@ def conditioned_streams(
 def current_streams(
     session: Session, robot: Robot, cutoff_hz: float | None = None
 ) -> list[Conditioned]:
-    """Reads a session's streams of currents, for drives of unknown gains.
+    """Reads a session's streams of currents, for drives of unknown gains; torques are currents [A].
 
-    Args:
-        session: The session.
-        robot: Its arm.
-        cutoff_hz: Cut-off of the low-pass [Hz]; by the motion where None.
-
-    Returns:
-        The streams, whose torques are currents [A].
+    The low-pass is chosen by the motion where no cut-off is given [Hz].
 
     Raises:
         DataError: There is no stream of currents, or one is wrong.

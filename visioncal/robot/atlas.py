@@ -28,13 +28,7 @@ class Atlas:
     """
 
     def __init__(self, robot: Robot, inverse: Inverse, rng: np.random.Generator) -> None:
-        """Draws the postures.
-
-        Args:
-            robot: The arm.
-            inverse: Its inverse kinematics, which samples its range.
-            rng: Source of randomness.
-        """
+        """Draws the postures from the ranges of the inverse kinematics."""
         self._robot, self._chain = robot, robot.chain
         self._reach_m = float(np.linalg.norm(self._chain.placements[1:, :3, 3], axis=1).sum())
         self._positions = inverse.starts(_POSTURES, rng)
@@ -46,11 +40,7 @@ class Atlas:
     def starts(
         self, base_from_flange: FloatArray, rng: np.random.Generator
     ) -> tuple[Mask, FloatArray]:
-        """Finds postures near poses.
-
-        Args:
-            base_from_flange: (k, 4, 4) the poses [m].
-            rng: Chooses among neighbours.
+        """Finds postures near (k, 4, 4) poses [m], drawn among neighbours.
 
         Returns:
             (k,) mask of the poses that may be reachable, and (r, n) effective positions [rad or m]

@@ -17,14 +17,10 @@ _FLOOR = 1e-13
 
 
 def chain_frames(chain: Chain, positions: FloatArray) -> FloatArray:
-    """Frames of the joints and the tip in the base.
-
-    Args:
-        chain: The arm.
-        positions: (m, n) effective positions [rad or m].
+    """Frames of the joints, after their motion, and of the tip, in the base.
 
     Returns:
-        (m, n + 1, 4, 4) the joints' frames after their motion, and the tip's, in the base [m].
+        (m, n + 1, 4, 4) at (m, n) effective positions [m].
     """
     frames = np.zeros((len(positions), len(chain) + 1, 4, 4))
     frames[..., 3, 3] = 1.0

@@ -65,11 +65,9 @@ class Chain:
     def function_basis(self, q: FloatArray) -> FloatArray:
         """Derivatives of the effective positions over the joint function coefficients.
 
-        Args:
-            q: (m, n) encoder positions [rad or m].
-
         Returns:
-            (m, n, 4): 1, q, sin(q), cos(q), the last two zero for a prismatic joint.
+            (m, n, 4) at encoder positions (m, n): 1, q, sin(q), cos(q), the last two zero for a
+            prismatic joint.
         """
         turning = np.where(self.prismatic, 0.0, 1.0)
         return np.stack([np.ones_like(q), q, turning * np.sin(q), turning * np.cos(q)], axis=-1)
@@ -258,11 +256,7 @@ def joint_function(row: DocumentTable, keys: Sequence[str]) -> list[float]:
 
 
 def number_list(row: DocumentTable, key: str, size: int) -> FloatArray:
-    """Reads a list of `size` finite numbers.
-
-    Raises:
-        DataError: The field is no such list.
-    """
+    """Reads a list of `size` finite numbers, or raises DataError."""
     return np.array(row.numbers(key, size))
 
 
@@ -278,18 +272,8 @@ def _placement(row: DocumentTable) -> FloatArray:
     needed = "a list of 4 rows of 4 numbers, a rigid transform [m]"
     if not isinstance(rows, Sequence) or isinstance(rows, str) or len(rows) != 4:
         raise row.refuse("placement", rows, needed)
-    matrix = np.array(
-        [
-            number_list(DocumentTable({"placement": value}, row.label), "placement", 4)
-            for value in rows
-        ]
-    )
-    _check_rigid(matrix, row.label)
-    return matrix
-
-
-def _check_rigid(matrix: FloatArray, label: str) -> None:
-    """Checks that (4, 4) numbers are a rigid transform."""
+    tables = [DocumentTable({"placement": value}, row.label) for value in rows]
+    matrix = np.array([number_list(table, "placement", 4) for table in tables])
     rotation = matrix[:3, :3]
     if (
         # Squares of the largest numbers overflow.
@@ -299,7 +283,8 @@ def _check_rigid(matrix: FloatArray, label: str) -> None:
         or matrix[3].tolist() != [0, 0, 0, 1]
     ):
         raise DataError(
-            f"{label}: placement is no rigid transform: a rotation, a position [m] and the last "
-            "row 0, 0, 0, 1 are needed.",
-            culprits=[f"{label}: placement"],
+            f"{row.label}: placement is no rigid transform: a rotation, a position [m] and the "
+            "last row 0, 0, 0, 1 are needed.",
+            culprits=[f"{row.label}: placement"],
         )
+    return matrix

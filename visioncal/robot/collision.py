@@ -15,7 +15,6 @@ from visioncal.robot.bodies import Body, body_name
 from visioncal.robot.model import Robot
 
 if TYPE_CHECKING:
-    import coal
     import pinocchio as pin
 
 # Additional clearance of stops, so that paths between them can depart and arrive [m].
@@ -94,14 +93,11 @@ class Collisions:
         self.names = tuple((names[a], names[b]) for a, b in self._pairs.bodies)
 
     def first_contact(self, q: FloatArray) -> IntArray:
-        """Finds a pair of bodies that are too near one another.
-
-        Args:
-            q: (m, n) joint angles [rad].
+        """Finds the nearest pair of bodies that are too near at each of (m, n) joint angles [rad].
 
         Returns:
-            (m,) index in `names` of the nearest such pair, by the clearance and the slack for paths
-            to and from the posture; -1 where there is none.
+            (m,) index in `names`, by the clearance and the slack for paths to and from the posture;
+            -1 where no pair is too near.
         """
         import pinocchio as pin
 
@@ -129,10 +125,6 @@ class Collisions:
         Conservative advancement (Mirtich 1996): the step from each posture to the next is bounded
         so that no pair can use up its margin in between. So the clearance is kept everywhere, not
         only at samples.
-
-        Args:
-            start: (n,) joint angles [rad].
-            end: (n,) joint angles [rad].
 
         Returns:
             Index in `names` of the first pair that comes too near; -1 for a clear path.
@@ -241,26 +233,16 @@ def _geometry(bodies: Sequence[Body], floor_m: float | None) -> "pin.GeometryMod
     import coal
     import pinocchio as pin
 
+    shapes = {"box": coal.Box, "capsule": coal.Capsule, "cylinder": coal.Cylinder}
     model = pin.GeometryModel()
-    for place, body in enumerate(bodies):
-        model.addGeometryObject(
-            pin.GeometryObject(
-                f"{place} {body.name}", body.link, pin.SE3(body.link_from_body), _shape(body)
-            )
-        )
+    for index, body in enumerate(bodies):
+        pose, shape = pin.SE3(body.link_from_body), shapes[body.shape](*body.size_m.tolist())
+        item = pin.GeometryObject(f"{index} {body.name}", body.link, pose, shape)
+        model.addGeometryObject(item)
     if floor_m is not None:
         below = coal.Halfspace(np.array([0.0, 0.0, 1.0]), floor_m)
         model.addGeometryObject(pin.GeometryObject("floor", 0, pin.SE3.Identity(), below))
     return model
-
-
-def _shape(body: Body) -> "coal.ShapeBase":
-    import coal
-
-    if body.shape == "box":
-        return coal.Box(*body.size_m.tolist())
-    kind = coal.Capsule if body.shape == "capsule" else coal.Cylinder
-    return kind(*body.size_m.tolist())
 
 
 def urdf_bodies(robot: Robot) -> tuple[tuple[Body, ...], frozenset[int]]:

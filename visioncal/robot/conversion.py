@@ -63,10 +63,6 @@ def convert_table(table: DHTable, convention: Convention) -> DHTable:
     where axes are nearly, not exactly, parallel. Converted back, d is again the distance to the
     common normal, some hundred metres for a milliradian.
 
-    Args:
-        table: The table.
-        convention: The wanted convention.
-
     Returns:
         The table. Poses agree to 1e-12, or 1e-8 where axes are less than 1e-4 and more than 0 rad
         from parallel; converting back gives the original table.
@@ -146,12 +142,7 @@ def table_of(
 
 
 def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
-    """Builds the same arm in another base frame.
-
-    Args:
-        robot: The robot; one that is described by a table stays so.
-        parent_from_base: (4, 4) its base in the new base frame [m].
-    """
+    """Builds the same arm in a new base frame, in which its base is at (4, 4) [m]."""
     gravity = {"gravity_m_s2": (parent_from_base[:3, :3] @ robot.gravity).tolist()}
     table = _described(robot)
     if table is not None:
@@ -164,12 +155,7 @@ def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
 
 
 def with_zeros(robot: Robot, zeros_rad: FloatArray) -> Robot:
-    """Builds the arm with shifted joint zeros.
-
-    Args:
-        robot: The robot; one that is described by a table stays so.
-        zeros_rad: (n,) offsets to be added to the reported joint angles [rad].
-    """
+    """Builds the arm with (n,) offsets added to its reported joint angles [rad]."""
     added = robot.chain.functions[:, 1] * zeros_rad
     table = _described(robot)
     if table is not None and not added[table.prismatic].any():
@@ -361,9 +347,9 @@ def other_convention(robot: Robot) -> tuple[Robot, Convention] | None:
     Returns:
         The arm and its convention; None where the robot is not described by a table.
     """
-    if "convention" not in robot.document:
+    declared = _described(robot)
+    if declared is None:
         return None
-    declared = table_from_document(robot.document)
     standard, modified = _readings(declared)
     other = standard if declared.convention == "modified" else modified
     document = chain_document(robot.name, robot.tip, chain_of_table(other))

@@ -77,9 +77,7 @@ def _parse_json(text: str, label: str) -> dict[str, Any]:
 def robot_file(document: Mapping[str, Any], named: str = "") -> tuple[str, str]:
     """Writes a robot's description as a file that `load_robot` reads: (file name, content).
 
-    Args:
-        document: The description.
-        named: Name of the file that it was read from, whose format is kept.
+    The format is that of the file `named`, from which it was read.
     """
     if "urdf" in document:
         return "robot.urdf", str(document["urdf"])

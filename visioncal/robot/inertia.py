@@ -129,11 +129,7 @@ def parameters_of(pseudo: FloatArray) -> FloatArray:
 
 
 def moving(link_from_body: FloatArray) -> FloatArray:
-    """Matrix (10, 10) that transforms a body's parameters from its own frame to a link's.
-
-    Args:
-        link_from_body: (4, 4) the body's frame in the link's [m].
-    """
+    """Matrix (10, 10) that transforms a body's parameters from its own frame to a link's."""
     units = pseudo_inertias(np.eye(10))
     return np.asarray(parameters_of(link_from_body @ units @ link_from_body.T).T)
 

@@ -157,14 +157,10 @@ class Inverse:
     def from_starts(
         self, base_from_flange: FloatArray, starts: FloatArray
     ) -> tuple[FloatArray, Mask]:
-        """Solves many poses from near starts: quick, for poses that may be left out.
-
-        Args:
-            base_from_flange: (m, 4, 4) the poses [m].
-            starts: (m, n) effective positions to start from [rad or m]; six joints or more.
+        """Solves many poses (m, 4, 4) [m] from near starts, for six joints or more; some may fail.
 
         Returns:
-            (m, n) positions, by whole turns nearest to zero, and (m,) whether the pose was reached.
+            (m, n) effective positions, by whole turns nearest to zero, and (m,) whether reached.
         """
         bounds = self._bounds
         positions, reached = reached_from(

@@ -60,16 +60,12 @@ def table_moves(
 
 
 def number_jacobian(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Jacobian of the flange over the numbers of a table.
-
-    Args:
-        table: The table.
-        q: (m, n) joint angles [rad or m].
+    """Jacobian of the flange over the numbers of a table, at (m, n) joint angles [rad or m].
 
     Returns:
         (m, 6, n + 1, 5) right perturbations of `base_from_flange` for a unit of theta, d, a, alpha
         and beta; first those of X_0, which has no theta and d, then of each Z_i X_i. And
-        (m, 6, n, 4) for a unit of the joints' functions.
+        (m, 6, n, 4) for a unit of the joint function coefficients.
     """
     # All conventions are the same product of their numbers; this one may have a beta.
     chain = chain_of_table(replace(table, convention="hayati"))

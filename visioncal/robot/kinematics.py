@@ -50,16 +50,7 @@ def build_model(name: str, tip: str, chain: Chain, masses: Masses | None = None)
 
 
 def flange_poses(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
-    """Forward kinematics.
-
-    Args:
-        model: Of `build_model`.
-        tip: Name of the tip frame.
-        positions: (m, n) effective positions [rad or m].
-
-    Returns:
-        (m, 4, 4) `base_from_tip` [m].
-    """
+    """Forward kinematics: (m, 4, 4) `base_from_tip` [m] at (m, n) effective positions."""
     import pinocchio as pin
 
     data, frame = model.createData(), model.getFrameId(tip)
@@ -82,14 +73,9 @@ def joint_frames(model: "pin.Model", positions: FloatArray) -> FloatArray:
 def placement_derivatives(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
     """Jacobian of the tip over the joints' placements: Pinocchio's kinematic regressor.
 
-    Args:
-        model: Of `build_model`.
-        tip: Name of the tip frame.
-        positions: (m, n) effective positions [rad or m].
-
     Returns:
         (m, 6, 6 n) right perturbations of `base_from_tip` for right perturbations of the
-        placements, both (rotation, translation).
+        placements, both (rotation, translation), at (m, n) effective positions [rad or m].
     """
     import pinocchio as pin
 
@@ -106,15 +92,9 @@ def placement_derivatives(model: "pin.Model", tip: str, positions: FloatArray) -
 
 
 def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Joint torques that hold the links' weight.
+    """Joint torques (m, n) that hold the weight of the model's links [N m, or N if prismatic].
 
-    Args:
-        model: Of `build_model`, with masses.
-        positions: (m, n) effective positions [rad or m].
-        gravity: (3,) in the base's frame [m/s^2].
-
-    Returns:
-        (m, n) [N m, or N for a prismatic joint].
+    Positions are effective ones (m, n) [rad or m], gravity is in the base's frame (3,) [m/s^2].
     """
     import pinocchio as pin
 
@@ -129,10 +109,7 @@ def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArr
 def weight_jacobian(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
     """Derivatives of the joint torques by weight over masses and first moments.
 
-    Args:
-        model: Of `build_model`.
-        positions: (m, n) effective positions [rad or m].
-        gravity: (3,) in the base's frame [m/s^2].
+    Positions are effective ones (m, n) [rad or m], gravity is in the base's frame (3,) [m/s^2].
 
     Returns:
         (m, n, 4 n) for the mass [kg] and first moments [kg m] of each joint's body.

@@ -125,15 +125,12 @@ class Loads:
 
 
 def masses_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) -> Masses | None:
-    """Reads `mass_kg` and `com_m` of a table of joints.
+    """Reads `mass_kg` and `com_m` of a table of joints; None where no joint states one.
 
     Args:
         rows: The joints' tables.
         joint_from_row: (n, 4, 4) the frames in which the centres are stated, in the joints' frames
             after their motion.
-
-    Returns:
-        The masses; None where no joint states one.
 
     Raises:
         DataError: Only some joints state their mass, or one is invalid.
@@ -171,18 +168,11 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
 
 
 def load_torques(robot: "Robot", q: FloatArray, loads: Loads | None = None) -> FloatArray:
-    """Torques of weight, payload and force on the joints.
+    """Torques (m, n) of weight, payload and force on the joints [N m, or N for a prismatic joint].
 
     That of the links' weight is the negative of Pinocchio's generalised gravity (Featherstone 2008,
-    section 5.3); those at the flange follow by the transpose of the geometric Jacobian.
-
-    Args:
-        robot: The arm; weightless where its masses are unknown.
-        q: (m, n) joint angles [rad].
-        loads: Payloads and forces; none where None.
-
-    Returns:
-        (m, n) [N m, or N for a prismatic joint].
+    section 5.3), zero where masses are unknown; those at the flange follow by the transpose of the
+    geometric Jacobian.
     """
     torques = np.zeros((len(q), robot.joint_count))
     if robot.masses is not None:

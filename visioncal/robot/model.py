@@ -47,7 +47,8 @@ class Robot:
     """A serial arm with its nominal or corrected geometry.
 
     Joints are those between the base and the tip, in this order; others are held at their neutral
-    position. A prismatic joint's "angle" and limits are lengths [m].
+    position. A prismatic joint's "angle" and limits are lengths [m]. All methods of joint angles
+    `q`, (m, n) or (n,) [rad], raise DataError where their number differs from the robot's.
 
     Attributes:
         name: The robot's name.
@@ -148,31 +149,11 @@ class Robot:
         return self._model
 
     def base_from_flange(self, q: FloatArray) -> FloatArray:
-        """Computes the forward kinematics.
-
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, 4, 4) `base_from_flange` [m].
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Forward kinematics: (m, 4, 4) `base_from_flange` [m] at (m, n) joint angles [rad]."""
         return flange_poses(self._model, self.tip, self._effective(q))
 
     def link_frames(self, q: FloatArray) -> FloatArray:
-        """Frames of the joints and the flange, for drawing.
-
-        Args:
-            q: (n,) joint angles [rad].
-
-        Returns:
-            (n + 1, 4, 4) the joints' frames, after their motion, and the flange in the base [m].
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Frames (n + 1, 4, 4) of the joints, after their motion, and of the flange [m]."""
         joints = joint_frames(self._model, self._effective(np.asarray(q)[None])[0])
         return np.array([*joints, joints[-1] @ self.chain.placements[-1]])
 
@@ -185,31 +166,17 @@ class Robot:
         flange seen from a joint (Pinocchio, computeFrameKinematicRegressor), and the last one is
         the identity.
 
-        Args:
-            q: (m, n) joint angles [rad].
-
         Returns:
             (m, 6, 6 (n + 1)) derivatives of `log(base_from_flange^-1 base_from_flange(step))`.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
         """
         links = placement_derivatives(self._model, self.tip, self._effective(q))
         own = np.broadcast_to(np.eye(6), (len(links), 6, 6))
         return np.concatenate([links, own], axis=2)
 
     def joint_jacobian(self, q: FloatArray) -> FloatArray:
-        """Jacobian of the flange over the joint angles.
+        """Jacobian (m, 6, n) of the flange over the joint angles, in the flange's frame.
 
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, 6, n) right perturbations (rotation, translation) of `base_from_flange` for each
-            joint, in the flange's frame [rad and m for 1 rad].
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
+        Right perturbations (rotation, translation) of `base_from_flange` [rad and m for 1 rad].
         """
         return self.axis_jacobian(q) * self.chain.jacobian(np.asarray(q, dtype=float))[:, None, :]
 
@@ -223,15 +190,9 @@ class Robot:
     def function_jacobian(self, q: FloatArray) -> FloatArray:
         """Jacobian of the flange over the joint function coefficients.
 
-        Args:
-            q: (m, n) joint angles [rad].
-
         Returns:
             (m, 6, 4 n) right perturbations of `base_from_flange` for each joint's offset [rad],
             ratio, sine and cosine [rad], as `chain.functions` has them.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
         """
         axes = self.axis_jacobian(q)
         basis = self.chain.function_basis(np.asarray(q, dtype=float))
@@ -239,49 +200,23 @@ class Robot:
         return columns.reshape(*axes.shape[:2], 4 * self.joint_count)
 
     def axis_jacobian(self, q: FloatArray) -> FloatArray:
-        """Jacobian of the flange over the joints' effective positions.
+        """Jacobian (m, 6, n) of the flange over effective joint positions, as right perturbations.
 
         A joint's motion commutes with a rotation of its placement about the same axis.
-
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, 6, n) right perturbations (rotation, translation) of `base_from_flange`.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
         """
         links = placement_derivatives(self._model, self.tip, self._effective(q))
         columns = links.reshape(-1, 6, self.joint_count, 6)
         return np.asarray(np.einsum("mijk,jk->mij", columns, self.chain.twists))
 
     def gravity_torques(self, q: FloatArray) -> FloatArray:
-        """Joint torques that hold the links' weight.
-
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, n) [N m]; zero where the masses are unknown.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Joint torques (m, n) that hold the links' weight [N m]; zero where masses are unknown."""
         return gravity_torques(self._model, self._effective(q), self.gravity)
 
     def weight_jacobian(self, q: FloatArray) -> FloatArray:
         """Derivatives of the joint torques by weight over masses and first moments.
 
-        Args:
-            q: (m, n) joint angles [rad].
-
         Returns:
-            (m, n, 4 n) derivatives of the torques [N m] over the mass [kg] and first moments
-            [kg m] that move with each joint.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
+            (m, n, 4 n) for mass [kg] and first moments [kg m] of all that moves with each joint.
         """
         return weight_jacobian(self._model, self._effective(q), self.gravity)
 
@@ -299,9 +234,6 @@ class Robot:
         Returns:
             (m, 6, 2 n k) right perturbations of `base_from_flange` for each joint's sine and cosine
             of each order [rad], as `chain.harmonics` has them; none for a prismatic joint.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
         """
         axes = np.where(self.chain.prismatic, 0.0, self.axis_jacobian(q))
         phases = np.arange(2, orders + 2) * np.asarray(q, dtype=float)[:, :, None]

@@ -56,17 +56,9 @@ def torque_regressor(
 def joint_torques(
     robot: Robot, inertias: Inertias, q: FloatArray, dq: FloatArray, ddq: FloatArray
 ) -> FloatArray:
-    """Inverse dynamics: joint torques of a motion.
+    """Inverse dynamics: joint torques (m, n) [N m] of a motion as in `torque_regressor`.
 
-    Args:
-        robot: The arm.
-        inertias: Of its links; they need not be physically consistent.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-        ddq: (m, n) their accelerations [rad/s^2].
-
-    Returns:
-        (m, n) [N m].
+    The inertias need not be physically consistent.
 
     Raises:
         DataError: A shape is wrong.
@@ -80,11 +72,7 @@ def joint_torques(
 def body_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
     """Regressor of the joint torques over the inertial parameters of a body on the flange.
 
-    Args:
-        robot: The arm.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-        ddq: (m, n) their accelerations [rad/s^2].
+    The motion is as in `torque_regressor`.
 
     Returns:
         (m, n, 10) for mass [kg], first moments [kg m] and inertia xx, xy, yy, xz, yz, zz
@@ -123,19 +111,11 @@ def effective_states(
 def momenta(
     robot: Robot, inertias: Inertias, q: FloatArray, dq: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Generalised momentum of an arm, and its rate without joint torques.
+    """Generalised momentum (m, n) [N m s] of an arm, and its rate without joint torques [N m].
 
-    `p = M dq` and `C^T dq - g`: the derivative of p is the latter plus all torques (De Luca and
-    Mattone 2003, Actuator failure detection and isolation using generalized momenta).
-
-    Args:
-        robot: The arm.
-        inertias: Of its links; those without mass have no first moments.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-
-    Returns:
-        (m, n) momenta [N m s] and (m, n) rates [N m].
+    `p = M dq` and `C^T dq - g`, at (m, n) joint angles [rad] and speeds [rad/s]: the derivative of
+    p is the latter plus all torques (De Luca and Mattone 2003, Actuator failure detection and
+    isolation using generalized momenta).
 
     Raises:
         DataError: The number of joints differs from the robot's, or first moments have no mass.

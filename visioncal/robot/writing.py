@@ -16,7 +16,7 @@ from visioncal.core.files import one_line
 from visioncal.core.transforms import compose, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import FUNCTION_NAMES, IDENTITY_FUNCTION, chain_document
-from visioncal.robot.conversion import parallel_axes, table_of
+from visioncal.robot.conversion import has_ur_axes, table_of
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, row_frames, table_document, table_from_document
@@ -24,8 +24,6 @@ from visioncal.robot.tables import DHTable, row_frames, table_document, table_fr
 # Links and their fields in ur_description's kinematics file, in order.
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _UR_FIELDS = ("x", "y", "z", "roll", "pitch", "yaw")
-# Parallel consecutive axes of a UR: those of shoulder, elbow and first wrist.
-_UR_PARALLEL = (False, True, True, False, False)
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 # Lever by which rotations are weighted against positions [m].
@@ -37,13 +35,7 @@ _DETERMINED = 1e-6
 
 
 def table_toml(table: DHTable, source: str, notes: Sequence[str] = ()) -> str:
-    """Writes a joint table as a `.toml` that `load_robot` reads.
-
-    Args:
-        table: The table.
-        source: Origin of its values.
-        notes: Lines for a comment at its head.
-    """
+    """Writes a joint table, with origin and notes, as a `.toml` that `load_robot` reads."""
     head = "".join(f"# {one_line(note)}\n" for note in notes)
     return head + tomli_w.dumps(table_document(table, source))
 
@@ -217,8 +209,7 @@ def ur_flange(robot: Robot, like: DHTable | None = None) -> FloatArray:
 
 def _ur_table(robot: Robot, like: DHTable | None) -> DHTable:
     """The robot's Hayati table in the controller's base."""
-    six = robot.joint_count == len(_UR_LINKS) and not robot.chain.prismatic.any()
-    if not six or tuple(parallel_axes(robot)) != _UR_PARALLEL:
+    if not has_ur_axes(robot):
         raise DataError(
             f"robot {robot.name}: ur_description's kinematics are of six revolute joints, the "
             f"second, third and fourth axis parallel, and {', '.join(robot.joint_names)} are not.",
@@ -249,15 +240,10 @@ def without_functions(robot: Robot) -> Robot:
 def fit_links(
     robot: Robot, q: FloatArray, base_from_flange: FloatArray, weights: FloatArray
 ) -> Robot:
-    """Fits placements and joint offsets of an arm to flange poses by weighted least squares.
+    """Fits placements and joint offsets of an arm to (m, 4, 4) flange poses, weighted by (m,).
 
-    The base and the other joint function coefficients stay; see `Robot.placement_jacobian`.
-
-    Args:
-        robot: The arm to start from.
-        q: (m, n) postures [rad].
-        base_from_flange: (m, 4, 4) flange poses to be fitted [m].
-        weights: (m,) weights of the postures.
+    Least squares over (m, n) joint angles; the base and the other joint function coefficients stay.
+    See `Robot.placement_jacobian`.
     """
     count, units = robot.joint_count, np.repeat([1.0, _LEVER_M], 3)
     row_weights = np.sqrt(weights)[:, None] * np.repeat([_LEVER_M, 1.0], 3)
@@ -393,11 +379,9 @@ def _corrected_tip_link(tip: str, joints: Mapping[str, Element], step: FloatArra
 
 
 def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
-    """Builds an arm with other inertias of its links.
+    """Builds an arm with other inertias of its links, in the joints' frames.
 
-    Args:
-        robot: The arm. A table or a chain stays one; a URDF becomes a chain.
-        inertias: Of its links, in the joints' frames.
+    A table or a chain stays one; a URDF becomes a chain.
     """
     if "convention" in robot.document:
         document = dict(robot.document)

@@ -83,7 +83,7 @@ class Heating:
         driven: FloatArray,
         seconds: float,
     ) -> FloatArray:
-        """Propagates the derivatives of the temperatures over the parameters by a step.
+        """Propagates the derivatives (n, s) of the temperatures over the parameters by a step.
 
         Args:
             jacobian: (n, s) derivatives before the step, in the order of `jacobian`.
@@ -91,9 +91,6 @@ class Heating:
             rest: (n,) steady state [deg C].
             driven: (n,) its part by motor currents [K].
             seconds: Duration of the step [s].
-
-        Returns:
-            (n, s).
         """
         share = seconds / self.tau_s
         kept = np.exp(-share)

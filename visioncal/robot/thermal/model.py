@@ -43,14 +43,11 @@ class ThermalModel:
         return self.robot.joint_count
 
     def columns(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the flange over the growth of links and the joint angles.
-
-        Args:
-            q: (m, n) joint angles [rad].
+        """Right perturbations (m, 6, n) of the flange for growth of links and rotation of joints.
 
         Returns:
-            Right perturbations (m, 6, n) of the flange for a relative growth of 1 of each link, and
-            for a rotation of each joint by 1 rad.
+            For a relative growth of 1 of each link, and for 1 rad of each joint, at (m, n) joint
+            angles [rad].
         """
         count = self.joint_count
         placements = self.robot.placement_jacobian(q).reshape(len(q), 6, count + 1, 6)[:, :, 1:, 3:]
@@ -69,14 +66,7 @@ class ThermalModel:
         return exp(np.einsum("mij,mj->mi", self.jacobian(q), np.broadcast_to(rises, q.shape)))
 
     def base_from_flange(self, q: FloatArray, links_c: FloatArray) -> FloatArray:
-        """Flange poses at link temperatures.
-
-        Args:
-            q: (m, n) joint angles [rad].
-            links_c: (m, n) temperatures of the links, or (n,) for all [deg C].
-
-        Returns:
-            (m, 4, 4) [m].
+        """Flange poses (m, 4, 4) [m] at joint angles (m, n) [rad] and temperatures (m, n) or (n,).
 
         Raises:
             DataError: The shapes do not match.
@@ -92,16 +82,13 @@ class ThermalModel:
         return self.robot.corrected(placements, functions)
 
     def basis(self, q: FloatArray, links_c: FloatArray, heated: FloatArray) -> FloatArray:
-        """Jacobian of the flange over all parameters, in the order of their covariance.
+        """Jacobian (m, 6, p) of the flange over all parameters, in the order of their covariance.
 
         Args:
             q: (m, n) joint angles [rad].
             links_c: (m, n) temperatures of the links [deg C].
             heated: (m, n, k) their derivatives over the k kinds of heating parameters
                 (`Heating.jacobian`).
-
-        Returns:
-            (m, 6, p) right perturbations.
         """
         grown, turned = self.columns(q)
         rises, jacobian = self.rises(links_c)[:, None, :], self.jacobian(q)
@@ -111,15 +98,12 @@ class ThermalModel:
     def sigma_m(
         self, q: FloatArray, links_c: FloatArray, heated: FloatArray | None = None
     ) -> FloatArray:
-        """Predicted sigma of the flange's drift from the reference.
+        """Predicted sigma (m,) of the flange's drift: root of the trace of its covariance [m].
 
         Args:
             q: (m, n) joint angles [rad].
             links_c: (m, n) temperatures of the links, or (n,) for all [deg C].
             heated: (m, n, k) as in `basis`; None leaves out the uncertainty of the heating.
-
-        Returns:
-            (m,) square roots of the traces of the position covariances [m].
         """
         links_c = np.broadcast_to(links_c, q.shape)
         none = np.zeros((*q.shape, 0))
