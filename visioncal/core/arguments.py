@@ -61,11 +61,7 @@ def typed(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
 
 
 def check_fields(instance: Any) -> None:  # noqa: ANN401 - any dataclass
-    """Checks the types of a dataclass' fields against its annotations.
-
-    Raises:
-        DataError: A field is of another type.
-    """
+    """Checks the types of a dataclass' fields against its annotations; raises DataError."""
     kind = type(instance)
     for name, hint in _hints(typing.cast(Hashable, kind)).items():
         _check(kind.__name__, name, getattr(instance, name), hint)

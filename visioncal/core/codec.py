@@ -148,12 +148,7 @@ def names_but(cls: type, others: str) -> tuple[str, ...]:
 
 
 def write(cls: type, value: object) -> dict[str, Any]:
-    """Writes the fields of a dataclass.
-
-    Args:
-        cls: The dataclass.
-        value: An instance of it, or of a class that has its fields.
-    """
+    """Writes the fields of a dataclass from an instance, or an object that has them."""
     document: dict[str, Any] = {}
     for entry in entries(cls):
         field_value = getattr(value, entry.name)
@@ -323,11 +318,7 @@ def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: AN
 
 
 def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what JSON may hold
-    """Checks that a value is a number, a text, or a boolean.
-
-    Raises:
-        DataError: It is something else.
-    """
+    """Checks that a value is a number, a text, or a boolean; raises DataError."""
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
         raise other(value, _WORDS[kind], path)

@@ -131,8 +131,9 @@ def _euler_orders() -> tuple[str, ...]:
     return tuple(name for order in straight + repeated for name in (order, order.lower()))
 
 
-def _all_forms() -> tuple[RotationForm, ...]:
-    return (
+ROTATION_FORMS: Mapping[str, RotationForm] = {
+    form.name: form
+    for form in (
         _quaternions("quaternion-xyzw", "a quaternion x, y, z, w", (0, 1, 2, 3)),
         _quaternions("quaternion-wxyz", "a quaternion w, x, y, z", (3, 0, 1, 2)),
         _quaternions(
@@ -148,9 +149,7 @@ def _all_forms() -> tuple[RotationForm, ...]:
         _matrices("matrix-transposed", "a rotation matrix by columns", transposed=True),
         *(_euler(order, unit) for order in _euler_orders() for unit in ("rad", "deg")),
     )
-
-
-ROTATION_FORMS: Mapping[str, RotationForm] = {form.name: form for form in _all_forms()}
+}
 
 
 @dataclass(frozen=True)

@@ -56,10 +56,7 @@ def json_text(document: Mapping[str, Any]) -> str:
 def written_beside(path: Path) -> Iterator[Path]:
     """Yields a temporary file in the same folder, which replaces `path` at the end.
 
-    After an exception it is removed, and `path` is unchanged.
-
-    Raises:
-        DataError: The file cannot be written; it names `path`.
+    After an exception it is removed, and `path` is unchanged; OSErrors become DataErrors.
     """
     with named_errors(path), aside_file(path.parent) as aside:
         yield aside
@@ -79,11 +76,7 @@ def flush_folder(folder: Path) -> None:
 
 @contextmanager
 def named_errors(path: Path) -> Iterator[None]:
-    """Converts errors of the operating system on writing to DataErrors that name the file.
-
-    Raises:
-        DataError: For an OSError.
-    """
+    """Converts OSErrors on writing to DataErrors that name the file."""
     try:
         yield
     except OSError as error:
@@ -199,11 +192,7 @@ def is_inside(path: Path, folder: Path) -> bool:
 
 
 def read_text_inside(folder: Path, name: str, most: int = MOST_BYTES) -> str:
-    """Reads a text file of an untrusted folder; see `read_text`.
-
-    Raises:
-        DataError: As `read_text`, or it is a link that leads out of the folder.
-    """
+    """Reads a text file of an untrusted folder; refuses links that lead out of it (DataError)."""
     if not is_inside(folder / name, folder):
         raise DataError(
             f"{folder / name} is a link that leads out of its folder, and is not followed.",
@@ -214,20 +203,12 @@ def read_text_inside(folder: Path, name: str, most: int = MOST_BYTES) -> str:
 
 
 def read_text(path: Path | str, most: int = MOST_BYTES) -> str:
-    """Reads a UTF-8 text file, with or without a byte-order mark; line ends are unchanged.
-
-    Raises:
-        DataError: As `read_bytes`, or it is not UTF-8.
-    """
+    """Reads UTF-8 with or without a byte-order mark, line ends unchanged; raises DataError."""
     return decode_text(read_bytes(path, most), str(path))
 
 
 def decode_text(data: bytes, label: str) -> str:
-    """Decodes UTF-8 with or without a byte-order mark; `label` names its origin in errors.
-
-    Raises:
-        DataError: The bytes are not UTF-8.
-    """
+    """Decodes UTF-8 with or without a byte-order mark; `label` names its origin in DataErrors."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -248,11 +229,7 @@ def save_as_utf8(encoding: str) -> str:
 
 
 def read_toml(path: Path, label: str) -> dict[str, Any]:
-    """Reads a TOML file; `label` names it in errors.
-
-    Raises:
-        DataError: As `read_text` and `parse_toml`.
-    """
+    """Reads a TOML file; `label` names it in DataErrors of `read_text` and `parse_toml`."""
     return parse_toml(read_text(path, MOST_TOML_BYTES), label)
 
 

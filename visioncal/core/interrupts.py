@@ -10,12 +10,7 @@ from types import FrameType
 def ended_like_ctrl_c(*names: str) -> Iterator[None]:
     """Runs a block in which signals raise KeyboardInterrupt, like Ctrl-C.
 
-    Args:
-        names: Names of the signals; by default SIGTERM, and SIGHUP of a closed terminal. Those that
-            the system does not have are ignored.
-
-    Raises:
-        KeyboardInterrupt: On one of the signals.
+    By default SIGTERM, and SIGHUP of a closed terminal; signals that the system lacks are ignored.
     """
     present = [name for name in names or ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     numbers = [getattr(signal, name) for name in present]

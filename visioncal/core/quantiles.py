@@ -16,13 +16,7 @@ def chi2_limit(chance: npt.ArrayLike, freedom: npt.ArrayLike) -> FloatArray:
 
 
 def f_limit(chance: float, freedom: npt.ArrayLike, of_noise: float) -> FloatArray:
-    """Upper quantile of F, the ratio of two mean squares.
-
-    Args:
-        chance: Probability to exceed it, between 0 and 1.
-        freedom: Degrees of freedom of the numerator.
-        of_noise: Those of the denominator.
-    """
+    """Upper quantile of F at degrees of freedom of numerator and denominator (`of_noise`)."""
     # The lower quantile of the reciprocal is accurate for small probabilities.
     return np.asarray(1.0 / fdtri(of_noise, freedom, chance), dtype=float)
 

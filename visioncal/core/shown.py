@@ -34,13 +34,9 @@ def text_card(title: str, facts: Mapping[str, str]) -> str:
 def html_card(
     title: str, facts: Mapping[str, str], status: str = "", says: Iterable[str] = ()
 ) -> str:
-    """Summary of a result for a notebook; all text is escaped.
+    """Summary of a result for a notebook: title, figures, and sentences; all text is escaped.
 
-    Args:
-        title: Its title.
-        facts: Its figures by name.
-        status: `good`, `check` or `bad`; empty without a verdict.
-        says: Sentences below the figures.
+    The status is `good`, `check` or `bad`, or empty without a verdict.
     """
     badge = (
         f'<span style="background:{_COLOURS[status]};color:#fff;border-radius:3px;'

@@ -29,14 +29,7 @@ def free_name(folder: Path) -> Path:
 
 @contextmanager
 def aside_file(folder: Path) -> Iterator[Path]:
-    """Yields an empty temporary file, which is removed at the end if it still exists.
-
-    Args:
-        folder: Its folder; abandoned temporary files in there are removed.
-
-    Raises:
-        OSError: It cannot be created.
-    """
+    """Yields an empty temporary file, which is removed at the end if it still exists."""
     remove_abandoned(folder)
     while True:
         path = free_name(folder)
@@ -56,14 +49,8 @@ def aside_file(folder: Path) -> Iterator[Path]:
 def aside_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
     """Yields a temporary folder, which is removed at the end if it still exists.
 
-    Args:
-        folder: Its parent; abandoned temporary files in there are removed.
-
     Yields:
         Its path, and whether it is locked, which needs a file system with locks.
-
-    Raises:
-        OSError: It cannot be created.
     """
     remove_abandoned(folder)
     while True:
@@ -82,16 +69,9 @@ def aside_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
 def locked(path: Path, *, wait: bool) -> Iterator[bool]:
     """Locks a file, which is created if needed.
 
-    Args:
-        path: The file.
-        wait: Whether to wait for another holder of the lock.
-
     Yields:
-        Whether the lock is held: not if another process has it, the file was moved or removed
-        meanwhile, or there are no locks.
-
-    Raises:
-        OSError: The file cannot be opened.
+        Whether the lock is held: not if another process has it (and `wait` is false), the file was
+        moved or removed meanwhile, or there are no locks.
     """
     if sys.platform == "win32":
         path.touch()

@@ -23,11 +23,7 @@ class SharedSetting:
     """A setting that holds while any thread is within its block."""
 
     def __init__(self, setting: Callable[[], AbstractContextManager[object]]) -> None:
-        """Prepares the setting.
-
-        Args:
-            setting: Builds the context manager that makes and undoes the setting.
-        """
+        """Takes a function whose context manager makes and undoes the setting."""
         self._make = setting
         self._made = ExitStack()
         self._lock = Lock()

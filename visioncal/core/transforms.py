@@ -16,14 +16,7 @@ LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 def invert(matrices: FloatArray) -> FloatArray:
-    """Inverts rigid transforms.
-
-    Args:
-        matrices: (..., 4, 4) `a_from_b`.
-
-    Returns:
-        (..., 4, 4) `b_from_a`.
-    """
+    """Inverts rigid transforms: (..., 4, 4) `a_from_b` to `b_from_a`."""
     inverse = np.zeros_like(matrices)
     rotation_t = np.swapaxes(matrices[..., :3, :3], -1, -2)
     inverse[..., :3, :3] = rotation_t
@@ -120,15 +113,9 @@ def _log_series(squared: FloatArray) -> FloatArray:
 
 
 def adjoint(matrices: FloatArray) -> FloatArray:
-    """Adjoints, which transform twists between frames.
+    """Adjoints (..., 6, 6), which transform (rotation, translation) twists from frame b to frame a.
 
     `a_from_b * exp(twist_b) = exp(adjoint(a_from_b) @ twist_b) * a_from_b`.
-
-    Args:
-        matrices: (..., 4, 4) `a_from_b`.
-
-    Returns:
-        (..., 6, 6) maps of (rotation, translation) twists from frame b to frame a.
     """
     rotation = matrices[..., :3, :3]
     adjoints = np.zeros((*matrices.shape[:-2], 6, 6))
@@ -139,19 +126,13 @@ def adjoint(matrices: FloatArray) -> FloatArray:
 
 
 def inverse_right_jacobian(twists: FloatArray) -> FloatArray:
-    """Derivative of `log(exp(twist) * exp(step))` over the step, at zero.
+    """Derivative (..., 6, 6) of `log(exp(twist) * exp(step))` over the step, at zero.
 
     The series in the adjoint of the twist with Bernoulli numbers (Iserles, Munthe-Kaas, Norsett and
     Zanna 2000, Lie-group methods, section 2) converges for rotations under 2 pi, and is truncated
     to an error of 1e-9 up to 0.5 rad. Beyond, it still gives descent directions, which suffice far
     from a minimum. The lower left block is the derivative of the upper left one along the
     translation, as for dual rotations.
-
-    Args:
-        twists: (..., 6) twists (rotation [rad], translation [m]).
-
-    Returns:
-        (..., 6, 6) derivatives.
     """
     # Components first: sums over rows of three numbers would take most of the time.
     rotation, translation = np.ascontiguousarray(np.moveaxis(twists, -1, 0)).reshape(2, 3, -1)

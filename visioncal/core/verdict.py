@@ -246,13 +246,7 @@ class Verdict:
     def with_paths(
         self, session: Path | str, out: Path | str = "", again: Sequence[str] = ()
     ) -> Self:
-        """Fills the paths of a run into the commands of its remedies.
-
-        Args:
-            session: The session's folder or recording.
-            out: The folder of its result; `out` if empty.
-            again: The words of the typed command line.
-        """
+        """Fills session, output and typed command line into the commands of remedies."""
 
         def filled(finding: Finding) -> Finding:
             if finding.do is None:

@@ -14,7 +14,10 @@ from visioncal.robot import Inertias, Robot, joint_torques, momenta, moving, wit
 
 @dataclass(frozen=True, eq=False)
 class ArmDynamics:
-    """An arm with physically consistent inertias of its links, and the friction of its drives."""
+    """An arm with physically consistent inertias of its links, and the friction of its drives.
+
+    Methods raise DataError where the number of joints differs from the robot's.
+    """
 
     robot: Robot
     inertias: Inertias
@@ -59,32 +62,19 @@ class ArmDynamics:
         return cls(robot, Inertias(parameters[:links].reshape(-1, 10)), friction)
 
     def torques(self, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
-        """Drive torques (m, n) [N m] of a motion, for feedforward control.
-
-        The motion is as in `robot.torque_regressor`.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Drive torques (m, n) [N m] for feedforward; the motion is as in `torque_regressor`."""
         links = joint_torques(self.robot, self.inertias, q, dq, ddq)
         return links + self.friction.torques(np.asarray(dq), np.asarray(ddq))
 
     def gravity(self, q: FloatArray) -> FloatArray:
-        """Gravity torques (m, n) [N m] at (m, n) joint angles [rad].
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Gravity torques (m, n) [N m] at (m, n) joint angles [rad]."""
         still = np.zeros_like(q)
         return joint_torques(self.robot, self.inertias, q, still, still)
 
     def momentum(self, q: FloatArray, dq: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Generalised momentum (m, n) [N m s], and its rate without drive torques (m, n) [N m].
 
-        The momentum includes the rotors', the rate friction; see `robot.momenta`.
-
-        Raises:
-            DataError: The number of joints differs from the robot's, or an inertia is inconsistent.
+        The momentum includes the rotors', the rate friction; see `robot.momenta` and its errors.
         """
         momentum, rate = momenta(self.robot, self.inertias, q, dq)
         still = np.zeros_like(dq)

@@ -209,11 +209,7 @@ def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatAr
 
 
 def check_turning(base: BaseModel, streams: Sequence[Conditioned]) -> None:
-    """Refuses motions in which a joint stands still.
-
-    Raises:
-        DegenerateError: There is one.
-    """
+    """Refuses motions in which a joint stands still, by a DegenerateError."""
     fastest = np.max(
         [np.abs(piece.measured.motion.dq).max(axis=0) for item in streams for piece in item.pieces],
         axis=0,
@@ -241,11 +237,7 @@ def _joint_of(name: str) -> int:
 
 
 def check_identifiable(base: BaseModel, blocks: Sequence[NoiseBlock]) -> None:
-    """Refuses motions that leave a combination of base parameters undetermined.
-
-    Raises:
-        DegenerateError: There is one; its main parameters are named.
-    """
+    """Refuses motions that leave base parameters undetermined, by a DegenerateError."""
     lost = null_space(base, blocks)
     if lost:
         names = base.names
@@ -266,15 +258,11 @@ def null_space(base: BaseModel, blocks: Sequence[NoiseBlock]) -> list[int]:
             x = block.x[:, joint]
             information += x.T @ x
             rows += len(x)
-    column_rms = _column_rms(base)
+    # Scaled by the root mean square of each column in random states.
+    states = random_motion(base.model, np.random.default_rng(1))
+    column_rms = np.sqrt(np.mean(base.regressor(states).reshape(-1, base.rank) ** 2, axis=0))
     relative = information / np.outer(column_rms, column_rms) / max(rows, 1)
     values, vectors = np.linalg.eigh(relative)
     undetermined = np.flatnonzero(values < _UNDETERMINED)
     shares = np.sqrt(np.sum(vectors[:, undetermined] ** 2, axis=1))
     return [int(index) for index in np.flatnonzero(shares > _SHARE)]
-
-
-def _column_rms(base: BaseModel) -> FloatArray:
-    """(b,) root mean square of each regressor column in random states."""
-    rows = base.regressor(random_motion(base.model, np.random.default_rng(1)))
-    return np.asarray(np.sqrt(np.mean(rows.reshape(-1, base.rank) ** 2, axis=0)))

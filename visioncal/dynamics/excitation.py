@@ -252,11 +252,6 @@ def excite(
 ) -> Excitation:
     """Searches for the motion that determines the base parameters best.
 
-    Args:
-        allowed: The motion's limits.
-        request: Options of the search.
-        progress: Called as the search goes on.
-
     Raises:
         DegenerateError: No motion was found that keeps all limits.
     """

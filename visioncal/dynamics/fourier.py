@@ -18,12 +18,7 @@ from visioncal.dynamics.motion import JointMotion
 
 @dataclass(frozen=True)
 class Harmonics:
-    """Basis functions of one joint's motion.
-
-    Attributes:
-        period_s: Period of the motion [s].
-        count: Number of its harmonics.
-    """
+    """Basis functions of one joint's motion: `count` harmonics of the period `period_s` [s]."""
 
     period_s: float
     count: int

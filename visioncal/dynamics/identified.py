@@ -138,11 +138,7 @@ class Identified:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Loads a dynamics.json, or that of a folder.
-
-        Raises:
-            DataError: It is missing or invalid.
-        """
+        """Loads a dynamics.json, or that of a folder; raises DataError if missing or invalid."""
         from visioncal.dynamics.document import fields_from_document
 
         path = Path(path)
@@ -160,11 +156,7 @@ class Identified:
             return cls(**fields_from_document(parse_stored(read_bytes(path), str(path))))
 
     def save(self, path: Path | str) -> None:
-        """Writes a dynamics.json atomically.
-
-        Raises:
-            DataError: The file cannot be written.
-        """
+        """Writes a dynamics.json atomically; raises DataError where it cannot be written."""
         from visioncal.dynamics.document import to_document
 
         write_json(path, to_document(self))
@@ -197,11 +189,7 @@ class Identified:
         return np.asarray(self.base.regressor(motion) @ self.values + self.stribeck.torques(motion))
 
     def consistent_torques(self, motion: JointMotion) -> FloatArray:
-        """Drive torques (m, n) by the consistent standard parameters [N m].
-
-        Raises:
-            DataError: There are none.
-        """
+        """Drive torques (m, n) by the consistent standard parameters [N m], or DataError."""
         if self.consistent is None:
             raise DataError(
                 f"dynamics: nothing was known of the inertias of {self.robot.name}, so there are "

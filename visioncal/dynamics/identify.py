@@ -54,13 +54,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """Identified dynamics with the streams and the regression that they come from.
-
-    Attributes:
-        identified: The result.
-        streams: The fitted streams.
-        fit: The regression; the parameters of Stribeck humps follow the base parameters.
-    """
+    """Identified dynamics, the fitted streams, and the regression, Stribeck terms last."""
 
     identified: Identified
     streams: tuple[Conditioned, ...]

@@ -122,14 +122,10 @@ class Friction:
 
 @dataclass(frozen=True, eq=False)
 class DynamicModel:
-    """`torques = regressor @ parameters`: rigid links, friction and rotors.
+    """`torques = regressor @ parameters`: rigid links, friction and rotors of a robot.
 
-    The parameters are ten a link (`Inertias.values`), link by link, and then those of friction,
-    joint by joint.
-
-    Attributes:
-        robot: The arm.
-        terms: The joints' own terms.
+    The parameters are ten a link (`Inertias.values`), link by link, and then those of the joints'
+    own terms, joint by joint.
     """
 
     robot: Robot

@@ -31,12 +31,7 @@ class JointMotion:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A motion, and the torques that were measured during it.
-
-    Attributes:
-        motion: The motion.
-        torques_nm: (m, n) torques of the joints [N m].
-    """
+    """A motion, and the torques (m, n) of the joints measured during it [N m]."""
 
     motion: JointMotion
     torques_nm: FloatArray

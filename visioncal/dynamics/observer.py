@@ -23,14 +23,10 @@ class MomentumObserver:
     """
 
     def __init__(self, arm: ArmDynamics, gain_per_s: float | FloatArray = USUAL_GAIN) -> None:
-        """Prepares an observer.
+        """Prepares an observer of an arm with its payload (`ArmDynamics.carrying`).
 
-        Args:
-            arm: The arm with its payload (`ArmDynamics.carrying`).
-            gain_per_s: Inverse time constant of the residual, one for all joints or (n,) [1/s].
-
-        Raises:
-            DataError: A gain is not above zero.
+        The gain is the inverse time constant of the residual, one for all joints or (n,) [1/s];
+        others than numbers above 0 raise DataError.
         """
         gain = np.broadcast_to(np.asarray(gain_per_s, dtype=float), (arm.robot.joint_count,))
         if not (np.isfinite(gain).all() and (gain > 0.0).all()):

@@ -63,14 +63,9 @@ class _Split:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Identified dynamics of a session with predicted torques.
+    """Identified dynamics of a session, the fit, and measured and predicted torques.
 
-    Attributes:
-        session: The session.
-        identified: The result.
-        identification: The fit.
-        predicted: Measured and predicted torques that were not fitted; None where there are none.
-        fitted: Measured and predicted torques of the fitted streams.
+    `fitted` are those of the fitted streams; `predicted` were not fitted, and may be None.
     """
 
     session: Session
@@ -205,20 +200,12 @@ def current_streams(
 
 
 def of_one_arm(session: Session, robot: str | None = None) -> Session:
-    """Selects one robot and its streams from a session.
-
-    Raises:
-        DataError: There is no such robot, or there are several to choose from.
-    """
+    """Selects one robot and its streams from a session; raises DataError if that is ambiguous."""
     return select(session, Choice(robot=robot), ARM)
 
 
 def robot_of(session: Session) -> Robot:
-    """The session's robot.
-
-    Raises:
-        DataError: It names no known robot, or several.
-    """
+    """The session's robot; raises DataError if it names none that is known, or several."""
     check_one_of_each(session)
     if session.robot_document is None:
         raise DataError(

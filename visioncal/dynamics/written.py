@@ -11,7 +11,6 @@ import numpy as np
 from visioncal.core.files import one_line
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
-from visioncal.dynamics.base import Condition
 from visioncal.dynamics.excitation import Excitation
 from visioncal.dynamics.fourier import Series
 from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept
@@ -29,13 +28,7 @@ _LOOKAHEAD_S, _GAIN = 0.1, 300
 
 @dataclass(frozen=True, eq=False)
 class MotionPlan:
-    """Motions planned to identify an arm's dynamics.
-
-    Attributes:
-        allowed: The limits.
-        excitation: The exciting motion.
-        sweeps: Sweeps for friction; None where they were not requested.
-    """
+    """Motions planned to identify an arm's dynamics; `sweeps` is None where not requested."""
 
     allowed: Allowed
     excitation: Excitation
@@ -107,17 +100,13 @@ def _excitation(excitation: Excitation) -> dict[str, Any]:
         "mean_rad": mean.tolist(),
         "sine_rad": sines.tolist(),
         "cosine_rad": cosines.tolist(),
-        "condition": _condition(excitation.condition),
-        "condition_random": _condition(excitation.random),
+        "condition": vars(excitation.condition),
+        "condition_random": vars(excitation.random),
         "base_parameters": list(excitation.base.names),
         "weights": excitation.weights.tolist(),
         "kept": _kept(excitation.kept) | {"rate_hz": CHECK_HZ},
         "search": search,
     }
-
-
-def _condition(condition: Condition) -> dict[str, float]:
-    return {"weighted": condition.weighted, "scaled": condition.scaled, "raw": condition.raw}
 
 
 def _sweeps(sweeps: Sweeps) -> dict[str, Any]:

@@ -144,7 +144,8 @@ class Inverse:
 
         goal, bounds = pin.SE3(base_from_flange), self._bounds
         first = self._descend(goal, wanted, bounds, wanted)
-        if first.reached and _largest_turn(first.positions - wanted, bounds) <= widest_rad:
+        turns = np.abs(first.positions - wanted)[bounds.turning]
+        if first.reached and turns.max(initial=0.0) <= widest_rad:
             return first
         candidates = [first, *self._from_random_starts(goal, bounds, wanted)]
         reached = [posture for posture in candidates if posture.reached]
@@ -272,11 +273,6 @@ class Inverse:
         np.matmul(rotation, own[:3], out=jacobian[:3])
         np.matmul(weight * pin.Jlog3(rotation), own[3:], out=jacobian[3:])
         return jacobian
-
-
-def _largest_turn(moves: FloatArray, bounds: _Bounds) -> float:
-    """Largest of (n,) joint motions, prismatic joints apart [rad]."""
-    return float(np.abs(moves[bounds.turning]).max(initial=0.0))
 
 
 def _moved(

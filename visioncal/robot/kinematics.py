@@ -29,16 +29,12 @@ def build_model(name: str, tip: str, chain: Chain, masses: Masses | None = None)
     model, last = pin.Model(), 0
     model.name = name
     for place, joint in enumerate(chain.joint_names):
-        kind = "P" if chain.prismatic[place] else "R"
+        kind = "Prismatic" if chain.prismatic[place] else "Revolute"
         letter = along.get(tuple(chain.axes[place].tolist()))
-        unaligned = (
-            pin.JointModelPrismaticUnaligned if kind == "P" else pin.JointModelRevoluteUnaligned
-        )
-        motion = (
-            unaligned(chain.axes[place])
-            if letter is None
-            else getattr(pin, f"JointModel{kind}{letter}")()
-        )
+        if letter is None:
+            motion = getattr(pin, f"JointModel{kind}Unaligned")(chain.axes[place])
+        else:
+            motion = getattr(pin, f"JointModel{kind[0]}{letter}")()
         last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
         if masses is not None:
             # The rotational inertia does not matter to an arm at rest.

@@ -30,11 +30,7 @@ _HEADER = re.compile(
 
 
 def read_npy(path: Path) -> Array:
-    """Reads an array of numbers or text.
-
-    Raises:
-        DataError: It is missing, no .npy, holds Python objects, or is too large.
-    """
+    """Reads an array of numbers or text; DataError if missing, invalid or too large."""
     return _parse_npy(read_bytes(path), str(path))
 
 

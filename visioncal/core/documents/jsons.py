@@ -45,11 +45,7 @@ def read_json(path: Path) -> object:
 
 
 def parse_json(text: str, where: str) -> object:
-    """Parses JSON; `where` names its origin in errors.
-
-    Raises:
-        DataError: As `read_json`.
-    """
+    """Parses JSON as `read_json` does; `where` names its origin in errors."""
     # An upper bound of the number of values: every value follows a comma or a bracket.
     if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
         raise too_many(where)

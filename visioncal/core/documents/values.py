@@ -63,11 +63,7 @@ def too_deep(where: str) -> DataError:
 
 
 def check_bounds(value: object, where: str) -> None:
-    """Checks depth and size of a document without recursion.
-
-    Raises:
-        DataError: It is nested too deep or has too many values.
-    """
+    """Checks depth and size of a document without recursion; raises DataError."""
     pending: list[tuple[object, int]] = [(value, 1)]
     count = 0
     while pending:
@@ -94,11 +90,7 @@ def shown(value: object) -> str:
 
 
 def as_numbers(value: object, where: str) -> FloatArray:
-    """Reads a number or regular nested lists of numbers; null becomes NaN.
-
-    Raises:
-        DataError: It has text, a mapping, or lists of different lengths.
-    """
+    """Reads a number or regular nested lists of numbers, null as NaN; raises DataError."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         return np.asarray(value, dtype=float)
     if isinstance(value, int | float | list) and not isinstance(value, bool):
@@ -110,11 +102,7 @@ def as_numbers(value: object, where: str) -> FloatArray:
 
 
 def number(value: object, where: str) -> float:
-    """Reads one finite number.
-
-    Raises:
-        DataError: It is not one finite number.
-    """
+    """Reads one finite number; raises DataError."""
     numbers = as_numbers(value, where)
     if numbers.size != 1 or not np.isfinite(numbers).all():
         raise DataError(
@@ -124,11 +112,7 @@ def number(value: object, where: str) -> float:
 
 
 def mapping(value: object, where: str) -> Mapping[str, Any]:
-    """Checks that a value is a mapping.
-
-    Raises:
-        DataError: It is no mapping.
-    """
+    """Checks that a value is a mapping; raises DataError."""
     if not isinstance(value, Mapping):
         raise DataError(
             f"{where} is {shown(value)}; keys with values are needed.", culprits=[where]

@@ -49,11 +49,7 @@ class Element:
 
 
 def read_xml(path: Path) -> Element:
-    """Reads an XML file: its root.
-
-    Raises:
-        DataError: It is missing, no XML, declares a document type, or is too large or too deep.
-    """
+    """Reads an XML file to its root; the errors are those of `parse_xml` and `read_bytes`."""
     return parse_xml(read_bytes(path), str(path))
 
 

@@ -58,11 +58,7 @@ def read_yaml(path: Path) -> object:
 
 
 def parse_yaml(text: str, where: str) -> object:
-    """Parses YAML; `where` names its origin in errors.
-
-    Raises:
-        DataError: As `read_yaml`.
-    """
+    """Parses YAML as `read_yaml` does; `where` names its origin in errors."""
     # OpenCV's `%YAML:1.0` is no valid directive; an empty comment keeps line numbers.
     plain = re.sub(r"\A%YAML[^\n]*", "#", text)
     builder = _Builder(where)

@@ -116,7 +116,10 @@ class OnlineCompensator:
         self._last = self._after(signal, air, stamp_s)
         self._stamps_s.append(stamp_s)
         self._links.append(self._last.links)
-        self._forget()
+        # Samples that are too old for the rates.
+        while len(self._stamps_s) > 2 and self._stamps_s[1] < stamp_s - 2.1 * _SPAN_S:
+            self._stamps_s.pop(0)
+            self._links.pop(0)
 
     def _after(self, signal: FloatArray, air: float, stamp_s: float) -> _Sample:
         """Link temperatures after a sample of the signal (n,) and of the air [deg C]."""
@@ -215,9 +218,3 @@ class OnlineCompensator:
         decay = min(max(decay, _LEAST_SHARE), float(np.exp(-_SPAN_S / _SLOWEST_S)))
         tau_s = np.full_like(latest, -_SPAN_S / np.log(decay))
         return latest, np.maximum(tau_s, heating.tau_s)
-
-    def _forget(self) -> None:
-        """Drops samples that are too old for the rates."""
-        while len(self._stamps_s) > 2 and self._stamps_s[1] < self._stamps_s[-1] - 2.1 * _SPAN_S:
-            self._stamps_s.pop(0)
-            self._links.pop(0)
