@@ -403,13 +403,7 @@ def condition(
             "were left out. Are they in rad/s, measured, and not delayed?"
         )
     return Conditioned(
-        recorded.label,
-        tuple(pieces),
-        band_hz,
-        cutoff,
-        rate_hz,
-        tuple(notes),
-        recorded.of_currents,
+        recorded.label, tuple(pieces), band_hz, cutoff, rate_hz, tuple(notes), recorded.of_currents
     )
 
 

@@ -95,11 +95,8 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
     request = IdentificationRequest() if request is None else request
     session = of_one_arm(session, request.robot)
     robot = robot_of(session)
-    names = [
-        stream
-        for stream in _torque_streams(session, request.streams)
-        if stream != request.validate_on
-    ]
+    candidates = _torque_streams(session, request.streams)
+    names = [name for name in candidates if name != request.validate_on]
     if not names:
         raise DataError(
             f"session {session.name!r}: {request.validate_on} is its only stream of torques, and "
