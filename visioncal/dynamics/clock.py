@@ -14,8 +14,8 @@ from visioncal.dynamics.reading import RecordedSamples
 # share of jitter, a step of several usual ones means missing samples; on a less even clock, only a
 # step of so many times the usual one that is also longer than the last [s].
 _JITTER, _EVEN, _GAP, _GAP_S = 0.02, 0.1, 2.5, 0.02
-# Least duration [s] and number of repeated angles that count as frozen, and number of samples before
-# and after in which the joint moves.
+# Least duration [s] and number of repeated angles that count as frozen, and number of samples
+# before and after in which the joint moves.
 _FROZEN_S, _FROZEN, _AROUND = 0.05, 5, 5
 # The angle then jumps by at least so many times the steps around it and the angles' resolution.
 _JUMP = 4.0
