@@ -1,1 +1,1 @@
-"""What every package uses: errors, plain data, rigid transforms, files, numbers in words."""
+"""Common basis of all packages: errors, data types, rigid transforms, files, number formats."""

@@ -1,4 +1,4 @@
-"""Arguments of public functions: what is of another type is refused by its name."""
+"""Runtime type checks of the arguments of public functions."""
 
 import inspect
 import types
@@ -32,20 +32,20 @@ _WORDS = {
 
 
 def typed(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
-    """Has a function refuse arguments of other types than it declares.
+    """Decorates a function to check the types of its arguments against its annotations.
 
-    Literals, shapes and values are left to the function, and so is what no type can tell.
+    Shapes and values are left to the function, and so are types that cannot be checked.
     """
 
     @wraps(function)
     def checked(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
         signature, hints = _declared(function)
         try:
-            given = signature.bind(*args, **kwargs).arguments
+            arguments = signature.bind(*args, **kwargs).arguments
         except TypeError:
-            # Python's own words name the function.
+            # Python's own message names the function.
             return function(*args, **kwargs)
-        for name, value in given.items():
+        for name, value in arguments.items():
             kind = signature.parameters[name].kind
             values = {name: value}
             if kind is inspect.Parameter.VAR_KEYWORD:
@@ -53,19 +53,15 @@ def typed(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
                 fields = typing.get_type_hints(hint[0]) if hint else {}
             else:
                 fields = hints
-            for key, number in values.items():
-                _check(function.__qualname__, key, number, fields.get(key, Any))
+            for key, argument in values.items():
+                _check(function.__qualname__, key, argument, fields.get(key, Any))
         return function(*args, **kwargs)
 
     return checked
 
 
 def check_fields(instance: Any) -> None:  # noqa: ANN401 - any dataclass
-    """Refuses a dataclass whose fields are of other types than it declares.
-
-    Raises:
-        DataError: One of them is.
-    """
+    """Checks the types of a dataclass' fields against its annotations; raises DataError."""
     kind = type(instance)
     for name, hint in _hints(typing.cast(Hashable, kind)).items():
         _check(kind.__name__, name, getattr(instance, name), hint)
@@ -73,14 +69,14 @@ def check_fields(instance: Any) -> None:  # noqa: ANN401 - any dataclass
 
 @cache
 def _declared(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]]:
-    taken = {
+    annotations = {
         name: annotation
         for name, annotation in function.__annotations__.items()
         if name != "return"
     }
-    # What a function gives back may be known to type checkers alone.
-    alone = types.SimpleNamespace(__annotations__=taken)
-    hints = typing.get_type_hints(alone, getattr(function, "__globals__", None))
+    # Return types may be imported for type checkers only.
+    parameters = types.SimpleNamespace(__annotations__=annotations)
+    hints = typing.get_type_hints(parameters, getattr(function, "__globals__", None))
     return inspect.signature(function), hints
 
 
@@ -95,8 +91,8 @@ def _check(owner: str, name: str, value: object, hint: object) -> None:
     options = list(_options(hint))
     for option in options:
         if isinstance(value, list | tuple) and _is_list(option):
-            for at, number in enumerate(value):
-                _check(owner, f"{name}[{at}]", number, typing.get_args(option)[0])
+            for index, element in enumerate(value):
+                _check(owner, f"{name}[{index}]", element, typing.get_args(option)[0])
     if isinstance(value, str) and (names := _names(options)):
         raise DataError(
             f"{owner}: {name} {value!r} is not one of {', '.join(names)}.",
@@ -114,11 +110,13 @@ def _check(owner: str, name: str, value: object, hint: object) -> None:
         loaders += ["load_target"] * (Target in options)
         step = f"Load it first: visioncal.{loaders[0]}({str(value)!r})." if loaders else ""
     raise DataError(
-        f"{owner}: {name} is {_seen(value)}; {needed} is needed.", culprits=[name], next_step=step
+        f"{owner}: {name} is {_described(value)}; {needed} is needed.",
+        culprits=[name],
+        next_step=step,
     )
 
 
-def _seen(value: object) -> str:
+def _described(value: object) -> str:
     if value is None:
         return "None"
     if isinstance(value, str | Path):
@@ -129,7 +127,7 @@ def _seen(value: object) -> str:
 
 
 def _options(hint: Any) -> Iterator[Any]:  # noqa: ANN401
-    """The types of which a value may be one."""
+    """The alternatives of a union, or the type itself."""
     if typing.get_origin(hint) in (Union, types.UnionType):
         for argument in typing.get_args(hint):
             yield from _options(argument)
@@ -169,7 +167,7 @@ def _words(hint: Any) -> str:  # noqa: ANN401
 
 
 def _fits(value: object, hint: Any) -> bool:  # noqa: ANN401 - a type, or a form of one
-    """Whether a value is of a type, as far as that can be seen at once."""
+    """Whether a value is of a type, as far as that can be checked without deep inspection."""
     options = list(_options(hint))
     if len(options) > 1:
         return hint is npt.ArrayLike or any(_fits(value, option) for option in options)
@@ -183,7 +181,7 @@ def _fits(value: object, hint: Any) -> bool:  # noqa: ANN401 - a type, or a form
 
 
 def _pixels(inner: tuple[Any, ...]) -> type | None:
-    """The type of an image's pixels; None of an array of numbers."""
+    """The pixel type of an image; None for an array of numbers."""
     (kind,) = typing.get_args(inner[1])
     return kind if isinstance(kind, type) and issubclass(kind, np.unsignedinteger) else None
 
@@ -195,7 +193,7 @@ def _is_array(value: object, inner: tuple[Any, ...]) -> bool:
     try:
         return np.asarray(value).dtype.kind in "biuf"
     except ValueError:
-        # Rows of several lengths; the function says which.
+        # Rows differ in length; the function itself reports which.
         return not isinstance(value, str)
 
 

@@ -1,7 +1,4 @@
-"""Names to choose among and usual values, in files and in options.
-
-Help lists them without waiting for numpy.
-"""
+"""Choices and default values of files and options, importable without numpy for quick help."""
 
 import math
 from collections.abc import Mapping
@@ -12,19 +9,19 @@ from typing import Literal, TypeAlias
 SolverName: TypeAlias = Literal[
     "joint", "tsai", "park", "horaud", "daniilidis", "andreff", "shah", "li"
 ]
-# What a recording keeps of the images of its session, beside their digests.
+# How a recording keeps its session's images, beside their digests.
 ImagesKept: TypeAlias = Literal["full", "thumbnail", "none"]
-# How a table of joints is meant.
+# Convention of a joint table.
 Convention: TypeAlias = Literal["standard", "modified", "hayati"]
 CONVENTIONS: tuple[Convention, ...] = ("standard", "modified", "hayati")
 CameraMount: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
 MOUNTS: tuple[CameraMount, ...] = ("eye-in-hand", "eye-to-hand")
-# What observes whom: a camera on the flange, one that stands still, or a measuring instrument that
-# stands still and reads a probe or points on the flange.
+# Mount of the observing device: a camera on the flange, a fixed camera, or a fixed measuring
+# instrument that observes a probe or points on the flange.
 Mount: TypeAlias = Literal["eye-in-hand", "eye-to-hand", "instrument"]
-# By what stops of a plan are chosen; `live.planning.design` says what each is.
+# Optimality criteria of planned stops, see `live.planning.design`.
 Criterion: TypeAlias = Literal["I", "D", "A", "E", "O1"]
-# What `convert` reads, and `export` writes, in the order of their registries.
+# Formats that `convert` reads and `export` writes, in the order of their registries.
 FOREIGN_NAMES = (
     *("industrial-calibration", "industrial-kinematics", "visp", "zivid", "easy-handeye2"),
     *("moveit", "views", "table"),
@@ -36,11 +33,11 @@ EXPORT_NAMES = (
     *("kuka-tool", "kuka-base", "fanuc-utool", "fanuc-uframe", "robot-urdf", "robot-dh"),
     *("ur-kinematics", "robot-json", "joint-corrections"),
 )
-# Simulated arms, and the whole cells whose descriptions come with visioncal.
+# Simulated arms, and built-in descriptions of whole cells.
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")
 
-# The faults that can be rehearsed; the last two are the camera's, at a stop.
+# Faults that can be rehearsed; the last two are of the camera, at a stop.
 Faults: TypeAlias = Literal[
     "protective-stop",
     "emergency-stop",
@@ -50,26 +47,25 @@ Faults: TypeAlias = Literal[
     "unplugged",
     "covered",
 ]
-# A UR's joints turn no faster while a plan is driven; slow enough to reach the stop button [rad/s
-# and rad/s^2].
+# Joint speed and acceleration of a UR that drives a plan, slow enough to reach the stop button
+# [rad/s and rad/s^2].
 PLAN_SPEED, PLAN_ACCELERATION = 0.4, 0.6
-# Joints that turn farther than this from one target to the next have taken another branch, or the
-# targets are no path [rad].
+# Greatest joint motion between consecutive targets of a path on one branch of the arm [rad].
 WIDEST_RAD = math.pi / 2
 
-# What `dynamics identify` writes.
+# Output of `dynamics identify`.
 DYNAMICS_FILE = "dynamics.json"
-# What a drive's gain is known to, as a share, where nobody says it: half of what two published
-# lists of a UR10e's gains differ by has an rms of 12 % [-].
+# Default relative standard deviation of a drive's gain: half the difference of two published lists
+# of a UR10e's gains has an rms of 12 % [-].
 GAIN_SIGMA = 0.12
 
-# Lengths in which others write positions [m].
+# Length units of foreign files [m].
 UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "inch": 0.0254}
 
 
 @dataclass(frozen=True)
 class PoseForm:
-    """How a robot's maker or a library writes a pose: a length unit [m] and a rotation."""
+    """Pose notation of a robot manufacturer or a library: length unit and rotation form."""
 
     name: str
     words: str

@@ -1,8 +1,8 @@
-"""Frozen dataclasses as JSON: written, read with checks, by the types of their fields.
+"""Codec of frozen dataclasses as JSON, with type checks on reading.
 
-A field is a key of its own name, or of the one that `Key` gives. What is None is absent on disk, as
-is an empty default. Keys that a class does not know are left out, or kept in its field of the kind
-`REST`. An error names the path of the value, as `kinematics.levels[2].rms_mm`.
+A field's key is its name, or that of its `Key`. None and empty defaults are not written. Unknown
+keys are ignored, or kept in a field marked `REST`. Errors name the path of the value, such as
+`kinematics.levels[2].rms_mm`.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -23,15 +23,15 @@ _WORDS = {float: "a number", int: "a whole number", str: "a text", bool: "true o
 
 @contextmanager
 def reading(label: str, what: str, next_step: str) -> Iterator[None]:
-    """Names the file in the errors of reading it, whatever its content has made fail.
+    """Turns all errors of reading a file into DataErrors that name the file.
 
     Args:
-        label: What the content came from.
-        what: What it has to be, such as `a calibration`.
-        next_step: How to make it again.
+        label: The file.
+        what: Its expected content, such as `a calibration`.
+        next_step: How to create it again.
 
     Raises:
-        DataError: It is not that.
+        DataError: The content is not that.
     """
     try:
         yield
@@ -47,18 +47,18 @@ def reading(label: str, what: str, next_step: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Key:
-    """The key of a field that is not of its own name."""
+    """The key of a field, where it differs from the field's name."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Array:
-    """The shape of an array.
+    """Shape and check of an array.
 
     Attributes:
-        shape: Its sizes, of which those that are negative may be any.
-        fault: Says what else is wrong with one; empty for nothing.
+        shape: Its sizes; negative for any size.
+        fault: Message on other faults of an array; empty for none.
     """
 
     shape: tuple[int, ...]
@@ -67,12 +67,12 @@ class Array:
 
 @dataclass(frozen=True, eq=False)
 class WrittenForm:
-    """How a value is written that is no dataclass of ours, or has another form on disk.
+    """Custom conversion of a value to JSON, or to a dataclass that is written in its place.
 
     Attributes:
-        write: Makes JSON of it, or its form.
-        read: Reads that; its path is for messages.
-        form: The dataclass that it is on disk; None for JSON of any kind.
+        write: Converts the value to JSON, or to `form`.
+        read: Converts it back; takes the path for messages.
+        form: The dataclass that is written; None for plain JSON.
     """
 
     write: Callable[[Any], Any]
@@ -80,9 +80,10 @@ class WrittenForm:
     form: type | None = None
 
 
-# Fields whose keys stand beside those of their owner, and one that has all keys of no other.
+# Marks of fields: INLINE puts the keys among those of the owner, REST collects all unknown keys.
 INLINE, REST = object(), object()
-# A field that is on disk though it is empty, a text that is not, and one that is never.
+# KEPT is written even if empty, DROPPED (a text or number) is not written if empty, UNWRITTEN
+# never.
 KEPT, DROPPED, UNWRITTEN = object(), object(), object()
 Vector = Annotated[FloatArray, Array((-1,))]
 Matrix = Annotated[FloatArray, Array((-1, -1))]
@@ -90,10 +91,10 @@ Matrix = Annotated[FloatArray, Array((-1, -1))]
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A part of a result.
+    """Base of the sections of a result.
 
     Attributes:
-        further: What a file has of it that this version does not know, as it is there.
+        further: Unknown keys of a file, unchanged.
     """
 
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict, repr=False)
@@ -101,7 +102,7 @@ class Section:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A field as it is on disk: its name, key and type, and whether it has to be there."""
+    """Description of a field: name, key, type, whether it is required, and marks."""
 
     name: str
     key: str
@@ -111,7 +112,7 @@ class Entry:
 
     @property
     def keys(self) -> set[str]:
-        """The keys that it has."""
+        """The keys that the field uses."""
         if INLINE in self.marks:
             forms = [mark.form for mark in self.marks if isinstance(mark, WrittenForm)]
             (inner,) = _alternatives(get_args(self.kind)[0])
@@ -119,7 +120,7 @@ class Entry:
         return set() if REST in self.marks else {self.key}
 
     def is_absent(self, value: object) -> bool:
-        """Whether a value is not written."""
+        """Whether a value is omitted."""
         is_empty = isinstance(value, tuple | Mapping) or DROPPED in self.marks
         can_be = not self.required and KEPT not in self.marks
         return value is None or (can_be and is_empty and not value)
@@ -127,9 +128,9 @@ class Entry:
 
 @cache
 def entries(cls: type) -> tuple[Entry, ...]:
-    """The fields of a dataclass in their order."""
+    """The written fields of a dataclass in order, a REST field first."""
     hints = get_type_hints(cls, include_extras=True)
-    found = []
+    result = []
     for entry in fields(cls):
         kind = hints[entry.name]
         marks = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
@@ -137,30 +138,24 @@ def entries(cls: type) -> tuple[Entry, ...]:
             continue
         keys = [mark.name for mark in marks if isinstance(mark, Key)]
         required = entry.default is MISSING and entry.default_factory is MISSING
-        found.append(Entry(entry.name, keys[0] if keys else entry.name, kind, required, marks))
-    # What is of other things stands first.
-    return tuple(sorted(found, key=lambda value: REST not in value.marks))
+        result.append(Entry(entry.name, keys[0] if keys else entry.name, kind, required, marks))
+    return tuple(sorted(result, key=lambda value: REST not in value.marks))
 
 
 def names_but(cls: type, others: str) -> tuple[str, ...]:
-    """The names of a dataclass' fields, but for some, with blanks between."""
+    """Names of a dataclass' fields except for some, given as a space-separated list."""
     return tuple(entry.name for entry in fields(cls) if entry.name not in others.split())
 
 
 def write(cls: type, value: object) -> dict[str, Any]:
-    """Writes the fields that a dataclass has.
-
-    Args:
-        cls: The dataclass.
-        value: One of it, or of a class that has its fields.
-    """
+    """Writes the fields of a dataclass from an instance, or an object that has them."""
     document: dict[str, Any] = {}
     for entry in entries(cls):
-        mine = getattr(value, entry.name)
-        if not entry.is_absent(mine):
-            written = _written(entry.kind, mine)
-            beside = INLINE in entry.marks or REST in entry.marks
-            document |= written if beside else {entry.key: written}
+        field_value = getattr(value, entry.name)
+        if not entry.is_absent(field_value):
+            written = _written(entry.kind, field_value)
+            is_inline = INLINE in entry.marks or REST in entry.marks
+            document |= written if is_inline else {entry.key: written}
     return document
 
 
@@ -179,26 +174,26 @@ def _written(kind: Any, value: Any) -> Any:  # noqa: ANN401 - what JSON may hold
     if is_dataclass(value):
         return write(type(value), value)
     if kind is not Any and isinstance(value, Mapping):
-        return {name: _written(get_args(kind)[1], number) for name, number in value.items()}
+        return {name: _written(get_args(kind)[1], item) for name, item in value.items()}
     if isinstance(value, tuple):
-        return [_written(get_args(kind)[0], number) for number in value]
+        return [_written(get_args(kind)[0], item) for item in value]
     return value
 
 
 def read(cls: type[_T], document: object, path: str) -> _T:
-    """Reads what `write` wrote.
+    """Reads a dataclass from JSON of `write`.
 
     Args:
         cls: The dataclass.
         document: The JSON.
-        path: Its place in the file, for messages.
+        path: Path of the document in the file, for messages.
 
     Raises:
-        DataError: Something in it is missing or of another kind; the message names its place.
+        DataError: A value is missing or of another type; the message names its path.
     """
-    found = read_fields(cls, document, path)
+    values = read_fields(cls, document, path)
     try:
-        return cls(**found)
+        return cls(**values)
     except ValueError as error:
         place = path or "the document"
         raise DataError(f"{place}: {error}.", culprits=[place]) from error
@@ -206,23 +201,23 @@ def read(cls: type[_T], document: object, path: str) -> _T:
 
 def read_fields(cls: type, document: object, path: str) -> dict[str, Any]:
     """Reads the fields of a dataclass by name; its errors are those of `read`."""
-    table, known = _table(document, path), entries(cls)
-    ours = set().union(*(entry.keys for entry in known))
-    found = {}
-    for entry in known:
+    table, known_fields = _table(document, path), entries(cls)
+    known_keys = set().union(*(entry.keys for entry in known_fields))
+    values = {}
+    for entry in known_fields:
         if REST in entry.marks:
-            rest = {key: value for key, value in table.items() if key not in ours}
-            found[entry.name] = _read(entry.kind, rest, path)
+            rest = {key: value for key, value in table.items() if key not in known_keys}
+            values[entry.name] = _read(entry.kind, rest, path)
         elif INLINE in entry.marks:
             if entry.required or entry.keys & table.keys():
-                found[entry.name] = _read(entry.kind, table, path)
+                values[entry.name] = _read(entry.kind, table, path)
         elif entry.key in table:
-            found[entry.name] = _read(entry.kind, table[entry.key], _joined(path, entry.key))
-    for entry in known:
-        if entry.required and entry.name not in found:
+            values[entry.name] = _read(entry.kind, table[entry.key], _joined(path, entry.key))
+    for entry in known_fields:
+        if entry.required and entry.name not in values:
             place = _joined(path, entry.key)
             raise DataError(f"{place} is missing.", culprits=[place])
-    return found
+    return values
 
 
 def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON may hold
@@ -242,7 +237,7 @@ def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON 
         return _read_tuple(args, value, path)
     if origin is not None and issubclass(origin, Mapping):
         table = _table(value, path)
-        return {name: _read(args[1], number, _joined(path, name)) for name, number in table.items()}
+        return {name: _read(args[1], item, _joined(path, name)) for name, item in table.items()}
     if is_dataclass(kind):
         return read(kind, value, path)  # type: ignore[arg-type] # no instance, but a class
     return plain(kind, value, path)
@@ -254,9 +249,9 @@ def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: 
         if isinstance(mark, Array):
             return _array(inner, mark, value, path)
         if isinstance(mark, WrittenForm):
-            known = value if mark.form is None else read(mark.form, value, path)
+            content = value if mark.form is None else read(mark.form, value, path)
             try:
-                return mark.read(known, path)
+                return mark.read(content, path)
             except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
                 why = str(error) or type(error).__name__
                 raise DataError(f"{path}: {why}.", culprits=[path]) from error
@@ -264,14 +259,14 @@ def _read_marked(args: tuple[Any, ...], value: Any, path: str) -> Any:  # noqa: 
 
 
 def _alternatives(kind: Any) -> list[Any]:  # noqa: ANN401 - a type
-    """What a type that may be None may be beside it."""
+    """The alternatives of a union except None, or the type itself."""
     if get_origin(kind) in (Union, UnionType):
         return [argument for argument in get_args(kind) if argument is not NoneType]
     return [kind]
 
 
 def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
-    """The type that a value is of: of dataclasses, that of whose keys it has most, missing few."""
+    """The alternative that fits a value: of dataclasses, the one with most of its keys present."""
     if len(kinds) == 1:
         return kinds[0]
     if not isinstance(value, Mapping):
@@ -279,8 +274,8 @@ def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
         return next((kind for kind in kinds if (get_origin(kind) is tuple) == is_row), kinds[0])
 
     def fit(kind: type) -> tuple[int, int]:
-        there = sum(entry.key in value for entry in entries(kind))
-        return there, there - len(entries(kind))
+        present = sum(entry.key in value for entry in entries(kind))
+        return present, present - len(entries(kind))
 
     return max(kinds, key=fit)
 
@@ -293,39 +288,37 @@ def _read_tuple(args: tuple[Any, ...], value: object, path: str) -> tuple[Any, .
     if len(value) != len(args):
         raise other(value, f"a list of {len(args)}", path)
     return tuple(
-        _read(kind, number, f"{path}[{at}]")
-        for at, (kind, number) in enumerate(zip(args, value, strict=True))
+        _read(kind, item, f"{path}[{index}]")
+        for index, (kind, item) in enumerate(zip(args, value, strict=True))
     )
 
 
 def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: ANN401
-    """An array of a type, as `npt.NDArray[np.float64]`."""
+    """Reads an array of a type such as `npt.NDArray[np.float64]`."""
     (wanted,) = get_args(get_args(kind)[1])
     sizes = " x ".join("n" if index < 0 else str(index) for index in form.shape)
-    needed = other(value, f"an array of {sizes} numbers", path)
+    shape_error = other(value, f"an array of {sizes} numbers", path)
     try:
-        found = np.asarray(value)
+        array = np.asarray(value)
     except ValueError as error:
-        raise needed from error
-    if not found.size:
-        found = np.zeros((*found.shape, *(0,) * len(form.shape))[: len(form.shape)])
-    elif found.dtype.kind not in ("b" if wanted is np.bool_ else "iuf"):
-        raise needed
-    pairs = zip(found.shape, form.shape, strict=False)
-    if found.ndim != len(form.shape) or not all(mine == its or its < 0 for mine, its in pairs):
-        raise needed
-    fault = form.fault(found) if form.fault else ""
+        raise shape_error from error
+    if not array.size:
+        array = np.zeros((*array.shape, *(0,) * len(form.shape))[: len(form.shape)])
+    elif array.dtype.kind not in ("b" if wanted is np.bool_ else "iuf"):
+        raise shape_error
+    pairs = zip(array.shape, form.shape, strict=False)
+    if array.ndim != len(form.shape) or not all(
+        actual == wanted_size or wanted_size < 0 for actual, wanted_size in pairs
+    ):
+        raise shape_error
+    fault = form.fault(array) if form.fault else ""
     if fault:
         raise DataError(f"{path} {fault}.", culprits=[path])
-    return found.astype(wanted)
+    return array.astype(wanted)
 
 
 def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what JSON may hold
-    """Checks a value that is a number, a text, or true or false.
-
-    Raises:
-        DataError: It is something else.
-    """
+    """Checks that a value is a number, a text, or a boolean; raises DataError."""
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
         raise other(value, _WORDS[kind], path)
@@ -333,7 +326,7 @@ def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what J
 
 
 def other(value: object, needed: str, path: str) -> DataError:
-    """Says what is there, and what is needed."""
+    """Builds the error for a value of another type than needed."""
     place = path or "the document"
     return DataError(f"{place} is {value!r:.60}; {needed} is needed.", culprits=[place])
 

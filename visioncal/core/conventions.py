@@ -1,7 +1,4 @@
-"""How others write poses: units, rotations, and the forms of the robots' makers.
-
-One table serves both ways: what `convert` reads, `export` writes.
-"""
+"""Pose notations: units, rotation forms, and those of robot manufacturers, for both directions."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -19,20 +16,21 @@ from visioncal.core.number_format import some_of
 from visioncal.core.transforms import compose, invert, nearest_rotation
 from visioncal.core.types import FloatArray, IntArray, Mask
 
-# Three written digits leave a quaternion's length within 9e-4 of 1 and a matrix within 8e-4 of a
-# rotation; views.csv has the same limit. What is farther off is read in the wrong form or order.
+# Tolerance of rotations: with three written digits a quaternion's norm is within 9e-4 of 1 and a
+# matrix within 8e-4 of a rotation (views.csv has the same limit). Larger errors mean a wrong form
+# or order.
 _NORM_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class RotationForm:
-    """A way to write a rotation as numbers.
+    """A representation of rotations as numbers.
 
     Attributes:
-        name: As the command line has it.
-        words: What it is, for messages.
-        size: How many numbers it takes.
-        read: (n, size) numbers to (n, 3, 3) rotations; NaN where they are none.
+        name: Name on the command line.
+        words: Description for messages.
+        size: Number of values.
+        read: (n, size) numbers to (n, 3, 3) rotations; NaN where they are invalid.
         write: (n, 3, 3) rotations to (n, size) numbers.
     """
 
@@ -49,15 +47,15 @@ def _quaternions(name: str, words: str, order: Sequence[int]) -> RotationForm:
     to_xyzw = np.argsort(from_xyzw)
 
     def read(numbers: FloatArray) -> FloatArray:
-        # No component of a unit is larger, and squares of the largest numbers overflow.
+        # Clipped, because squares of the largest numbers overflow.
         norms = np.linalg.norm(np.clip(numbers, -2.0, 2.0), axis=1)
-        off = np.abs(norms - 1.0) > _NORM_TOLERANCE
-        unit = np.where(off[:, None] | ~np.isfinite(numbers), 0.5, numbers)
+        invalid = np.abs(norms - 1.0) > _NORM_TOLERANCE
+        unit = np.where(invalid[:, None] | ~np.isfinite(numbers), 0.5, numbers)
         rotations = Rotation.from_quat(unit[:, to_xyzw]).as_matrix()
-        return _without(rotations, np.asarray(off) | ~_finite_rows(numbers))
+        return _without(rotations, np.asarray(invalid) | ~_finite_rows(numbers))
 
     def write(rotations: FloatArray) -> FloatArray:
-        # A quaternion and its negative are one rotation; robots' makers write w >= 0.
+        # A quaternion and its negative are the same rotation; manufacturers write w >= 0.
         numbers = Rotation.from_matrix(rotations).as_quat(canonical=True)
         return np.asarray(numbers[:, from_xyzw])
 
@@ -75,13 +73,13 @@ def _rotation_vectors(name: str, words: str, unit_rad: float) -> RotationForm:
 
 
 def _euler(order: str, unit: str) -> RotationForm:
-    """Builds a form of three angles: capitals turn about moving axes, small letters about fixed."""
+    """Builds a form of Euler angles: capitals for moving axes, small letters for fixed axes."""
     degrees = unit == "deg"
     about = "moving" if order.isupper() else "fixed"
 
     def write(rotations: FloatArray) -> FloatArray:
         with warnings.catch_warnings():
-            # At the singularity one of the endless many triples is as right as any.
+            # At the singularity any of the equivalent triples will do.
             warnings.simplefilter("ignore", UserWarning)
             return np.asarray(Rotation.from_matrix(rotations).as_euler(order, degrees=degrees))
 
@@ -97,25 +95,25 @@ def _euler(order: str, unit: str) -> RotationForm:
 
 
 def _matrices(name: str, words: str, *, transposed: bool) -> RotationForm:
-    def turned(rotations: FloatArray) -> FloatArray:
+    def oriented(rotations: FloatArray) -> FloatArray:
         return np.swapaxes(rotations, 1, 2) if transposed else rotations
 
     def read(numbers: FloatArray) -> FloatArray:
-        rotations = turned(numbers.reshape(-1, 3, 3))
-        there = _finite_rows(rotations.reshape(-1, 9))
-        safe = np.where(there[:, None, None], rotations, np.eye(3))
+        rotations = oriented(numbers.reshape(-1, 3, 3))
+        finite = _finite_rows(rotations.reshape(-1, 9))
+        safe = np.where(finite[:, None, None], rotations, np.eye(3))
         nearest = nearest_rotation(safe)
-        off = np.abs(nearest - safe).max(axis=(1, 2)) > _NORM_TOLERANCE
-        return _without(nearest, np.asarray(off) | ~there)
+        invalid = np.abs(nearest - safe).max(axis=(1, 2)) > _NORM_TOLERANCE
+        return _without(nearest, np.asarray(invalid) | ~finite)
 
     return RotationForm(
-        name, words, 9, read, lambda rotations: turned(rotations).reshape(-1, 9).copy()
+        name, words, 9, read, lambda rotations: oriented(rotations).reshape(-1, 9).copy()
     )
 
 
 def _finite(numbers: FloatArray, build: Callable[[FloatArray], Rotation]) -> FloatArray:
-    there = _finite_rows(numbers)
-    return _without(build(np.where(there[:, None], numbers, 0.0)).as_matrix(), ~there)
+    finite = _finite_rows(numbers)
+    return _without(build(np.where(finite[:, None], numbers, 0.0)).as_matrix(), ~finite)
 
 
 def _finite_rows(numbers: FloatArray) -> Mask:
@@ -127,14 +125,15 @@ def _without(rotations: FloatArray, missing: Mask) -> FloatArray:
 
 
 def _euler_orders() -> tuple[str, ...]:
-    """The twelve orders of three turns, about moving axes and about fixed ones."""
+    """The twelve Euler angle sequences, about moving axes and about fixed axes."""
     straight = ["".join(permutation) for permutation in permutations("XYZ")]
     repeated = [f"{a}{b}{a}" for a, b in permutations("XYZ", 2)]
     return tuple(name for order in straight + repeated for name in (order, order.lower()))
 
 
-def _all_forms() -> tuple[RotationForm, ...]:
-    return (
+ROTATION_FORMS: Mapping[str, RotationForm] = {
+    form.name: form
+    for form in (
         _quaternions("quaternion-xyzw", "a quaternion x, y, z, w", (0, 1, 2, 3)),
         _quaternions("quaternion-wxyz", "a quaternion w, x, y, z", (3, 0, 1, 2)),
         _quaternions(
@@ -150,19 +149,17 @@ def _all_forms() -> tuple[RotationForm, ...]:
         _matrices("matrix-transposed", "a rotation matrix by columns", transposed=True),
         *(_euler(order, unit) for order in _euler_orders() for unit in ("rad", "deg")),
     )
-
-
-ROTATION_FORMS: Mapping[str, RotationForm] = {form.name: form for form in _all_forms()}
+}
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What poses written as numbers are taken to mean.
+    """Interpretation of poses that are given as numbers.
 
     Attributes:
         rotation: A name among `ROTATION_FORMS`.
         unit: A name among `UNITS_M`.
-        inverse: Whether the numbers give the inverse of the pose that is asked for.
+        inverse: Whether the numbers give the inverse of the wanted pose.
     """
 
     rotation: str = "quaternion-xyzw"
@@ -171,20 +168,20 @@ class Reading:
 
     @property
     def words(self) -> str:
-        """The reading in words."""
+        """Description of the reading."""
         rotation = ROTATION_FORMS[self.rotation].words
         return f"{self.unit}, {rotation}{', inverse' if self.inverse else ''}"
 
 
 @dataclass(frozen=True, eq=False)
 class PoseNumbers:
-    """Poses as someone else wrote them, before anything is believed of them.
+    """Poses as uninterpreted numbers with their assumed reading.
 
     Attributes:
         positions: (n, 3) in the reading's unit; NaN in a row without a pose.
         rotations: (n, k) in the reading's form.
-        reading: What the file, or the user, says of them.
-        places: (n,) where each stands, for messages: `poses.csv, line 3`.
+        reading: The interpretation by the file or the user.
+        places: (n,) origin of each, for messages: `poses.csv, line 3`.
     """
 
     positions: FloatArray
@@ -197,13 +194,13 @@ class PoseNumbers:
 
     @classmethod
     def of_poses(cls, poses: FloatArray, places: Sequence[str]) -> "PoseNumbers":
-        """Takes (n, 4, 4) transforms [m], NaN in a row without one."""
+        """From (n, 4, 4) transforms [m], NaN in a row without one."""
         rotations = poses[:, :3, :3].reshape(-1, 9)
         return cls(poses[:, :3, 3], rotations, Reading("matrix"), tuple(places))
 
     @classmethod
     def written(cls, poses: FloatArray, reading: Reading, places: Sequence[str]) -> "PoseNumbers":
-        """Writes (n, 4, 4) transforms [m] so that a reading gives them again."""
+        """From (n, 4, 4) transforms [m], as numbers that a reading turns into them."""
         meant = invert(poses) if reading.inverse else poses
         rotations = ROTATION_FORMS[reading.rotation].write(meant[:, :3, :3])
         return cls(meant[:, :3, 3] / UNITS_M[reading.unit], rotations, reading, tuple(places))
@@ -216,11 +213,11 @@ class PoseNumbers:
 
     @property
     def there(self) -> Mask:
-        """(n,) which rows have a pose, readable or not."""
+        """(n,) rows that have a pose, valid or not."""
         return _finite_rows(self.positions) & _finite_rows(self.rotations)
 
     def rows(self, rows: IntArray) -> "PoseNumbers":
-        """Takes some rows, in the order that is given."""
+        """The given rows, in their order."""
         return replace(
             self,
             positions=self.positions[rows],
@@ -229,17 +226,17 @@ class PoseNumbers:
         )
 
     def read_as(self, reading: Reading) -> "PoseNumbers":
-        """Returns the same numbers under another reading."""
+        """The same numbers under another reading."""
         return replace(self, reading=reading)
 
     def poses(self) -> FloatArray:
-        """Reads the numbers.
+        """Interprets the numbers.
 
         Returns:
             (n, 4, 4) transforms [m]; NaN in a row without a pose.
 
         Raises:
-            DataError: Rows have a part of a pose, or are no rotations in this form; they are named.
+            DataError: Rows have incomplete poses or invalid rotations; they are named.
         """
         form = ROTATION_FORMS[self.reading.rotation]
         if self.rotations.shape[1] != form.size:
@@ -248,9 +245,9 @@ class PoseNumbers:
                 f"{form.words} has {form.size}.",
                 culprits=[self.places[0]],
             )
-        there = self.there
-        known = np.isfinite(np.hstack([self.positions, self.rotations]))
-        partly = self._places_of(known.any(axis=1) & ~there)
+        present = self.there
+        given = np.isfinite(np.hstack([self.positions, self.rotations]))
+        partly = self._places_of(given.any(axis=1) & ~present)
         if partly:
             raise DataError(
                 f"{some_of(partly)}: a part of the pose's numbers is missing; all or none are "
@@ -259,15 +256,15 @@ class PoseNumbers:
                 next_step="Fill in what is missing, or leave the whole pose of that row empty.",
             )
         rotations = form.read(self.rotations)
-        wrong = self._places_of(there & ~np.isfinite(rotations).all(axis=(1, 2)))
-        if wrong:
+        invalid = self._places_of(present & ~np.isfinite(rotations).all(axis=(1, 2)))
+        if invalid:
             raise DataError(
-                f"{some_of(wrong)}: the numbers are not {form.words}.",
-                culprits=wrong,
+                f"{some_of(invalid)}: the numbers are not {form.words}.",
+                culprits=invalid,
                 next_step="Name another form of rotation, or other numbers.",
             )
         poses = compose(rotations, UNITS_M[self.reading.unit] * self.positions)
-        poses[~there] = np.nan
+        poses[~present] = np.nan
         return invert(poses) if self.reading.inverse else poses
 
     def _places_of(self, rows: Mask) -> list[str]:
@@ -275,7 +272,7 @@ class PoseNumbers:
 
 
 def write_pose(pose: FloatArray, form: PoseForm) -> FloatArray:
-    """Writes one (4, 4) pose [m] as numbers in a maker's form: position, then rotation."""
+    """Writes a (4, 4) pose [m] as numbers in a manufacturer's notation: position, rotation."""
     position = pose[:3, 3] / UNITS_M[form.unit]
     rotation = ROTATION_FORMS[form.rotation].write(pose[None, :3, :3])[0]
     return np.concatenate([position, rotation])

@@ -1,9 +1,9 @@
-"""The errors of visioncal: one class for each way in which a caller can react."""
+"""Exceptions of visioncal, one class for each possible reaction of a caller."""
 
 from collections.abc import Sequence
 from typing import Self
 
-# What a file says stands in messages as it is, which may be all of a file.
+# Messages quote input, which may be a whole file; their greatest length, and that of a line.
 _MOST_LETTERS, _LEAST_LETTERS = 2000, 300
 
 
@@ -11,9 +11,9 @@ class VisioncalError(Exception):
     """Base of all errors that visioncal raises on purpose.
 
     Attributes:
-        message: What is wrong: the value seen and the value needed.
+        message: What is wrong: the value found and the value needed.
         culprits: The files, rows, views, columns or directions to look at.
-        next_step: What the user can do about it; empty where the message already says it.
+        next_step: What the user can do about it; empty where the message says it.
     """
 
     def __init__(self, message: str, *, culprits: Sequence[str] = (), next_step: str = "") -> None:
@@ -26,12 +26,12 @@ class VisioncalError(Exception):
         self.next_step = next_step
 
     def with_culprits(self, more: Sequence[str]) -> Self:
-        """Returns the same error with more places to look at."""
+        """The same error with more culprits."""
         culprits = (*self.culprits, *more)
         return type(self)(self.message, culprits=culprits, next_step=self.next_step)
 
     def within(self, label: str) -> Self:
-        """Returns the same error with the file that it is in before its message, once."""
+        """The same error with its message prefixed by a file, once."""
         message = self.message
         if not message.startswith(label):
             message = f"{label}: {message}"
@@ -42,22 +42,22 @@ class VisioncalError(Exception):
 
 
 def _shortened(line: str, most: int) -> str:
-    """A line without its middle, where it is longer than anybody reads."""
+    """The line without its middle, where it is too long."""
     half = most // 2
     return line if len(line) <= most else f"{line[:half]} ... {line[-half:]}"
 
 
 class DataError(VisioncalError):
-    """The input is wrong or missing: mend the file or the row that is named."""
+    """The input is wrong or missing: correct the file or row that is named."""
 
 
 class DegenerateError(VisioncalError):
-    """The input is sound but cannot determine the answer: add the views that are named."""
+    """The input is valid but does not determine the result: add the views that are named."""
 
 
 class ConvergenceError(VisioncalError):
-    """An iteration did not settle on data that should allow it: report it with the session."""
+    """An iteration did not converge on valid data: report it with the session."""
 
 
 class DriverError(VisioncalError):
-    """A device is absent or misbehaves: look at the cable or install the extra that is named."""
+    """A device is absent or fails: check the cable or install the extra that is named."""

@@ -23,15 +23,15 @@ def sha256(data: bytes) -> str:
 
 
 def write_atomically(path: Path | str, data: bytes | str) -> None:
-    """Writes a file so that a reader sees the old content or the new one, never a part.
+    """Writes a file atomically: readers see the old content or the new one, never a part.
 
-    The data goes to a file of another name in the same folder, is flushed to the disk, and takes
-    the place of `path` in one step. Killed before that, it leaves the other file behind, which the
-    next write in that folder removes.
+    The data goes to a temporary file in the same folder, is flushed to the disk, and replaces
+    `path` by a rename. If the process is killed, the temporary file stays until the next write in
+    that folder.
 
     Args:
         path: The file to write; its folder must exist.
-        data: Its content; text is written as UTF-8 with its line ends as they are.
+        data: Its content; text is written as UTF-8 with unchanged line ends.
 
     Raises:
         DataError: The folder is missing or cannot be written.
@@ -43,23 +43,20 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
 
 
 def write_json(path: Path | str, document: Mapping[str, Any]) -> None:
-    """Writes a document as `json_text` has it, whole or not at all; see `write_atomically`."""
+    """Writes a document as JSON atomically; see `json_text` and `write_atomically`."""
     write_atomically(path, json_text(document))
 
 
 def json_text(document: Mapping[str, Any]) -> str:
-    """The lines of a JSON file for people and programs; what is no number is refused."""
+    """A document as indented JSON; NaN and infinite numbers are refused."""
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
 
 
 @contextmanager
 def written_beside(path: Path) -> Iterator[Path]:
-    """Gives an empty file in the same folder to write to, which takes the place of `path`.
+    """Yields a temporary file in the same folder, which replaces `path` at the end.
 
-    Where something goes wrong it is removed, and `path` stays as it was.
-
-    Raises:
-        DataError: What is done within cannot be written; it names `path`.
+    After an exception it is removed, and `path` is unchanged; OSErrors become DataErrors.
     """
     with named_errors(path), aside_file(path.parent) as aside:
         yield aside
@@ -67,7 +64,7 @@ def written_beside(path: Path) -> Iterator[Path]:
 
 
 def flush_folder(folder: Path) -> None:
-    """Waits until the names in a folder are on the disk; Windows has no way to ask for it."""
+    """Flushes a folder's entries to the disk; not possible on Windows."""
     if os.name == "nt":
         return
     handle = os.open(folder, os.O_RDONLY)
@@ -79,11 +76,7 @@ def flush_folder(folder: Path) -> None:
 
 @contextmanager
 def named_errors(path: Path) -> Iterator[None]:
-    """Turns an error of the operating system into one that names the file.
-
-    Raises:
-        DataError: In its place.
-    """
+    """Converts OSErrors on writing to DataErrors that name the file."""
     try:
         yield
     except OSError as error:
@@ -97,21 +90,21 @@ def named_errors(path: Path) -> Iterator[None]:
 
 
 def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
-    """Checks that nothing is overwritten without a word of the user.
+    """Checks that nothing is overwritten without permission.
 
     Args:
-        path: What is to be written.
-        force: Whether the user allows that a file is replaced; a folder never is.
-        replaceable: Whether it could be allowed.
+        path: The file or folder to be written.
+        force: Whether the user allows to replace a file; folders are never replaced.
+        replaceable: Whether that can be allowed.
 
     Raises:
-        DataError: `path` is there.
+        DataError: `path` exists.
     """
     with named_errors(path):
-        # A link that leads nowhere is there, too.
-        there = path.exists() or path.is_symlink()
+        # Broken links count as existing.
+        exists = path.exists() or path.is_symlink()
         replaceable = replaceable and (path.is_file() or path.is_symlink())
-    if not there or (force and replaceable):
+    if not exists or (force and replaceable):
         return
     raise DataError(
         f"{path} exists, and nothing is overwritten.",
@@ -122,26 +115,26 @@ def check_free(path: Path, *, force: bool, replaceable: bool = True) -> None:
     )
 
 
-# Up to these sizes files are read [bytes]: a larger one is of another kind, or broken. Thousands of
-# views fill a few megabytes of a table or of JSON; a description is written by hand.
+# Greatest sizes of files [bytes]; larger ones are of another kind, or broken. Thousands of views
+# take a few megabytes as a table or JSON; TOML descriptions are written by hand.
 MOST_BYTES, MOST_TOML_BYTES = 50_000_000, 2_000_000
-# The largest sensors have 150 million pixels, of 16 bits each where nothing packs them.
+# The largest sensors have 150 million pixels of 16 bits, uncompressed.
 MOST_IMAGE_BYTES = 300_000_000
-# File systems take no longer name [bytes].
+# Longest name in file systems [bytes].
 _LONGEST_NAME = 255
 UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 # Matrices in lists in tables need six.
 _DEEPEST = 40
-# How tomllib says that a table, or a key, is there already.
+# tomllib's messages on repeated tables and keys.
 _TWICE = re.compile("twice|overwrite a value")
 
 
 def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
-    """Reads a regular file: a pipe might never end, and a device never does.
+    """Reads a regular file; pipes and devices may not end.
 
     Args:
         path: The file.
-        most: Up to how many bytes it may have.
+        most: Greatest size [bytes].
 
     Raises:
         DataError: It is missing, no regular file, too large, or cannot be read.
@@ -175,7 +168,7 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
 
 
 def absence(path: Path) -> str:
-    """Says why there is no regular file at a path, after its name; empty where there is one."""
+    """Why there is no regular file at a path, as a predicate; empty where there is one."""
     if any(len(part.encode("utf-8", "surrogatepass")) > _LONGEST_NAME for part in path.parts):
         return f"has a name longer than {_LONGEST_NAME} bytes, as no file has"
     try:
@@ -190,7 +183,7 @@ def absence(path: Path) -> str:
 
 
 def is_inside(path: Path, folder: Path) -> bool:
-    """Tells whether a path that need not exist lies in a folder, wherever links lead."""
+    """Whether a path, which need not exist, is in a folder after links are resolved."""
     try:
         path.exists()  # raises where a part of it is too long
         return path.resolve().is_relative_to(folder.resolve())
@@ -199,11 +192,7 @@ def is_inside(path: Path, folder: Path) -> bool:
 
 
 def read_text_inside(folder: Path, name: str, most: int = MOST_BYTES) -> str:
-    """Reads a text file of a folder that someone else may have made; see `read_text`.
-
-    Raises:
-        DataError: As `read_text`, or it is a link that leads out of the folder.
-    """
+    """Reads a text file of an untrusted folder; refuses links that lead out of it (DataError)."""
     if not is_inside(folder / name, folder):
         raise DataError(
             f"{folder / name} is a link that leads out of its folder, and is not followed.",
@@ -214,20 +203,12 @@ def read_text_inside(folder: Path, name: str, most: int = MOST_BYTES) -> str:
 
 
 def read_text(path: Path | str, most: int = MOST_BYTES) -> str:
-    """Reads a UTF-8 text file, with or without a byte-order mark; line ends stay as they are.
-
-    Raises:
-        DataError: As `read_bytes`, or it is not UTF-8.
-    """
+    """Reads UTF-8 with or without a byte-order mark, line ends unchanged; raises DataError."""
     return decode_text(read_bytes(path, most), str(path))
 
 
 def decode_text(data: bytes, label: str) -> str:
-    """Decodes UTF-8 with or without a byte-order mark; `label` names its origin in errors.
-
-    Raises:
-        DataError: The bytes are not UTF-8.
-    """
+    """Decodes UTF-8 with or without a byte-order mark; `label` names its origin in DataErrors."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -240,7 +221,7 @@ def decode_text(data: bytes, label: str) -> str:
 
 
 def save_as_utf8(encoding: str) -> str:
-    """Words how a text file in another encoding is saved as UTF-8."""
+    """Instruction to save a text file of another encoding as UTF-8."""
     return (
         "Save the file as UTF-8: in Excel as the type `CSV UTF-8`, in an editor with that encoding "
         f"under `Save as`, or with `iconv -f {encoding} -t UTF-8 FILE > COPY`."
@@ -248,11 +229,7 @@ def save_as_utf8(encoding: str) -> str:
 
 
 def read_toml(path: Path, label: str) -> dict[str, Any]:
-    """Reads a TOML file; `label` names it in errors.
-
-    Raises:
-        DataError: As `read_text` and `parse_toml`.
-    """
+    """Reads a TOML file; `label` names it in DataErrors of `read_text` and `parse_toml`."""
     return parse_toml(read_text(path, MOST_TOML_BYTES), label)
 
 
@@ -260,8 +237,8 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
     """Parses TOML; `label` names its origin in errors.
 
     Raises:
-        DataError: The text is not TOML; the message gives line and column. Or it is nested deeper
-            than any description is, or has a whole number of more than TOML's 64 bits.
+        DataError: The text is not TOML (the message gives line and column), nested too deep, or has
+            an integer of more than TOML's 64 bits.
     """
     try:
         document = tomllib.loads(text)
@@ -278,7 +255,7 @@ def parse_toml(text: str, label: str) -> dict[str, Any]:
     except RecursionError as error:
         raise _too_deep(label) from error
     except ValueError as error:
-        # Python itself refuses whole numbers of thousands of digits, and impossible dates.
+        # Integers of thousands of digits, and impossible dates.
         raise DataError(f"{label} is not valid TOML: {error}.", culprits=[label]) from error
     _check_toml(document, label)
     return document
@@ -293,10 +270,10 @@ def _check_toml(document: dict[str, Any], label: str) -> None:
             raise _too_deep(f"{label}: {path[:80]}")
         if isinstance(value, dict):
             pending += [
-                (f"{path}.{key}".lstrip("."), number, depth + 1) for key, number in value.items()
+                (f"{path}.{key}".lstrip("."), item, depth + 1) for key, item in value.items()
             ]
         elif isinstance(value, list):
-            pending += [(f"{path}[{at}]", number, depth + 1) for at, number in enumerate(value)]
+            pending += [(f"{path}[{index}]", item, depth + 1) for index, item in enumerate(value)]
         elif isinstance(value, int) and value.bit_length() > 63:
             raise DataError(
                 f"{label}: {path} has more than the 64 bits of a whole number of TOML.",
@@ -311,12 +288,12 @@ def _too_deep(where: str) -> DataError:
 
 
 def one_line(text: str) -> str:
-    """Replaces by spaces what does not print, such as line ends."""
-    return "".join(name if name.isprintable() else " " for name in text)
+    """Replaces unprintable characters, such as line ends, by spaces."""
+    return "".join(character if character.isprintable() else " " for character in text)
 
 
 def natural(path: Path) -> tuple[object, ...]:
-    """Orders names as people do: `view2` before `view10`."""
+    """Key of the natural order of file names: `view2` before `view10`."""
     parts = re.split(r"([0-9]+)", path.name)
     return tuple(
         (int(part), "") if part.isascii() and part.isdecimal() else (-1, part) for part in parts
@@ -334,10 +311,10 @@ def find_described(
     """Finds the file that describes a board or a robot.
 
     Args:
-        name_or_path: A shipped name, or a path that ends in one of `suffixes`.
-        what: What is looked for, for messages: `target`, `robot`.
-        shipped: The files that come with visioncal, by name.
-        suffixes: The endings by which a path differs from a name.
+        name_or_path: A built-in name, or a path that ends in one of `suffixes`.
+        what: The kind of description, for messages: `target`, `robot`.
+        shipped: Built-in files by name.
+        suffixes: Suffixes that distinguish paths from names.
         folder: Relative paths start here; the working directory where None.
 
     Raises:
@@ -374,8 +351,8 @@ class DocumentTable:
     of another type, or out of range.
 
     Attributes:
-        content: The table as it was read.
-        label: Where it stands, for messages.
+        content: The parsed table.
+        label: Its location, for messages.
     """
 
     content: Mapping[str, Any]
@@ -391,7 +368,7 @@ class DocumentTable:
         return value
 
     def refuse(self, key: str, value: object, needed: str, next_step: str = "") -> DataError:
-        """Builds the error for a field whose value does not serve."""
+        """Builds the error for a field with an invalid value."""
         return DataError(
             f"{self.label}: {key} is {value!r}; {needed} is needed.",
             culprits=[f"{self.label}: {key}"],
@@ -399,7 +376,7 @@ class DocumentTable:
         )
 
     def number(self, key: str, default: float | None = None, *, positive: bool = False) -> float:
-        """Reads a finite number, above zero where `positive`."""
+        """Reads a finite number, greater than zero if `positive`."""
         needed = "a number above 0" if positive else "a number"
         value = self._value(key, default, needed)
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -409,7 +386,7 @@ class DocumentTable:
         return float(value)
 
     def numbers(self, key: str, count: int) -> list[float]:
-        """Reads a list of so many finite numbers."""
+        """Reads a list of `count` finite numbers."""
         needed = f"a list of {count} numbers"
         values = self._value(key, None, needed)
         if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
@@ -425,7 +402,7 @@ class DocumentTable:
         return value
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Reads a text."""
+        """Reads a string."""
         value = self._value(key, default, "a text")
         if not isinstance(value, str):
             raise self.refuse(key, value, "a text")
@@ -439,7 +416,7 @@ class DocumentTable:
         return value
 
     def choice(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
-        """Reads one of a few words."""
+        """Reads one of several strings."""
         needed = " or ".join(f'"{choice}"' for choice in choices)
         value = self._value(key, default, needed)
         if value not in choices:

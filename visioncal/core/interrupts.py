@@ -1,4 +1,4 @@
-"""Signals that end a block as Ctrl-C does."""
+"""Handling of termination signals as KeyboardInterrupt."""
 
 import signal
 from collections.abc import Iterator
@@ -8,17 +8,12 @@ from types import FrameType
 
 @contextmanager
 def ended_like_ctrl_c(*names: str) -> Iterator[None]:
-    """Runs a block that signals end as Ctrl-C does.
+    """Runs a block in which signals raise KeyboardInterrupt, like Ctrl-C.
 
-    Args:
-        names: Of the signals; SIGTERM, and SIGHUP of a terminal that is closed, where left out.
-            Those that the system does not have are passed over.
-
-    Raises:
-        KeyboardInterrupt: When one of them comes.
+    By default SIGTERM, and SIGHUP of a closed terminal; signals that the system lacks are ignored.
     """
-    there = [name for name in names or ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    numbers = [getattr(signal, name) for name in there]
+    present = [name for name in names or ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [getattr(signal, name) for name in present]
     previous = {number: signal.signal(number, _interrupt) for number in numbers}
     try:
         yield

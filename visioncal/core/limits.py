@@ -1,4 +1,4 @@
-"""Limits of every verdict, in one table; pairs are where doubt begins and where trust ends."""
+"""Limits of all verdicts; pairs are the limits of `check` and `bad`."""
 
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -6,23 +6,24 @@ from typing import TypeAlias
 # A result is `check` beyond the first and `bad` beyond the second.
 Pair: TypeAlias = tuple[float, float]
 
-# Predicted sigma of a place that a camera gives [mm]: pick cells live with 1 mm.
+# Predicted sigma of a position by a camera [mm]: pick cells tolerate 1 mm.
 _PLACE_MM = (1.0, 3.0)
-# Predicted sigma of a place that is touched [mm]: a careful hand repeats to 0.1 mm or better.
+# Predicted sigma of a touched position [mm]: careful touches repeat to 0.1 mm or better.
 _TOUCHED_MM = (0.5, 2.0)
 # Noise of a touch per axis [mm], for the same reason.
 _TOUCH_NOISE_MM = (0.5, 3.0)
-# Predicted sigma of the rotation of what is small: a tool, or one board [deg].
+# Predicted sigma of the rotation of small objects: a tool, or one board [deg].
 _SMALL_TURN_DEG = (0.3, 1.0)
 
 
 @dataclass(frozen=True)
 class NeedLimits:
-    """Of a task's need.
+    """Limits on a task's need.
 
     Attributes:
-        probability: Picks within the need: `good` from the first on, `bad` below the second.
-        chance: Left-out views of a sound cell err by more than the need in so many sessions.
+        probability: Probability of picks within the need: `good` from the first on, `bad` below the
+            second.
+        chance: Share of sessions of sound cells with left-out errors beyond the need.
     """
 
     probability: Pair = (0.95, 0.5)
@@ -31,7 +32,7 @@ class NeedLimits:
 
 @dataclass(frozen=True)
 class CalibrationLimits:
-    """Of a calibration without a need: one camera and robot, or a whole cell.
+    """Limits on a calibration without a need: one camera and robot, or a whole cell.
 
     Attributes:
         scatter_mm: Left-out scatter of the target's position [mm].
@@ -39,15 +40,15 @@ class CalibrationLimits:
         sigma_mm: Predicted sigma of the worst direction of an edge [mm].
         sigma_deg: The same in rotation [deg]: 0.1 deg moves a point 0.5 m away by 1 mm.
         pixel_px: Noise of a corner's coordinate [px]; sharp images give 0.05 to 0.3.
-        level: How much more a camera's poses scatter than its corners say.
+        level: Scatter of a camera's poses over that expected from its corners.
         robot_mm: Error of the flange from stop to stop [mm]; arms repeat to 0.1 mm or better, and
-            what is beyond is seldom independent from stop to stop, as the covariance takes it.
+            larger errors are seldom independent between stops, as the covariance assumes.
         robot_deg: The same in rotation [deg].
-        stops: Stops of the robot in the fit; fewer leave too little to check the result with.
+        stops: Stops of the robot in the fit; fewer do not suffice to check the result.
         lost_share: Share of views that could not be used.
-        optimism: Left-out over in-sample scatter; large where each view carries the fit.
-        outlier: Residual of a view over the median of all.
-        holdout: Residuals of views held back over those of views left out in turn.
+        optimism: Left-out over in-sample scatter; large where each view has high leverage.
+        outlier: Residual of a view over the median of all views.
+        holdout: Residuals of held-out views over those of views left out in turn.
     """
 
     scatter_mm: Pair = (2.0, 10.0)
@@ -67,13 +68,13 @@ class CalibrationLimits:
 
 @dataclass(frozen=True)
 class ToolLimits:
-    """Of a tool by touches.
+    """Limits on a tool by touches.
 
     Attributes:
         sigma_mm: Predicted sigma of the tip's worst direction [mm].
         sigma_deg: The same of the rotation [deg].
         noise_mm: Noise of a touch per axis [mm].
-        touches: Touches in the fit; fewer leave too little to check it with.
+        touches: Touches in the fit; fewer do not suffice to check it.
     """
 
     sigma_mm: Pair = _TOUCHED_MM
@@ -84,13 +85,13 @@ class ToolLimits:
 
 @dataclass(frozen=True)
 class FixtureLimits:
-    """Of a fixture by touches or by markers.
+    """Limits on a fixture by touches or markers.
 
     Attributes:
-        sigma_mm: Predicted sigma of the fixture's worst offset, amid its points [mm].
+        sigma_mm: Predicted sigma of the fixture's worst offset, at the centre of its points [mm].
         sigma_deg: The same of its rotation [deg]: 0.1 deg are half a millimetre over 300.
         noise_mm: Noise of a touch per axis [mm].
-        points: Points of a drawing in the fit; with fewer none could be shown wrong.
+        points: Points of a drawing in the fit; with fewer a wrong one cannot be detected.
     """
 
     sigma_mm: Pair = _TOUCHED_MM
@@ -101,7 +102,7 @@ class FixtureLimits:
 
 @dataclass(frozen=True)
 class ImageFrameLimits:
-    """Of a tool or a fixture by a target in images.
+    """Limits on a tool or a fixture by a target in images.
 
     Attributes:
         sigma_mm: Predicted sigma of the offset's worst direction [mm].
@@ -114,16 +115,15 @@ class ImageFrameLimits:
 
 @dataclass(frozen=True)
 class CheckLimits:
-    """Of a check of a calibration by a few stops.
+    """Limits on a check of a calibration by a few stops.
 
     Attributes:
-        likelihood_ratio: A change is reported where it makes the stops so many times as likely as
-            none. Chance does that in one check of as many at most, by Markov's inequality: the
-            ratio is one on average.
-        ruled_out: A cause that makes the stops so many times less likely than the best is ruled
-            out.
-        unexplained: Noise leaves more than the right cause explains in so many checks.
-        stops: Fewer hardly separate one cause from another.
+        likelihood_ratio: Likelihood ratio of a change to none at which it is reported. Its mean is
+            one without a change, so that by Markov's inequality chance exceeds the limit in at most
+            one of as many checks.
+        ruled_out: Likelihood ratio of the best cause to another at which that is ruled out.
+        unexplained: Significance level of residuals that no cause explains.
+        stops: Number of stops; fewer hardly separate causes.
     """
 
     likelihood_ratio: float = 100.0
@@ -134,17 +134,17 @@ class CheckLimits:
 
 @dataclass(frozen=True)
 class DynamicsLimits:
-    """Of identified dynamics.
+    """Limits on identified dynamics.
 
     Attributes:
-        worse: Torques of other motions may be predicted so many times worse than those fitted.
-        bodies_worse: Consistent bodies may predict so many times worse than base parameters.
-        slight_share: An error under this share of a torque's range is no reason for doubt.
-        range_share: Error of a prediction as a share of the torque's range.
-        known_share: Known inertias that leave more of the range are another robot's.
-        lag_share: A lag of the torques that changes them by less of their range is a note.
-        undetermined_share: So many of the base parameters may be noise: those of the wrist weigh
-            little.
+        worse: Prediction error of other motions over the fit's residual.
+        bodies_worse: Prediction error of consistent parameters over that of base parameters.
+        slight_share: Share of a torque's range below which an error is no reason for doubt.
+        range_share: Prediction error over the torque's range.
+        known_share: Prediction error of known inertias over the range, beyond which the robot is
+            another one.
+        lag_share: Change of torques by their lag over the range, below which it is only a note.
+        undetermined_share: Share of undetermined base parameters; those of the wrist matter little.
     """
 
     worse: float = 1.5
@@ -156,5 +156,5 @@ class DynamicsLimits:
     undetermined_share: float = 0.5
 
 
-# Widest edges of an image that a board is read in, as a Gaussian's sigma [px].
+# Greatest blur of an image in which a board is detected, as a Gaussian's sigma [px].
 MAX_BLUR_PX = 4.0

@@ -1,16 +1,16 @@
-"""How figures, lists and names are written: in sentences, and in tables with their sigmas."""
+"""Formatting of numbers, lists and names for messages and tables."""
 
 import difflib
 import math
 from collections.abc import Iterable, Sequence
 
-# Nobody acts on less, in millimetres, degrees or pixels: in sentences, and in tables.
+# Least figures in sentences, and in tables [mm, deg or px]: smaller ones do not matter.
 _LEAST, _SMALLEST = 1e-3, 1e-4
 _MAX_DECIMALS = 6
 
 
 def figure(value: float) -> str:
-    """Writes a figure [mm, deg or px] with two significant digits, in words where it is tiny."""
+    """Formats a figure [mm, deg or px] with two significant digits, tiny ones as `under ...`."""
     if not math.isfinite(value):
         return f"{value:g}"
     if 0.0 < abs(value) < _LEAST:
@@ -22,48 +22,48 @@ def figure(value: float) -> str:
 
 
 def mm_and_deg(mm: float, deg: float) -> str:
-    """Writes how far something is off, or known: `0.12 mm and 0.02 deg`."""
+    """Formats an error or sigma of a pose: `0.12 mm and 0.02 deg`."""
     return f"{figure(mm)} mm and {figure(deg)} deg"
 
 
 def percent(probability: float) -> str:
-    """Writes a probability; none is certain."""
+    """Formats a probability as a percentage between `under 1 %` and `over 99 %`."""
     if probability > 0.99:
         return "over 99 %"
     return "under 1 %" if probability < 0.01 else f"{100.0 * probability:.0f} %"
 
 
 def decimals_for(sigma: float) -> int:
-    """Decimals at which a standard deviation shows two significant digits."""
+    """Number of decimals that show two significant digits of a standard deviation."""
     if not math.isfinite(sigma) or sigma <= 0.0:
         return _MAX_DECIMALS
-    # Rounding first keeps 0.0996, which prints as 0.10, from asking for one decimal too many.
+    # Rounded first, because 0.0996 is printed as 0.10.
     exponent = int(f"{sigma:.1e}".partition("e")[2])
     return min(max(1 - exponent, 0), _MAX_DECIMALS)
 
 
 def matched(value: float, sigma: float) -> str:
-    """Writes a value with the decimals that its standard deviation supports."""
+    """Formats a value with the decimals that match its standard deviation."""
     return fixed(value, decimals_for(sigma))
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Writes a value with so many decimals, and nothing as no negative zero."""
+    """Formats a value with a number of decimals, without negative zeros."""
     text = f"{value:.{decimals}f}"
     return text[1:] if text.startswith("-") and not text.strip("-0.") else text
 
 
 def signed(value: float, decimals: int) -> str:
-    """Writes a change with its sign; what rounds to nothing has none."""
+    """Formats a change with its sign; `0` if it rounds to zero."""
     text = f"{value:+.{decimals}f}"
     return text if text.strip("+-0.") else "0"
 
 
 def significant(value: float | None, digits: int = 2) -> str:
-    """Writes a non-negative figure with so many significant digits and no exponent.
+    """Formats a non-negative figure with significant digits and no exponent.
 
     Returns:
-        The text; an en dash where there is no figure.
+        The text; an en dash for None.
     """
     if value is None:
         return "\N{EN DASH}"
@@ -76,18 +76,18 @@ def significant(value: float | None, digits: int = 2) -> str:
 
 
 def counted(count: int, thing: str) -> str:
-    """Writes how many of something there are: `1 stop`, `3 stops`."""
+    """A count with its noun: `1 stop`, `3 stops`."""
     return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
 def listed(words: Sequence[str]) -> str:
-    """Writes words one after the other: `a, b and c`."""
+    """Joins words: `a, b and c`."""
     *first, last = words
     return f"{', '.join(first)} and {last}" if first else last
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """Writes whole numbers with runs drawn together: `1-4,7`."""
+    """Formats integers with consecutive ones as ranges: `1-4,7`."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
         if runs and number == runs[-1][-1] + 1:
@@ -98,13 +98,13 @@ def ranges(numbers: Iterable[int]) -> str:
 
 
 def some_of(names: Sequence[str], most: int = 8) -> str:
-    """Words a list, cut short: `a, b and 3 more`."""
+    """Joins words, shortened: `a, b and 3 more`."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def did_you_mean(word: str, known: Iterable[str], least: float = 0.6) -> str:
-    """Words a hint at the known names nearest to `word`; empty where none is as near as `least`."""
+    """Suggestion of known names similar to `word`; empty if none is as similar as `least`."""
     names = {name.lower(): name for name in sorted(known)}
     near = difflib.get_close_matches(word.lower(), names, n=3, cutoff=least)
     return f"Did you mean {' or '.join(names[name] for name in near)}?" if near else ""

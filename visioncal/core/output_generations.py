@@ -1,16 +1,16 @@
-"""The files of an output folder, replaced together: killed at any moment, one generation is whole.
+"""Atomic replacement of all files of an output folder, even if the process is killed.
 
-The new files are written into a folder aside. It then becomes `.visioncal-switch`, of which there
-is one at a time in an output folder:
+The new files are written into a temporary folder, which is then renamed to `.visioncal-switch`; an
+output folder has at most one of that name:
 
     new/       the new files
-    old/       the files of the earlier generation, as hard links
-    current    a symlink to old/, and from one moment on to new/
+    old/       the files of the previous generation, as hard links
+    current    a symlink to old/, then to new/
 
-Each public name is replaced by a symlink through `current`, which shows what was there before; one
-rename of `current` changes them all; and each link is replaced by the file that it shows. What is
-only in one of the generations is a link that leads nowhere while the other one is current. After a
-kill, the next writer replaces the links in the same way: by the files of whichever is current.
+Each file is replaced by a symlink through `current`, first to its old version; one rename of
+`current` switches all of them; then each link is replaced by the file it points to. Files that
+exist in one generation only are broken links while the other is current. After a kill, the next
+writer replaces the links likewise, by the files of the current generation.
 """
 
 import errno
@@ -31,23 +31,23 @@ _OLD, _NEW, _CURRENT = "old", "new", "current"
 def write_generation(
     folder: Path, names: Sequence[str], write: Callable[[Path], None]
 ) -> tuple[Path, ...]:
-    """Replaces files of a folder by new ones, all at once or not at all, whenever it is killed.
+    """Replaces files of a folder, all at once or not at all, even if the process is killed.
 
-    What an earlier writer left when it was killed is put in order first. Where the file system has
-    no links or locks (Windows, FAT, some network drives), the files are renamed one by one: a kill
-    just then leaves new ones beside old ones, and hidden folders stay.
+    First cleans up after an earlier writer that was killed. Where the file system has no links or
+    locks (Windows, FAT, some network drives), files are renamed one by one: a kill at that moment
+    leaves a mixture of new and old files, and hidden folders stay.
 
     Args:
-        folder: Where to; it is made where there is none. Other files in it are left alone.
-        names: The files of a generation, the one that counts last.
-        write: Writes them into the folder that it is given. Those that it leaves out are no longer
-            there in the end.
+        folder: The output folder, created if needed. Other files in it are not changed.
+        names: The files of a generation, the main one last.
+        write: Writes them into the folder that it is given. Files that it does not write are
+            removed.
 
     Returns:
-        The files that were written, in reverse order.
+        The written files, in reverse order.
 
     Raises:
-        DataError: The folder cannot be written, or one of the names is a folder's.
+        DataError: The folder cannot be written, or one of the names is a folder.
     """
     taken = [folder / name for name in names if (folder / name).is_dir()]
     if taken:
@@ -58,11 +58,11 @@ def write_generation(
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _put_in_order(folder, wait=False)
+        _recover(folder, wait=False)
         with aside_folder(folder) as (aside, is_locked):
             new = aside / _NEW
             new.mkdir()
-            with _named_publicly(new, folder):
+            with _final_paths_in_errors(new, folder):
                 write(new)
             written = [name for name in names if (new / name).exists()]
             if is_locked:
@@ -82,8 +82,8 @@ def write_generation(
 
 
 @contextmanager
-def _named_publicly(new: Path, folder: Path) -> Iterator[None]:
-    """Has errors name the files as they would be called in the end."""
+def _final_paths_in_errors(new: Path, folder: Path) -> Iterator[None]:
+    """Replaces temporary paths in errors by the final ones."""
     try:
         yield
     except DataError as error:
@@ -95,19 +95,19 @@ def _named_publicly(new: Path, folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _switch(folder: Path, aside: Path) -> Iterator[Path]:
-    """Makes a folder aside the one switch of an output folder; in the end it is aside again."""
+    """Renames a temporary folder to the switch of an output folder, and back at the end."""
     switch = folder / _SWITCH
     while not _renamed(aside, switch):
-        _put_in_order(folder, wait=True)
+        _recover(folder, wait=True)
     try:
         yield switch
     finally:
-        _settle(folder)
+        _resolve_links(folder)
         switch.rename(aside)
 
 
 def _renamed(aside: Path, switch: Path) -> bool:
-    """Whether the name of the switch could be had."""
+    """Renames to the switch; False if another one exists."""
     try:
         aside.rename(switch)
     except OSError as error:
@@ -141,12 +141,12 @@ def _replace_together(folder: Path, switch: Path, names: Sequence[str]) -> None:
 def _link_old(folder: Path, old: Path, names: Sequence[str]) -> None:
     old.mkdir()
     for name in names:
-        there = folder / name
-        if there.is_symlink():
-            # From another folder a relative link would lead elsewhere.
-            (old / name).symlink_to(os.path.realpath(there))
-        elif there.exists():
-            os.link(there, old / name)
+        path = folder / name
+        if path.is_symlink():
+            # A relative link would be wrong in another folder.
+            (old / name).symlink_to(os.path.realpath(path))
+        elif path.exists():
+            os.link(path, old / name)
 
 
 def _through_switch(name: str) -> str:
@@ -161,8 +161,8 @@ def _replace_one_by_one(folder: Path, new: Path, names: Sequence[str]) -> None:
             (folder / name).unlink(missing_ok=True)
 
 
-def _settle(folder: Path) -> None:
-    """Replaces each link through the switch by the file that it shows, if it shows one."""
+def _resolve_links(folder: Path) -> None:
+    """Replaces each link through the switch by the file that it points to, or removes it."""
     current = folder / _SWITCH / _CURRENT
     for path in folder.iterdir():
         if path.is_symlink() and path.readlink() == Path(_through_switch(path.name)):
@@ -173,12 +173,12 @@ def _settle(folder: Path) -> None:
     flush_folder(folder)
 
 
-def _put_in_order(folder: Path, *, wait: bool) -> None:
-    """Ends the switch of a writer that was killed; one that lives is waited for, or left alone."""
+def _recover(folder: Path, *, wait: bool) -> None:
+    """Completes the switch of a killed writer; waits for a live one, or leaves it alone."""
     switch = folder / _SWITCH
     with locked(switch / LOCK, wait=wait) as held:
         if held:
-            _settle(folder)
+            _resolve_links(folder)
             aside = free_name(folder)
             switch.rename(aside)
             shutil.rmtree(aside, ignore_errors=True)

@@ -1,6 +1,6 @@
-"""Limits that chance passes seldom: upper quantiles of the distributions of squared errors.
+"""Upper quantiles of chi-square and F, and tail probability of t.
 
-By scipy.special: scipy.stats takes longer to load than a calibration takes to run.
+By scipy.special, because scipy.stats takes longer to import than a calibration to run.
 """
 
 import numpy as np
@@ -11,22 +11,16 @@ from visioncal.core.types import FloatArray
 
 
 def chi2_limit(chance: npt.ArrayLike, freedom: npt.ArrayLike) -> FloatArray:
-    """What a sum of so many squared standard normal deviates exceeds with a given chance."""
+    """Upper quantile of chi-square: exceeded with probability `chance` at `freedom` degrees."""
     return np.asarray(chdtri(freedom, chance), dtype=float)
 
 
 def f_limit(chance: float, freedom: npt.ArrayLike, of_noise: float) -> FloatArray:
-    """What the ratio of two mean squares exceeds with a given chance (Fisher's F).
-
-    Args:
-        chance: Between 0 and 1.
-        freedom: Degrees of freedom of the mean square above the line.
-        of_noise: Those of the one below.
-    """
-    # The reciprocal's lower tail keeps its digits where the chance is small.
+    """Upper quantile of F at degrees of freedom of numerator and denominator (`of_noise`)."""
+    # The lower quantile of the reciprocal is accurate for small probabilities.
     return np.asarray(1.0 / fdtri(of_noise, freedom, chance), dtype=float)
 
 
 def t_chance(value: float, freedom: float) -> float:
-    """The chance that Student's t with some degrees of freedom is at least so far from zero."""
+    """Two-sided tail probability of Student's t."""
     return float(2.0 * stdtr(freedom, -abs(value)))

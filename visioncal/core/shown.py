@@ -1,4 +1,4 @@
-"""How results show themselves in a console and in a notebook, and how their names are looked up."""
+"""Text and HTML summaries of results, and dictionaries that suggest similar names."""
 
 from collections.abc import Iterable, Mapping
 from html import escape
@@ -12,11 +12,11 @@ _COLOURS = {"good": "#2e7d32", "check": "#b26a00", "bad": "#c62828"}
 
 
 class UnknownNameError(DataError, KeyError):
-    """A name that is not there; the message has the nearest one."""
+    """An unknown name; the message suggests a similar one."""
 
 
 class ByName(dict[str, _T]):
-    """Values by name, which suggests the nearest name for one that is not there."""
+    """Values by name; the error for an unknown name suggests a similar one."""
 
     def __missing__(self, name: str) -> _T:
         raise UnknownNameError(
@@ -27,20 +27,16 @@ class ByName(dict[str, _T]):
 
 
 def text_card(title: str, facts: Mapping[str, str]) -> str:
-    """A few lines: what it is, then its facts."""
+    """Summary of a result: its title, then its facts line by line."""
     return "\n".join([title, *(f"  {name}: {value}" for name, value in facts.items())])
 
 
 def html_card(
     title: str, facts: Mapping[str, str], status: str = "", says: Iterable[str] = ()
 ) -> str:
-    """A card for a notebook, of text that may come from anywhere.
+    """Summary of a result for a notebook: title, figures, and sentences; all text is escaped.
 
-    Args:
-        title: What it is.
-        facts: Its figures by name.
-        status: `good`, `check` or `bad`; empty without a verdict.
-        says: Sentences below.
+    The status is `good`, `check` or `bad`, or empty without a verdict.
     """
     badge = (
         f'<span style="background:{_COLOURS[status]};color:#fff;border-radius:3px;'

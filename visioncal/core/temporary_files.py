@@ -1,8 +1,8 @@
-"""Files and folders that are written aside, and the removal of those that a killed process left.
+"""Temporary files and folders, and the removal of those of killed processes.
 
-They are called `.HEX.tmp`. Whoever writes one holds a lock (flock) on it, which ends with the
-process: one that nobody holds is abandoned, and the next writer in the same folder removes it.
-Where there are no such locks (Windows, some network drives) they stay.
+They are named `.HEX.tmp`, and their writer holds a lock (flock) that ends with its process: an
+unlocked one is abandoned, and the next writer in the same folder removes it. Without such locks
+(Windows, some network drives) they stay.
 """
 
 import os
@@ -17,32 +17,25 @@ from uuid import uuid4
 if sys.platform != "win32":
     import fcntl
 
-# The file by which a folder is locked.
+# Lock file of a folder.
 LOCK = "lock"
 _NAME = re.compile(r"\.[0-9a-f]{32}\.tmp")
 
 
 def free_name(folder: Path) -> Path:
-    """A name that is free in a folder; short, for it may hold names of the longest kind allowed."""
+    """An unused name in a folder; short, to leave room for long names within."""
     return folder / f".{uuid4().hex}.tmp"
 
 
 @contextmanager
 def aside_file(folder: Path) -> Iterator[Path]:
-    """Gives an empty file to write to; in the end it is removed if it is still there.
-
-    Args:
-        folder: Where it is made; abandoned ones in there are removed.
-
-    Raises:
-        OSError: It cannot be made.
-    """
+    """Yields an empty temporary file, which is removed at the end if it still exists."""
     remove_abandoned(folder)
     while True:
         path = free_name(folder)
         path.touch(exist_ok=False)
         with locked(path, wait=True) as held:
-            # Before it was locked, another writer may have taken it for abandoned.
+            # Another writer may have removed it as abandoned before it was locked.
             if held or path.exists():
                 try:
                     yield path
@@ -54,16 +47,10 @@ def aside_file(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def aside_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
-    """Gives a folder to write to; in the end it is removed if it is still there.
-
-    Args:
-        folder: Where it is made; abandoned ones in there are removed.
+    """Yields a temporary folder, which is removed at the end if it still exists.
 
     Yields:
-        Its path, and whether it is locked: not where there are no locks.
-
-    Raises:
-        OSError: It cannot be made.
+        Its path, and whether it is locked, which needs a file system with locks.
     """
     remove_abandoned(folder)
     while True:
@@ -80,18 +67,11 @@ def aside_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
 
 @contextmanager
 def locked(path: Path, *, wait: bool) -> Iterator[bool]:
-    """Locks a file, which is made if it is missing.
-
-    Args:
-        path: The file.
-        wait: Whether to wait for who holds the lock.
+    """Locks a file, which is created if needed.
 
     Yields:
-        Whether the lock is held. It is not where somebody else has it, where the file was moved or
-        removed meanwhile, and where there are no locks.
-
-    Raises:
-        OSError: The file cannot be opened.
+        Whether the lock is held: not if another process has it (and `wait` is false), the file was
+        moved or removed meanwhile, or there are no locks.
     """
     if sys.platform == "win32":
         path.touch()
@@ -126,10 +106,10 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Removes from a folder what killed processes have left aside, as far as it can be."""
+    """Removes the temporary files of killed processes from a folder, as far as possible."""
     with suppress(OSError), os.scandir(folder) as entries:
-        found = [entry for entry in entries if _NAME.fullmatch(entry.name)]
-        for entry in found:
+        temporary = [entry for entry in entries if _NAME.fullmatch(entry.name)]
+        for entry in temporary:
             path, is_folder = Path(entry.path), entry.is_dir(follow_symlinks=False)
             with suppress(OSError), locked(path / LOCK if is_folder else path, wait=False) as held:
                 if held and is_folder:

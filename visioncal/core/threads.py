@@ -1,7 +1,7 @@
-"""Settings of the whole process that are changed for a while, by several threads at once.
+"""Process-wide settings that several threads change temporarily.
 
-A setting is made by the first thread that needs it and undone by the last, whichever that is: each
-for itself would restore what another one had set.
+The first thread that needs a setting makes it and the last one undoes it; if each restored the
+value it found, it could restore another thread's.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,19 +15,15 @@ from threadpoolctl import ThreadpoolController
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
 
-# Matplotlib's settings are the process's, too, but differ: figures are drawn one at a time.
+# Matplotlib's settings are process-wide, too, but differ between figures: one is drawn at a time.
 DRAWING = RLock()
 
 
 class SharedSetting:
-    """A setting that holds while any thread is within."""
+    """A setting that holds while any thread is within its block."""
 
     def __init__(self, setting: Callable[[], AbstractContextManager[object]]) -> None:
-        """Prepares it.
-
-        Args:
-            setting: Makes the setting on entering, and undoes it on leaving.
-        """
+        """Takes a function whose context manager makes and undoes the setting."""
         self._make = setting
         self._made = ExitStack()
         self._lock = Lock()
@@ -35,7 +31,7 @@ class SharedSetting:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Makes the setting hold within the block."""
+        """Holds the setting within the block."""
         with self._lock:
             if self._within == 0:
                 self._made.enter_context(self._make())
@@ -50,24 +46,24 @@ class SharedSetting:
 
 
 def one_blas_thread() -> AbstractContextManager[None]:
-    """Keeps small dense solves on one thread: on a busy machine threads make them far slower."""
+    """Limits BLAS to one thread: on a busy machine more make small dense solves far slower."""
     return _ONE_BLAS_THREAD.held()
 
 
 def on_one_blas_thread(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
-    """Has a function run within `one_blas_thread`."""
+    """Decorates a function to run within `one_blas_thread`."""
 
     @wraps(function)
-    def alone(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
+    def limited(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
         with one_blas_thread():
             return function(*args, **kwargs)
 
-    return alone
+    return limited
 
 
 @cache
 def _thread_pools() -> ThreadpoolController:
-    # Looking for the loaded libraries takes as long as a whole fit.
+    # Cached: the search for loaded libraries takes as long as a whole fit.
     return ThreadpoolController()
 
 

@@ -1,7 +1,7 @@
-"""Rigid transforms as arrays: batched SE(3) for inner loops.
+"""Batched rigid transforms, SE(3), as arrays.
 
-Module boundaries speak `scipy.spatial.transform.RigidTransform`; inside the solvers and the
-estimator, batches are plain (m, 4, 4) arrays. Twists are (rotation [rad], translation [m]) and
+Public interfaces use `scipy.spatial.transform.RigidTransform`; solvers and the estimator use plain
+(m, 4, 4) arrays. Twists are (rotation [rad], translation [m]) and
 perturbations act on the right, in the local frame: `T * exp(twist)`.
 """
 
@@ -10,20 +10,13 @@ from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.types import FloatArray
 
-# Poses come with five digits or more; a matrix that is off by more is no rotation.
+# Tolerance of rotation matrices, which are given with five digits or more.
 RIGID = 1e-4
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 def invert(matrices: FloatArray) -> FloatArray:
-    """Inverts rigid transforms.
-
-    Args:
-        matrices: (..., 4, 4) `a_from_b`.
-
-    Returns:
-        (..., 4, 4) `b_from_a`.
-    """
+    """Inverts rigid transforms: (..., 4, 4) `a_from_b` to `b_from_a`."""
     inverse = np.zeros_like(matrices)
     rotation_t = np.swapaxes(matrices[..., :3, :3], -1, -2)
     inverse[..., :3, :3] = rotation_t
@@ -43,18 +36,18 @@ def compose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
 
 
 def apply(matrices: FloatArray, points: FloatArray) -> FloatArray:
-    """Carries (..., n, 3) points through (..., 4, 4) transforms."""
+    """Applies (..., 4, 4) transforms to (..., n, 3) points."""
     turned = points @ np.swapaxes(matrices[..., :3, :3], -1, -2)
     return np.asarray(turned + matrices[..., None, :3, 3])
 
 
 def apply_each(matrices: FloatArray, points: FloatArray) -> FloatArray:
-    """Carries (n, 3) points through a transform each, (n, 4, 4)."""
+    """Applies (n, 4, 4) transforms to one point each, (n, 3)."""
     return np.asarray((matrices[:, :3, :3] @ points[:, :, None])[:, :, 0] + matrices[:, :3, 3])
 
 
 def skew(vectors: FloatArray) -> FloatArray:
-    """Builds the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
+    """Cross-product matrices (..., 3, 3) of (..., 3) vectors."""
     matrices = np.zeros((*vectors.shape, 3))
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     matrices[..., 0, 1], matrices[..., 0, 2] = -z, y
@@ -64,7 +57,7 @@ def skew(vectors: FloatArray) -> FloatArray:
 
 
 def cross(vectors: FloatArray, others: FloatArray) -> FloatArray:
-    """(..., 3) cross products; of few vectors, numpy's takes five times as long."""
+    """Cross products (..., 3); for few vectors five times as fast as numpy's."""
     after, before = [1, 2, 0], [2, 0, 1]
     products = vectors[..., after] * others[..., before]
     return np.asarray(products - vectors[..., before] * others[..., after])
@@ -79,56 +72,50 @@ def exp(twists: FloatArray) -> FloatArray:
 def log(matrices: FloatArray) -> FloatArray:
     """Logarithm map: (..., 4, 4) transforms to (..., 6) twists, the inverse of `exp`.
 
-    By the quaternion of each rotation (Shepperd 1978): scipy makes every matrix the nearest
-    rotation first, which takes five times as long.
+    By the quaternion of each rotation (Shepperd 1978): scipy orthogonalises every matrix first,
+    which takes five times as long.
     """
     flat = matrices.reshape(-1, 4, 4)
     vector, scalar = _quaternions(flat[:, :3, :3])
     sine = np.sqrt(np.sum(vector**2, axis=1))
     half = np.arctan2(sine, np.abs(scalar))
-    stretch = 2.0 * half / np.maximum(sine, np.finfo(float).tiny)
-    turn = np.copysign(stretch, scalar)[:, None] * vector
+    scale = 2.0 * half / np.maximum(sine, np.finfo(float).tiny)
+    rotation = np.copysign(scale, scalar)[:, None] * vector
     squared = 4.0 * half**2
-    # 1 / angle^2 - cot(angle / 2) / (2 angle), by its series where that is a difference of giants.
+    # 1 / angle^2 - cot(angle / 2) / (2 angle), by its series where it cancels.
     is_small = squared < 1e-4
     half, angle_sq = np.where(is_small, 1.0, half), np.where(is_small, 1.0, squared)
-    across = np.where(is_small, _across(squared), (1.0 - half / np.tan(half)) / angle_sq)
-    shift = flat[:, :3, 3]
-    turned = cross(turn, shift)
-    place = shift - 0.5 * turned + across[:, None] * cross(turn, turned)
-    return np.concatenate([turn, place], axis=1).reshape(*matrices.shape[:-2], 6)
+    coefficient = np.where(is_small, _log_series(squared), (1.0 - half / np.tan(half)) / angle_sq)
+    translation = flat[:, :3, 3]
+    crossed = cross(rotation, translation)
+    result = translation - 0.5 * crossed + coefficient[:, None] * cross(rotation, crossed)
+    return np.concatenate([rotation, result], axis=1).reshape(*matrices.shape[:-2], 6)
 
 
 def _quaternions(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Vectors (m, 3) and scalars (m,) of the quaternions of rotations, of any length and sign."""
+    """Vector parts (m, 3) and scalars (m,) of the rotations' quaternions, not normalised."""
     diagonal = np.diagonal(rotations, axis1=1, axis2=2)
     trace = diagonal.sum(axis=1)
     after, before = [2, 0, 1], [1, 2, 0]
     vector, scalar = rotations[:, after, before] - rotations[:, before, after], 1.0 + trace
-    # The largest component is that by which all are divided: a small one is mostly rounding.
-    far = np.flatnonzero(trace < 0.0)
-    most = diagonal[far].argmax(axis=1)
-    scalar[far] = vector[far, most]
-    vector[far] = rotations[far, most] + rotations[far, :, most]
-    vector[far, most] = 1.0 + 2.0 * diagonal[far, most] - trace[far]
+    # Relative to the largest component, since a small one is mostly rounding.
+    large = np.flatnonzero(trace < 0.0)
+    axis = diagonal[large].argmax(axis=1)
+    scalar[large] = vector[large, axis]
+    vector[large] = rotations[large, axis] + rotations[large, :, axis]
+    vector[large, axis] = 1.0 + 2.0 * diagonal[large, axis] - trace[large]
     return vector, scalar
 
 
-def _across(squared: FloatArray) -> FloatArray:
-    """1 / x^2 - cot(x / 2) / (2 x) of x^2, to 1e-9 up to 0.5, with Bernoulli's numbers."""
+def _log_series(squared: FloatArray) -> FloatArray:
+    """1 / x^2 - cot(x / 2) / (2 x) as a series in x^2, to 1e-9 up to x = 0.5."""
     return 1 / 12 + squared * (1 / 720 + squared * (1 / 30240 + squared / 1209600))
 
 
 def adjoint(matrices: FloatArray) -> FloatArray:
-    """Adjoints, which carry twists between frames.
+    """Adjoints (..., 6, 6), which transform (rotation, translation) twists from frame b to frame a.
 
     `a_from_b * exp(twist_b) = exp(adjoint(a_from_b) @ twist_b) * a_from_b`.
-
-    Args:
-        matrices: (..., 4, 4) `a_from_b`.
-
-    Returns:
-        (..., 6, 6) maps of (rotation, translation) twists from frame b to frame a.
     """
     rotation = matrices[..., :3, :3]
     adjoints = np.zeros((*matrices.shape[:-2], 6, 6))
@@ -139,43 +126,40 @@ def adjoint(matrices: FloatArray) -> FloatArray:
 
 
 def inverse_right_jacobian(twists: FloatArray) -> FloatArray:
-    """Derivative of `log(exp(twist) * exp(step))` by the step, at zero.
+    """Derivative (..., 6, 6) of `log(exp(twist) * exp(step))` over the step, at zero.
 
-    The series in the adjoint of the twist with Bernoulli's numbers (Iserles, Munthe-Kaas, Norsett
-    and Zanna 2000, Lie-group methods, section 2), which converges for rotations under 2 pi and is
-    cut where it is exact to 1e-9 up to 0.5 rad. Beyond, it still points downhill, which is all that
-    a fit needs far from its minimum. A twist is a dual rotation: below the rotation's function is
-    how that changes with the translation.
-
-    Args:
-        twists: (..., 6) twists (rotation [rad], translation [m]).
-
-    Returns:
-        (..., 6, 6) derivatives.
+    The series in the adjoint of the twist with Bernoulli numbers (Iserles, Munthe-Kaas, Norsett and
+    Zanna 2000, Lie-group methods, section 2) converges for rotations under 2 pi, and is truncated
+    to an error of 1e-9 up to 0.5 rad. Beyond, it still gives descent directions, which suffice far
+    from a minimum. The lower left block is the derivative of the upper left one along the
+    translation, as for dual rotations.
     """
-    # Components come first: sums over rows of three numbers would take most of the time.
-    turn, shift = np.ascontiguousarray(np.moveaxis(twists, -1, 0)).reshape(2, 3, -1)
-    squared, along = np.sum(turn**2, axis=0), np.sum(turn * shift, axis=0)
-    across = _across(squared)
-    slope = 1 / 720 + squared * (2 / 30240 + squared * 3 / 1209600)
-    # Squares of the matrices of the cross product are products of the vectors, but for a diagonal.
-    mixed = (across * shift + along * slope * turn)[:, None] * turn
-    found, axes = np.zeros((6, 6, len(squared))), np.arange(3)
-    found[:3, :3], found[3:, :3] = (across * turn)[:, None] * turn, mixed + np.swapaxes(mixed, 0, 1)
-    found[axes, axes] += 1.0 - across * squared
-    found[3 + axes, axes] -= 2.0 * along * (across + slope * squared)
-    for row, vector in ((0, 0.5 * turn), (3, 0.5 * shift)):
+    # Components first: sums over rows of three numbers would take most of the time.
+    rotation, translation = np.ascontiguousarray(np.moveaxis(twists, -1, 0)).reshape(2, 3, -1)
+    squared, dot = np.sum(rotation**2, axis=0), np.sum(rotation * translation, axis=0)
+    coefficient = _log_series(squared)
+    derivative = 1 / 720 + squared * (2 / 30240 + squared * 3 / 1209600)
+    # Squares of cross-product matrices are outer products of the vectors, but for a diagonal.
+    mixed = (coefficient * translation + dot * derivative * rotation)[:, None] * rotation
+    jacobian, axes = np.zeros((6, 6, len(squared))), np.arange(3)
+    jacobian[:3, :3], jacobian[3:, :3] = (
+        (coefficient * rotation)[:, None] * rotation,
+        mixed + np.swapaxes(mixed, 0, 1),
+    )
+    jacobian[axes, axes] += 1.0 - coefficient * squared
+    jacobian[3 + axes, axes] -= 2.0 * dot * (coefficient + derivative * squared)
+    for row, vector in ((0, 0.5 * rotation), (3, 0.5 * translation)):
         after, before = [2, 0, 1], [1, 2, 0]
-        found[[row + index for index in after], before] += vector
-        found[[row + index for index in before], after] -= vector
-    found[3:, 3:] = found[:3, :3]
-    return np.ascontiguousarray(found.transpose(2, 0, 1)).reshape(*twists.shape, 6)
+        jacobian[[row + index for index in after], before] += vector
+        jacobian[[row + index for index in before], after] -= vector
+    jacobian[3:, 3:] = jacobian[:3, :3]
+    return np.ascontiguousarray(jacobian.transpose(2, 0, 1)).reshape(*twists.shape, 6)
 
 
 def nearest_rotation(matrices: FloatArray) -> FloatArray:
     """Projects (..., 3, 3) matrices onto the nearest rotations in the Frobenius norm.
 
-    Method: Umeyama (1991), the orthogonal Procrustes solution with its determinant kept at +1.
+    Umeyama (1991): the orthogonal Procrustes solution with determinant +1.
     """
     u, _, vt = np.linalg.svd(matrices)
     sign = np.ones(matrices.shape[:-1])
@@ -209,7 +193,7 @@ def rotation_angle(matrices: FloatArray) -> FloatArray:
 
 
 def distances(poses: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances (m,) [m] and (m,) [rad] of (m, 4, 4) poses from another, or from one each."""
+    """Distances (m,) [m] and angles (m,) [rad] of (m, 4, 4) poses from one pose, or one each."""
     return (
         np.linalg.norm(poses[:, :3, 3] - others[..., :3, 3], axis=1),
         rotation_angle(invert(others) @ poses),
@@ -223,14 +207,14 @@ def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
 
 
 def rigid_fault(matrix: FloatArray, most: float = RIGID) -> tuple[str, str]:
-    """Says why a matrix is no rigid transform, the likeliest mistake first.
+    """Message on why a matrix is no rigid transform; the likeliest mistake is tested first.
 
     Args:
         matrix: (4, 4).
-        most: By how much an entry of the rotation's product with its transpose may be off.
+        most: Tolerance of the entries of the rotation's product with its transpose.
 
     Returns:
-        What it is, and what to do about it; both empty where it is a rigid transform.
+        The fault, and how to correct it; both empty for a rigid transform.
     """
     rotation, last = matrix[:3, :3], matrix[3]
     if not np.isfinite(matrix).all():
@@ -253,9 +237,9 @@ def rigid_fault(matrix: FloatArray, most: float = RIGID) -> tuple[str, str]:
         )
     if scale > 0.0 and np.abs(product / scale**2 - np.eye(3)).max() < most:
         return f"its rotation is scaled by {scale:.4g}", f"Divide the rotation by {scale:.4g}."
-    off = np.abs(product - np.eye(3)).max()
+    error = np.abs(product - np.eye(3)).max()
     return (
         f"the columns of its rotation are no unit vectors at right angles: they are off by "
-        f"{off:.2g}, and {most:g} is allowed",
+        f"{error:.2g}, and {most:g} is allowed",
         "Give a rotation in its upper left 3 x 3.",
     )

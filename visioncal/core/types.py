@@ -1,4 +1,4 @@
-"""Plain frozen data that travels between the layers; it carries no behaviour of its own."""
+"""Data types shared by all packages."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-# Options name them, and help does not wait for numpy.
+# Defined where options can use them without importing numpy.
 from visioncal.core.choices import MOUNTS as MOUNTS
 from visioncal.core.choices import CameraMount as CameraMount
 from visioncal.core.choices import Mount as Mount
@@ -30,12 +30,12 @@ Progress: TypeAlias = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Need:
-    """How near picks have to come; a pick is to meet both, where both are given.
+    """Required accuracy of picks; both limits apply, where both are given.
 
     Attributes:
-        mm: Distance from where it is meant [mm]; None where any will do.
-        deg: Angle from how it is meant [deg]; likewise.
-        at: Where that counts: where the views looked, or a place (x, y, z) in the base [m].
+        mm: Greatest position error [mm]; None for no limit.
+        deg: Greatest rotation error [deg]; None for no limit.
+        at: Where it applies: at the views' targets, or at a point (x, y, z) in the base frame [m].
     """
 
     mm: float | None = None
@@ -47,17 +47,17 @@ class Need:
 class Target:
     """A printed target or a rig of known points, as its `.toml` declares it.
 
-    Its frame is defined in core/README.md; that of a rig is the one that its table is in.
+    Its frame is defined in core/README.md; that of a rig is the one of its table.
 
     Attributes:
-        name: The name under which a session asks for it.
-        kind: What is printed; `points` for a rig, of which detectors of others find the points.
+        name: The name by which sessions refer to it.
+        kind: Kind of pattern; `points` for a rig, whose points are detected by other programs.
         columns: Squares (ChArUco), inner corners (checkerboard), tags (AprilGrid) or circles along
             x; 1 for a marker, and the points for a rig.
         rows: The same along y; 1 for a marker and for a rig.
         square_m: Side of a square; of the marker itself for a single marker and for an AprilGrid,
             the distance of rows of circles, and the greatest extent of a rig [m].
-        square_sigma_m: How well that side is known, as a standard deviation [m]; 0 for a rig.
+        square_sigma_m: Standard deviation of that side [m]; 0 for a rig.
         marker_m: Side of the markers inside a ChArUco board [m]; 0 elsewhere.
         dictionary: ArUco dictionary by OpenCV's name, as `DICT_5X5_100`; empty without markers.
         legacy: Whether a ChArUco board has the layout that OpenCV printed before 4.6.
@@ -67,12 +67,11 @@ class Target:
         diameter_m: Diameter of the circles of a grid [m]; 0 elsewhere.
         asymmetric: Whether every second row of them is shifted by half of their distance in a row,
             which is twice that of the rows.
-        points_m: Places of a rig's points [m]; empty elsewhere.
-        point_numbers: The numbers that its table gives them.
-        point_sigmas_m: How well each place is known per axis, as a standard deviation [m]; empty
-            where they are exact.
-        point_tags: The id of the tag of which each point is a corner, and which one, from 0 to 3
-            clockwise from the upper left; empty where the points are none of tags.
+        points_m: Positions of a rig's points [m]; empty elsewhere.
+        point_numbers: Their numbers in the rig's table.
+        point_sigmas_m: Standard deviation of each position per axis [m]; empty if exact.
+        point_tags: For points that are corners of tags, the tag's id and the corner, from 0 to 3
+            clockwise from the upper left; else empty.
     """
 
     name: str
@@ -114,19 +113,17 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """What was found of the target in one image.
+    """Detected corners of the target in one image.
 
     Attributes:
         view: The view's number.
-        ids: (n,) corner numbers, ascending, in the target's numbering; where a session has several
-            targets, the calibration numbers their corners through.
+        ids: (n,) corner numbers, ascending, in the target's numbering; in sessions with several
+            targets the calibration numbers their corners consecutively.
         px: (n, 2) corner positions [px], pixel centres at integers.
-        blur_px: Width of the edges that were seen, as a Gaussian's sigma [px]; 0 where others
-            found the corners.
-        weights: (n,) by how much more than `stated_px` each corner is known, as the ratio of
-            standard deviations; None for corners that are known alike.
-        stated_px: Standard deviation of a typical corner's coordinate, as it is stated; None where
-            it is to be estimated [px].
+        blur_px: Blur of the edges, as a Gaussian's sigma [px]; 0 for externally detected corners.
+        weights: (n,) typical over each corner's standard deviation; None for equal ones.
+        stated_px: Stated standard deviation of a typical corner's coordinate [px]; None if it is to
+            be estimated.
     """
 
     view: int
@@ -137,14 +134,14 @@ class Corners:
     stated_px: float | None = None
 
     def take(self, rows: IntArray | Mask) -> "Corners":
-        """Returns those of (m,) rows or of an (n,) mask."""
+        """The corners of (m,) rows or of an (n,) mask."""
         weights = None if self.weights is None else self.weights[rows]
         return replace(self, ids=self.ids[rows], px=self.px[rows], weights=weights)
 
 
 @dataclass(frozen=True)
 class Rejection:
-    """A view that is not used, and why, in words for the user."""
+    """A view that is not used, and the reason, worded for the user."""
 
     view: int
     reason: str

@@ -1,4 +1,4 @@
-"""Verdicts: what was found, how likely it is the cause, what it costs, and what to do about it."""
+"""Verdicts: findings with their probabilities as causes, their effects, and remedies."""
 
 import re
 import shlex
@@ -15,54 +15,54 @@ from visioncal.core.shown import html_card
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 
-# So many findings are shown first, and so many steps; causes as likely as this are among them, and
-# steps against causes as likely as the other.
+# Number of findings, and of steps, that are shown first; least probability of causes among them,
+# and of causes with steps.
 _SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
-# Kinds of findings that are no doubts.
+# Kinds of findings that are not doubts.
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
-# Images that are not there, or of another size than the camera's, and a few rows without either: no
-# doubt about the rest, and said first.
+# Missing images, images of another size than the camera's, and empty rows: no doubts about the
+# rest, and reported first.
 MISSING, EMPTY_ROWS, OTHER_SIZE = "missing_images", "empty_rows", "image_size"
 NOT_USABLE = (MISSING, EMPTY_ROWS, OTHER_SIZE)
-# A part of the image in which no corner was seen: a hint where the task says what it needs.
+# A part of the image without corners: only a hint where the task states its need.
 EMPTY_IMAGE = "empty_image"
-# Rows of poses that are exchanged come first among causes that are as good as certain.
+# Kinds with a special rank among causes of at least the last probability.
 EXCHANGED, ARM_ERRORS, UNEXPLAINED, _SURE = "exchanged_views", "arm_errors", "unexplained", 0.99
-# What says how large errors are, the most important first.
+# Kinds of findings that state the size of errors, the most important first.
 _SIZES = (NEED, GOOD_FOR, UNEXPLAINED, "optimism", "weak_motion", "place", "workspace")
 
 
-# No need is as small [mm]: what is left out of a result takes nothing from it.
+# Smaller than any need [mm]: for findings on what is left out of a result, which do not impair it.
 LEAST_NEED_MM = 1e-3
 _HEADLINES = {
     "good": "Good: ready to use",
     "check": "Check before use",
     "bad": "Bad: do not use",
 }
-# Kinds of findings about the sources of errors: how likely they are is their share, in their words.
+# Kinds of findings on sources of errors, whose probability is their share.
 SOURCES = ("calibration", "unmeasured_board", "robot_noise", "robot_noise_of_pick")
-# Commands of steps.
+# Commands of remedies.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
 GUESS_AND_CALIBRATE = f"{GUESS} && {CALIBRATE.replace('SESSION', 'FIXED')}"
 REVIEW = "visioncal review OUT"
 CALIBRATE_ANEW = "visioncal calibrate SESSION -o NEW"
-# Fewer views are too few for a calibration of their own.
+# Least number of views for a separate calibration.
 _FEWEST_ALONE = 6
-# The command line as it was typed, to which options are added.
+# Placeholder of the typed command line, to which options are added.
 AGAIN = "AGAIN"
 _PATH = re.compile(r"\b(SESSION|FIXED|OUT|NEW|AGAIN)\b")
 
 
 @dataclass(frozen=True)
 class Remedy:
-    """What to do about a finding.
+    """Advice on a finding.
 
     Attributes:
         words: A sentence in the imperative.
-        command: A command line that does it or leads on; empty where there is none. SESSION, FIXED
-            (a corrected copy of the session), OUT, NEW (beside OUT) and AGAIN (the command as it
-            was typed) stand for what `with_paths` fills in.
+        command: A command line for it; empty where there is none. `with_paths` fills in the
+            placeholders SESSION, FIXED (a corrected copy of the session), OUT, NEW (beside OUT) and
+            AGAIN (the typed command).
     """
 
     words: str
@@ -85,7 +85,7 @@ def exchanging(first: int, second: int) -> str:
 
 
 def or_alone(words: str, views: Sequence[int]) -> Remedy:
-    """What to do, with the command that calibrates some views alone where they are enough."""
+    """Advice with the command to calibrate some views alone, if they are enough."""
     are_enough = len(views) >= _FEWEST_ALONE
     return Remedy(words, f"{CALIBRATE_ANEW} --views {ranges(views)}" if are_enough else "")
 
@@ -97,22 +97,22 @@ READ_AGAIN = Remedy(
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found, worded once.
+    """A finding on a result.
 
     Attributes:
-        kind: What it is, as a short name that stays.
-        words: The same in sentences, with its figures.
-        do: What to do about it; None where that is nothing.
-        views: The views that it is about.
-        probability: How likely it is the cause of what is wrong; 0 for what is no cause.
-        without_it: What the result would be without it, in a sentence.
+        kind: Its kind, as a short permanent name.
+        words: Its text, with figures.
+        do: Advice; None for none.
+        views: The views concerned.
+        probability: Probability that it is the cause of what is wrong; 0 for no cause.
+        without_it: The result without it, as a sentence.
         is_fatal: Whether it alone makes a result bad.
-        until_mm: The need of a task from which on it is no doubt [mm]: zero where it says how large
-            errors are, which any need says better than a limit; infinite where something is
+        until_mm: The need of a task from which on it is no doubt [mm]: zero for findings on the
+            size of errors, which a need judges better than a limit; infinite where errors are
             unexplained.
-        mahalanobis_sq: The evidence for it, as the square of a standard normal variable; zero where
-            the limit of the test that found it has to do.
-        up_to_mm: A pick errs by no more because of it [mm]; infinite where that is not known.
+        mahalanobis_sq: Squared test statistic, as of a standard normal variable; zero where the
+            limit of its test decides.
+        up_to_mm: Greatest error of a pick that it causes [mm]; infinite where unknown.
     """
 
     kind: str
@@ -127,19 +127,19 @@ class Finding:
     up_to_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
 
     def of(self, name: str) -> Self:
-        """The same finding with whom it is of, where there are several; empty names nobody."""
+        """The same finding prefixed by the name of its camera or robot, if not empty."""
         if not name:
             return self
         return replace(self, words=f"{name}: {self.words[0].lower()}{self.words[1:]}")
 
     @property
     def reason(self) -> str:
-        """What it is, and what to do about it."""
+        """Its text and advice."""
         return self.words if self.do is None else f"{self.words} {self.do}"
 
 
 def remarks(sentences: Iterable[str], kind: str = "remark") -> tuple[Finding, ...]:
-    """Findings that no test is behind."""
+    """Findings without tests."""
     return tuple(Finding(kind, sentence) for sentence in sentences)
 
 
@@ -148,10 +148,9 @@ class Verdict:
     """Whether a result can be trusted.
 
     Attributes:
-        status: In one word.
-        findings: Why: doubts, those that settle it first, what is needed and met, then notes.
-        good_for_mm: The least need that it would be good for [mm]; None where something is
-            unexplained, and it is good for none.
+        status: The judgement.
+        findings: The reasons: doubts, fatal ones first, findings on needs, then notes.
+        good_for_mm: The least need for which it is good [mm]; None where errors are unexplained.
     """
 
     status: VerdictStatus
@@ -160,12 +159,12 @@ class Verdict:
 
     @classmethod
     def of(cls, status: VerdictStatus, *sentences: str) -> Self:
-        """A verdict with sentences that no test is behind."""
+        """A verdict with sentences without tests."""
         return cls(status, remarks(sentences))
 
     @classmethod
     def by(cls, doubts: Sequence[Finding], praise: Finding) -> Self:
-        """`bad` with a doubt that settles it, `check` with others, else `good` with its praise."""
+        """`bad` with a fatal doubt, `check` with other doubts, else `good` with the praise."""
         if not doubts:
             return cls("good", (praise,))
         status: VerdictStatus = "bad" if any(doubt.is_fatal for doubt in doubts) else "check"
@@ -189,28 +188,28 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """All findings in sentences, with what to do; what is most likely wrong stands first."""
-        wrong = (cause for cause in self.causes[:1] if cause.kind not in SOURCES)
-        distinct = {id(finding): finding for finding in (*wrong, *self.findings)}
+        """All findings with advice, the most likely cause first."""
+        likeliest = (cause for cause in self.causes[:1] if cause.kind not in SOURCES)
+        distinct = {id(finding): finding for finding in (*likeliest, *self.findings)}
         return tuple(finding.reason for finding in distinct.values())
 
     @property
     def causes(self) -> tuple[Finding, ...]:
-        """What may be why it is not good, likeliest first."""
-        found = (finding for finding in self.findings if finding.probability)
+        """Possible causes of doubts, likeliest first."""
+        possible = (finding for finding in self.findings if finding.probability)
 
         def order(finding: Finding) -> tuple[float, int, float]:
-            # Among what is as good as certain, rows that are exchanged mislead all the rest, and
-            # errors of an arm, which are always there, come after what happened; so does what no
-            # cause is known of.
-            place = {EXCHANGED: -1, ARM_ERRORS: 1, UNEXPLAINED: 1}.get(finding.kind, 0)
-            return -min(finding.probability, _SURE), place, -finding.probability
+            # Among causes that are as good as certain, exchanged rows come first, since they
+            # mislead all other tests; errors of the arm, which always exist, and unexplained errors
+            # come last.
+            rank = {EXCHANGED: -1, ARM_ERRORS: 1, UNEXPLAINED: 1}.get(finding.kind, 0)
+            return -min(finding.probability, _SURE), rank, -finding.probability
 
-        return tuple(sorted(found, key=order))
+        return tuple(sorted(possible, key=order))
 
     @property
     def ranked(self) -> tuple[Finding, ...]:
-        """All findings as people read them: the likeliest cause, what it costs, then the rest."""
+        """All findings in reading order: the likeliest cause, its effect, then the rest."""
         causes = [cause for cause in self.causes if cause.probability >= _LEAST_LIKELY]
         costs = [finding for kind in _SIZES for finding in self.findings if finding.kind == kind]
         missing = [finding for finding in self.findings if finding.kind in NOT_USABLE]
@@ -219,12 +218,12 @@ class Verdict:
 
     @property
     def top(self) -> tuple[str, ...]:
-        """What is read first, in sentences."""
+        """The first findings as sentences."""
         return tuple(map(self._line, self.ranked[:_SHOWN]))
 
     @property
     def rest(self) -> tuple[str, ...]:
-        """All else, in sentences."""
+        """The remaining findings as sentences."""
         return tuple(map(self._line, self.ranked[_SHOWN:]))
 
     def _line(self, finding: Finding) -> str:
@@ -236,7 +235,7 @@ class Verdict:
 
     @property
     def next_steps(self) -> tuple[Remedy, ...]:
-        """What to do about the findings, in their order; each once."""
+        """Advice on the findings, in their order, without repetitions."""
         unlikely = [cause for cause in self.causes[1:] if cause.probability < _LIKELY]
         steps: dict[str, Remedy] = {}
         for finding in self.ranked:
@@ -247,13 +246,7 @@ class Verdict:
     def with_paths(
         self, session: Path | str, out: Path | str = "", again: Sequence[str] = ()
     ) -> Self:
-        """Fills the paths of a run into the commands of its steps.
-
-        Args:
-            session: The session's folder or recording.
-            out: The folder of its result; empty leaves it open.
-            again: The command line as it was typed, in words.
-        """
+        """Fills session, output and typed command line into the commands of remedies."""
 
         def filled(finding: Finding) -> Finding:
             if finding.do is None:
@@ -269,22 +262,22 @@ def with_paths(
 ) -> str:
     """Fills the paths of a run into a command; see `Verdict.with_paths`."""
     folder, result = Path(session), Path(out or "out")
-    fixed = _free(f"{folder.with_suffix('') if folder.is_file() else folder}-fixed")
+    fixed = _free_name(f"{folder.with_suffix('') if folder.is_file() else folder}-fixed")
     is_file = result.suffix in (".json", ".rrd")
     new = f"{result.parent if is_file else result}-new"
     paths = {"SESSION": str(session), "FIXED": fixed, "OUT": str(out) or "out", "NEW": new}
     words = {name: shlex.quote(path) for name, path in paths.items()}
-    # Of a sentence, an apostrophe is no quotation.
+    # Only then: shlex would take an apostrophe in a sentence for a quotation mark.
     if AGAIN in command:
-        words[AGAIN] = shlex.join([*_without(again, shlex.split(command))])
+        words[AGAIN] = shlex.join([*_without_options(again, shlex.split(command))])
     return _PATH.sub(lambda found: words[found[0]], command)
 
 
-def _without(typed: Sequence[str], added: Sequence[str]) -> Iterator[str]:
-    """A command line's words without the options, and their values, that are to be added to it."""
+def _without_options(typed: Sequence[str], options: Sequence[str]) -> Iterator[str]:
+    """Words of a command line without the options, and their values, that will be added."""
     has_value = {
         name: not value.startswith("--")
-        for name, value in zip(added, [*added, "--"][1:], strict=True)
+        for name, value in zip(options, [*options, "--"][1:], strict=True)
         if name.startswith("--")
     }
     words = iter(typed)
@@ -296,7 +289,7 @@ def _without(typed: Sequence[str], added: Sequence[str]) -> Iterator[str]:
             next(words, None)
 
 
-def _free(name: str) -> str:
-    """A name that no folder has yet: nothing is written over."""
+def _free_name(name: str) -> str:
+    """A name that does not exist yet."""
     names = (name, *(f"{name}-{index}" for index in range(2, 100)))
     return next((word for word in names if not Path(word).exists()), name)

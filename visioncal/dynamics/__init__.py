@@ -1,4 +1,4 @@
-"""Dynamics: the torques that an arm needs, and the parameters identified from measured ones."""
+"""Arm dynamics: inverse dynamics, and identification of inertias and friction from torques."""
 
 from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.base import BaseModel

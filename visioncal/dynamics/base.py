@@ -1,11 +1,9 @@
-"""Base parameters, all that a motion can identify: independent combinations of a model's.
+"""Base parameters: the independent combinations of standard parameters that torques identify.
 
-What a motion does not determine of them is named, with its cause.
-
-Many of a model's parameters move the torques alike, or not at all. A rank-revealing decomposition
-of its regressor in many random states finds a set of columns that are independent, and how the
-others follow from these (Gautier 1991, Numerical calculation of the base inertial parameters of
-robots); Businger and Golub's pivots (1965) and columns of equal length make the choice sound.
+Many standard parameters affect the torques alike, or not at all. A rank-revealing QR decomposition
+of the regressor in many random states finds a set of independent columns, and how the others depend
+on these (Gautier 1991, Numerical calculation of the base inertial parameters of robots); Businger
+and Golub's pivoting (1965) and columns of unit length make the choice well conditioned.
 """
 
 from collections.abc import Sequence
@@ -24,23 +22,24 @@ from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.regression import NoiseBlock
 
-# States that stand for all, and their greatest speeds [rad/s] and accelerations [rad/s^2]; at these
-# gravity, speed and acceleration have like shares in the torques.
+# Number of random states, and their greatest speeds [rad/s] and accelerations [rad/s^2], at which
+# gravity, speed and acceleration contribute about equally to the torques.
 _STATES, _FASTEST, _HARDEST = 200, 3.0, 10.0
-# A column is another's multiple where less than this share of it is left, and has no effect where
-# its length is less than this share of the longest. True shares are above 1e-3, rounding 1e-13.
+# A column is dependent where less than this share of it is left, and has no effect where its norm
+# is less than this share of the largest. True shares are above 1e-3, rounding 1e-13.
 _RANK = 1e-8
-# Equal columns, as those of a rotor and of its link about the first joint, are taken in their order
-# whatever rounding says: each counts for so much less than the first.
+# Tie-break of the pivoting: equal columns, as those of a rotor and of its link about the first
+# joint, are chosen in their order whatever rounding says, since pivoting weights decrease by this
+# much.
 _TIE = 1e-4
-# Coefficients smaller than this share of a row's columns are rounding.
+# Coefficients below this, between columns of unit length, are rounding.
 _ROUNDING = 1e-9
-# A motion without effect on a parameter must not divide by zero.
+# Avoids division by zero for parameters without effect.
 _TINY = 1e-12
-# A joint that never gets faster than this stands still, and its speed is noise [rad/s].
+# A joint that never exceeds this speed stands still, and its speed is noise [rad/s].
 _STILL_RAD_S = 0.01
-# Not determined are directions with less than this share of a full motion's information.
-# Fast multi-sines get 1e-4 of it along the worst direction, motion about one axis 1e-16.
+# Directions with less than this share of a full motion's information are undetermined.
+# Fast multi-sines have 1e-4 of it in the worst direction, motion about one axis 1e-16.
 _UNDETERMINED = 1e-9
 # Parameters with this share of an undetermined direction are named with it.
 _SHARE = 0.3
@@ -52,11 +51,11 @@ _NEXT = (
 
 @dataclass(frozen=True, eq=False)
 class BaseModel:
-    """A model in its b base parameters.
+    """A dynamic model in its b base parameters.
 
     Attributes:
-        model: In its p standard parameters.
-        independent: (b,) ascending places of the standard parameters whose columns are kept.
+        model: The model in its p standard parameters.
+        independent: (b,) ascending indices of the standard parameters whose columns are kept.
         dependence: (b, p) `base = dependence @ standard`; the identity in the kept columns.
     """
 
@@ -66,49 +65,42 @@ class BaseModel:
 
     @classmethod
     def reduce(cls, model: DynamicModel, rng: np.random.Generator | None = None) -> Self:
-        """Finds the base parameters of a model.
-
-        Args:
-            model: The model.
-            rng: Chooses the states; always the same ones where None.
-        """
-        matrix = _columns(model, rng or np.random.default_rng(0))
+        """Finds the base parameters of a model, in random states (seed 0 by default)."""
+        matrix = _random_regressor(model, rng or np.random.default_rng(0))
         lengths = np.linalg.norm(matrix, axis=0)
-        acts = np.flatnonzero(lengths > _RANK * lengths.max())
-        favour = 1.0 - _TIE * np.arange(len(acts)) / len(acts)
-        upper, order = qr(matrix[:, acts] * (favour / lengths[acts]), mode="r", pivoting=True)
-        left = np.abs(np.diag(upper))
-        rank = int(np.sum(left > _RANK * left[0]))
-        return cls.keeping(model, np.sort(acts[order[:rank]]))
+        effective = np.flatnonzero(lengths > _RANK * lengths.max())
+        weights = 1.0 - _TIE * np.arange(len(effective)) / len(effective)
+        upper, order = qr(
+            matrix[:, effective] * (weights / lengths[effective]), mode="r", pivoting=True
+        )
+        remaining = np.abs(np.diag(upper))
+        rank = int(np.sum(remaining > _RANK * remaining[0]))
+        return cls.keeping(model, np.sort(effective[order[:rank]]))
 
     @classmethod
     def keeping(cls, model: DynamicModel, independent: IntArray) -> Self:
-        """Takes a model with columns that are known to be independent, and all that there are.
-
-        Args:
-            model: The model.
-            independent: (b,) ascending places of the parameters that are kept.
+        """Builds the base model that keeps (b,) given independent parameters, in ascending order.
 
         Raises:
-            DataError: They are not independent, or others are independent of them.
+            DataError: Their columns are dependent, or do not span the others.
         """
-        matrix = _columns(model, np.random.default_rng(0))
+        matrix = _random_regressor(model, np.random.default_rng(0))
         lengths = np.linalg.norm(matrix, axis=0)
         lengths[lengths <= _RANK * lengths.max()] = np.inf
-        scaled = matrix / lengths
-        across, upper = qr(scaled[:, independent], mode="economic")
-        shares = across.T @ scaled
-        left = np.abs(np.diag(upper)).min(initial=1.0)
-        if left <= _RANK or np.abs(scaled - across @ shares).max() > _RANK:
+        unit_columns = matrix / lengths
+        basis, upper = qr(unit_columns[:, independent], mode="economic")
+        projected = basis.T @ unit_columns
+        remaining = np.abs(np.diag(upper)).min(initial=1.0)
+        if remaining <= _RANK or np.abs(unit_columns - basis @ projected).max() > _RANK:
             kept = ", ".join(model.names[index] for index in independent)
             raise DataError(
                 f"robot {model.robot.name}: {kept} are no base parameters of it.",
                 culprits=[model.robot.name],
             )
-        mixed = solve_triangular(upper, shares)
-        mixed[np.abs(mixed) < _ROUNDING] = 0.0
-        sizes = np.where(np.isfinite(lengths), lengths, 0.0)
-        dependence = mixed * sizes / lengths[independent][:, None]
+        coefficients = solve_triangular(upper, projected)
+        coefficients[np.abs(coefficients) < _ROUNDING] = 0.0
+        norms = np.where(np.isfinite(lengths), lengths, 0.0)
+        dependence = coefficients * norms / lengths[independent][:, None]
         dependence[:, independent] = np.eye(len(independent))
         return cls(model, independent, dependence)
 
@@ -119,50 +111,50 @@ class BaseModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each base parameter is made of, as `m6*cz6 + 0.0922*m5`."""
+        """Expression of each base parameter, such as `m6*cz6 + 0.0922*m5`."""
         return tuple(
             _sum_text(self.model.names, row, int(own))
             for row, own in zip(self.dependence, self.independent, strict=True)
         )
 
     def regressor(self, motion: JointMotion) -> FloatArray:
-        """Derivatives (m, n, b) of the torques by the base parameters."""
+        """Regressor of the base parameters: derivatives (m, n, b) of the torques."""
         return self.model.regressor(motion, self.independent)
 
     def of(self, standard: FloatArray) -> FloatArray:
-        """The (b,) base parameters that (p,) standard parameters make up."""
+        """Base parameters (b,) of (p,) standard parameters."""
         return np.asarray(self.dependence @ standard)
 
 
-def _columns(model: DynamicModel, rng: np.random.Generator) -> FloatArray:
-    """The regressor in random states, row by row: (m n, p)."""
+def _random_regressor(model: DynamicModel, rng: np.random.Generator) -> FloatArray:
+    """Regressor (m n, p) in random states."""
     return model.regressor(random_motion(model, rng)).reshape(-1, len(model.names))
 
 
 def random_motion(model: DynamicModel, rng: np.random.Generator) -> JointMotion:
-    """States all around, at random."""
+    """Random states over the full ranges of angle, speed and acceleration."""
     shape = (_STATES, model.robot.joint_count)
     q, dq, ddq = (rng.uniform(-value, value, shape) for value in (np.pi, _FASTEST, _HARDEST))
     return JointMotion(np.arange(float(_STATES)), q, dq, ddq)
 
 
-def _sum_text(names: tuple[str, ...], row: FloatArray, own: int) -> str:
-    """A sum of parameters in words, the kept one first."""
-    said = names[own]
-    for place in np.flatnonzero(row):
-        if place != own:
-            size = abs(float(row[place]))
+def _sum_text(names: tuple[str, ...], row: FloatArray, kept: int) -> str:
+    """A base parameter as text, its kept standard parameter first."""
+    text = names[kept]
+    for index in np.flatnonzero(row):
+        if index != kept:
+            size = abs(float(row[index]))
             factor = "" if abs(size - 1.0) < 1e-9 else f"{size:.4g}*"
-            said += f" {'-' if row[place] < 0.0 else '+'} {factor}{names[place]}"
-    return said
+            text += f" {'-' if row[index] < 0.0 else '+'} {factor}{names[index]}"
+    return text
 
 
 @dataclass(frozen=True)
 class Condition:
     """Condition numbers of a motion's regressor of the base parameters.
 
-    Units of the parameters do not matter to a least-squares fit, and change the raw figure at will:
-    columns of unit length are the ones to compare by (van der Sluis 1969).
+    The parameters' units change the raw condition arbitrarily, and do not matter to a least-squares
+    fit: compare motions by columns of unit length (van der Sluis 1969).
 
     Attributes:
         weighted: Each joint's rows divided by its noise, columns of unit length.
@@ -176,36 +168,33 @@ class Condition:
 
 
 def condition_of(base: BaseModel, motion: JointMotion, weights: FloatArray) -> Condition:
-    """Computes the condition numbers of a motion.
+    """Condition numbers of an evenly sampled motion.
 
-    Args:
-        base: The parameters.
-        motion: Evenly sampled.
-        weights: (n,) inverse of each joint's torque noise, up to a common factor.
+    The weights (n,) are inverse to each joint's torque noise, up to a common factor.
     """
     rows = base.regressor(motion)
     flat = rows.reshape(-1, base.rank)
     weighted = (rows * weights[:, None]).reshape(-1, base.rank)
-    figures = [float(np.linalg.cond(array)) for array in (_unit(weighted), _unit(flat), flat)]
+    figures = [
+        float(np.linalg.cond(array))
+        for array in (_unit_columns(weighted), _unit_columns(flat), flat)
+    ]
     return Condition(*figures)
 
 
-def _unit(rows: FloatArray) -> FloatArray:
+def _unit_columns(rows: FloatArray) -> FloatArray:
     return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), _TINY))
 
 
 def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatArray]:
-    """The logarithm of the condition of column-scaled rows, made smooth.
+    """Smooth approximation of the log condition number of column-scaled rows (r, b).
 
-    Greatest and least eigenvalue are taken by power means over all of them: with sharpness 1 it is
-    half the logarithm of trace(G) trace(G^-1), A-optimality; with more it tends to the condition.
-
-    Args:
-        rows: (r, b).
-        sharpness: Power of the means.
+    The greatest and least eigenvalues of the information G are replaced by power means over all of
+    them: with sharpness 1 it is half the logarithm of trace(G) trace(G^-1), A-optimality; with more
+    it tends to the condition number.
 
     Returns:
-        The value, and its derivatives (r, b) by the rows.
+        The value, and its gradient (r, b) with respect to the rows.
     """
     lengths = np.maximum(np.linalg.norm(rows, axis=0), _TINY)
     unit = rows / lengths
@@ -213,20 +202,16 @@ def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatAr
     values = np.maximum(values, _TINY)
     powers = sharpness * np.log(values)
     value = 0.5 * (logsumexp(powers) + logsumexp(-powers)) / sharpness
-    by_values = 0.5 * (softmax(powers) - softmax(-powers)) / values
-    by_unit = 2.0 * unit @ ((vectors * by_values) @ vectors.T)
-    by_rows = (by_unit - unit * np.sum(by_unit * unit, axis=0)) / lengths
-    return float(value), np.asarray(by_rows)
+    gradient_values = 0.5 * (softmax(powers) - softmax(-powers)) / values
+    gradient_unit = 2.0 * unit @ ((vectors * gradient_values) @ vectors.T)
+    gradient_rows = (gradient_unit - unit * np.sum(gradient_unit * unit, axis=0)) / lengths
+    return float(value), np.asarray(gradient_rows)
 
 
 def check_turning(base: BaseModel, streams: Sequence[Conditioned]) -> None:
-    """Refuses motions in which a joint stands still.
-
-    Raises:
-        DegenerateError: One does.
-    """
+    """Refuses motions in which a joint stands still, by a DegenerateError."""
     fastest = np.max(
-        [np.abs(piece.measured.motion.dq).max(axis=0) for of in streams for piece in of.pieces],
+        [np.abs(piece.measured.motion.dq).max(axis=0) for item in streams for piece in item.pieces],
         axis=0,
     )
     still = np.flatnonzero(fastest < _STILL_RAD_S)
@@ -252,11 +237,7 @@ def _joint_of(name: str) -> int:
 
 
 def check_identifiable(base: BaseModel, blocks: Sequence[NoiseBlock]) -> None:
-    """Refuses motions that leave a combination of base parameters open.
-
-    Raises:
-        DegenerateError: There is one; its main parameters are named.
-    """
+    """Refuses motions that leave base parameters undetermined, by a DegenerateError."""
     lost = null_space(base, blocks)
     if lost:
         names = base.names
@@ -269,7 +250,7 @@ def check_identifiable(base: BaseModel, blocks: Sequence[NoiseBlock]) -> None:
 
 
 def null_space(base: BaseModel, blocks: Sequence[NoiseBlock]) -> list[int]:
-    """The base parameters in directions about which a motion says nothing."""
+    """Indices of the base parameters in the null space of the motions' information."""
     information = np.zeros((base.rank, base.rank))
     rows = 0
     for block in blocks:
@@ -277,15 +258,11 @@ def null_space(base: BaseModel, blocks: Sequence[NoiseBlock]) -> list[int]:
             x = block.x[:, joint]
             information += x.T @ x
             rows += len(x)
-    sizes = _usual(base)
-    relative = information / np.outer(sizes, sizes) / max(rows, 1)
+    # Scaled by the root mean square of each column in random states.
+    states = random_motion(base.model, np.random.default_rng(1))
+    column_rms = np.sqrt(np.mean(base.regressor(states).reshape(-1, base.rank) ** 2, axis=0))
+    relative = information / np.outer(column_rms, column_rms) / max(rows, 1)
     values, vectors = np.linalg.eigh(relative)
-    null = np.flatnonzero(values < _UNDETERMINED)
-    shares = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1))
+    undetermined = np.flatnonzero(values < _UNDETERMINED)
+    shares = np.sqrt(np.sum(vectors[:, undetermined] ** 2, axis=1))
     return [int(index) for index in np.flatnonzero(shares > _SHARE)]
-
-
-def _usual(base: BaseModel) -> FloatArray:
-    """(b,) root mean square of each column in a motion all around."""
-    rows = base.regressor(random_motion(base.model, np.random.default_rng(1)))
-    return np.asarray(np.sqrt(np.mean(rows.reshape(-1, base.rank) ** 2, axis=0)))

@@ -1,4 +1,4 @@
-"""From the stamps of a controller's samples to an even clock, over what is lost of them."""
+"""Resampling of a controller's stamped samples to an even clock, bridging missing samples."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -10,25 +10,25 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.dynamics.reading import RecordedSamples
 
-# Steps that differ by more than this share of the usual are resampled. Where they are whole
-# multiples of it but for the second share, others are missing between them; on a clock that is more
-# uneven, only where a step is so many times the usual and longer than so much [s].
+# Clocks whose jitter exceeds the first share of the usual step are resampled. Up to the second
+# share of jitter, a step of several usual ones means missing samples; on a less even clock, only a
+# step of so many times the usual one that is also longer than the last [s].
 _JITTER, _EVEN, _GAP, _GAP_S = 0.02, 0.1, 2.5, 0.02
-# Angles that repeat for so long, and so many times, while their steps are others just before and
-# after, are frozen; so far is just before and after [s], [samples].
+# Least duration [s] and number of repeated angles that count as frozen, and number of samples
+# before and after in which the joint moves.
 _FROZEN_S, _FROZEN, _AROUND = 0.05, 5, 5
-# Behind them angles are off by so many times their steps and what they are resolved to.
+# The angle then jumps by at least so many times the steps around it and the angles' resolution.
 _JUMP = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class StampClock:
-    """The steps of a stream's stamps.
+    """Sampling clock of a stream.
 
     Attributes:
-        usual_s: From one sample to the next [s].
-        counts: (m - 1,) how many usual steps each step is; more than one where samples are missing.
-        jitter: How far steps are from whole ones, as a standard deviation over the usual step.
+        usual_s: Median step from one sample to the next [s].
+        counts: (m - 1,) each step in usual steps; more than one where samples are missing.
+        jitter: Standard deviation of the steps from whole multiples, over the usual step.
     """
 
     usual_s: float
@@ -37,7 +37,7 @@ class StampClock:
 
     @classmethod
     def of(cls, times_s: FloatArray) -> Self:
-        """Reads it off (m,) stamps [s]."""
+        """Determines the clock of (m,) stamps [s]."""
         steps = np.diff(times_s)
         usual = float(np.median(steps))
         counts = np.maximum(np.rint(steps / usual), 1.0)
@@ -49,62 +49,62 @@ class StampClock:
 
     @property
     def even(self) -> bool:
-        """Whether its steps are whole ones."""
+        """Whether the jitter is small enough to do without resampling."""
         return self.jitter <= _JITTER
 
 
 @dataclass(frozen=True, eq=False)
-class Even:
-    """A part of a stream on an even clock.
+class EvenPart:
+    """A part of a stream without long gaps, on an even clock.
 
     Attributes:
-        recorded: Its samples; angles are interpolated where they are missing.
-        bad: (m, n) torques without information.
-        there: (m,) where torques were recorded.
+        samples: Its samples; angles are interpolated where they are missing.
+        invalid: (m, n) torques without information.
+        present: (m,) where torques were recorded.
     """
 
-    recorded: RecordedSamples
-    bad: Mask
-    there: Mask
+    samples: RecordedSamples
+    invalid: Mask
+    present: Mask
 
     def __len__(self) -> int:
-        return len(self.recorded)
+        return len(self.samples)
 
     @property
     def rate_hz(self) -> float:
         """Samples a second."""
-        times_s = self.recorded.times_s
+        times_s = self.samples.times_s
         return (len(times_s) - 1) / float(times_s[-1] - times_s[0])
 
 
 def even_parts(
-    recorded: RecordedSamples, bad: Mask, clock: StampClock, widest_s: float
-) -> list[Even]:
-    """The parts between gaps, each on an even clock.
+    recorded: RecordedSamples, invalid: Mask, clock: StampClock, longest_gap_s: float
+) -> list[EvenPart]:
+    """Splits a stream at long gaps, and resamples each part to an even clock.
 
     Args:
         recorded: The samples.
-        bad: (m, n) torques without information.
-        clock: Of their stamps.
-        widest_s: Angles are interpolated where samples are missing for no longer [s].
+        invalid: (m, n) torques without information.
+        clock: Their clock.
+        longest_gap_s: Longest gap over which angles are interpolated [s].
     """
-    bounds = [0, *(_gaps_of(clock, widest_s) + 1), len(recorded)]
+    bounds = [0, *(_gaps_of(clock, longest_gap_s) + 1), len(recorded)]
     return [
-        _even(recorded, bad, clock, slice(begin, end))
+        _resampled(recorded, invalid, clock, slice(begin, end))
         for begin, end in pairwise(bounds)
         if end - begin > 2
     ]
 
 
-def _gaps_of(clock: StampClock, widest_s: float) -> IntArray:
-    """The samples behind which others are missing for longer than that [s]."""
-    return np.flatnonzero((clock.counts > 1) & ((clock.counts - 1) * clock.usual_s > widest_s))
+def _gaps_of(clock: StampClock, longest_gap_s: float) -> IntArray:
+    """Indices of the samples before gaps that are longer than that [s]."""
+    return np.flatnonzero((clock.counts > 1) & ((clock.counts - 1) * clock.usual_s > longest_gap_s))
 
 
-def clock_notes(recorded: RecordedSamples, clock: StampClock, widest_s: float) -> list[str]:
-    """What is wrong with a stream's clock, and what was done about it, in words."""
+def clock_notes(recorded: RecordedSamples, clock: StampClock, longest_gap_s: float) -> list[str]:
+    """Messages on gaps, missing samples and jitter of a stream's clock."""
     steps, notes = np.diff(recorded.times_s), []
-    gaps = _gaps_of(clock, widest_s)
+    gaps = _gaps_of(clock, longest_gap_s)
     if len(gaps):
         places = [f"{recorded.times_s[index] - recorded.times_s[0]:.2f} s" for index in gaps]
         notes.append(
@@ -129,50 +129,52 @@ def clock_notes(recorded: RecordedSamples, clock: StampClock, widest_s: float) -
 
 
 def _jitter(steps: FloatArray, counts: FloatArray, usual: float) -> float:
-    near = counts * usual <= max(_GAP * usual, _GAP_S)
-    return float(np.std((steps - counts * usual)[near])) / usual
+    without_gaps = counts * usual <= max(_GAP * usual, _GAP_S)
+    return float(np.std((steps - counts * usual)[without_gaps])) / usual
 
 
-def _even(recorded: RecordedSamples, bad: Mask, clock: StampClock, rows: slice) -> Even:
-    """A part with a sample at every usual step."""
+def _resampled(
+    recorded: RecordedSamples, invalid: Mask, clock: StampClock, rows: slice
+) -> EvenPart:
+    """Resamples rows to a sample at every usual step."""
     times_s, counts = recorded.times_s[rows], clock.counts[rows.start : rows.stop - 1]
-    places = np.concatenate([[0], np.cumsum(counts)])
-    even = np.linspace(times_s[0], times_s[-1], places[-1] + 1)
+    indices = np.concatenate([[0], np.cumsum(counts)])
+    even_s = np.linspace(times_s[0], times_s[-1], indices[-1] + 1)
     if clock.even:
-        times_s = even[places]
-    behind = np.clip(np.searchsorted(times_s, even, "right") - 1, 0, len(counts) - 1)
-    near = np.minimum(np.abs(even - times_s[behind]), np.abs(times_s[behind + 1] - even))
-    seen = (counts[behind] == 1) | (near < _JITTER * clock.usual_s)
+        times_s = even_s[indices]
+    before = np.clip(np.searchsorted(times_s, even_s, "right") - 1, 0, len(counts) - 1)
+    distance_s = np.minimum(np.abs(even_s - times_s[before]), np.abs(times_s[before + 1] - even_s))
+    present = (counts[before] == 1) | (distance_s < _JITTER * clock.usual_s)
 
     def at(values: FloatArray) -> FloatArray:
-        return np.stack([np.interp(even, times_s, column) for column in values[rows].T], axis=1)
+        return np.stack([np.interp(even_s, times_s, column) for column in values[rows].T], axis=1)
 
     part = replace(
         recorded,
-        times_s=even,
-        q=_bridged(even, at(recorded.q), seen),
-        dq=None if recorded.dq is None else _bridged(even, at(recorded.dq), seen),
+        times_s=even_s,
+        q=_bridged(even_s, at(recorded.q), present),
+        dq=None if recorded.dq is None else _bridged(even_s, at(recorded.dq), present),
         torques_nm=at(recorded.torques_nm),
     )
-    return Even(part, np.asarray(at(bad.astype(float)) > 0.0), seen)
+    return EvenPart(part, np.asarray(at(invalid.astype(float)) > 0.0), present)
 
 
-def _bridged(times_s: FloatArray, values: FloatArray, seen: Mask) -> FloatArray:
-    """Values (m, n) with cubic splines in place of those that were not seen."""
-    if seen.all():
+def _bridged(times_s: FloatArray, values: FloatArray, present: Mask) -> FloatArray:
+    """Values (m, n) with the missing ones replaced by cubic splines."""
+    if present.all():
         return values
     from scipy.interpolate import CubicSpline
 
     bridged = values.copy()
-    bridged[~seen] = CubicSpline(times_s[seen], values[seen])(times_s[~seen])
+    bridged[~present] = CubicSpline(times_s[present], values[present])(times_s[~present])
     return bridged
 
 
 def without_frozen(recorded: RecordedSamples, notes: list[str]) -> RecordedSamples:
-    """The stream without the rows in which angles of a joint repeat while it moves.
+    """The stream without the rows in which a joint's angle is frozen while the joint moves.
 
-    A joint that stops, and one that sets off, has short steps just before and after; one whose
-    angles are frozen has as long ones as ever, and a far longer one behind.
+    A joint that stops or sets off has short steps just before and after; a frozen angle has steps
+    of the usual length, and then a far longer one.
     """
     rows = np.ones(len(recorded), dtype=bool)
     for angles in recorded.q.T:
@@ -181,28 +183,28 @@ def without_frozen(recorded: RecordedSamples, notes: list[str]) -> RecordedSampl
         return recorded
     begins = np.flatnonzero(rows[:-1] & ~rows[1:])
     ends = np.flatnonzero(~rows & np.append(rows[1:], True))
-    lasted = recorded.times_s[ends] - recorded.times_s[begins]
+    gaps_s = recorded.times_s[ends] - recorded.times_s[begins]
     places = [f"{recorded.times_s[begin] - recorded.times_s[0]:.2f} s" for begin in begins]
     notes.append(
-        f"{recorded.label}: angles are frozen for up to {figure(float(lasted.max()))} s behind "
+        f"{recorded.label}: angles are frozen for up to {figure(float(gaps_s.max()))} s behind "
         f"{some_of(places, 3)}, though the joints move; these {(~rows).sum()} rows are left out."
     )
     return recorded.among(rows)
 
 
 def _frozen(times_s: FloatArray, angles: FloatArray) -> Mask:
-    """(m,) which of a joint's angles are those of the last sample before a longer step."""
+    """(m,) mask of a joint's angles that repeat an earlier sample although the joint moves."""
     frozen = np.zeros(len(angles), dtype=bool)
     steps = np.abs(np.diff(angles))
     if not steps.any():
         return frozen
-    resolved = float(steps[steps > 0.0].min())
+    resolution = float(steps[steps > 0.0].min())
     edges = np.diff(np.concatenate([[False], steps == 0.0, [False]]).astype(np.int8))
     for begin, end in np.flatnonzero(edges).reshape(-1, 2):
         if end - begin < _FROZEN or times_s[end] - times_s[begin] < _FROZEN_S or end == len(steps):
             continue
         before, after = steps[max(begin - _AROUND, 0) : begin], steps[end + 1 : end + 1 + _AROUND]
         around = max(float(np.median(array)) if len(array) else 0.0 for array in (before, after))
-        if steps[end] > _JUMP * max(around, resolved):
+        if steps[end] > _JUMP * max(around, resolution):
             frozen[begin + 1 : end + 1] = True
     return frozen

@@ -1,4 +1,4 @@
-"""From what a controller recorded to motions and torques for a regression, by one low-pass."""
+"""Conditioning of recorded streams for the regression: cleaning, smoothing, low-pass filtering."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,53 +14,53 @@ from visioncal.dynamics.clock import StampClock, clock_notes, even_parts, withou
 from visioncal.dynamics.motion import JointMotion, Measured
 from visioncal.dynamics.reading import RecordedSamples
 
-# Torques of a rigid arm have all but their friction's corners within so many times the band of its
-# motion; below so many a second there is little to estimate noise from, and beyond the other gears
-# and links swing by themselves [Hz]. Motions are smoothed no less than so many times wider.
+# Cut-off of the low-pass: a rigid arm's torques, but for the corners of friction, lie within so
+# many times the motion's bandwidth; below the least there is little to estimate noise from, above
+# the most gears and links resonate [Hz]. The motion's smoothing is at most so many times wider.
 _TORQUE_BAND, _LEAST_HZ, _MOST_HZ, _WIDEST = 10.0, 4.0, 10.0, 3.0
-# Angles are interpolated where no more than this share of a smoothing polynomial's samples is
-# missing on end: there the others determine it.
+# Angles are interpolated over gaps of at most this share of a smoothing polynomial's window, where
+# the other samples determine it.
 _BRIDGED = 0.25
-# Torques at rest on an extreme for so many samples on end, within this share of it, are cut off.
+# Torques that stay at an extreme for so many samples, within this share of the range, are
+# saturated.
 _FLAT_SAMPLES, _FLAT = 5, 1e-6
 _MOST_AT_LIMIT = 0.2
-# A joint that is slower than this in the mean of so long, for so long, stands still [rad/s], [s].
+# A joint stands still where its mean speed over this time stays below this for as long [rad/s],
+# [s].
 _REST_RAD_S, _REST_S = 1e-3, 0.1
-# Torques that stand out from their neighbours by so many times what is usual, and by this share of
-# their range, are slips of the line.
+# Torques that deviate from their neighbours by so many times the usual deviation, and by this share
+# of their range, are spikes (data transmission errors).
 _SPIKE, _SPIKE_SHARE, _NEIGHBOURS = 10.0, 0.02, 5
-# So many samples' regressors are held at a time.
+# Samples whose regressors are held in memory at a time.
 _SAMPLES_AT_ONCE = 20_000
-# An output that rests on bad samples by more than this share is not used.
-_TOUCHED = 0.02
-# Nor is one for which more than this share of its samples is missing.
+# A filter output is not used where more than this share of its weights is on invalid samples.
+_MOST_INVALID = 0.02
+# Nor where more than this share is on missing samples.
 _MOST_MISSING = 0.5
 
 # Kaiser's design (1974): 60 dB of attenuation from 1.5 times the cut-off on.
 _BETA, _SPAN = 5.65, 1.81
-# Outputs of which no more than this share is there are not made whole.
+# Outputs with less than this weight on present samples are not normalised.
 _LEAST_WEIGHT = 0.1
-# A motion's band ends where the power of its accelerations stays under this share of its peak,
-# sought in parts of a quarter octave; joints count that move at least this share of the
-# fastest one.
+# A motion's bandwidth ends where the power of its accelerations stays under this share of its peak,
+# searched in so many bins an octave, over joints that move at least this share of the fastest one.
 _OUT_OF_BAND, _PARTS, _MOVING = 0.03, 4, 0.05
-# Polynomials of fourth order keep all within a sixth of their own band, to a few in ten thousand.
+# Polynomials of fourth order pass a sixth of their own bandwidth to a few parts in ten thousand.
 _ORDER, WIDER = 4, 6.0
-# Reported speeds may depart from the angles' by this share, and by this much [rad/s].
-_APART, _APART_RAD_S = 0.1, 0.005
+# Reported speeds may deviate from the angles' derivatives by this share, and this much [rad/s].
+_DEVIATION, _DEVIATION_RAD_S = 0.1, 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class LowPass:
-    """A symmetric finite filter, which shifts nothing in time, and every so manieth output of it.
+    """A decimating zero-phase FIR low-pass filter.
 
-    What leaves it is 6 dB down at the cut-off, to whose double rate it is thinned out: white noise
-    stays nearly white. Only windows that lie wholly within the samples are kept, so there are no
-    effects of their ends.
+    Its response is 6 dB down at the cut-off, and outputs come at twice the cut-off's rate: white
+    noise stays nearly white. Only full windows give outputs, so there are no end effects.
 
     Attributes:
-        taps: (w,) weights, whose sum is 1; w - 1 is a multiple of twice `step`.
-        step: Outputs are so many samples apart.
+        taps: (w,) coefficients, whose sum is 1; w - 1 is a multiple of twice `step`.
+        step: Decimation: samples from one output to the next.
     """
 
     taps: FloatArray
@@ -68,7 +68,7 @@ class LowPass:
 
     @classmethod
     def of(cls, band_hz: float, rate_hz: float) -> Self:
-        """Designs the filter for a cut-off and a rate of samples [Hz]."""
+        """Designs the filter for a cut-off and a sampling rate [Hz]."""
         step = max(int(rate_hz / (2.0 * band_hz)), 1)
         half = step * int(np.ceil(_SPAN * rate_hz / band_hz / step))
         at = np.arange(-half, half + 1)
@@ -77,41 +77,43 @@ class LowPass:
 
     @property
     def half(self) -> int:
-        """Samples on either side of an output that it rests on."""
+        """Samples of the window on either side of an output."""
         return len(self.taps) // 2
 
     @property
     def correlation(self) -> FloatArray:
-        """(l,) correlations of one output with the next, and so on, where the input is white."""
+        """(l,) autocorrelation of the outputs at lags 1, 2, ..., for white input."""
         full = np.correlate(self.taps, self.taps, "full")[len(self.taps) - 1 :: self.step]
         return np.asarray(full[1:] / full[0])
 
     def count(self, samples: int) -> int:
-        """How many outputs so many samples give."""
+        """Number of outputs for a number of samples."""
         return max((samples - len(self.taps)) // self.step + 1, 0)
 
-    def __call__(self, values: FloatArray, there: Mask | None = None) -> FloatArray:
+    def __call__(self, values: FloatArray, present: Mask | None = None) -> FloatArray:
         """Filters (m, ...) values along their first axis: (k, ...), the first at `half`.
 
         Args:
-            values: What is filtered.
-            there: (m,) which of them count, all where None. Outputs are means over these; those
-                for which hardly any is there are of no use.
+            values: The values.
+            present: (m,) which of them count; all where None. Outputs are weighted means over
+                these, and meaningless where hardly any is present.
         """
-        if there is None or there.all():
-            return self._summed(values, self.taps)
+        if present is None or present.all():
+            return self._weighted_sums(values, self.taps)
         axes = (-1,) + (1,) * (values.ndim - 1)
-        weights = self._summed(there.astype(float), self.taps)
+        weights = self._weighted_sums(present.astype(float), self.taps)
         weights = np.where(np.abs(weights) < _LEAST_WEIGHT, 1.0, weights)
-        return self._summed(values * there.reshape(axes), self.taps) / weights.reshape(axes)
+        return self._weighted_sums(values * present.reshape(axes), self.taps) / weights.reshape(
+            axes
+        )
 
-    def touched(self, bad: Mask) -> FloatArray:
-        """(k, ...) what share of each output's weights rests on bad samples (m, ...)."""
+    def share_of(self, invalid: Mask) -> FloatArray:
+        """(k, ...) share of each output's weights that is on invalid samples (m, ...)."""
         weights = np.abs(self.taps)
-        return self._summed(bad.astype(float), weights / weights.sum())
+        return self._weighted_sums(invalid.astype(float), weights / weights.sum())
 
-    def _summed(self, values: FloatArray, taps: FloatArray) -> FloatArray:
-        """Products of blocks of samples with blocks of taps, summed along the diagonals."""
+    def _weighted_sums(self, values: FloatArray, taps: FloatArray) -> FloatArray:
+        """Weighted sums: blocks of samples times blocks of taps, summed along the diagonals."""
         count, flat = self.count(len(values)), values.reshape(len(values), -1)
         if len(taps) == 1:
             return values
@@ -125,37 +127,34 @@ class LowPass:
         return np.asarray(total.reshape(count, *values.shape[1:]))
 
 
-def band_of(q: FloatArray, rate_hz: float) -> float:
-    """Finds the highest frequency of note in (m, n) evenly sampled angles [Hz].
-
-    Of a periodic motion that is its highest harmonic.
-    """
+def bandwidth(q: FloatArray, rate_hz: float) -> float:
+    """Bandwidth of (m, n) evenly sampled angles [Hz]; a periodic motion's highest harmonic."""
     frequencies = np.asarray(np.fft.rfftfreq(len(q), 1.0 / rate_hz)[1:], dtype=float)
     spectrum = np.fft.rfft((q - q.mean(axis=0)) * np.hanning(len(q))[:, None], axis=0)[1:]
     speeds = np.sqrt(np.sum(np.abs(spectrum * frequencies[:, None]) ** 2, axis=0))
     moving = speeds >= _MOVING * speeds.max()
     power = np.abs(spectrum[:, moving] * frequencies[:, None] ** 2) ** 2
     octaves = np.log2(frequencies / frequencies[0])
-    parts = (_PARTS * octaves).astype(np.int64)
-    return max(_edge(column, parts, frequencies) for column in power.T)
+    bins = (_PARTS * octaves).astype(np.int64)
+    return max(_band_edge(column, bins, frequencies) for column in power.T)
 
 
-def _edge(power: FloatArray, parts: IntArray, frequencies: FloatArray) -> float:
-    """Where a joint's power, from its peak on upwards, falls out of the band."""
+def _band_edge(power: FloatArray, bins: IntArray, frequencies: FloatArray) -> float:
+    """Frequency above its peak at which a joint's power falls below the limit [Hz]."""
     slow = frequencies < 0.02 * frequencies[-1]
     peak = int(np.argmax(np.where(slow, power, 0.0)))
     limit = _OUT_OF_BAND * power[peak]
-    for part in range(int(parts[peak]) + 1, int(parts[-1]) + 1):
-        inside = parts == part
+    for bin_ in range(int(bins[peak]) + 1, int(bins[-1]) + 1):
+        inside = bins == bin_
         if inside.any() and power[inside].max() < limit:
-            before = parts < part
+            before = bins < bin_
             within = before & (power >= limit)
             return float(frequencies[within][-1])
     return float(frequencies[-1])
 
 
 def window_of(band_hz: float, rate_hz: float, longest: int) -> int:
-    """Samples that a polynomial spans so that its output is 3 dB down at a frequency.
+    """Window of a Savitzky-Golay filter that is 3 dB down at a frequency, in samples.
 
     Schafer 2011, What is a Savitzky-Golay filter, equation 12. At least two more than the order
     needs, and no more than there are.
@@ -169,19 +168,19 @@ def smoothed_motion(
 ) -> tuple[JointMotion, bool]:
     """Smooths and differentiates evenly sampled angles (Savitzky and Golay 1964).
 
-    Accelerations come from reported speeds where that is less noisy.
+    Accelerations are derivatives of the reported speeds where that is less noisy.
 
     Args:
         times_s: (m,) [s].
         q: (m, n) joint angles [rad].
-        dq: (m, n) reported speeds [rad/s], if there are.
-        window: Samples that a polynomial spans.
+        dq: (m, n) reported speeds [rad/s], if any.
+        window: Samples of a smoothing polynomial.
 
     Returns:
-        The motion at all m times, which is good from half a window on from either end, and whether
-        the reported speeds belong to the angles.
+        The motion at all m times, valid from half a window on from either end, and whether the
+        reported speeds agree with the angles.
     """
-    # With it comes scipy.stats, which no other command shall have to wait for.
+    # It imports scipy.stats, for which no other command shall wait.
     from scipy.signal import savgol_filter
 
     step = float(times_s[-1] - times_s[0]) / (len(times_s) - 1)
@@ -195,17 +194,22 @@ def smoothed_motion(
         return derived, True
     reported = fitted(dq, 0)
     inner = slice(window // 2, -(window // 2))
-    apart = np.sqrt(np.mean((reported - speeds)[inner] ** 2, axis=0))
-    if np.any(apart > _APART * np.sqrt(np.mean(speeds[inner] ** 2, axis=0)) + _APART_RAD_S):
+    deviation = np.sqrt(np.mean((reported - speeds)[inner] ** 2, axis=0))
+    if np.any(
+        deviation > _DEVIATION * np.sqrt(np.mean(speeds[inner] ** 2, axis=0)) + _DEVIATION_RAD_S
+    ):
         return derived, False
-    noise = [_noise(q - smooth, window, 2, step), _noise(dq - reported, window, 1, step)]
+    noise = [
+        _derivative_noise(q - smooth, window, 2, step),
+        _derivative_noise(dq - reported, window, 1, step),
+    ]
     if noise[0] <= noise[1]:
         return derived, True
     return JointMotion(times_s, smooth, reported, fitted(dq, 1)), True
 
 
-def _noise(residual: FloatArray, window: int, order: int, step: float) -> float:
-    """How noisy a derivative of that order is, by what smoothing left [rad/s^2]."""
+def _derivative_noise(residual: FloatArray, window: int, order: int, step: float) -> float:
+    """Noise of a derivative of that order, from the smoothing residuals [rad/s^2]."""
     from scipy.signal import savgol_coeffs
 
     taps = savgol_coeffs(window, _ORDER, order, step)
@@ -214,34 +218,33 @@ def _noise(residual: FloatArray, window: int, order: int, step: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Evenly sampled motion and torques without a gap, and how they are to be filtered.
+    """Evenly sampled motion and torques without a long gap, and their filter.
 
     Attributes:
         measured: The samples.
-        bad: (m, n) torques without information: cut off, or of a joint that stands still.
-        there: (m,) where torques were recorded; the filter takes the regressor's rows from there,
-            too, so that both are sums over the same samples.
-        lowpass: For torques and regressor alike.
+        bad: (m, n) torques without information: saturated, or of a joint that stands still.
+        present: (m,) where torques were recorded; regressors are filtered over the same samples.
+        lowpass: Filter of torques and regressors alike.
     """
 
     measured: Measured
     bad: Mask
-    there: Mask
+    present: Mask
     lowpass: LowPass
 
     @property
     def times_s(self) -> FloatArray:
-        """(k,) when the filtered samples are [s]."""
+        """(k,) times of the filtered samples [s]."""
         begin, count = self.lowpass.half, self.lowpass.count(len(self.measured))
         return self.measured.motion.times_s[begin :: self.lowpass.step][:count]
 
     @property
     def torques_nm(self) -> FloatArray:
         """(k, n) filtered torques [N m]."""
-        return self.lowpass(self.measured.torques_nm, self.there)
+        return self.lowpass(self.measured.torques_nm, self.present)
 
     def filtered(self, columns: Callable[[JointMotion], FloatArray]) -> FloatArray:
-        """Filters what is computed of a motion (m, ...), a part of it at a time: (k, ...)."""
+        """Filters (m, ...) functions of the motion, a part of it at a time: (k, ...)."""
         step, width = self.lowpass.step, len(self.lowpass.taps)
         total, parts = self.lowpass.count(len(self.measured)), []
         at_once = max(_SAMPLES_AT_ONCE // step, 1)
@@ -249,46 +252,47 @@ class Piece:
             end = min(begin + at_once, total)
             rows = slice(begin * step, (end - 1) * step + width)
             values = columns(self.measured.motion.chosen(rows))
-            parts.append(self.lowpass(values, self.there[rows]))
+            parts.append(self.lowpass(values, self.present[rows]))
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     @property
     def used(self) -> Mask:
-        """(k, n) which of the filtered torques rest on good samples."""
+        """(k, n) which of the filtered torques can be used."""
         used = np.ones((len(self.times_s), self.bad.shape[1]), dtype=bool)
         if self.bad.any():
-            used &= self.lowpass.touched(self.bad) <= _TOUCHED
-        if not self.there.all():
-            used &= self.lowpass.touched(~self.there)[:, None] <= _MOST_MISSING
+            used &= self.lowpass.share_of(self.bad) <= _MOST_INVALID
+        if not self.present.all():
+            used &= self.lowpass.share_of(~self.present)[:, None] <= _MOST_MISSING
         return used
 
     def advanced(self, lag_s: float) -> Self:
-        """The same with torques of so much later in the place of theirs [s]."""
+        """The same with the torques shifted earlier by a lag [s]."""
         times_s = self.measured.motion.times_s
-        later = times_s + lag_s
+        later_s = times_s + lag_s
 
         def at(values: FloatArray) -> FloatArray:
-            return np.stack([np.interp(later, times_s, column) for column in values.T], axis=1)
+            return np.stack([np.interp(later_s, times_s, column) for column in values.T], axis=1)
 
-        lost = at((~self.there)[:, None].astype(float))[:, 0] > 0.0
-        there = ~lost & (later >= times_s[0]) & (later <= times_s[-1])
+        lost = at((~self.present)[:, None].astype(float))[:, 0] > 0.0
+        present = ~lost & (later_s >= times_s[0]) & (later_s <= times_s[-1])
         measured = replace(self.measured, torques_nm=at(self.measured.torques_nm))
-        # Of joints at rest both what was recorded then and what stands there now says nothing.
+        # Of joints at rest neither the torque recorded then nor the one shifted there is
+        # informative.
         bad = self.bad | (at(self.bad.astype(float)) > 0.0)
-        return replace(self, measured=measured, bad=np.asarray(bad), there=np.asarray(there))
+        return replace(self, measured=measured, bad=np.asarray(bad), present=np.asarray(present))
 
 
 @dataclass(frozen=True, eq=False)
 class Conditioned:
-    """A stream, ready for a regression.
+    """A conditioned stream, ready for the regression.
 
     Attributes:
-        label: Its place, for messages.
-        pieces: What lies between its gaps.
-        band_hz: Highest frequency of the motion [Hz].
+        label: Its file, for messages.
+        pieces: The parts between its gaps.
+        band_hz: Bandwidth of the motion [Hz].
         cutoff_hz: Where the low-pass is 6 dB down [Hz].
-        rate_hz: Samples a second.
-        notes: What was found in the samples and done about it, in words.
+        rate_hz: Sampling rate before the filter [Hz].
+        notes: Messages on faults of the samples, and how they were handled.
         of_currents: Whether the torques are currents times gains.
     """
 
@@ -302,12 +306,12 @@ class Conditioned:
 
     @property
     def count(self) -> int:
-        """How many filtered samples there are."""
+        """Number of filtered samples."""
         return sum(len(piece.times_s) for piece in self.pieces)
 
     @property
     def times_s(self) -> FloatArray:
-        """(k,) when the filtered samples are [s]."""
+        """(k,) times of the filtered samples [s]."""
         return np.concatenate([piece.times_s for piece in self.pieces])
 
     @property
@@ -317,21 +321,21 @@ class Conditioned:
 
     @property
     def used(self) -> Mask:
-        """(k, n) which of the filtered torques rest on good samples."""
+        """(k, n) which of the filtered torques can be used."""
         return np.concatenate([piece.used for piece in self.pieces])
 
     @property
     def correlation(self) -> FloatArray:
-        """What the filter leaves of white noise from one sample to the next, and so on."""
+        """Autocorrelation of filtered white noise, at lags 1, 2, ..."""
         return self.pieces[0].lowpass.correlation
 
     def filtered(self, columns: Callable[[JointMotion], FloatArray]) -> FloatArray:
-        """Filters what is computed of the motion, as the torques are: (k, ...)."""
+        """Filters (m, ...) functions of the motion as the torques are filtered: (k, ...)."""
         parts = [piece.filtered(columns) for piece in self.pieces]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def advanced(self, lag_s: float) -> Self:
-        """The same with torques of so much later in the place of theirs [s]."""
+        """The same with the torques shifted earlier by a lag [s]."""
         return replace(self, pieces=tuple(piece.advanced(lag_s) for piece in self.pieces))
 
 
@@ -340,51 +344,51 @@ def condition(
 ) -> Conditioned:
     """Resamples, differentiates and filters a stream.
 
-    Torques and regressor go through the same low-pass, which therefore moves no parameter (Gautier
-    1997, parallel filtering). It shifts nothing in time.
+    Torques and regressor go through the same zero-phase low-pass, which therefore biases no
+    parameter (Gautier 1997, parallel filtering).
 
     Args:
         recorded: The stream's samples.
-        cutoff_hz: Where the low-pass is 6 dB down [Hz]; ten times the motion's band, 4 to 10 Hz,
-            where None.
-        limits_nm: (n,) torques beyond which the drives give none [N m], where known.
+        cutoff_hz: Where the low-pass is 6 dB down [Hz]; ten times the motion's bandwidth, 4 to
+            10 Hz, where None.
+        limits_nm: (n,) the drives' greatest torques [N m], where known.
 
     Raises:
         DataError: No part without gaps is as long as the filters.
     """
     notes: list[str] = []
     recorded = without_frozen(recorded, notes)
-    torques, bad = _cleaned(recorded, limits_nm, notes)
+    torques, invalid = _cleaned(recorded, limits_nm, notes)
     recorded = replace(recorded, torques_nm=torques)
     clock = StampClock.of(recorded.times_s)
-    # Of how slow a motion may be, until its band is known.
+    # For the slowest motion, until the bandwidth is known.
     slowest = min(_LEAST_HZ if cutoff_hz is None else cutoff_hz, 0.25 / clock.usual_s)
-    widest_s = _widest(slowest, 1.0 / clock.usual_s, clock.usual_s)
-    parts = even_parts(recorded, bad, clock, widest_s)
+    longest_gap_s = _longest_gap(slowest, 1.0 / clock.usual_s, clock.usual_s)
+    parts = even_parts(recorded, invalid, clock, longest_gap_s)
     longest = max(parts, key=len)
     rate_hz = longest.rate_hz
-    band_hz = band_of(longest.recorded.q, rate_hz)
+    band_hz = bandwidth(longest.samples.q, rate_hz)
     usual = min(max(_TORQUE_BAND * band_hz, _LEAST_HZ), _MOST_HZ)
     cutoff = min(usual if cutoff_hz is None else cutoff_hz, 0.25 * rate_hz)
     lowpass = LowPass.of(cutoff, rate_hz)
     smoothing = min(max(WIDER * band_hz, cutoff), _WIDEST * cutoff)
-    if _widest(smoothing, rate_hz, clock.usual_s) < widest_s:
-        widest_s = _widest(smoothing, rate_hz, clock.usual_s)
-        parts = even_parts(recorded, bad, clock, widest_s)
+    if _longest_gap(smoothing, rate_hz, clock.usual_s) < longest_gap_s:
+        longest_gap_s = _longest_gap(smoothing, rate_hz, clock.usual_s)
+        parts = even_parts(recorded, invalid, clock, longest_gap_s)
         longest = max(parts, key=len)
-    notes += clock_notes(recorded, clock, widest_s)
+    notes += clock_notes(recorded, clock, longest_gap_s)
     window = window_of(smoothing, rate_hz, len(longest))
-    pieces, good = [], True
+    pieces, speeds_agree = [], True
     for part in parts:
         if len(part) < len(lowpass.taps) + 2 * window:
             continue
-        whole = part.recorded
-        motion, agree = smoothed_motion(whole.times_s, whole.q, whole.dq, window)
-        good &= agree
+        samples = part.samples
+        motion, part_agrees = smoothed_motion(samples.times_s, samples.q, samples.dq, window)
+        speeds_agree &= part_agrees
         inner = slice(window // 2, -(window // 2))
-        measured = Measured(motion.chosen(inner), whole.torques_nm[inner])
+        measured = Measured(motion.chosen(inner), samples.torques_nm[inner])
         resting = _resting(measured.motion, rate_hz)
-        pieces.append(Piece(measured, part.bad[inner] | resting, part.there[inner], lowpass))
+        pieces.append(Piece(measured, part.invalid[inner] | resting, part.present[inner], lowpass))
     if not pieces:
         span_s = (len(lowpass.taps) + 2 * window) / rate_hz
         raise DataError(
@@ -393,52 +397,46 @@ def condition(
             culprits=[recorded.label],
             next_step="Record for longer without losing samples; 10 to 30 s are usual.",
         )
-    if not good:
+    if not speeds_agree:
         notes.append(
             f"{recorded.label}: dq1_rad_s ... are not the speeds at which q1_rad ... change; they "
             "were left out. Are they in rad/s, measured, and not delayed?"
         )
     return Conditioned(
-        recorded.label,
-        tuple(pieces),
-        band_hz,
-        cutoff,
-        rate_hz,
-        tuple(notes),
-        recorded.of_currents,
+        recorded.label, tuple(pieces), band_hz, cutoff, rate_hz, tuple(notes), recorded.of_currents
     )
 
 
 def _resting(motion: JointMotion, rate_hz: float) -> Mask:
-    """(m, n) where a joint stands: there friction holds it by any torque up to its bound."""
+    """(m, n) where a joint stands still: friction then holds it by any torque up to its bound."""
     samples = max(round(_REST_S * rate_hz), 1)
     slow = np.abs(uniform_filter1d(motion.dq, samples, axis=0)) < _REST_RAD_S
     return np.asarray(binary_opening(slow, np.ones((samples, 1), dtype=bool)))
 
 
-def _widest(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:
-    """For how long samples may be missing where polynomials of that cut-off smooth angles [s]."""
+def _longest_gap(smoothing_hz: float, rate_hz: float, usual_s: float) -> float:
+    """Longest gap over which polynomials of that cut-off may interpolate angles [s]."""
     return _BRIDGED * usual_s * window_of(smoothing_hz, rate_hz, _SAMPLES_AT_ONCE)
 
 
 def _cleaned(
     recorded: RecordedSamples, limits_nm: FloatArray | None, notes: list[str]
 ) -> tuple[FloatArray, Mask]:
-    """Torques with single slips taken out, and which of them are none."""
+    """Torques with spikes replaced, and the mask of saturated ones."""
     torques = recorded.torques_nm.copy()
     flat = np.stack([_flat_tops(column) for column in torques.T], axis=1)
     if limits_nm is not None:
         beyond = np.abs(torques) >= 0.999 * limits_nm
-        # Drives that are at their limits all the time are none: the torques are of another unit.
+        # Torques that are beyond the limits often are not saturated, but in another unit.
         flat |= beyond & (beyond.mean(axis=0) < _MOST_AT_LIMIT)
-    around = median_filter(torques, (_NEIGHBOURS, 1), mode="nearest")
-    away = np.abs(torques - around)
-    # Of normal noise three in four samples depart from the median of five by less than this.
-    usual = np.quantile(away, 0.75, axis=0)
+    medians = median_filter(torques, (_NEIGHBOURS, 1), mode="nearest")
+    deviations = np.abs(torques - medians)
+    # Three in four samples of normal noise deviate from the median of five by less than this.
+    usual_deviations = np.quantile(deviations, 0.75, axis=0)
     range_nm = np.quantile(torques, 0.999, axis=0) - np.quantile(torques, 0.001, axis=0)
-    spikes = (away > np.maximum(_SPIKE * usual, _SPIKE_SHARE * range_nm)) & ~flat
-    spikes &= spikes.mean(axis=0) < _TOUCHED
-    torques[spikes] = around[spikes]
+    spikes = (deviations > np.maximum(_SPIKE * usual_deviations, _SPIKE_SHARE * range_nm)) & ~flat
+    spikes &= spikes.mean(axis=0) < _MOST_INVALID
+    torques[spikes] = medians[spikes]
     for what, wrong, done in (
         ("at rest on an extreme value (saturated)", flat, "what rests on them is left out"),
         ("far off from their neighbours", spikes, "the median around is used in their place"),
@@ -450,7 +448,7 @@ def _cleaned(
 
 
 def _flat_tops(values: FloatArray) -> Mask:
-    """Where torques (m,) stay at their highest or lowest for longer than anywhere else."""
+    """(m,) where torques stay at their extremes for longer than anywhere else: saturation."""
     flat = np.zeros(len(values), dtype=bool)
     span = float(np.ptp(values))
     same = np.abs(np.diff(values)) <= _FLAT * span

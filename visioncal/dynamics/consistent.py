@@ -1,9 +1,8 @@
-"""Standard parameters that are those of bodies, near known ones, and explain the measured torques.
+"""Physically consistent standard parameters from identified base parameters.
 
-A motion determines base parameters only. What is free or badly determined follows what is
-known of the links before: the fit goes over log-Cholesky coordinates, in which every link is a body
-whatever the torques say, with a weak prior at the known one (Wensing, Kim and Slotine 2018; Lee,
-Wensing and Park 2019; Rucker and Wensing 2022).
+A motion determines base parameters only; the rest follows a prior at the robot's own inertias. The
+fit is over log-Cholesky coordinates, in which every link is physically consistent, with a weak
+prior (Wensing, Kim and Slotine 2018; Lee, Wensing and Park 2019; Rucker and Wensing 2022).
 """
 
 from dataclasses import dataclass, replace
@@ -17,23 +16,22 @@ from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marqu
 from visioncal.estimation.linalg import covariance_from, damped_step
 from visioncal.robot import Inertias, LogCholesky
 
-# Links differ from what is known of them by about so much in each coordinate: a third of their
-# extent, and twice that of their mass.
+# Standard deviation of the prior in each log-Cholesky coordinate: 30 % of a link's extent, twice
+# that of its mass.
 PRIOR_SIGMA = 0.3
 _SETTLED = 1e-9
-# Parameters of joints that cannot be below zero.
+# Prefixes of the joint parameters that cannot be negative.
 _POSITIVE = ("Fc", "Fv", "Ia")
 
 
 @dataclass(frozen=True, eq=False)
 class Consistent:
-    """Standard parameters of bodies.
+    """Physically consistent standard parameters.
 
     Attributes:
-        values: (p,) as `DynamicModel.names` has them.
-        covariance: (p, p) of these: what the torques and the prior leave together.
-        misfit: By how much the torques' squared residuals, in units of their noise, are larger than
-            with the base parameters that fit best.
+        values: (p,) in the order of `DynamicModel.names`.
+        covariance: (p, p) posterior covariance, given torques and prior.
+        misfit: Chi-square by which the torques fit worse than with the best base parameters.
     """
 
     values: FloatArray
@@ -41,23 +39,23 @@ class Consistent:
     misfit: float
 
     def inertias(self, joints: int) -> Inertias:
-        """Of the links."""
+        """Inertial parameters of the links."""
         return Inertias(self.values[: 10 * joints].reshape(joints, 10))
 
 
 def fit_consistent(
     base: BaseModel, values: FloatArray, covariance: FloatArray, known: Inertias
 ) -> Consistent:
-    """Finds the bodies, near known ones, whose base parameters are nearest to measured ones.
+    """Fits consistent standard parameters, near known inertias, to measured base parameters.
 
     Args:
         base: The model.
         values: (b,) measured base parameters.
         covariance: (b, b) their covariance.
-        known: The links as they are known before.
+        known: Prior inertias of the links.
 
     Raises:
-        DataError: What is known is that of no body.
+        DataError: The prior inertias are physically inconsistent.
     """
     joints = len(known.values)
     names = base.model.names[10 * joints :]
@@ -68,21 +66,21 @@ def fit_consistent(
     )
     for _ in range(len(names) + 1):
         state, _ = levenberg_marquardt(problem.start(), problem.linearised, _SETTLED)
-        wrong = positive & (state.own < 0.0) & ~problem.held
-        if not wrong.any():
+        negative = positive & (state.own < 0.0) & ~problem.held
+        if not negative.any():
             break
-        # A negative one is held at zero: it is noise, or the torques are of another model.
-        problem = replace(problem, held=problem.held | wrong)
+        # Negative ones are held at zero: they are noise, or the model does not fit.
+        problem = replace(problem, held=problem.held | negative)
     information, _, _ = problem.normal(state)
     jacobian = problem.jacobian(state)
     posterior = jacobian @ covariance_from(information) @ jacobian.T
-    away = problem.whitened.of_vector(values - base.of(problem.standard(state)))
-    return Consistent(problem.standard(state), posterior, float(away @ away))
+    residual = problem.whitened.apply(values - base.of(problem.standard(state)))
+    return Consistent(problem.standard(state), posterior, float(residual @ residual))
 
 
 @dataclass(frozen=True, eq=False)
 class _Whitened:
-    """Turns deviations of a covariance into ones of unit covariance."""
+    """Whitening transform of a covariance."""
 
     root: FloatArray
     scale: FloatArray
@@ -92,14 +90,14 @@ class _Whitened:
         scale = np.sqrt(np.diag(covariance))
         return cls(cholesky(covariance / np.outer(scale, scale), lower=True), scale)
 
-    def of_vector(self, away: FloatArray) -> FloatArray:
-        scaled = away / self.scale.reshape(-1, *[1] * (away.ndim - 1))
+    def apply(self, residual: FloatArray) -> FloatArray:
+        scaled = residual / self.scale.reshape(-1, *[1] * (residual.ndim - 1))
         return np.asarray(solve_triangular(self.root, scaled, lower=True))
 
 
 @dataclass(frozen=True, eq=False)
 class _LinkState:
-    """Coordinates (n, 10) of the links, and the parameters that joints have of their own."""
+    """Log-Cholesky coordinates (n, 10) of the links, and the joints' own parameters."""
 
     links: FloatArray
     own: FloatArray
@@ -107,7 +105,7 @@ class _LinkState:
 
 @dataclass(frozen=True, eq=False)
 class _ConsistentFit:
-    """The fit, with its unknowns in units of the prior where they have one."""
+    """The least-squares problem; link coordinates in units of their prior sigma."""
 
     base: BaseModel
     values: FloatArray
@@ -116,20 +114,20 @@ class _ConsistentFit:
     held: Mask
 
     def start(self) -> _LinkState:
-        """The known links, with the joints' own parameters that go best with them."""
+        """The prior links, with the joints' own parameters fitted to the rest."""
         joints = len(self.coordinates.maps)
         links = np.zeros((joints, 10))
         known = self.coordinates.values(links).ravel()
-        own = self.whitened.of_vector(self.base.dependence[:, len(known) :] * ~self.held)
+        own = self.whitened.apply(self.base.dependence[:, len(known) :] * ~self.held)
         rest = self.values - self.base.dependence[:, : len(known)] @ known
-        found = np.linalg.lstsq(own, self.whitened.of_vector(rest), rcond=None)[0]
-        return _LinkState(links, np.where(self.held, 0.0, found))
+        fitted = np.linalg.lstsq(own, self.whitened.apply(rest), rcond=None)[0]
+        return _LinkState(links, np.where(self.held, 0.0, fitted))
 
     def standard(self, state: _LinkState) -> FloatArray:
         return np.concatenate([self.coordinates.values(state.links).ravel(), state.own])
 
     def jacobian(self, state: _LinkState) -> FloatArray:
-        """(p, p) derivatives of the standard parameters by the unknowns."""
+        """(p, p) Jacobian of the standard parameters."""
         count, own = state.links.size, state.own.size
         jacobian = np.zeros((count + own, count + own))
         for joint, block in enumerate(self.coordinates.jacobians(state.links)):
@@ -139,15 +137,15 @@ class _ConsistentFit:
         return jacobian
 
     def normal(self, state: _LinkState) -> tuple[FloatArray, FloatArray, float]:
-        """Information, gradient and cost by the unknowns."""
+        """Information, gradient and cost."""
         prior = np.zeros(state.links.size + state.own.size)
         prior[: state.links.size] = state.links.ravel() / PRIOR_SIGMA
-        residual = self.whitened.of_vector(self.base.of(self.standard(state)) - self.values)
-        jacobian = self.whitened.of_vector(self.base.dependence @ self.jacobian(state))
-        known = np.zeros(prior.size)
-        known[: state.links.size] = 1.0
-        known[state.links.size :][self.held] = 1.0
-        information = jacobian.T @ jacobian + np.diag(known)
+        residual = self.whitened.apply(self.base.of(self.standard(state)) - self.values)
+        jacobian = self.whitened.apply(self.base.dependence @ self.jacobian(state))
+        prior_information = np.zeros(prior.size)
+        prior_information[: state.links.size] = 1.0
+        prior_information[state.links.size :][self.held] = 1.0
+        information = jacobian.T @ jacobian + np.diag(prior_information)
         gradient = jacobian.T @ residual + prior
         return information, gradient, float(residual @ residual + prior @ prior)
 
@@ -155,9 +153,9 @@ class _ConsistentFit:
         information, gradient, cost = self.normal(state)
 
         def step(damping: float) -> _LinkState:
-            by = damped_step(information, gradient, damping)
-            links = PRIOR_SIGMA * by[: state.links.size].reshape(state.links.shape)
-            own = by[state.links.size :]
+            update = damped_step(information, gradient, damping)
+            links = PRIOR_SIGMA * update[: state.links.size].reshape(state.links.shape)
+            own = update[state.links.size :]
             return _LinkState(state.links + links, state.own + np.where(self.held, 0.0, own))
 
         return Linearised(state, cost, step)

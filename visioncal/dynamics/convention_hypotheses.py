@@ -1,8 +1,8 @@
-"""Torques of other units, other joints or the other sign, found by what the robot should need.
+"""Detection of torques in other units, of other joints or of the other sign.
 
-The robot's own inertias are off by a fifth, but a recording that is mistaken is off by far more. So
-each mistake is tried out: the recording is taken as if it had been made, and what is predicted of
-it is compared with what was measured, next to friction, which brakes.
+Each possible mistake is undone in turn, and the torques that the robot's own inertias then predict,
+with friction, are compared with the measured ones. The inertias may be off by a fifth; a mistaken
+recording is off by far more.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,34 +20,34 @@ from visioncal.dynamics.model import sign
 from visioncal.dynamics.motion import JointMotion, Measured
 from visioncal.robot import Inertias, Robot, joint_torques
 
-# So many samples are enough for a test; fewer, as of sweeps of single joints, are not.
+# Samples of a test, and the least number: sweeps of single joints have fewer.
 _SAMPLES, _LEAST = 250, 100
-# A mistake is named where undoing it divides the unexplained power of the torques by this much, and
-# leaves of the joints concerned no more than this share.
+# With inertias a mistake is reported where undoing it divides the torques' unexplained power by
+# this factor, and leaves at most this share unexplained in the joints concerned.
 _BETTER, _LEFT = 10.0, 0.5
-# Two joints that are swapped are named where undoing it divides what a fit leaves by this much, all
-# joints together, and leaves no more than this share: right recordings of exciting motions get
-# worse by any swap, and those of slow sweeps, where friction is all there is, hardly change.
+# Swapped joints are reported where undoing the swap divides the fit's residual power, over all
+# joints, by this factor, and leaves at most this share: correct recordings of exciting motions get
+# worse by any swap, and slow sweeps, where friction is nearly all, hardly change.
 _FITS_BETTER, _FIT_LEFT = 10.0, 0.01
-# Without inertias a mistake is named where undoing it divides what a fit leaves by this much, and
-# leaves no more than this share; of right recordings it is divided by 1.2 at most.
+# Without inertias a mistake is reported where undoing it divides the fit's residual power by this
+# factor, and leaves at most this share; for correct recordings the factor is at most 1.2.
 _SURELY_BETTER, _EXPLAINED = 100.0, 0.1
-# Of the power of a joint's torques so much is always left: noise, and inertias that are off.
+# Least share of a joint's torque power that counts as unexplained: noise, and wrong inertias.
 _FLOOR = 0.01
-# Inertias are off by less than these factors, and a torque on the motor's side, or in thousandths,
-# by far more. They are read from joints of whose torque the links need at least this share.
+# Torques whose scale to the predicted ones is outside these factors are in other units, such as
+# motor-side torques; only joints of whose torque the links make up at least this share are tested.
 _HIGH, _LOW, _SHARE = 5.0, 0.2, 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
-    """A recording as it would be without some mistake.
+    """A recording with some mistake undone.
 
     Attributes:
-        words: The mistake, in words; empty for the recording as it is.
+        words: The mistake, for the message; empty for the recording as it is.
         joints: The joints concerned.
-        measured: The recording without it.
-        predicted: (m, n) what the links should need [N m].
+        measured: The corrected recording.
+        predicted: (m, n) torques of the links by the robot's inertias [N m].
     """
 
     words: str
@@ -59,72 +59,75 @@ class _Hypothesis:
 def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     """Refuses recordings that are plainly mistaken.
 
-    Without inertias a fit has to explain the torques: units and the sign of all of them are open
-    then, as a heavier arm needs more.
+    Without inertias, mistakes are tested by a fit of all parameters, which cannot show the unit or
+    sign that all torques share.
 
     Raises:
         DataError: Torques or angles are of another joint, of the other sign, or in other units.
     """
     robot = base.model.robot
     for stream in streams:
-        measured = _some(stream)
+        measured = _sampled(stream)
         if len(measured) < _LEAST:
             continue
         joints = tuple(range(measured.torques_nm.shape[1]))
         as_it_is = _Hypothesis("", joints, measured, _predicted(robot, measured.motion))
         if robot.inertias is None:
-            found = _explained_better(base, as_it_is)
+            mistake = _explained_better(base, as_it_is)
         else:
-            found = _predicted_better(robot, as_it_is) or _fitted_better(base, as_it_is)
-        if found is not None:
+            mistake = _predicted_better(robot, as_it_is) or _fitted_better(base, as_it_is)
+        if mistake is not None:
             raise DataError(
-                f"{stream.label}: {found[0].words}: {found[1]}.",
-                culprits=[f"joint {joint + 1}" for joint in found[0].joints],
+                f"{stream.label}: {mistake[0].words}: {mistake[1]}.",
+                culprits=[f"joint {joint + 1}" for joint in mistake[0].joints],
                 next_step="Mend the columns of the stream, or name the robot that was recorded.",
             )
         if robot.inertias is not None:
             _check_units(stream.label, robot, as_it_is)
 
 
-def _some(stream: Conditioned) -> Measured:
-    """Samples from all over a stream at which all joints move, as they were before the filter."""
+def _sampled(stream: Conditioned) -> Measured:
+    """Unfiltered samples, spread over a stream, at which all torques are valid."""
     piece = max(stream.pieces, key=lambda value: len(value.measured))
-    good = np.flatnonzero(piece.there & ~piece.bad.any(axis=1))
+    good = np.flatnonzero(piece.present & ~piece.bad.any(axis=1))
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
 
 
 def _predicted_better(robot: Robot, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
-    """The mistake without which by far the most is as predicted, if there is one, and why."""
-    before = _left(as_it_is)
+    """The mistake whose correction makes the prediction fit far better, and why; else None."""
+    before = _unexplained_shares(as_it_is)
     best, gain = None, np.log(_BETTER)
-    for guess in _guesses(robot, as_it_is):
-        after = _left(guess)
+    for hypothesis in _hypotheses(robot, as_it_is):
+        after = _unexplained_shares(hypothesis)
         better = float(np.sum(np.log(before / after)))
-        if better > gain and after[list(guess.joints)].max() < _LEFT:
-            best, gain = guess, better
+        if better > gain and after[list(hypothesis.joints)].max() < _LEFT:
+            best, gain = hypothesis, better
     if best is None:
         return None
     joints = list(best.joints)
-    shares = [100.0 * (1.0 - float(left[joints].mean())) for left in (_left(best), before)]
+    percent = [
+        100.0 * (1.0 - float(shares[joints].mean()))
+        for shares in (_unexplained_shares(best), before)
+    ]
     return best, (
-        f"so taken, {shares[0]:.0f} % of the torques of {_named(best.joints)} is explained by the "
-        f"inertias of {robot.name} and by friction, instead of {max(shares[1], 0.0):.0f} %"
+        f"so taken, {percent[0]:.0f} % of the torques of {_named(best.joints)} is explained by "
+        f"the inertias of {robot.name} and by friction, instead of {max(percent[1], 0.0):.0f} %"
     )
 
 
 def _fitted_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
-    """Two exchanged joints, if a fit finds such a pair, and why."""
-    # Where friction is most of their torques, predictions hardly show it; but no inertias at all
-    # can explain the others' torques.
-    before, predicted = _unfitted(base, as_it_is.measured), _left(as_it_is)
+    """Two swapped joints, if a fit shows such a pair, and why; else None."""
+    # The prediction hardly shows it where their torques are mostly friction; but then no inertias
+    # at all explain the other joints' torques.
+    before, predicted = _residual_power(base, as_it_is.measured), _unexplained_shares(as_it_is)
     best, gain = None, np.log(_FITS_BETTER)
-    for guess in _swapped_joints(base.model.robot, as_it_is):
-        if np.sum(np.log(predicted / _left(guess))) < -1.0:
+    for hypothesis in _swapped_joints(base.model.robot, as_it_is):
+        if np.sum(np.log(predicted / _unexplained_shares(hypothesis))) < -1.0:
             continue
-        after = _unfitted(base, guess.measured)
+        after = _residual_power(base, hypothesis.measured)
         better = float(np.sum(np.log(before / after)))
         if better > gain and after.max() < _FIT_LEFT:
-            best, gain = guess, better
+            best, gain = hypothesis, better
     if best is None:
         return None
     times = float(np.exp(gain / len(as_it_is.joints)))
@@ -132,27 +135,27 @@ def _fitted_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis,
 
 
 def _explained_better(base: BaseModel, as_it_is: _Hypothesis) -> tuple[_Hypothesis, str] | None:
-    """The mistake without which a fit of any inertias leaves by far less, if there is one, and why.
+    """The mistake whose correction makes the best fit far better, and why; else None.
 
-    Slow sweeps tell the torques of two joints hardly from their angles: both are named.
+    Slow sweeps hardly separate swapped torques from swapped angles: both are named.
     """
-    before = _unfitted(base, as_it_is.measured)
+    before = _residual_power(base, as_it_is.measured)
     tried = []
-    for guess in _guesses(base.model.robot, as_it_is):
-        after = _unfitted(base, guess.measured)
+    for hypothesis in _hypotheses(base.model.robot, as_it_is):
+        after = _residual_power(base, hypothesis.measured)
         if after.max() < _EXPLAINED:
-            tried.append((float(np.sum(np.log(before / after))), guess))
+            tried.append((float(np.sum(np.log(before / after))), hypothesis))
     gain, best = max(tried, key=lambda pair: pair[0], default=(0.0, as_it_is))
     if gain < np.log(_SURELY_BETTER):
         return None
-    alike = [guess.words for more, guess in tried if more > gain - np.log(_FITS_BETTER)]
+    alike = [hypothesis.words for more, hypothesis in tried if more > gain - np.log(_FITS_BETTER)]
     times = float(np.exp(gain / len(as_it_is.joints)))
     why = f"so taken, the best fit leaves {times:.2g} times less of the torques' power a joint"
     return replace(best, words=", or ".join(alike)), why
 
 
-def _unfitted(base: BaseModel, measured: Measured) -> FloatArray:
-    """(n,) what the best fit leaves of the power of each joint's torques."""
+def _residual_power(base: BaseModel, measured: Measured) -> FloatArray:
+    """(n,) share of the power of each joint's torques that the best fit leaves."""
     sizes = np.maximum(np.std(measured.torques_nm, axis=0), 1e-12)
     x = base.regressor(measured.motion) / sizes[:, None]
     y = measured.torques_nm / sizes
@@ -163,8 +166,8 @@ def _unfitted(base: BaseModel, measured: Measured) -> FloatArray:
     return np.asarray(np.maximum(left, 1e-12))
 
 
-def _guesses(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording without one mistake or another."""
+def _hypotheses(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
+    """The recording with each possible mistake undone."""
     yield from _swapped_columns(robot, as_it_is)
     yield from _swapped_joints(robot, as_it_is)
     yield from _flipped(robot, as_it_is)
@@ -179,34 +182,34 @@ def _guesses(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
 
 
 def _swapped_columns(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording without the torques, or the angles, of two joints swapped."""
+    """The recording with the torques, or the angles, of two joints swapped back."""
     measured = as_it_is.measured
     for pair, order in _pairs(as_it_is):
         words = f"of joints {pair[0] + 1} and {pair[1] + 1} are swapped"
         swapped = replace(measured, torques_nm=measured.torques_nm[:, order])
         yield replace(as_it_is, words=f"the torques {words}", joints=pair, measured=swapped)
-        turned = _reordered(measured.motion, order)
-        yield _moved(robot, turned, measured.torques_nm, f"the angles {words}", pair)
+        motion = _reordered(measured.motion, order)
+        yield _moved(robot, motion, measured.torques_nm, f"the angles {words}", pair)
 
 
 def _swapped_joints(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording without two joints taken for each other."""
+    """The recording with two joints swapped back, angles and torques together."""
     measured = as_it_is.measured
     for pair, order in _pairs(as_it_is):
         words = f"joints {pair[0] + 1} and {pair[1] + 1} are swapped, with angles and torques"
-        turned = _reordered(measured.motion, order)
-        yield _moved(robot, turned, measured.torques_nm[:, order], words, pair)
+        motion = _reordered(measured.motion, order)
+        yield _moved(robot, motion, measured.torques_nm[:, order], words, pair)
 
 
 def _pairs(as_it_is: _Hypothesis) -> Iterator[tuple[tuple[int, int], IntArray]]:
-    for one, other in combinations(as_it_is.joints, 2):
+    for first, second in combinations(as_it_is.joints, 2):
         order = np.array(as_it_is.joints)
-        order[[one, other]] = other, one
-        yield (one, other), order
+        order[[first, second]] = second, first
+        yield (first, second), order
 
 
 def _flipped(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
-    """The recording without the other sign of a joint's torque or angle."""
+    """The recording with the sign of a joint's torque or angle reversed."""
     measured = as_it_is.measured
     for joint in as_it_is.joints:
         signs = np.where(np.array(as_it_is.joints) == joint, -1.0, 1.0)
@@ -214,8 +217,8 @@ def _flipped(robot: Robot, as_it_is: _Hypothesis) -> Iterator[_Hypothesis]:
         words = f"the torque of joint {joint + 1} has the other sign than its angle"
         yield replace(as_it_is, words=words, joints=(joint,), measured=flipped)
         words = f"the angle of joint {joint + 1} has the other sign"
-        turned = _scaled(measured.motion, signs)
-        yield _moved(robot, turned, measured.torques_nm, words, (joint,))
+        motion = _scaled(measured.motion, signs)
+        yield _moved(robot, motion, measured.torques_nm, words, (joint,))
 
 
 def _moved(
@@ -234,24 +237,26 @@ def _reordered(motion: JointMotion, order: Sequence[int] | IntArray) -> JointMot
     return JointMotion(motion.times_s, *parts)
 
 
-def _scaled(motion: JointMotion, by: FloatArray | float) -> JointMotion:
-    return JointMotion(motion.times_s, by * motion.q, by * motion.dq, by * motion.ddq)
+def _scaled(motion: JointMotion, factor: FloatArray | float) -> JointMotion:
+    return JointMotion(motion.times_s, factor * motion.q, factor * motion.dq, factor * motion.ddq)
 
 
-def _left(guess: _Hypothesis) -> FloatArray:
-    """(n,) share of the power of each joint's torques that nothing explains."""
-    return np.array([_fitted(guess, index)[1] for index in range(guess.predicted.shape[1])])
+def _unexplained_shares(hypothesis: _Hypothesis) -> FloatArray:
+    """(n,) share of the power of each joint's torques that prediction and friction leave."""
+    return np.array(
+        [_joint_fit(hypothesis, index)[1] for index in range(hypothesis.predicted.shape[1])]
+    )
 
 
-def _fitted(guess: _Hypothesis, joint: int) -> tuple[FloatArray, float]:
-    """A joint's torques by multiples of what is predicted and of friction, none below zero."""
-    dq, torques = guess.measured.motion.dq[:, joint], guess.measured.torques_nm[:, joint]
-    columns = np.column_stack([guess.predicted[:, joint], sign(dq), dq])
-    columns, about = columns - columns.mean(axis=0), torques - torques.mean()
+def _joint_fit(hypothesis: _Hypothesis, joint: int) -> tuple[FloatArray, float]:
+    """Non-negative fit of a joint's torques: factors of prediction and friction, share left."""
+    dq, torques = hypothesis.measured.motion.dq[:, joint], hypothesis.measured.torques_nm[:, joint]
+    columns = np.column_stack([hypothesis.predicted[:, joint], sign(dq), dq])
+    columns, centred = columns - columns.mean(axis=0), torques - torques.mean()
     sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-    found, left = nnls(columns / sizes, about)
-    power = max(float(about @ about), 1e-24)
-    return found / sizes, max(left**2 / power, _FLOOR)
+    factors, left = nnls(columns / sizes, centred)
+    power = max(float(centred @ centred), 1e-24)
+    return factors / sizes, max(left**2 / power, _FLOOR)
 
 
 def _named(joints: tuple[int, ...]) -> str:
@@ -260,15 +265,17 @@ def _named(joints: tuple[int, ...]) -> str:
     )
 
 
-def _check_units(label: str, robot: Robot, guess: _Hypothesis) -> None:
-    """Refuses torques that are multiples of what they should be."""
-    scales = np.full(len(guess.joints), np.nan)
-    for joint in guess.joints:
-        found, left = _fitted(guess, joint)
-        torques = guess.measured.torques_nm[:, joint]
-        share = found[0] ** 2 * np.var(guess.predicted[:, joint]) / max(np.var(torques), 1e-24)
+def _check_units(label: str, robot: Robot, hypothesis: _Hypothesis) -> None:
+    """Refuses torques whose scale to the predicted ones shows another unit."""
+    scales = np.full(len(hypothesis.joints), np.nan)
+    for joint in hypothesis.joints:
+        factors, left = _joint_fit(hypothesis, joint)
+        torques = hypothesis.measured.torques_nm[:, joint]
+        share = (
+            factors[0] ** 2 * np.var(hypothesis.predicted[:, joint]) / max(np.var(torques), 1e-24)
+        )
         if share > _SHARE and left < _LEFT:
-            scales[joint] = found[0]
+            scales[joint] = factors[0]
     wrong = np.flatnonzero((scales > _HIGH) | (scales < _LOW))
     if not len(wrong):
         return
@@ -285,7 +292,7 @@ def _check_units(label: str, robot: Robot, guess: _Hypothesis) -> None:
 
 
 def _unit(scale: float) -> str:
-    """What torques are likely to be."""
+    """The likely unit of torques with that scale, as a question."""
     if scale > 200.0:
         return "are they mN m, or mA for A?"
     if scale > _HIGH:

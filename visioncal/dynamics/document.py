@@ -1,4 +1,4 @@
-"""dynamics.json."""
+"""Reading and writing of dynamics.json."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ SCHEMA = 1
 
 
 def to_document(identified: Identified) -> dict[str, Any]:
-    """Builds the content of dynamics.json; what was not computed is absent."""
+    """Builds the content of dynamics.json; fields that were not computed are absent."""
     base = identified.base
     document: dict[str, Any] = {"schema": SCHEMA, "visioncal": __version__, **identified.facts}
     document |= {
@@ -54,16 +54,18 @@ def to_document(identified: Identified) -> dict[str, Any]:
 
 
 def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
-    """The parameters of each joint whose friction has a hump at low speed."""
+    """Parameters of each joint with a Stribeck hump."""
     humps, count = identified.stribeck, len(identified.stribeck.joints)
     names = [identified.base.model.names[index] for index in identified.base.independent]
     rows = []
     for at, joint in enumerate(humps.joints.tolist()):
-        sliding = names.index(f"Fc{joint + 1}")
-        hump, log = (identified.base.rank + at + part * count for part in (0, 1))
-        covariance = identified.covariance[np.ix_([sliding, hump], [sliding, hump])]
-        coulomb, extra = float(identified.values[sliding]), float(humps.hump_nm[at])
-        slope = np.array([-extra / coulomb**2, 1.0 / coulomb])
+        coulomb_index = names.index(f"Fc{joint + 1}")
+        hump_index, log_index = (identified.base.rank + at + part * count for part in (0, 1))
+        covariance = identified.covariance[
+            np.ix_([coulomb_index, hump_index], [coulomb_index, hump_index])
+        ]
+        coulomb, extra = float(identified.values[coulomb_index]), float(humps.hump_nm[at])
+        gradient = np.array([-extra / coulomb**2, 1.0 / coulomb])
         rows.append(
             {
                 "joint": joint + 1,
@@ -72,10 +74,10 @@ def stribeck_rows(identified: Identified) -> list[dict[str, Any]]:
                 "static_nm": coulomb + extra,
                 "static_sigma_nm": float(np.sqrt(covariance.sum())),
                 "static_over_coulomb": 1.0 + extra / coulomb,
-                "static_over_coulomb_sigma": float(np.sqrt(slope @ covariance @ slope)),
+                "static_over_coulomb_sigma": float(np.sqrt(gradient @ covariance @ gradient)),
                 "speed_rad_s": float(humps.speed_rad_s[at]),
                 "speed_sigma_rad_s": float(
-                    humps.speed_rad_s[at] * np.sqrt(identified.covariance[log, log])
+                    humps.speed_rad_s[at] * np.sqrt(identified.covariance[log_index, log_index])
                 ),
             }
         )
@@ -105,11 +107,11 @@ _OWN_KEYS = frozenset(
 
 
 def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Reads the fields of a result from what `to_document` built.
+    """Reads the fields of `Identified` from a document of `to_document`.
 
     Raises:
         DataError: It is of another schema.
-        LookupError, TypeError, ValueError, AttributeError: It is none of this one.
+        LookupError, TypeError, ValueError, AttributeError: It does not match the schema.
     """
     if document.get("schema") != SCHEMA:
         raise DataError(
@@ -119,7 +121,11 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         )
     robot = Robot.from_document(document["robot"])
     terms = FrictionTerms(**document["friction"])
-    base = _base(DynamicModel(robot, terms), [str(row["name"]) for row in document["base"]])
+    model = DynamicModel(robot, terms)
+    # `BaseModel.reduce` may keep other parameters: its choice depends on rounding, and so on the
+    # machine.
+    kept = [model.names.index(str(row["name"]).split()[0]) for row in document["base"]]
+    base = BaseModel.keeping(model, np.array(kept, dtype=np.int64))
     size = base.rank + 2 * len(document["stribeck"])
     standard = document.get("standard")
     return {
@@ -129,34 +135,27 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
         "covariance": _array(document["covariance"], (size, size)),
         "stribeck": _stribeck(document["stribeck"], terms),
         "consistent": None if standard is None else _consistent(standard, len(base.model.names)),
-        **_of_joints(read(_Figures, document, ""), robot.joint_count),
+        **_checked_fields(read(_Figures, document, ""), robot.joint_count),
         "facts": {name: value for name, value in document.items() if name not in _OWN_KEYS},
     }
 
 
 @dataclass(frozen=True)
 class _Figures:
-    """What is read as it was written."""
+    """The fields that the codec reads."""
 
     streams: tuple[StreamFacts, ...]
     validation: TorqueValidation | None = None
     lag: Lag | None = None
 
 
-def _of_joints(found: _Figures, joints: int) -> dict[str, Any]:
-    """The same by name, if all of it is of so many joints."""
-    for stream in (*found.streams, found.validation):
+def _checked_fields(figures: _Figures, joints: int) -> dict[str, Any]:
+    """Fields by name, after checking that all arrays are of that number of joints."""
+    for stream in (*figures.streams, figures.validation):
         for name, value in vars(stream).items() if stream else ():
             if isinstance(value, np.ndarray) and len(value) != joints:
                 raise ValueError(f"{name} has {len(value)} numbers for {joints} joints")
-    return vars(found)
-
-
-def _base(model: DynamicModel, names: Sequence[str]) -> BaseModel:
-    """The base parameters that begin as those that were written."""
-    # Which ones are kept may hang on rounding, and so on the machine.
-    kept = [model.names.index(name.split()[0]) for name in names]
-    return BaseModel.keeping(model, np.array(kept, dtype=np.int64))
+    return vars(figures)
 
 
 def _stribeck(rows: Sequence[Mapping[str, Any]], terms: FrictionTerms) -> Stribeck:

@@ -1,11 +1,11 @@
-"""Exciting motions: those that determine an arm's base parameters best, and their objective.
+"""Search for exciting motions, which determine an arm's base parameters best.
 
 Swevers, Verdonck and De Schutter (2007, Dynamic model identification for industrial robots): the
 coefficients of finite Fourier series are optimised for the condition of the regressor, within the
-limits of joints, drives and cell. Here the condition is made smooth, and sharper from round to
-round; descents start from random motions, and the best one is kept that a look at a thousand
-samples a second finds within all limits. The same request gives the same motion, on a slow computer
-too, unless it limits the time.
+limits of joints, drives and cell. Here a smooth approximation of the condition is sharpened from
+round to round; descents start from random motions, and the best result that is within all limits at
+a thousand samples a second is kept. Results depend on the computer's speed only if the request
+limits the time.
 """
 
 import time
@@ -25,67 +25,60 @@ from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept, kept_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import JointMotion
 
-# How long a motion may be [s], and of how many harmonics: fewer cannot determine the parameters of
-# six joints, more have speeds that shake the arm.
+# Range of a motion's duration [s], and of its number of harmonics: fewer cannot determine the
+# parameters of six joints, more shake the arm.
 SHORTEST_S, LONGEST_S = 10.0, 30.0
 FEWEST, MOST = 3, 10
-# Sharpness of the condition and price of breaches, round by round.
+# Sharpness of the smoothed condition and penalty weight of the limits, round by round.
 _ROUNDS = ((1.0, 10.0), (4.0, 80.0), (15.0, 640.0))
-# Random motions use this share of the limits, and start from one of so many random postures.
+# Share of the limits that random motions use, and number of random postures tried for their start.
 _MODEST, _POSTURES = 0.5, 2000
-# They are halved so many times, at most, until they are clear of everything: a descent that begins
-# within a body may never come out of it.
+# They are halved at most so many times until they are free of collisions: a descent that begins
+# inside a body may never come out of it.
 _HALVINGS, _CLEAR_HZ = 8, 10.0
-# A motion that breaks a limit is made smaller by this, so many times, before it is given up.
+# A motion that exceeds a limit is scaled by this at most so many times before it is given up.
 _SMALLER, _TRIES = 0.97, 5
-# Figures do not change with more samples than these.
+# Sampling of the condition numbers, which do not change with more.
 _FIGURES_HZ = 100.0
 # Random motions whose condition is reported for comparison.
 _COMPARED = 20
-# Broken limits that a message names.
+# Exceeded limits that a message names.
 _NAMED = 3
 
-# Samples for each of the highest harmonic's periods: torques hold products of few of them. Limits
-# and distances are looked at more often.
-_SAMPLES, _LOOKS = 10, 3
-# Dry friction is spread over this share of the greatest speed: else its sense jumps at a sample.
+# Samples of the regressor per period of the highest harmonic, and how many times denser limits and
+# distances are sampled.
+_SAMPLES, _LIMIT_DENSITY = 10, 3
+# Dry friction is smoothed over this share of the greatest speed, so that the objective is smooth.
 _SPREAD = 0.03
-# Steps of the derivatives [rad and its rates]: far above rounding, and the regressor bends little.
+# Finite-difference steps of regressor and distances [rad and its rates], far above rounding.
 _STEP, _STEP_CLEAR = 1e-6, 1e-5
-# Peaks lie between samples: limits end earlier by this share, distances by this [m].
+# Margins for peaks between samples: a share of the limits, and of the distances [m].
 _EARLIER, _BUFFER_M = 0.03, 0.03
-# A distance that lacks this much costs as much as a limit that is exceeded by its own size [m].
+# Scale of the distances' penalty: as costly as exceeding a limit by its own size [m].
 _SHORT_M = 0.1
 
 
 class Objective:
-    """The criterion of a motion and its derivatives, by the free numbers of its series.
+    """Objective of a motion and its gradient, over the free coefficients of its series.
 
     Attributes:
-        harmonics: What the motion is made of.
+        harmonics: Basis functions of the motion.
     """
 
     def __init__(
         self, allowed: Allowed, base: BaseModel, weights: FloatArray, harmonics: Harmonics
     ) -> None:
-        """Prepares the samples.
-
-        Args:
-            allowed: What the motion must keep.
-            base: The parameters that it is to determine.
-            weights: (n,) inverse of each joint's torque noise.
-            harmonics: What it is made of.
-        """
+        """Prepares the samples; weights (n,) are the inverse of each joint's torque noise."""
         self.harmonics = harmonics
         self._allowed, self._weights = allowed, weights
         terms = replace(base.model.terms, slow_rad_s=_SPREAD * float(allowed.speed.max()))
         self._base = replace(base, model=DynamicModel(base.model.robot, terms))
         count = _SAMPLES * harmonics.count
-        # Between the ends, at which speeds are zero and have no sense.
+        # Between the ends, where speeds are zero and have no sign.
         self._times = (np.arange(count) + 0.5) * harmonics.period_s / count
         self._basis = harmonics.basis(self._times)
-        looks = (np.arange(_LOOKS * count) + 0.5) * harmonics.period_s / (_LOOKS * count)
-        self._looks = harmonics.basis(looks)
+        dense = _LIMIT_DENSITY * count
+        self._limit_basis = harmonics.basis((np.arange(dense) + 0.5) * harmonics.period_s / dense)
         self._nominal = None
         if allowed.inertias is not None:
             standard = np.zeros(len(base.model.names))
@@ -93,45 +86,42 @@ class Objective:
             self._nominal = base.of(standard)
 
     def series(self, free: FloatArray) -> Series:
-        """The motion of (k,) free numbers."""
+        """The motion of (k,) free coefficients."""
         return Series(self.harmonics, free.reshape(self._allowed.robot.joint_count, -1))
 
     def value(self, free: FloatArray, sharpness: float, price: float) -> tuple[float, FloatArray]:
-        """The criterion.
+        """Smoothed log condition number plus the penalty of exceeded limits, and the gradient (k,).
 
         Args:
-            free: (k,) free numbers of all joints.
+            free: (k,) free coefficients of all joints.
             sharpness: Of `smooth_condition`.
-            price: Of what is beyond the limits.
-
-        Returns:
-            The value, and its derivatives (k,).
+            price: Weight of the penalty.
         """
-        numbers = self.series(free).free
-        value, by_value = self._condition(numbers, sharpness, price)
-        lost, by_lost = self._beyond(numbers)
-        jacobian = _back(self._basis, by_value) + price * _back(self._looks, by_lost)
-        return value + price * lost, jacobian.ravel()
+        coefficients = self.series(free).free
+        value, by_value = self._condition(coefficients, sharpness, price)
+        penalty, by_penalty = self._penalty(coefficients)
+        gradient = _chained(self._basis, by_value) + price * _chained(self._limit_basis, by_penalty)
+        return value + price * penalty, gradient.ravel()
 
     def _condition(
-        self, numbers: FloatArray, sharpness: float, price: float
+        self, coefficients: FloatArray, sharpness: float, price: float
     ) -> tuple[float, list[FloatArray]]:
-        """Condition and torques, with derivatives (m, n) by positions, speeds, accelerations."""
-        states = [array @ numbers.T for array in self._basis]
+        """Log condition and torque penalty; gradients (m, n) over position, speed, acceleration."""
+        states = [array @ coefficients.T for array in self._basis]
         rows, jacobian = self._regressors(states)
         weighted = (rows * self._weights[:, None]).reshape(-1, rows.shape[2])
         value, by_weighted = smooth_condition(weighted, sharpness)
         by_rows = by_weighted.reshape(rows.shape) * self._weights[:, None]
         if self._nominal is not None:
-            lost, by_torque = _hinge(rows @ self._nominal, self._allowed.torque)
-            # As dear as the limits that are looked at more often.
-            value += price * _LOOKS * lost
-            by_rows = by_rows + price * _LOOKS * by_torque[:, :, None] * self._nominal
+            penalty, by_torque = _hinge(rows @ self._nominal, self._allowed.torque)
+            # The same weight as the limits, which are sampled more densely.
+            value += price * _LIMIT_DENSITY * penalty
+            by_rows = by_rows + price * _LIMIT_DENSITY * by_torque[:, :, None] * self._nominal
         by_states = np.einsum("kmjp,mjp->mk", jacobian, by_rows, optimize=True)
         return value, np.split(by_states, len(states), axis=1)
 
     def _regressors(self, states: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Rows (m, n, b), and their derivatives (3 n, m, n, b) by the numbers of the states."""
+        """Regressor (m, n, b), and its derivatives (3 n, m, n, b) over the states' components."""
         # Forward differences; the rows are linear in the accelerations and quadratic in the speeds.
         count, joints = states[0].shape
         stepped = [np.repeat(state[None], 3 * joints + 1, axis=0) for state in states]
@@ -143,19 +133,19 @@ class Objective:
         rows = self._base.regressor(motion).reshape(3 * joints + 1, count, joints, -1)
         return rows[0], (rows[1:] - rows[0]) / _STEP
 
-    def _beyond(self, numbers: FloatArray) -> tuple[float, list[FloatArray]]:
-        """What is beyond limits and distances, with derivatives (m, n)."""
+    def _penalty(self, coefficients: FloatArray) -> tuple[float, list[FloatArray]]:
+        """Penalty of exceeded limits and distances, with gradients (m, n)."""
         allowed, less = self._allowed, 1.0 - _EARLIER
-        q, dq, ddq = (look @ numbers.T for look in self._looks)
+        q, dq, ddq = (array @ coefficients.T for array in self._limit_basis)
         position, by_q = _hinge(q - allowed.middle, less * allowed.half)
         speed, by_dq = _hinge(dq, less * allowed.speed)
-        hard, by_ddq = _hinge(ddq, less * allowed.acceleration)
-        near, by_near = self._near(q)
-        return position + speed + hard + near, [by_q + by_near, by_dq, by_ddq]
+        acceleration, by_ddq = _hinge(ddq, less * allowed.acceleration)
+        distance, by_q_distance = self._distance_penalty(q)
+        return position + speed + acceleration + distance, [by_q + by_q_distance, by_dq, by_ddq]
 
-    def _near(self, q: FloatArray) -> tuple[float, FloatArray]:
-        """What the distances fall short, squared, with derivatives (m, n) by the positions."""
-        value, jacobian = 0.0, np.zeros_like(q)
+    def _distance_penalty(self, q: FloatArray) -> tuple[float, FloatArray]:
+        """Sum of squared shortfalls of the distances, with its gradient (m, n)."""
+        value, gradient = 0.0, np.zeros_like(q)
         for row, posture in enumerate(q):
             short = self._shortfall(posture)
             if not short.any():
@@ -164,41 +154,40 @@ class Objective:
             for joint in range(len(posture)):
                 moved = posture.copy()
                 moved[joint] += _STEP_CLEAR
-                jacobian[row, joint] = 2.0 * short @ (self._shortfall(moved) - short) / _STEP_CLEAR
-        return value, jacobian
+                gradient[row, joint] = 2.0 * short @ (self._shortfall(moved) - short) / _STEP_CLEAR
+        return value, gradient
 
     def _shortfall(self, posture: FloatArray) -> FloatArray:
-        """(k,) how much each pair's distance lacks, in its unit; zero for those far apart."""
+        """(k,) shortfall of each pair's distance, over its scale; zero for those far apart."""
         collisions = self._allowed.collisions
         left = collisions.distances(posture) - collisions.needed_m() - _BUFFER_M
         return np.maximum(-left / _SHORT_M, 0.0)
 
 
 def _hinge(values: FloatArray, limits: FloatArray) -> tuple[float, FloatArray]:
-    """Squares of what (m, n) values exceed (n,) limits by, as shares of these; derivatives."""
+    """Sum of squared relative excesses of (m, n) values over (n,) limits, with its gradient."""
     beyond = np.maximum(np.abs(values) / limits - 1.0, 0.0)
     return float(np.sum(beyond**2)), 2.0 * beyond * np.sign(values) / limits
 
 
-def _back(basis: tuple[FloatArray, ...], jacobian: list[FloatArray]) -> FloatArray:
-    """(n, k) derivatives by the free numbers, of those (m, n) by the states."""
-    found = sum(values.T @ array for values, array in zip(basis, jacobian, strict=True))
-    return np.asarray(found).T
+def _chained(basis: tuple[FloatArray, ...], gradients: list[FloatArray]) -> FloatArray:
+    """Gradient (n, k) over the free coefficients from that (m, n) over the states."""
+    total = sum(values.T @ array for values, array in zip(basis, gradients, strict=True))
+    return np.asarray(total).T
 
 
 @dataclass(frozen=True)
 class ExcitationRequest:
-    """What motion is wished.
+    """Options of the search for an exciting motion.
 
     Attributes:
-        period_s: How long it lasts [s].
-        harmonics: How many harmonics of that period it has.
+        period_s: Duration of the motion [s].
+        harmonics: Number of its harmonics.
         terms: The friction to be identified besides the inertias.
-        starts: How many random motions the search starts from.
-        seed: Of these.
-        steps: The most of each round of a descent.
-        seconds: A limit of the search [s of one core's time], at which no more descents are begun
-            and the last one is ended, once a motion is found.
+        starts: Number of random motions to start from.
+        seed: Seed of these.
+        steps: Greatest number of steps in each round of a descent.
+        seconds: Time limit [s of one core], at which the search ends once a motion is found.
     """
 
     period_s: float = 20.0
@@ -235,16 +224,16 @@ class Excitation:
     """An exciting motion.
 
     Attributes:
-        request: What was wished.
+        request: The options of the search.
         base: The parameters that it determines.
-        weights: (n,) inverse of the joints' torque noise: the share that they have of the greatest
-            torque, or one each where that is not known.
+        weights: (n,) inverse of the joints' torque noise, taken to be proportional to their
+            greatest torques; ones where these are not known.
         series: The motion.
-        condition: Of its regressor.
-        random: The median of random motions within the limits of joints and drives.
-        kept: What it uses of the limits, at a thousand samples a second.
-        starts: How many descents were made.
-        seconds: How long the search took [s of one core's time].
+        condition: Condition numbers of its regressor.
+        random: Median of those of random motions within the limits of joints and drives.
+        kept: Its extremes, at a thousand samples a second.
+        starts: Number of descents made.
+        seconds: Duration of the search [s of one core].
     """
 
     request: ExcitationRequest
@@ -263,23 +252,15 @@ def excite(
 ) -> Excitation:
     """Searches for the motion that determines the base parameters best.
 
-    Args:
-        allowed: What it must keep.
-        request: What is wished.
-        progress: Called as the search goes on.
-
-    Returns:
-        The best motion found that keeps all limits.
-
     Raises:
-        DegenerateError: No motion was found that does.
+        DegenerateError: No motion was found that keeps all limits.
     """
     with one_blas_thread():
         return _ExcitationSearch(allowed, request, progress).run()
 
 
 class _ExcitationSearch:
-    """Descents from random motions, and the best of their ends."""
+    """Descents from random motions; the best result is kept."""
 
     def __init__(
         self, allowed: Allowed, request: ExcitationRequest, progress: Progress | None
@@ -309,23 +290,23 @@ class _ExcitationSearch:
                 "--duration, --margin-deg, --clearance-mm, --floor.",
             )
         condition, series, kept = self._best
-        found = (series, condition, self._random(), kept, starts)
+        result = (series, condition, self._random(), kept, starts)
         return Excitation(
-            request, self._base, self._weights, *found, time.process_time() - self._begin
+            request, self._base, self._weights, *result, time.process_time() - self._begin
         )
 
     @property
     def _is_over(self) -> bool:
-        """Whether the time is up; never before a motion is found."""
+        """Whether the time limit is over; never before a motion is found."""
         taken_s = time.process_time() - self._begin
         return self._best is not None and taken_s > self._request.seconds
 
     def _descend(self, free: FloatArray, place: int) -> FloatArray:
-        """Goes down from the start at `place`, round by round, until the time is up."""
+        """Minimises the objective from start number `place`, round by round."""
         steps = len(_ROUNDS) * self._request.steps
         done = place * steps
 
-        def look(_: FloatArray) -> None:
+        def report(_: FloatArray) -> None:
             nonlocal done
             done += 1
             if self._progress is not None:
@@ -342,15 +323,15 @@ class _ExcitationSearch:
                 args=(sharpness, price),
                 jac=True,
                 method="BFGS",
-                callback=look,
+                callback=report,
                 options={"maxiter": self._request.steps},
             )
             free = found.x
         return free
 
     def _keep(self, free: FloatArray) -> None:
-        """Takes a motion for the best one if it is, and keeps the limits or can be made to."""
-        series = _within(self._allowed, self._objective.series(free))
+        """Keeps a motion if it is the best yet and within the limits, shrunk where needed."""
+        series = _shrunk_to_limits(self._allowed, self._objective.series(free))
         for _ in range(_TRIES):
             condition = self._figures(series)
             if self._best is not None and condition.weighted >= self._best[0].weighted:
@@ -366,27 +347,27 @@ class _ExcitationSearch:
         return condition_of(self._base, series.sampled(_FIGURES_HZ), self._weights)
 
     def _start(self) -> FloatArray:
-        """A random motion (k,) that is clear of everything, or nearly at rest."""
+        """Coefficients (k,) of a random motion without collisions, or nearly at rest."""
         motion = self._modest(self._posture())
         for _ in range(_HALVINGS):
-            way = motion.sampled(_CLEAR_HZ).q
-            if (self._allowed.collisions.first_contact(way) < 0).all():
+            q = motion.sampled(_CLEAR_HZ).q
+            if (self._allowed.collisions.first_contact(q) < 0).all():
                 break
             motion = motion.shrunk(0.5)
         return motion.free.ravel()
 
     def _posture(self) -> FloatArray:
-        """A random posture that is clear of everything (n,) [rad]."""
+        """A random posture without collisions, (n,) [rad]."""
         allowed = self._allowed
-        turn = np.minimum(np.pi, allowed.half)
-        seen: Sequence[int] = ()
-        drawn = self._rng.uniform(-turn, turn, (_POSTURES, len(turn))) + allowed.middle
+        half = np.minimum(np.pi, allowed.half)
+        contacts: Sequence[int] = ()
+        drawn = self._rng.uniform(-half, half, (_POSTURES, len(half))) + allowed.middle
         for posture in drawn:
             contact = int(allowed.collisions.first_contact(posture[None])[0])
             if contact < 0:
                 return np.asarray(posture)
-            seen = (*seen, contact)
-        names = allowed.collisions.names[int(np.bincount(seen).argmax())]
+            contacts = (*contacts, contact)
+        names = allowed.collisions.names[int(np.bincount(contacts).argmax())]
         raise DegenerateError(
             f"robot {allowed.robot.name}: none of {_POSTURES} postures within the limits is clear; "
             f"{' and '.join(names)} are too near one another in most.",
@@ -395,7 +376,7 @@ class _ExcitationSearch:
         )
 
     def _modest(self, posture: FloatArray) -> Series:
-        """A random motion from a posture, well within the limits of joints and drives."""
+        """A random motion about a posture, well within the limits of joints and drives."""
         allowed, resting = self._allowed, self._harmonics.resting
         orders = np.arange(1.0, self._harmonics.count + 1.0)
         sizes = 1.0 / np.concatenate([[np.inf], orders, orders])
@@ -415,7 +396,7 @@ class _ExcitationSearch:
         return Series(self._harmonics, scaled + np.outer(posture, resting[0]))
 
     def _random(self) -> Condition:
-        """The median condition of random motions, which nobody optimised."""
+        """Median condition of random motions, for comparison."""
         drawn = [self._figures(self._modest(self._posture())) for _ in range(_COMPARED)]
         figures = np.median(
             [(condition.weighted, condition.scaled, condition.raw) for condition in drawn], axis=0
@@ -423,14 +404,14 @@ class _ExcitationSearch:
         return Condition(*figures.tolist())
 
 
-def _within(allowed: Allowed, series: Series) -> Series:
-    """Makes a motion smaller until it keeps the limits of joints' ranges, speeds, accelerations."""
+def _shrunk_to_limits(allowed: Allowed, series: Series) -> Series:
+    """Shrinks a motion to the limits of the joints' ranges, speeds and accelerations."""
     motion, middle = series.sampled(CHECK_HZ), series.coefficients[0]
-    far, low = motion.q.max(axis=0) - middle, middle - motion.q.min(axis=0)
+    above, below = motion.q.max(axis=0) - middle, middle - motion.q.min(axis=0)
     with np.errstate(divide="ignore"):
         shares = [
-            (allowed.upper - middle) / far,
-            (middle - allowed.lower) / low,
+            (allowed.upper - middle) / above,
+            (middle - allowed.lower) / below,
             allowed.speed / np.abs(motion.dq).max(axis=0),
             allowed.acceleration / np.abs(motion.ddq).max(axis=0),
         ]

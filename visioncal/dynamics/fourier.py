@@ -18,12 +18,7 @@ from visioncal.dynamics.motion import JointMotion
 
 @dataclass(frozen=True)
 class Harmonics:
-    """The functions of which one joint's motion is made.
-
-    Attributes:
-        period_s: When the motion is back at its beginning [s].
-        count: How many harmonics of that period there are.
-    """
+    """Basis functions of one joint's motion: `count` harmonics of the period `period_s` [s]."""
 
     period_s: float
     count: int
@@ -35,12 +30,12 @@ class Harmonics:
         return np.asarray(null_space(np.vstack([speed, acceleration])))
 
     def basis(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Positions, speeds and accelerations (m, 2 count - 1) for a unit of each free number."""
+        """Positions, speeds, accelerations (m, 2 count - 1) for a unit of each free coefficient."""
         q, dq, ddq = (function @ self.resting for function in self._functions(times_s))
         return q, dq, ddq
 
     def _functions(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(m, 1 + 2 count) each: one, the sines and the cosines, and their derivatives."""
+        """(m, 1 + 2 count) constant, sines and cosines, and their first and second derivatives."""
         rates = 2.0 * np.pi / self.period_s * np.arange(1, self.count + 1)
         phases = np.asarray(times_s)[:, None] * rates
         sine, cosine = np.sin(phases), np.cos(phases)
@@ -54,11 +49,11 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The motion of n joints.
+    """Fourier series of n joints that begin and end at rest.
 
     Attributes:
-        harmonics: The functions that it is made of.
-        free: (n, 2 count - 1) each joint's numbers in the basis of those that begin at rest [rad].
+        harmonics: The basis functions.
+        free: (n, 2 count - 1) coefficients in the basis `Harmonics.resting` [rad].
     """
 
     harmonics: Harmonics
@@ -72,12 +67,12 @@ class Series:
 
     @property
     def start(self) -> FloatArray:
-        """(n,) where it begins and ends [rad]."""
+        """(n,) posture at beginning and end [rad]."""
         mean, _, cosines = self.coefficients
         return np.asarray(mean + cosines.sum(axis=1))
 
     def motion(self, times_s: FloatArray) -> JointMotion:
-        """Where the joints are at (m,) times [s], and how they move."""
+        """The motion at (m,) times [s]."""
         q, dq, ddq = (array @ self.free.T for array in self.harmonics.basis(times_s))
         return JointMotion(np.asarray(times_s, dtype=float), q, dq, ddq)
 
@@ -86,12 +81,12 @@ class Series:
         return self.motion(even_times(self.harmonics.period_s, rate_hz))
 
     def shrunk(self, share: float) -> "Series":
-        """The same motion about the same middle, so many times as far."""
-        # The mean alone is in the span of the free numbers: rest does not limit it.
+        """The motion scaled by a factor about its mean."""
+        # The mean is in the span of the free coefficients: the conditions of rest do not limit it.
         middle = np.outer(self.coefficients[0], self.harmonics.resting[0])
         return Series(self.harmonics, middle + share * (self.free - middle))
 
 
 def even_times(duration_s: float, rate_hz: float) -> FloatArray:
-    """(m,) times from zero to a duration, at a rate or a little more, so that both ends are met."""
+    """(m,) times from zero to a duration, both included, at a rate or slightly more."""
     return np.linspace(0.0, duration_s, 1 + int(np.ceil(duration_s * rate_hz - 1e-9)))

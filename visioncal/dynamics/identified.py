@@ -21,26 +21,26 @@ from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.stribeck import Stribeck
 from visioncal.robot import Inertias, Robot
 
-# A parameter is determined to so many percent of itself, or worse, or not at all.
+# Classes of a parameter's relative sigma; beyond the last it is not determined.
 CLASSES = ((0.02, "2 %"), (0.1, "10 %"), (1.0, "poorly"))
 UNKNOWN = "not at all"
 
 
 @dataclass(frozen=True, eq=False)
 class StreamFacts:
-    """The figures of a fitted stream.
+    """Statistics of a fitted stream.
 
     Attributes:
-        label: Its place.
-        samples: How many filtered samples it has.
-        left_out: How many of these torques were left out, as outliers or as none.
-        band_hz: Highest frequency of the motion [Hz].
+        label: Its file.
+        samples: Number of filtered samples.
+        left_out: Number of their torques that were not used: outliers and invalid ones.
+        band_hz: Bandwidth of the motion [Hz].
         cutoff_hz: Where the low-pass is 6 dB down [Hz].
-        rate_hz: Samples a second before the filter.
+        rate_hz: Sampling rate before the filter [Hz].
         noise_nm: (n,) noise of the filtered torques [N m].
-        rms_nm: (n,) their residuals, as a root mean square [N m].
-        torque_nm: (n,) how far they range, as a standard deviation [N m].
-        notes: What was found in its samples, in words.
+        rms_nm: (n,) root mean square of the residuals [N m].
+        torque_nm: (n,) standard deviation of the torques, as their range [N m].
+        notes: Messages on faults of its samples.
     """
 
     label: Annotated[str, Key("stream")]
@@ -57,16 +57,16 @@ class StreamFacts:
 
 @dataclass(frozen=True, eq=False)
 class TorqueValidation:
-    """How torques are predicted that were not fitted.
+    """Prediction errors of torques that were not fitted.
 
     Attributes:
-        label: Of which samples, in words.
-        rms_nm: (n,) error, as a root mean square [N m].
-        torque_nm: (n,) how far the torques range, as a standard deviation [N m].
+        label: The samples, for messages.
+        rms_nm: (n,) root mean square error [N m].
+        torque_nm: (n,) standard deviation of the torques, as their range [N m].
         noise_nm: (n,) noise of the torques by the fit [N m].
-        consistent_rms_nm: (n,) error with the standard parameters of bodies; None without these.
-        known_rms_nm: (n,) error with the robot's own inertias and the friction that goes best with
-            them; None where it has none.
+        consistent_rms_nm: (n,) error with the consistent standard parameters; None without these.
+        known_rms_nm: (n,) error with the robot's own inertias and friction fitted to them; None
+            where it has no inertias.
     """
 
     label: Annotated[str, Key("samples")]
@@ -84,12 +84,12 @@ class TorqueValidation:
 
 @dataclass(frozen=True)
 class Lag:
-    """How much later torques come than their angles.
+    """Delay of the torques behind the angles.
 
     Attributes:
-        seconds: Their lag; below zero where they come earlier [s].
+        seconds: The delay; negative where torques are ahead [s].
         sigma_s: Its standard deviation [s].
-        share: What it changes of a joint's torques, over their range, where it changes most.
+        share: Greatest change of a joint's torques by it, over their range.
     """
 
     seconds: float
@@ -98,7 +98,7 @@ class Lag:
 
     @property
     def words(self) -> str:
-        """The lag, and what was done about it."""
+        """Message on the lag and its correction."""
         late = self.seconds > 0.0
         return (
             f"The torques {'lag' if late else 'are ahead of'} the angles by "
@@ -109,21 +109,20 @@ class Lag:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """What torques say of an arm; `save` writes it as dynamics.json.
+    """Identified dynamics of an arm; `save` writes them as dynamics.json.
 
     Attributes:
-        robot: The arm as it was known before.
+        robot: The arm before identification.
         base: Its model in base parameters.
-        values: (b,) these.
-        covariance: (b + 2 a, b + 2 a) of these, of a humps of dry friction [N m], and of the
-            logarithms of their speeds.
+        values: (b,) the base parameters.
+        covariance: (b + 2 a, b + 2 a) of these, of a Stribeck humps [N m], and of the logarithms of
+            their speeds.
         stribeck: The humps.
-        consistent: Standard parameters of bodies; None where the robot's inertias are not known.
-        streams: What was fitted.
-        validation: How torques are predicted that were not fitted; None where there were none.
-        facts: Whence it comes: session, digest, when.
-        lag: By how much the torques were later than their angles, as it was undone; None where that
-            is not clear, or does not matter.
+        consistent: Consistent standard parameters; None where the robot's inertias are not known.
+        streams: Statistics of the fitted streams.
+        validation: Prediction errors of torques that were not fitted; None where there were none.
+        facts: Provenance: session, digest, date.
+        lag: Delay of the torques, which was corrected; None where not significant.
     """
 
     robot: Robot
@@ -139,11 +138,7 @@ class Identified:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Loads a dynamics.json, or that of a folder.
-
-        Raises:
-            DataError: It is missing or is none.
-        """
+        """Loads a dynamics.json, or that of a folder; raises DataError if missing or invalid."""
         from visioncal.dynamics.document import fields_from_document
 
         path = Path(path)
@@ -161,28 +156,24 @@ class Identified:
             return cls(**fields_from_document(parse_stored(read_bytes(path), str(path))))
 
     def save(self, path: Path | str) -> None:
-        """Writes it, whole or not at all.
-
-        Raises:
-            DataError: The file cannot be written.
-        """
+        """Writes a dynamics.json atomically; raises DataError where it cannot be written."""
         from visioncal.dynamics.document import to_document
 
         write_json(path, to_document(self))
 
     @property
     def sigmas(self) -> FloatArray:
-        """(b,) of the base parameters."""
+        """(b,) standard deviations of the base parameters."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[: self.base.rank]))
 
     @property
     def fitted_rms_nm(self) -> FloatArray:
-        """(n,) residuals of what was fitted, of the worst stream, as a root mean square [N m]."""
+        """(n,) root mean square of the residuals, of the worst stream [N m]."""
         return np.asarray(np.max([stream.rms_nm for stream in self.streams], axis=0))
 
     @property
     def determined(self) -> tuple[str, ...]:
-        """How well each base parameter is determined: to `2 %` of itself, `10 %`, worse, or not."""
+        """Class of each base parameter's relative sigma: `2 %`, `10 %`, `poorly`, `not at all`."""
         shares = self.sigmas / np.maximum(np.abs(self.values), 1e-300)
         return tuple(
             next((word for most, word in CLASSES if share < most), UNKNOWN) for share in shares
@@ -190,19 +181,15 @@ class Identified:
 
     @cached_property
     def inertias(self) -> Inertias | None:
-        """Of the links, as bodies; None where the robot's were not known before."""
+        """Consistent inertias of the links; None where the robot's own were not known."""
         return None if self.consistent is None else self.consistent.inertias(self.robot.joint_count)
 
     def torques(self, motion: JointMotion) -> FloatArray:
-        """(m, n) what the drives have to give, by the base parameters [N m]."""
+        """Drive torques (m, n) by the base parameters [N m]."""
         return np.asarray(self.base.regressor(motion) @ self.values + self.stribeck.torques(motion))
 
     def consistent_torques(self, motion: JointMotion) -> FloatArray:
-        """(m, n) the same by the standard parameters of bodies [N m].
-
-        Raises:
-            DataError: There are none.
-        """
+        """Drive torques (m, n) by the consistent standard parameters [N m], or DataError."""
         if self.consistent is None:
             raise DataError(
                 f"dynamics: nothing was known of the inertias of {self.robot.name}, so there are "

@@ -1,8 +1,8 @@
-"""Dynamic identification: from streams of motion and torque to the parameters of an arm.
+"""Identification of an arm's base parameters, Stribeck humps, standard parameters and torque lag.
 
-Torques that are filtered, or stamped by another clock, lag the angles. One number for all streams
-is sought by what the best fit leaves, and made exact by Gauss and Newton's steps, with the torques'
-derivative as one more column.
+Torques that are filtered, or stamped by another clock, lag the angles. One lag of all streams is
+searched on a grid by the residuals of the best fit, and refined by Gauss-Newton steps with the
+torques' time derivative as one more column.
 """
 
 from collections.abc import Sequence
@@ -23,27 +23,27 @@ from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_o
 from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
 from visioncal.robot import Robot
 
-# What speeds are known to after filtering; joints are through it in no time [rad/s].
+# Uncertainty of filtered speeds, below which the sign of friction is smoothed [rad/s].
 SLOW_RAD_S = 1e-4
 
 _LIMITS = DynamicsLimits()
-# Lags are sought up to this one, so many to a period of the cut-off, by so many torques [s].
+# Greatest lag [s], grid points per period of the cut-off, and number of torques of the grid search.
 _LARGEST_S, _PER_PERIOD, _ROWS = 0.25, 16, 20_000
-# A lag is one that differs from zero by so many sigmas, where the fit leaves of the torques' range
-# no more than this share in the median of the joints: no lag mends what else is wrong.
+# A lag is significant from so many sigmas on, if the median residual of the joints is at most this
+# share of the torques' range: larger residuals have other causes.
 _SIGMAS, _LEFT = 5.0, 0.3
 _ROUNDS, _SETTLED = 5, 0.1
 
 
 @dataclass(frozen=True)
 class Options:
-    """What is estimated.
+    """Options of the identification.
 
     Attributes:
-        terms: What joints have of their own.
-        stribeck: Whether humps of dry friction at low speed are looked for.
-        consistent: Whether standard parameters of bodies are sought near the robot's own.
-        checked: Whether the torques are compared with what the robot's inertias predict.
+        terms: The joints' own parameters: friction, offsets, rotors.
+        stribeck: Whether Stribeck humps of friction are fitted.
+        consistent: Whether consistent standard parameters are fitted near the robot's own.
+        checked: Whether mistaken recordings are searched for and refused.
     """
 
     terms: FrictionTerms = field(default_factory=partial(FrictionTerms, slow_rad_s=SLOW_RAD_S))
@@ -54,13 +54,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """A result with what it rests on.
-
-    Attributes:
-        identified: The result.
-        streams: What it was identified from.
-        fit: The regression; behind the base parameters stand those of Stribeck's humps.
-    """
+    """Identified dynamics, the fitted streams, and the regression, Stribeck terms last."""
 
     identified: Identified
     streams: tuple[Conditioned, ...]
@@ -73,8 +67,8 @@ def identify(
     """Identifies an arm's dynamics.
 
     Args:
-        robot: The arm; where it has inertias, torques are checked against these, and standard
-            parameters are sought near them. Without, units of all torques cannot be told.
+        robot: The arm; its inertias, if known, serve to check the torques' units and as prior of
+            the standard parameters.
         streams: Motions with their torques.
         options: What is estimated.
 
@@ -93,8 +87,10 @@ def identify(
     humps = Stribeck.none()
     if options.stribeck and options.terms.coulomb:
         names = [base.model.names[index] for index in base.independent]
-        sliding = np.array([names.index(f"Fc{index + 1}") for index in range(robot.joint_count)])
-        humps, fit = fit_stribeck(streams, blocks, fit, options.terms.slow_rad_s, sliding)
+        coulomb_indices = np.array(
+            [names.index(f"Fc{index + 1}") for index in range(robot.joint_count)]
+        )
+        humps, fit = fit_stribeck(streams, blocks, fit, options.terms.slow_rad_s, coulomb_indices)
     consistent = None
     if options.consistent and robot.inertias is not None:
         kept = slice(base.rank)
@@ -108,13 +104,13 @@ def identify(
 
 
 def block_of(base: BaseModel, stream: Conditioned) -> NoiseBlock:
-    """The filtered regressor and torques of a stream."""
+    """Filtered regressor and torques of a stream."""
     x = stream.filtered(base.regressor)
     return NoiseBlock(x, stream.torques_nm, stream.used, stream.correlation)
 
 
 def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts, ...]:
-    """The figures of each stream."""
+    """Statistics of each stream."""
     return tuple(
         StreamFacts(
             label=stream.label,
@@ -135,16 +131,16 @@ def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts,
 
 
 def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms) -> Lag | None:
-    """Estimates the lag of the torques of an arm's motions.
+    """Estimates the lag of the torques behind the angles.
 
     Args:
         robot: The arm.
-        streams: Its motions, with torques that lag alike.
-        terms: What joints have of their own. Rotors count, too, where the motion allows: a lag of
-            viscous friction would else stand for them.
+        streams: Its motions, with torques of one lag.
+        terms: The joints' own parameters. Rotors are added where the motion determines them:
+            otherwise a lag of viscous friction would take their place.
 
     Returns:
-        The lag; None where there is none that is clear and matters, or the motion tells none.
+        The lag; None where it is insignificant, or the motion does not determine it.
     """
     for rotors in (True, terms.motor_inertia):
         model = DynamicModel(robot, replace(terms, motor_inertia=rotors))
@@ -155,13 +151,13 @@ def find_lag(robot: Robot, streams: Sequence[Conditioned], terms: FrictionTerms)
     else:
         return None
     try:
-        return _found(streams, blocks)
+        return _estimated_lag(streams, blocks)
     except np.linalg.LinAlgError:
         return None
 
 
-def _found(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> Lag | None:
-    lag_s = _nearest(streams, blocks)
+def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> Lag | None:
+    lag_s = _grid_lag(streams, blocks)
     if lag_s is None:
         return None
     for _ in range(_ROUNDS):
@@ -171,20 +167,20 @@ def _found(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> Lag 
         lag_s -= change
         if abs(change) < _SETTLED * sigma or abs(lag_s) > _LARGEST_S:
             break
-    found = Lag(lag_s, sigma, _share(fit, lag_s))
-    left = [
+    lag = Lag(lag_s, sigma, _change_share(fit, lag_s))
+    residual_shares = [
         rms_of(residual, block.used) / spread_of(block.y, block.used)
         for residual, block in zip(fit.residuals, fit.blocks, strict=True)
     ]
-    clear = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and found.share > _LIMITS.slight_share
-    return found if clear and np.median(left) < _LEFT else None
+    significant = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and lag.share > _LIMITS.slight_share
+    return lag if significant and np.median(residual_shares) < _LEFT else None
 
 
-def _nearest(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> float | None:
-    """The lag on a grid by which the best fit leaves least [s]; None where samples are too few."""
+def _grid_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> float | None:
+    """Most likely lag on a grid [s]; None where samples are too few."""
     step_s = 1.0 / (_PER_PERIOD * max(stream.cutoff_hz for stream in streams))
-    many = int(_LARGEST_S / step_s)
-    lags = step_s * np.arange(-many, many + 1)
+    steps = int(_LARGEST_S / step_s)
+    lags = step_s * np.arange(-steps, steps + 1)
     rows, torques, joints = [], [], []
     total = sum(block.y.size for block in blocks)
     for stream, block in zip(streams, blocks, strict=True):
@@ -199,41 +195,41 @@ def _nearest(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> fl
         return None
     directions = np.linalg.qr(x / np.maximum(np.linalg.norm(x, axis=0), 1e-12))[0]
     left = (y - directions @ (directions.T @ y)) ** 2
-    # The likelihood of joints each with a noise of its own.
+    # Negative log-likelihood, with a noise level per joint.
     cost = np.zeros(len(lags))
-    for one in np.unique(joint):
-        of = joint == one
-        cost += of.sum() * np.log(np.maximum(left[of].sum(axis=0), 1e-12))
+    for number in np.unique(joint):
+        rows_of_joint = joint == number
+        cost += rows_of_joint.sum() * np.log(np.maximum(left[rows_of_joint].sum(axis=0), 1e-12))
     return float(lags[np.argmin(cost)])
 
 
 def _lagged(stream: Conditioned, block: NoiseBlock, lag_s: float) -> NoiseBlock:
-    """The block with its torques taken so much later, and their derivative as one more column."""
+    """The block with its torques advanced by a lag, and their derivative as one more column."""
     step_s = 1.0 / stream.rate_hz
     y, before, after = (
         _torques(stream, value) for value in (lag_s, lag_s - step_s, lag_s + step_s)
     )
-    slope = (after - before) / (2.0 * step_s)
+    derivative = (after - before) / (2.0 * step_s)
     used = block.used & _inside(stream, abs(lag_s) + step_s)[:, None]
     return NoiseBlock(
-        np.concatenate([block.x, slope[:, :, None]], axis=2), y, used, block.correlation
+        np.concatenate([block.x, derivative[:, :, None]], axis=2), y, used, block.correlation
     )
 
 
 def _torques(stream: Conditioned, lag_s: float) -> FloatArray:
-    """(k, n) filtered torques of so much later, summed over the samples that count now [N m]."""
+    """Filtered torques (k, n), advanced by a lag, over the samples present now [N m]."""
     parts = []
     for piece in stream.pieces:
         times_s = piece.measured.motion.times_s
         later = [
             np.interp(times_s + lag_s, times_s, column) for column in piece.measured.torques_nm.T
         ]
-        parts.append(piece.lowpass(np.stack(later, axis=1), piece.there))
+        parts.append(piece.lowpass(np.stack(later, axis=1), piece.present))
     return np.concatenate(parts)
 
 
 def _inside(stream: Conditioned, lag_s: float) -> Mask:
-    """(k,) which filtered samples rest on recorded torques, whichever way they lag [s]."""
+    """(k,) filtered samples whose windows, shifted by a lag either way, are within the piece."""
     parts = []
     for piece in stream.pieces:
         ends_s = piece.measured.motion.times_s[[0, -1]] + np.array([1.0, -1.0]) * (
@@ -243,8 +239,8 @@ def _inside(stream: Conditioned, lag_s: float) -> Mask:
     return np.concatenate(parts)
 
 
-def _share(fit: Regression, lag_s: float) -> float:
-    """The most that a lag changes of a joint's torques, over their range."""
+def _change_share(fit: Regression, lag_s: float) -> float:
+    """Greatest change of a joint's torques by a lag, over their range."""
     shares = [
         rms_of(lag_s * block.x[:, :, -1], block.used)
         / np.maximum(spread_of(block.y, block.used), 1e-12)

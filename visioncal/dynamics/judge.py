@@ -1,4 +1,4 @@
-"""Whether identified dynamics can be trusted, in sentences with their figures."""
+"""Verdict on identified dynamics, with its reasons."""
 
 from collections.abc import Iterator
 from typing import TypeAlias
@@ -23,25 +23,25 @@ def _check(kind: str, words: str, do: Remedy | None = None) -> _Judged:
 
 
 def _plan(identified: Identified, words: str) -> Remedy:
-    """Advice to record a planned motion; an arm that has a name can be planned for."""
+    """Advice to record a planned motion, with the command for a robot that visioncal knows."""
     name = identified.robot.name
     command = f"visioncal dynamics plan {name} -o motions" if name in robot_names() else ""
     return Remedy(f"{words}; visioncal dynamics plan writes some.", command)
 
 
 def judge(identified: Identified) -> Verdict:
-    """Judges a result by what it predicts, and by what the motion determined."""
-    found = [
+    """Judges identified dynamics by their predictions, and by what the motion determined."""
+    judged = [
         *_of_lag(identified),
         *_of_prediction(identified),
         *_of_range(identified),
         *_of_parameters(identified),
     ]
-    statuses = {status for status, _ in found}
+    statuses = {status for status, _ in judged}
     worst: VerdictStatus = (
         "bad" if "bad" in statuses else "check" if "check" in statuses else "good"
     )
-    return Verdict(worst, tuple(finding for _, finding in found))
+    return Verdict(worst, tuple(finding for _, finding in judged))
 
 
 def _of_lag(identified: Identified) -> Iterator[_Judged]:
@@ -84,13 +84,13 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
         ),
     )
     fitted = identified.fitted_rms_nm
-    surprised = validation.rms_nm > _LIMITS.worse * np.maximum(fitted, validation.noise_nm)
-    surprised &= shares > _LIMITS.slight_share
-    if surprised.any():
+    worse = validation.rms_nm > _LIMITS.worse * np.maximum(fitted, validation.noise_nm)
+    worse &= shares > _LIMITS.slight_share
+    if worse.any():
         yield _check(
             "optimism",
-            f"{_joints(surprised)}: torques are predicted "
-            f"{figure(float((validation.rms_nm / fitted)[surprised].max()))} times worse than "
+            f"{_joints(worse)}: torques are predicted "
+            f"{figure(float((validation.rms_nm / fitted)[worse].max()))} times worse than "
             "they were fitted: the motion says too little, or something changed.",
             _plan(identified, _MOTION),
         )
@@ -100,11 +100,11 @@ def _of_prediction(identified: Identified) -> Iterator[_Judged]:
 def _of_known(identified: Identified, validation: TorqueValidation) -> Iterator[_Judged]:
     known, bodies = validation.known_rms_nm, validation.consistent_rms_nm
     if known is not None:
-        lost = validation.rms_nm > known
-        if lost.any():
+        less_accurate = validation.rms_nm > known
+        if less_accurate.any():
             yield _check(
                 "worse_than_known",
-                f"{_joints(lost)}: the inertias that {identified.robot.name} comes with "
+                f"{_joints(less_accurate)}: the inertias that {identified.robot.name} comes with "
                 "predict torques better than the identified ones.",
                 _plan(identified, _MOTION),
             )
@@ -118,11 +118,11 @@ def _of_known(identified: Identified, validation: TorqueValidation) -> Iterator[
                     f"{identified.robot.name} comes with, in the median of the joints.",
                 ),
             )
-        strange = known > _LIMITS.known_share * validation.torque_nm
-        if strange.any():
+        unexplained = known > _LIMITS.known_share * validation.torque_nm
+        if unexplained.any():
             yield _check(
                 "other_robot",
-                f"{_joints(strange)}: by the inertias that {identified.robot.name} comes with, "
+                f"{_joints(unexplained)}: by the inertias that {identified.robot.name} comes with, "
                 f"{figure(100.0 * float((known / validation.torque_nm).max()))} % of the "
                 "torques' range stays unexplained.",
                 Remedy(
@@ -141,7 +141,7 @@ def _of_known(identified: Identified, validation: TorqueValidation) -> Iterator[
 
 
 def _of_range(identified: Identified) -> Iterator[_Judged]:
-    """Whether the parameters predict the torques of fast motions of all joints."""
+    """Checks the predicted uncertainty of the torques of fast motions of all joints."""
     base = identified.base
     motion = random_motion(base.model, np.random.default_rng(0))
     x = base.regressor(motion)
@@ -160,12 +160,16 @@ def _of_range(identified: Identified) -> Iterator[_Judged]:
 
 
 def _of_parameters(identified: Identified) -> Iterator[_Judged]:
-    lost = np.array([name == UNKNOWN for name in identified.determined])
-    if lost.mean() > _LIMITS.undetermined_share:
-        names = [name for name, is_lost in zip(identified.base.names, lost, strict=True) if is_lost]
+    unknown = np.array([name == UNKNOWN for name in identified.determined])
+    if unknown.mean() > _LIMITS.undetermined_share:
+        names = [
+            name
+            for name, is_unknown in zip(identified.base.names, unknown, strict=True)
+            if is_unknown
+        ]
         yield _check(
             "undetermined",
-            f"{lost.sum()} of {len(lost)} base parameters are not determined by this motion, "
+            f"{unknown.sum()} of {len(unknown)} base parameters are not determined by this motion, "
             f"among them {some_of(names, 3)}.",
             _plan(identified, _MOTION),
         )

@@ -1,4 +1,4 @@
-"""What a motion must keep, and whether it does: limits of joints and drives, and distances."""
+"""Limits of a motion (joints, drives, distances), and the check that a motion keeps them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,21 +15,21 @@ from visioncal.robot.bodies import Body, arm_bodies
 from visioncal.robot.collision import Collisions
 
 CHECK_HZ = 1000.0
-# Rounding alone is no breach: a motion is scaled to end at its limits.
+# Tolerance for rounding, since motions are scaled to reach their limits exactly.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class Share:
-    """How much of its limits a motion may use.
+    """Margins of a planned motion.
 
     Attributes:
         margin_rad: Distance of the joints from the ends of their ranges [rad].
-        speed: Of the greatest speeds.
-        acceleration: Of the greatest accelerations.
-        torque: How many times larger the torques may be than the nominal inertias have them.
+        speed: Usable share of the greatest speeds.
+        acceleration: Usable share of the greatest accelerations.
+        torque: Safety factor of the torques predicted by the nominal inertias.
         clearance_m: Distance of the arm from itself, the floor and all bodies [m].
-        floor_m: Height of the floor in the base [m]; None for none.
+        floor_m: Height of the floor in the base frame [m]; None for none.
     """
 
     margin_rad: float = 0.05
@@ -54,7 +54,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Missing:
-    """What stands for limits that the robot's description does not state; None where none is given.
+    """Defaults of limits that the robot's description does not state; None for no default.
 
     Attributes:
         range_rad: Farthest position to either side [rad].
@@ -69,7 +69,7 @@ class Missing:
 
 @dataclass(frozen=True, eq=False)
 class Allowed:
-    """What an arm may do, with all margins taken off.
+    """Limits of a motion, margins included.
 
     Attributes:
         robot: The arm.
@@ -77,10 +77,9 @@ class Allowed:
         upper: (n,) greatest positions [rad].
         speed: (n,) greatest speeds [rad/s].
         acceleration: (n,) greatest accelerations [rad/s^2].
-        torque: (n,) greatest torques, as the nominal inertias have them [N m]; inf where they are
-            not known.
-        inertias: Nominal, with what the arm carries; None where they are not known.
-        bodies: The arm's, and those in the cell.
+        torque: (n,) greatest torques predicted by the nominal inertias [N m]; inf where unknown.
+        inertias: Nominal ones, with the payload; None where unknown.
+        bodies: Collision bodies of the arm and of the cell.
         share: The margins.
     """
 
@@ -96,23 +95,23 @@ class Allowed:
 
     @cached_property
     def collisions(self) -> Collisions:
-        """The distances of the cell; one object a thread."""
+        """Distance computation of the cell; to be used by one thread."""
         share = self.share
         return Collisions(self.robot, self.bodies, share.clearance_m, share.floor_m)
 
     @property
     def middle(self) -> FloatArray:
-        """(n,) middle of the ranges [rad]."""
+        """(n,) centres of the ranges [rad]."""
         return 0.5 * (self.lower + self.upper)
 
     @property
     def half(self) -> FloatArray:
-        """(n,) half of the ranges [rad]."""
+        """(n,) half widths of the ranges [rad]."""
         return 0.5 * (self.upper - self.lower)
 
     @property
     def unchecked(self) -> tuple[str, ...]:
-        """What cannot be looked at for want of knowledge, in words."""
+        """Messages on limits that cannot be checked for lack of data."""
         if self.inertias is None:
             return (
                 f"torques: the description of {self.robot.name} states no inertias of its links",
@@ -127,7 +126,7 @@ class Allowed:
         return ()
 
     def torques(self, motion: JointMotion) -> FloatArray | None:
-        """Torques (m, n) of the nominal arm [N m]; None where its inertias are not known."""
+        """Torques (m, n) predicted by the nominal inertias [N m]; None where unknown."""
         if self.inertias is None:
             return None
         return joint_torques(self.robot, self.inertias, motion.q, motion.dq, motion.ddq)
@@ -141,18 +140,17 @@ def allowed_motion(
     bodies: Sequence[Body] = (),
     payload: FloatArray | None = None,
 ) -> Allowed:
-    """Collects what an arm may do.
+    """Collects the limits of a motion.
 
     Args:
         robot: The arm.
         share: The margins.
-        missing: What stands for limits that its description does not state.
-        bodies: What it carries, and what stands in the cell.
-        payload: (10,) inertial parameters of what it carries, in the flange's frame, about its
-            origin; None for nothing.
+        missing: Defaults of limits that the robot's description does not state.
+        bodies: Collision bodies of tool and cell.
+        payload: (10,) inertial parameters of the payload in the flange frame; None for none.
 
     Raises:
-        DataError: A limit is not stated, or nothing is left of one.
+        DataError: A limit is not stated, or the margins leave no range.
     """
     missing = missing or Missing()
     given = np.full(robot.joint_count, np.inf if missing.range_rad is None else missing.range_rad)
@@ -178,14 +176,20 @@ def allowed_motion(
         share,
     )
     _check_left(allowed)
-    return allowed if payload is None else _carrying(allowed, payload)
+    if payload is None or allowed.inertias is None:
+        return allowed
+    values = allowed.inertias.values.copy()
+    values[-1] += moving(robot.chain.placements[-1]) @ payload
+    return replace(allowed, inertias=Inertias(values))
 
 
-def _check_stated(robot: Robot, reach: FloatArray, speed: FloatArray, hard: FloatArray) -> None:
+def _check_stated(
+    robot: Robot, reach: FloatArray, speed: FloatArray, acceleration: FloatArray
+) -> None:
     for values, what, keys, option in (
         (reach, "positions", "lower_deg and upper_deg", "--range-deg"),
         (speed, "speed", "velocity_rad_s", "--speed-deg"),
-        (hard, "acceleration", "acceleration_rad_s2", "--acceleration-deg"),
+        (acceleration, "acceleration", "acceleration_rad_s2", "--acceleration-deg"),
     ):
         unlimited = [
             name
@@ -216,29 +220,20 @@ def _check_left(allowed: Allowed) -> None:
             )
 
 
-def _carrying(allowed: Allowed, payload: FloatArray) -> Allowed:
-    if allowed.inertias is None:
-        return allowed
-    values = allowed.inertias.values.copy()
-    values[-1] += moving(allowed.robot.chain.placements[-1]) @ payload
-    return replace(allowed, inertias=Inertias(values))
-
-
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """The extremes of a motion.
+    """Extremes of a motion, against its limits.
 
     Attributes:
-        allowed: What it must keep.
+        allowed: The limits.
         lowest: (n,) least positions [rad].
         highest: (n,) greatest positions [rad].
         speed: (n,) greatest speeds [rad/s].
         acceleration: (n,) greatest accelerations [rad/s^2].
-        torque: (n,) greatest torques of the nominal arm [N m]; None where they are not known.
-        apart_m: Least distance of what must stay apart, beyond what it must be [m]; inf where
-            nothing must.
-        nearest: The two that come nearest; empty where nothing must stay apart.
-        nearest_s: When they do [s].
+        torque: (n,) greatest torques predicted by the nominal inertias [N m]; None where unknown.
+        apart_m: Least distance of collision pairs less the required one [m]; inf without pairs.
+        nearest: The nearest pair; empty without pairs.
+        nearest_s: Time at which it is nearest [s].
     """
 
     allowed: Allowed
@@ -253,28 +248,30 @@ class Kept:
 
     @property
     def clearance_m(self) -> float:
-        """Least distance of what must stay apart [m]."""
+        """Least distance of collision pairs [m]."""
         return self.apart_m + self.allowed.share.clearance_m
 
     @property
     def shares(self) -> dict[str, list[float]]:
-        """By limit, what share of it each joint uses; torque only where it is known."""
+        """Used share of each limit, joint by joint; torque only where known."""
         allowed = self.allowed
         reach = np.maximum(self.highest - allowed.middle, allowed.middle - self.lowest)
-        found = {
+        shares = {
             "range": reach / allowed.half,
             "speed": self.speed / allowed.speed,
             "acceleration": self.acceleration / allowed.acceleration,
         }
         if self.torque is not None and not allowed.unchecked:
-            found["torque"] = self.torque / allowed.torque
-        return {name: [float(value) for value in np.round(used, 6)] for name, used in found.items()}
+            shares["torque"] = self.torque / allowed.torque
+        return {
+            name: [float(value) for value in np.round(used, 6)] for name, used in shares.items()
+        }
 
     @property
     def breaches(self) -> tuple[str, ...]:
-        """What is not kept, in words; empty for a motion that may be driven."""
+        """Messages on exceeded limits; empty for a motion that may be driven."""
         allowed, names = self.allowed, self.allowed.robot.joint_names
-        found = []
+        messages = []
         for what, used, limit, unit in (
             ("position", -self.lowest, -allowed.lower, "rad"),
             ("position", self.highest, allowed.upper, "rad"),
@@ -283,26 +280,21 @@ class Kept:
             *([("torque", self.torque, allowed.torque, "N m")] if self.torque is not None else []),
         ):
             beyond = np.flatnonzero(used > limit + _ROUNDING * np.maximum(1.0, np.abs(limit)))
-            found += [
+            messages += [
                 f"{what} of {names[joint]} reaches {abs(used[joint]):.3g} {unit}, "
                 f"{abs(limit[joint]):.3g} is allowed"
                 for joint in beyond
             ]
         if self.apart_m < 0.0:
-            found.append(
+            messages.append(
                 f"{' and '.join(self.nearest)} come to {1e3 * self.clearance_m:.0f} mm of one "
                 f"another, {1e3 * allowed.share.clearance_m:.0f} mm is allowed"
             )
-        return tuple(found)
+        return tuple(messages)
 
 
 def kept_limits(allowed: Allowed, motion: JointMotion) -> Kept:
-    """Looks for the extremes of a motion at all its samples.
-
-    Args:
-        allowed: What it must keep.
-        motion: Densely sampled.
-    """
+    """Computes the extremes of a densely sampled motion."""
     torques = allowed.torques(motion)
     apart_m, nearest, row = _nearest(allowed, motion.q)
     return Kept(
@@ -319,10 +311,10 @@ def kept_limits(allowed: Allowed, motion: JointMotion) -> Kept:
 
 
 def _nearest(allowed: Allowed, q: FloatArray) -> tuple[float, tuple[str, ...], int]:
-    """What is left of the distances at (m, n) postures: the least [m], whose it is, and where."""
+    """Least excess of the distances at (m, n) postures [m], its pair, and its posture's index."""
     collisions = allowed.collisions
     if not collisions.names:
         return np.inf, (), 0
-    left = np.array([collisions.distances(value) for value in q]) - collisions.needed_m()
-    row, pair = np.unravel_index(int(left.argmin()), left.shape)
-    return float(left[row, pair]), collisions.names[pair], int(row)
+    excess = np.array([collisions.distances(value) for value in q]) - collisions.needed_m()
+    row, pair = np.unravel_index(int(excess.argmin()), excess.shape)
+    return float(excess[row, pair]), collisions.names[pair], int(row)

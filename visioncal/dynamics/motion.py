@@ -1,4 +1,4 @@
-"""How an arm moved, and what its joints needed for it."""
+"""Joint motions, and the torques measured during them."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Where n joints were at m times, and how they moved.
+    """Positions, speeds and accelerations of n joints at m times.
 
     Attributes:
         times_s: (m,) ascending [s].
@@ -25,18 +25,13 @@ class JointMotion:
         return len(self.times_s)
 
     def chosen(self, rows: slice | IntArray | Mask) -> "JointMotion":
-        """Some of the samples."""
+        """The samples of given rows."""
         return JointMotion(self.times_s[rows], self.q[rows], self.dq[rows], self.ddq[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A motion, and the torques that were measured during it.
-
-    Attributes:
-        motion: How the arm moved.
-        torques_nm: (m, n) of its joints [N m].
-    """
+    """A motion, and the torques (m, n) of the joints measured during it [N m]."""
 
     motion: JointMotion
     torques_nm: FloatArray
@@ -45,5 +40,5 @@ class Measured:
         return len(self.motion)
 
     def chosen(self, rows: slice | IntArray | Mask) -> "Measured":
-        """Some of the samples."""
+        """The samples of given rows."""
         return Measured(self.motion.chosen(rows), self.torques_nm[rows])

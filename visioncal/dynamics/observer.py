@@ -1,4 +1,4 @@
-"""What pushes at an arm: the residual of its generalised momentum.
+"""Momentum observer: external torques from the residual of the generalised momentum.
 
 No acceleration is needed, and no mass matrix is inverted (De Luca and Mattone 2003, 2005,
 Sensorless robot collision detection and hybrid force/motion control).
@@ -11,27 +11,22 @@ from visioncal.core.types import FloatArray
 from visioncal.dynamics.arm import ArmDynamics
 from visioncal.dynamics.motion import Measured
 
-# How fast the residual follows: a push is seen to 63 % after the inverse of it [1/s].
+# Observer gain: the inverse of the residual's time constant [1/s].
 USUAL_GAIN = 25.0
 
 
 class MomentumObserver:
-    """Follows a moving arm sample by sample, and estimates external torques on its joints.
+    """Estimates external torques on the joints of a moving arm, sample by sample.
 
-    The residual r obeys `dr/dt = gain (external torque - r)`: that of a push comes through a
-    first-order filter, joint by joint. It is computed by an implicit Euler step, which is stable
-    for any sampling.
+    The residual r obeys `dr/dt = gain (external torque - r)`, a first-order filter joint by joint.
+    It is integrated by implicit Euler steps, which are stable at any sampling rate.
     """
 
     def __init__(self, arm: ArmDynamics, gain_per_s: float | FloatArray = USUAL_GAIN) -> None:
-        """Begins to observe.
+        """Prepares an observer of an arm with its payload (`ArmDynamics.carrying`).
 
-        Args:
-            arm: The arm with what it carries (`ArmDynamics.carrying`).
-            gain_per_s: How fast the residual follows, one for all joints or (n,) [1/s].
-
-        Raises:
-            DataError: A gain is not above zero.
+        The gain is the inverse time constant of the residual, one for all joints or (n,) [1/s];
+        others than numbers above 0 raise DataError.
         """
         gain = np.broadcast_to(np.asarray(gain_per_s, dtype=float), (arm.robot.joint_count,))
         if not (np.isfinite(gain).all() and (gain > 0.0).all()):
@@ -40,33 +35,33 @@ class MomentumObserver:
             )
         self._arm, self._gain = arm, gain
         self._time_s: float | None = None
-        self._begun = self._given = self._push = self._residual = np.zeros(len(gain))
+        self._initial = self._integral = self._rate = self._residual = np.zeros(len(gain))
 
     def update(
         self, time_s: float, q: FloatArray, dq: FloatArray, torques_nm: FloatArray
     ) -> FloatArray:
-        """Takes one sample in.
+        """Updates the residual with a sample.
 
         Args:
-            time_s: When [s], later than the sample before.
+            time_s: Time [s], later than the sample before.
             q: (n,) joint angles [rad].
             dq: (n,) their speeds [rad/s].
-            torques_nm: (n,) what the drives gave [N m].
+            torques_nm: (n,) drive torques [N m].
 
         Returns:
-            (n,) the torques that others put on the joints, positive in the joints' sense [N m].
+            (n,) external torques, positive in the joints' sense [N m].
 
         Raises:
-            DataError: Time does not go on, or a shape is wrong.
+            DataError: Times do not ascend, or a shape is wrong.
         """
         rows = (np.asarray(array, dtype=float)[None] for array in (q, dq))
         momentum, rate = (array[0] for array in self._arm.momentum(*rows))
         return self._step(time_s, momentum, rate + torques_nm)
 
-    def _step(self, time_s: float, momentum: FloatArray, push: FloatArray) -> FloatArray:
-        """The residual after a sample with a momentum and all that is known to change it."""
+    def _step(self, time_s: float, momentum: FloatArray, rate: FloatArray) -> FloatArray:
+        """Residual after a sample with its momentum and the momentum's known rate."""
         if self._time_s is None:
-            self._begun = momentum
+            self._initial = momentum
         else:
             step_s = time_s - self._time_s
             if not step_s > 0.0:
@@ -75,30 +70,27 @@ class MomentumObserver:
                     "ascending times are needed.",
                     culprits=["time_s"],
                 )
-            # The known push by the trapezium's rule, the residual by its new value.
-            given = self._given + 0.5 * step_s * (self._push + push)
-            left = momentum - self._begun - given
-            self._residual = self._gain * left / (1.0 + self._gain * step_s)
-            self._given = given + step_s * self._residual
-        self._time_s, self._push = time_s, push
+            # The known rate is integrated by the trapezoidal rule, the residual by its new value.
+            integral = self._integral + 0.5 * step_s * (self._rate + rate)
+            unexplained = momentum - self._initial - integral
+            self._residual = self._gain * unexplained / (1.0 + self._gain * step_s)
+            self._integral = integral + step_s * self._residual
+        self._time_s, self._rate = time_s, rate
         return self._residual
 
 
 def external_torques(
     arm: ArmDynamics, measured: Measured, gain_per_s: float | FloatArray = USUAL_GAIN
 ) -> FloatArray:
-    """Tells the torques that others put on the joints during a recorded motion.
+    """External torques on the joints during a recorded motion; see `MomentumObserver`.
 
-    Args:
-        arm: The arm with what it carries.
-        measured: The motion and the drives' torques; accelerations do not matter.
-        gain_per_s: As for `MomentumObserver`.
+    Accelerations are not used.
 
     Returns:
         (m, n) positive in the joints' sense [N m]; zero at the first sample.
 
     Raises:
-        DataError: As `MomentumObserver` has it.
+        DataError: As for `MomentumObserver`.
     """
     observer = MomentumObserver(arm, gain_per_s)
     motion = measured.motion

@@ -1,8 +1,8 @@
-"""What an arm carries, by what its drives give more; and their gains, by a body that is known.
+"""Payload from the additional drive torques, and drive gains from a known payload.
 
-The torques of a body on the flange are linear in its ten inertial parameters, and all ten are
-identifiable: what the arm itself takes is known from a run without it (Atkeson, An and Hollerbach
-1986, Estimation of inertial parameters of manipulator loads and links).
+The torques of a body on the flange are linear in its ten inertial parameters. With the arm's own
+torques known from a run without it, all ten are identifiable (Atkeson, An and Hollerbach 1986,
+Estimation of inertial parameters of manipulator loads and links).
 """
 
 from collections.abc import Sequence
@@ -25,31 +25,30 @@ from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of
 from visioncal.robot import Inertias, body_regressor, entries
 
-# A mass that is known no better than to this share of itself is none [-].
+# Relative sigma from which on a mass does not differ from none [-].
 _WORST = 0.5
-# How much of the variance of their gains the drives of an arm have in common: of the 12 % of
-# GAIN_SIGMA a mean of 11 % is alike in all joints [-].
-_ALIKE = 0.8
-# Weighing knows a mass as well as gravity: where that is not stated, it is within such a standard
-# deviation of the standard value where people live [-].
+# Correlation of the gain errors of an arm's drives: of the 12 % of GAIN_SIGMA about 11 % are common
+# to all joints [-].
+_GAIN_CORRELATION = 0.8
+# Relative standard deviation of gravity about the standard value, over inhabited places; a mass is
+# as uncertain where gravity is not stated [-].
 _GRAVITY_SIGMA = 5e-4
 _HOW = "Drive the exciting trajectory of visioncal dynamics plan with the payload on the flange."
-# A gain that is known no better than to this share of itself counts as not determined [-].
+# Relative sigma from which on a gain is not determined [-].
 _WORST_GAIN = 0.1
-# Columns of which less is left are multiples of others [-].
+# Relative pivot below which a column is dependent [-].
 _RANK = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """A body on the flange.
+    """Estimated inertial parameters of a body on the flange.
 
     Attributes:
-        values: (10,) its inertial parameters in the flange's frame, in the order of `Inertias`.
+        values: (10,) inertial parameters in the flange's frame, in the order of `Inertias`.
         covariance: (10, 10) of these.
-        rms_nm: (n,) torques that it leaves unexplained where they count, as a root mean square
-            [N m].
-        gains_sigma_kg: What of the mass's standard deviation comes from the drives' gains [kg].
+        rms_nm: (n,) root mean square of the residual torques [N m].
+        gains_sigma_kg: Standard deviation of the mass by the drive gains alone [kg].
     """
 
     values: FloatArray
@@ -59,41 +58,38 @@ class Payload:
 
     @property
     def mass_kg(self) -> float:
-        """Its mass [kg]."""
+        """Mass [kg]."""
         return float(self.values[0])
 
     @property
     def mass_sigma_kg(self) -> float:
-        """Standard deviation of its mass [kg]."""
+        """Standard deviation of the mass [kg]."""
         return float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def centre_m(self) -> FloatArray:
-        """(3,) its centre, in the flange's frame [m]."""
+        """(3,) centre of mass in the flange's frame [m]."""
         return np.asarray(self.values[1:4] / self.mass_kg)
 
     @property
     def centre_sigma_m(self) -> FloatArray:
-        """(3,) standard deviations of its centre [m]."""
+        """(3,) standard deviations of the centre of mass [m]."""
         jacobian = np.column_stack([-self.centre_m, np.eye(3)]) / self.mass_kg
         return np.asarray(np.sqrt(np.diag(jacobian @ self.covariance[:4, :4] @ jacobian.T)))
 
     @property
     def inertia_kg_m2(self) -> FloatArray:
-        """(6,) xx, xy, yy, xz, yz, zz about its centre, along the flange's axes [kg m^2]."""
+        """(6,) xx, xy, yy, xz, yz, zz about the centre, along the flange's axes [kg m^2]."""
         return entries(self._inertias.about_centres[0])
 
     @property
     def consistent(self) -> bool:
-        """Whether a body can have this inertia; that of a light one is lost in the noise."""
+        """Whether the inertia is physically consistent; a light body's is lost in the noise."""
         return self._inertias.consistent
 
     @property
     def body(self) -> FloatArray:
-        """(10,) parameters to reckon with: of one point where its inertia can be no body's.
-
-        `ArmDynamics.carrying` takes them.
-        """
+        """(10,) consistent parameters for `ArmDynamics.carrying`: a point mass where needed."""
         if self.consistent:
             return self.values
         point = Inertias.of_bodies(self.values[:1], self.centre_m[None], np.zeros((1, 3, 3)))
@@ -127,14 +123,14 @@ def estimate_payload(
     friction_changes: bool = True,
     gain_sigma: float = GAIN_SIGMA,
 ) -> Payload:
-    """Estimates what the arm carried.
+    """Estimates the payload of an arm.
 
     Args:
-        identified: The arm's dynamics without it.
+        identified: The arm's dynamics without payload.
         loaded: Motions with it.
-        friction_changes: Whether dry and viscous friction may be others than without it, as with
-            gears that are pressed harder or warmer.
-        gain_sigma: What each drive's gain is known to, as a share of it, where torques are currents
+        friction_changes: Whether dry and viscous friction may differ from those without payload, as
+            with gears under more load or warmer.
+        gain_sigma: Relative standard deviation of each drive's gain, where torques are currents
             times gains.
 
     Raises:
@@ -152,38 +148,40 @@ def estimate_payload(
         raise DegenerateError(
             "payload: the motion does not determine all of its inertia.", next_step=_HOW
         ) from error
-    of_gains = _of_gains(loaded, fit, gain_sigma)
-    found = Payload(
+    gains_covariance = _gains_covariance(loaded, fit, gain_sigma)
+    payload = Payload(
         fit.values[:10],
-        (fit.covariance + _of_arm(identified, loaded, fit) + of_gains)[:10, :10]
-        + _of_gravity(identified, fit),
+        (fit.covariance + _arm_covariance(identified, loaded, fit) + gains_covariance)[:10, :10]
+        + _gravity_covariance(identified, fit),
         rms_of(np.concatenate(fit.residuals), np.concatenate([block.used for block in fit.blocks])),
-        float(np.sqrt(of_gains[0, 0])),
+        float(np.sqrt(gains_covariance[0, 0])),
     )
-    if not found.mass_sigma_kg < _WORST * found.mass_kg:
+    if not payload.mass_sigma_kg < _WORST * payload.mass_kg:
         raise DegenerateError(
-            f"payload: a mass of {figure(found.mass_kg)} kg, with a sigma of "
-            f"{figure(found.mass_sigma_kg)} kg, does not differ from none.",
+            f"payload: a mass of {figure(payload.mass_kg)} kg, with a sigma of "
+            f"{figure(payload.mass_sigma_kg)} kg, does not differ from none.",
             next_step=f"{_HOW} Is this the run with it?",
         )
-    return found
+    return payload
 
 
 def _block(identified: Identified, terms: FrictionTerms, stream: Conditioned) -> NoiseBlock:
-    """What the drives gave beyond what the arm alone takes, and its derivatives."""
+    """Torques in excess of the arm's own, and their regressor."""
     robot = identified.robot
 
     def columns(motion: JointMotion) -> FloatArray:
         body = body_regressor(robot, motion.q, motion.dq, motion.ddq)
         return np.concatenate([body, terms.columns(motion)], axis=2)
 
-    more = stream.torques_nm - stream.filtered(identified.torques)
-    return NoiseBlock(stream.filtered(columns), more, stream.used, stream.correlation)
+    excess = stream.torques_nm - stream.filtered(identified.torques)
+    return NoiseBlock(stream.filtered(columns), excess, stream.used, stream.correlation)
 
 
-def _of_arm(identified: Identified, loaded: Sequence[Conditioned], fit: Regression) -> FloatArray:
-    """What the arm's own covariance adds to that of the payload."""
-    # The fit takes torques that the arm's parameters explain wrongly for the payload's.
+def _arm_covariance(
+    identified: Identified, loaded: Sequence[Conditioned], fit: Regression
+) -> FloatArray:
+    """Covariance that the arm's own uncertainty adds to the payload's."""
+    # Errors of the arm's predicted torques pass into the payload through the least-squares fit.
     base = identified.base
     information = np.zeros((len(fit.values), len(fit.values)))
     cross = np.zeros((len(fit.values), base.rank))
@@ -193,23 +191,23 @@ def _of_arm(identified: Identified, loaded: Sequence[Conditioned], fit: Regressi
         rows = (block.x * weights).reshape(-1, len(fit.values))
         information += rows.T @ rows
         cross += rows.T @ own.reshape(-1, base.rank)
-    taken = np.linalg.solve(information, cross)
+    sensitivity = np.linalg.solve(information, cross)
     kept = slice(base.rank)
-    return np.asarray(taken @ identified.covariance[kept, kept] @ taken.T)
+    return np.asarray(sensitivity @ identified.covariance[kept, kept] @ sensitivity.T)
 
 
-def _of_gravity(identified: Identified, fit: Regression) -> FloatArray:
-    """(10, 10) what gravity that is not stated adds: to the mass and, alike, to its moments."""
-    weighed = np.zeros(10)
+def _gravity_covariance(identified: Identified, fit: Regression) -> FloatArray:
+    """(10, 10) covariance that unstated gravity adds to the mass and the first moments."""
+    sigmas = np.zeros(10)
     if "gravity_m_s2" not in identified.robot.document:
-        weighed[:4] = _GRAVITY_SIGMA * fit.values[:4]
-    return np.outer(weighed, weighed)
+        sigmas[:4] = _GRAVITY_SIGMA * fit.values[:4]
+    return np.outer(sigmas, sigmas)
 
 
-def _of_gains(loaded: Sequence[Conditioned], fit: Regression, sigma: float) -> FloatArray:
-    """What errors of the drives' gains add to the covariance."""
-    # A joint's torques with and without the payload are currents times one gain: what they say of
-    # the payload is as wrong, in share, as the gain.
+def _gains_covariance(loaded: Sequence[Conditioned], fit: Regression, sigma: float) -> FloatArray:
+    """Covariance that errors of the drive gains add."""
+    # A joint's torques with and without the payload are currents times one gain: its contribution
+    # to the payload has the gain's relative error.
     count = len(fit.values)
     information, parts = np.zeros((count, count)), np.zeros((count, fit.blocks[0].y.shape[1]))
     for stream, block, noise in zip(loaded, fit.blocks, fit.sigmas, strict=True):
@@ -218,8 +216,10 @@ def _of_gains(loaded: Sequence[Conditioned], fit: Regression, sigma: float) -> F
         information += np.einsum("kjp,kjq->pq", rows, rows)
         parts += stream.of_currents * np.einsum("kjp,kj->pj", rows, block.y * weights)
     by_joint = sigma * np.linalg.solve(information, parts)
-    whole = by_joint.sum(axis=1, keepdims=True)
-    return np.asarray((1.0 - _ALIKE) * by_joint @ by_joint.T + _ALIKE * whole @ whole.T)
+    common = by_joint.sum(axis=1, keepdims=True)
+    return np.asarray(
+        (1.0 - _GAIN_CORRELATION) * by_joint @ by_joint.T + _GAIN_CORRELATION * common @ common.T
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,8 +227,8 @@ class Gains:
     """The gains of n drives.
 
     Attributes:
-        nm_per_a: (n,) torque about the joint for a current [N m/A].
-        sigma: (n,) standard deviations [N m/A]; inf where the payload does not move the joint.
+        nm_per_a: (n,) joint torque per current [N m/A].
+        sigma: (n,) standard deviations [N m/A]; inf where the payload does not act on the joint.
     """
 
     nm_per_a: FloatArray
@@ -236,7 +236,7 @@ class Gains:
 
     @property
     def determined(self) -> FloatArray:
-        """(n,) which of them are determined to a tenth of their value."""
+        """(n,) gains that are determined to a tenth of their value."""
         return np.asarray(self.sigma < _WORST_GAIN * np.abs(self.nm_per_a))
 
 
@@ -247,14 +247,14 @@ def drive_gains(
     loaded: Sequence[Conditioned],
     body: FloatArray,
 ) -> Gains:
-    """Finds the drives' gains.
+    """Estimates the drive gains.
 
-    Each joint's current is a sum of what the arm takes, in the joint's own measure, and of the
-    known torque of the payload over the gain. The former is eliminated (Frisch and Waugh 1933).
+    Each joint's current is the sum of the arm's own, linear in unknown parameters, and of the
+    payload's known torque over the gain. The former is eliminated (Frisch and Waugh 1933).
 
     Args:
         base: The arm's model.
-        empty: Motions without the payload; `torques_nm` are currents [A] here.
+        empty: Motions without the payload; their `torques_nm` are currents [A].
         loaded: The same with it.
         body: (10,) the payload's inertial parameters in the flange's frame.
 
@@ -268,19 +268,19 @@ def drive_gains(
 
     streams = (*empty, *loaded)
     own = np.concatenate([stream.filtered(base.regressor) for stream in streams])
-    pulls = np.concatenate(
+    payload_torques = np.concatenate(
         [np.zeros_like(item.torques_nm) for item in empty]
         + [item.filtered(load) for item in loaded]
     )
     currents = np.concatenate([stream.torques_nm for stream in streams])
     used = np.concatenate([stream.used for stream in streams])
-    found = np.array(
+    estimates = np.array(
         [
-            _gain(own[rows, joint], pulls[rows, joint], currents[rows, joint])
+            _gain(own[rows, joint], payload_torques[rows, joint], currents[rows, joint])
             for joint, rows in enumerate(used.T)
         ]
     )
-    gains = Gains(found[:, 0], found[:, 1])
+    gains = Gains(estimates[:, 0], estimates[:, 1])
     if not gains.determined.any():
         raise DegenerateError(
             "drive gains: the payload's torques stand out at no joint.",
@@ -290,21 +290,21 @@ def drive_gains(
 
 
 def _gain(own: FloatArray, load: FloatArray, currents: FloatArray) -> tuple[float, float]:
-    """A joint's gain and its sigma, from rows of what it takes (m, b), the load, the currents."""
-    acts = own.any(axis=0)
-    lengths = np.linalg.norm(own[:, acts], axis=0)
-    directions, upper, _ = qr(own[:, acts] / lengths, mode="economic", pivoting=True)
-    left = np.abs(np.diag(upper))
-    directions = directions[:, left > _RANK * left[0]]
+    """A joint's gain and its sigma, from its regressor (m, b), payload torques and currents."""
+    effective = own.any(axis=0)
+    lengths = np.linalg.norm(own[:, effective], axis=0)
+    directions, upper, _ = qr(own[:, effective] / lengths, mode="economic", pivoting=True)
+    pivots = np.abs(np.diag(upper))
+    directions = directions[:, pivots > _RANK * pivots[0]]
     load = load - directions @ (directions.T @ load)
     currents = currents - directions @ (directions.T @ currents)
     square = float(load @ load)
     if square <= 0.0:
         return 0.0, np.inf
-    share = float(load @ currents) / square
-    rest = currents - share * load
-    freedom = max(len(rest) - directions.shape[1] - 1, 1)
-    sigma = float(np.sqrt(rest @ rest / freedom / square))
-    if share == 0.0:
+    inverse_gain = float(load @ currents) / square
+    residual = currents - inverse_gain * load
+    freedom = max(len(residual) - directions.shape[1] - 1, 1)
+    sigma = float(np.sqrt(residual @ residual / freedom / square))
+    if inverse_gain == 0.0:
         return 0.0, np.inf
-    return 1.0 / share, sigma / share**2
+    return 1.0 / inverse_gain, sigma / inverse_gain**2

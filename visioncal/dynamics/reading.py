@@ -1,4 +1,4 @@
-"""What a stream says of an arm's motion and of its drives."""
+"""Reading of joint angles and torques from the streams of a session."""
 
 import re
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.session import Stream, too_far_apart
 
 _NUMBERED = re.compile(r"(q|tau|current|dq)([1-9][0-9]*)_(rad|nm|a|rad_s)", re.ASCII)
-# Fewer samples than these are no motion.
+# Least number of samples of a motion.
 _LEAST_SAMPLES = 200
-# Samples farther apart show no motion [s].
+# Greatest usual step between samples [s].
 _SLOWEST_S = 0.5
 _HOW = (
     "A stream for dynamics has stamp_s, q1_rad ..., and tau1_nm ... or current1_a ... of every "
@@ -23,14 +23,14 @@ _HOW = (
 
 @dataclass(frozen=True, eq=False)
 class RecordedSamples:
-    """The samples of a stream in which all that counts is filled.
+    """The complete samples of a stream.
 
     Attributes:
-        label: The stream's place, for messages: `streams/robot.csv`.
-        times_s: (m,) when [s].
+        label: The stream's file, for messages: `streams/robot.csv`.
+        times_s: (m,) times [s].
         q: (m, n) joint angles [rad].
-        dq: (m, n) speeds as the controller reports them [rad/s]; None where it does not.
-        torques_nm: (m, n) of the joints [N m].
+        dq: (m, n) reported speeds [rad/s]; None where the controller reports none.
+        torques_nm: (m, n) torques of the joints [N m].
         of_currents: Whether the torques are currents times gains.
     """
 
@@ -45,11 +45,11 @@ class RecordedSamples:
         return len(self.times_s)
 
     def part(self, begin: float, end: float) -> "RecordedSamples":
-        """The samples between two shares of the whole, 0 to 1."""
+        """The samples between two fractions of the stream, 0 to 1."""
         return self.among(slice(round(begin * len(self)), round(end * len(self))))
 
     def among(self, rows: slice | Mask) -> "RecordedSamples":
-        """Some of the samples."""
+        """The samples of given rows."""
         return replace(
             self,
             times_s=self.times_s[rows],
@@ -62,29 +62,29 @@ class RecordedSamples:
 def read_recorded(
     stream: Stream, label: str, count: int, gains_nm_a: Sequence[float] = ()
 ) -> RecordedSamples:
-    """Takes out of a stream what identification needs.
+    """Reads the columns of a stream that identification needs.
 
     Args:
         stream: The stream.
-        label: Its place, for messages.
+        label: Its file, for messages.
         count: The robot's number of joints.
-        gains_nm_a: (count,) torque for a current, on the joints' side, where currents were
-            recorded in the place of torques [N m/A].
+        gains_nm_a: (count,) joint torque per current, where currents were recorded instead of
+            torques [N m/A].
 
     Raises:
-        DataError: Columns of a joint are missing or there are those of more joints than the robot
-            has, currents have no gains, too few samples are filled, or stamps are not in seconds.
+        DataError: Columns of a joint are missing, there are columns of more joints than the robot
+            has, currents have no gains, too few samples are complete, or stamps are not in seconds.
     """
     names = {name: _names(name, count) for name in ("q", "tau", "current", "dq")}
-    there = {word: [name in stream for name in names[word]] for word in names}
+    present = {word: [name in stream for name in names[word]] for word in names}
     _check_joints(stream, label, count)
-    of_currents = not any(there["tau"]) and any(there["current"])
+    of_currents = not any(present["tau"]) and any(present["current"])
     drive = "current" if of_currents else "tau"
     missing = [
         name
         for group in ("q", drive)
-        for name, is_there in zip(names[group], there[group], strict=True)
-        if not is_there
+        for name, is_present in zip(names[group], present[group], strict=True)
+        if not is_present
     ]
     if missing:
         raise DataError(
@@ -93,7 +93,7 @@ def read_recorded(
             next_step=_HOW,
         )
     gains = _gains(label, count, gains_nm_a) if of_currents else np.ones(count)
-    with_dq = all(there["dq"])
+    with_dq = all(present["dq"])
     columns = [*names["q"], *names[drive], *(names["dq"] if with_dq else [])]
     times_s, values = stream.group(columns)
     if len(times_s) < _LEAST_SAMPLES:

@@ -1,7 +1,7 @@
-"""Weighted least squares on many filtered torques, with a covariance that counts what they share.
+"""Weighted least squares on filtered torques, with a covariance that allows for correlated noise.
 
-Each joint has a noise of its own, estimated from its residuals. Filtered noise is correlated from
-one sample to the next; the estimate stands that, but its covariance must know.
+The noise level of each joint is estimated from its residuals. Noise is correlated between samples
+by the filter: that does not bias the estimate, but enlarges its covariance.
 """
 
 from collections.abc import Sequence
@@ -15,28 +15,28 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Mask
 
-# Rows that are decomposed at a time, so that they stay in the processor's cache.
+# Rows of a QR decomposition at a time, so that they stay in the processor's cache.
 _CHUNK = 2000
 _ROUNDS, _SETTLED = 30, 1e-4
-# A residual that chance exceeds less often than this, among all of them, is an outlier.
+# Outliers are residuals with less than this probability of being exceeded by any of them.
 _OUTLIER_CHANCE = 1e-3
-_CUTS = 10
-# Correlations are followed until they are lost in their own noise, and over this share of samples.
+_OUTLIER_ROUNDS = 10
+# Autocorrelations count up to the first insignificant one (in sigmas), and over this share of
+# samples.
 _LOST, _FOLLOWED = 3.0, 0.1
-# No frequency has less than this share of white noise's power.
+# Least power of the noise's spectrum, over that of white noise.
 _LEAST_POWER = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseBlock:
-    """Samples whose joints have each one level of noise.
+    """Regressor and torques of samples that share a noise level for each joint.
 
     Attributes:
-        x: (k, n, p) derivatives of the torques by the parameters.
+        x: (k, n, p) regressor.
         y: (k, n) torques [N m].
-        used: (k, n) which of them count.
-        correlation: (l,) what the filter alone leaves of white noise from one sample to the next,
-            the one after, and so on.
+        used: (k, n) mask of the torques that are fitted.
+        correlation: (l,) autocorrelation of filtered white noise at lags 1, 2, ...
     """
 
     x: FloatArray
@@ -45,17 +45,17 @@ class NoiseBlock:
     correlation: FloatArray
 
     def __post_init__(self) -> None:
-        # Joint after joint in memory, since that is how they are read, again and again.
+        # Contiguous for each joint, as it is read again and again.
         by_joint = np.ascontiguousarray(np.moveaxis(self.x, 1, 0))
         object.__setattr__(self, "x", np.moveaxis(by_joint, 0, 1))
 
     def predicted(self, values: FloatArray) -> FloatArray:
-        """(k, n) torques by (p,) parameters [N m]."""
+        """Torques (k, n) predicted by (p,) parameters [N m]."""
         joints = range(self.y.shape[1])
         return np.stack([self.x[:, joint] @ values for joint in joints], axis=1)
 
     def within(self, values: FloatArray, sigma: FloatArray) -> "NoiseBlock":
-        """The same without torques that are farther from a fit than chance takes them."""
+        """The same without outliers of a fit."""
         count = max(int(self.used.sum()), 1)
         limit = float(np.sqrt(chi2_limit(_OUTLIER_CHANCE / count, 1.0)))
         near = np.abs(self.y - self.predicted(values)) <= limit * sigma
@@ -69,8 +69,8 @@ class Regression:
     Attributes:
         values: (p,) the parameters.
         covariance: (p, p) of these.
-        sigmas: One (n,) noise of the joints a block [N m].
-        blocks: What was fitted, without outliers.
+        sigmas: (n,) noise of the joints, for each block [N m].
+        blocks: The fitted blocks, outliers masked.
     """
 
     values: FloatArray
@@ -80,59 +80,59 @@ class Regression:
 
     @property
     def residuals(self) -> tuple[FloatArray, ...]:
-        """(k, n) torques less the fit, a block."""
+        """Measured less predicted torques (k, n), for each block."""
         return tuple(block.y - block.predicted(self.values) for block in self.blocks)
 
 
 @dataclass(frozen=True, eq=False)
-class _Joint:
-    """All that a block says of a joint: a triangle in place of its rows.
+class _JointFactor:
+    """Triangular factor of a joint's rows, which holds all their information.
 
     Attributes:
-        columns: (c,) the parameters that move this joint.
-        triangle: (c + 1, c + 1) of [x, y] decomposed.
-        count: How many rows it stands for.
+        columns: (c,) indices of the parameters that affect this joint.
+        triangle: (c + 1, c + 1) R factor of [x, y].
+        count: Number of rows.
     """
 
     columns: IntArray
     triangle: FloatArray
     count: int
 
-    def scatter(self, values: FloatArray) -> float:
+    def squared_residuals(self, values: FloatArray) -> float:
         """Sum of squared residuals."""
         left = self.triangle[:, :-1] @ values[self.columns] - self.triangle[:, -1]
         return float(left @ left)
 
 
 def regress(blocks: Sequence[NoiseBlock]) -> Regression:
-    """Fits parameters, the joints' noise, and finds outliers.
+    """Fits parameters and the joints' noise, and masks outliers.
 
     Raises:
         numpy.linalg.LinAlgError: The rows do not determine all parameters.
     """
     blocks = tuple(blocks)
     with one_blas_thread():
-        for _ in range(_CUTS):
+        for _ in range(_OUTLIER_ROUNDS):
             values, sigmas, root = _weighted(blocks)
-            cut = tuple(
+            masked = tuple(
                 block.within(values, sigma) for block, sigma in zip(blocks, sigmas, strict=True)
             )
-            pairs = zip(cut, blocks, strict=True)
+            pairs = zip(masked, blocks, strict=True)
             if all(new.used.sum() == old.used.sum() for new, old in pairs):
                 break
-            blocks = cut
+            blocks = masked
         fit = Regression(values, root @ root.T, sigmas, blocks)
         return replace(fit, covariance=_covariance(fit))
 
 
 def rms_of(values: FloatArray, used: Mask) -> FloatArray:
-    """(n,) root mean square of those of (k, n) values that count."""
+    """(n,) root mean square of the used ones of (k, n) values."""
     counts = np.maximum(used.sum(axis=0), 1)
     return np.asarray(np.sqrt(np.sum(used * values**2, axis=0) / counts))
 
 
 def spread_of(values: FloatArray, used: Mask) -> FloatArray:
-    """(n,) standard deviation of those of (k, n) values that count."""
+    """(n,) standard deviation of the used ones of (k, n) values."""
     counts = np.maximum(used.sum(axis=0), 1)
     return rms_of(values - np.sum(used * values, axis=0) / counts, used)
 
@@ -140,8 +140,8 @@ def spread_of(values: FloatArray, used: Mask) -> FloatArray:
 def _weighted(
     blocks: Sequence[NoiseBlock],
 ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray]:
-    """Parameters, noise of the joints by block, and a root (p, p) of the white covariance."""
-    # Each joint's rows are decomposed once; changing weights costs triangles alone.
+    """Parameters, noise of the joints by block, and a square root (p, p) of the covariance."""
+    # Each joint's rows are decomposed once; reweighting only needs their triangular factors.
     joints = [_decomposed(block) for block in blocks]
     size = blocks[0].x.shape[2]
     sigmas = [np.ones(len(joint)) for joint in joints]
@@ -150,9 +150,9 @@ def _weighted(
         before = sigmas
         sigmas = [
             np.array(
-                [_sigma(joint, values, root, old) for joint, old in zip(of, olds, strict=True)]
+                [_sigma(joint, values, root, old) for joint, old in zip(factors, olds, strict=True)]
             )
-            for of, olds in zip(joints, before, strict=True)
+            for factors, olds in zip(joints, before, strict=True)
         ]
         pairs = zip(before, sigmas, strict=True)
         if turn and all(np.allclose(old, new, rtol=_SETTLED) for old, new in pairs):
@@ -160,31 +160,33 @@ def _weighted(
     return values, tuple(sigmas), root
 
 
-def _decomposed(block: NoiseBlock) -> list[_Joint]:
-    """The triangles of a block's joints, chunk by chunk (Golub and Van Loan 2013, 5.3.5)."""
-    found = []
+def _decomposed(block: NoiseBlock) -> list[_JointFactor]:
+    """Triangular factors of a block's joints, chunk by chunk (Golub and Van Loan 2013, 5.3.5)."""
+    factors = []
     for joint in range(block.y.shape[1]):
         rows = block.used[:, joint]
         x = block.x[:, joint]
         columns = np.flatnonzero(x.any(axis=0))
         triangle = np.zeros((0, len(columns) + 1))
         for begin in range(0, len(x), _CHUNK):
-            some = slice(begin, begin + _CHUNK)
-            chunk = np.column_stack([x[some][:, columns], block.y[some, joint]])[rows[some]]
+            chunk_rows = slice(begin, begin + _CHUNK)
+            chunk = np.column_stack([x[chunk_rows][:, columns], block.y[chunk_rows, joint]])[
+                rows[chunk_rows]
+            ]
             if len(chunk):
                 (triangle,) = qr(np.concatenate([triangle, chunk]), mode="r", overwrite_a=True)
                 triangle = triangle[: len(columns) + 1]
-        found.append(_Joint(columns, triangle, int(rows.sum())))
-    return found
+        factors.append(_JointFactor(columns, triangle, int(rows.sum())))
+    return factors
 
 
 def _solved(
-    joints: Sequence[Sequence[_Joint]], sigmas: Sequence[FloatArray], size: int
+    joints: Sequence[Sequence[_JointFactor]], sigmas: Sequence[FloatArray], size: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Parameters under given noise, and a root of their covariance."""
+    """Parameters at given noise, and a square root of their covariance."""
     parts = []
-    for of, noise in zip(joints, sigmas, strict=True):
-        for joint, sigma in zip(of, noise, strict=True):
+    for factors, noise in zip(joints, sigmas, strict=True):
+        for joint, sigma in zip(factors, noise, strict=True):
             part = np.zeros((len(joint.triangle), size + 1))
             part[:, [*joint.columns, size]] = joint.triangle / sigma
             parts.append(part)
@@ -199,66 +201,65 @@ def _solved(
     return root @ triangle[:size, -1], root
 
 
-def _sigma(joint: _Joint, values: FloatArray, root: FloatArray, before: float) -> float:
-    """A joint's noise by its residuals, less the freedom that the fit has taken of its rows."""
-    taken = np.sum((joint.triangle[:, :-1] @ root[joint.columns]) ** 2) / before**2
-    freedom = max(joint.count - taken, 1.0)
-    # Exact torques leave rounding, and no joint may get all the weight for it.
+def _sigma(joint: _JointFactor, values: FloatArray, root: FloatArray, before: float) -> float:
+    """A joint's noise from its residuals and their degrees of freedom."""
+    fitted = np.sum((joint.triangle[:, :-1] @ root[joint.columns]) ** 2) / before**2
+    freedom = max(joint.count - fitted, 1.0)
+    # Residuals of exact torques are rounding, which must not give a joint all the weight.
     size = np.linalg.norm(joint.triangle[:, -1]) / np.sqrt(max(joint.count, 1))
-    return float(max(np.sqrt(joint.scatter(values) / freedom), 1e-9 * size, 1e-12))
+    return float(max(np.sqrt(joint.squared_residuals(values) / freedom), 1e-9 * size, 1e-12))
 
 
 def _covariance(fit: Regression) -> FloatArray:
     """The estimate's covariance under correlated noise."""
-    # That of least squares under another noise than it was weighted for (White 1980; Newey and West
-    # 1987), with the correlations that the filter leaves of white noise, and those of the residuals
-    # where they are plainly larger.
+    # Sandwich covariance (White 1980; Newey and West 1987), with the autocorrelation of filtered
+    # white noise, or that of the residuals where it differs significantly.
     white = fit.covariance
     scores = np.zeros_like(white)
     for block, residuals, sigma in zip(fit.blocks, fit.residuals, fit.sigmas, strict=True):
         for joint in range(len(sigma)):
             used = block.used[:, joint]
-            shares = _correlations(residuals[:, joint] * used, used, block.correlation)
+            correlations = _correlations(residuals[:, joint] * used, used, block.correlation)
             rows = block.x[:, joint] * used[:, None] / sigma[joint]
             columns = np.flatnonzero(rows.any(axis=0))
-            scores[np.ix_(columns, columns)] += _scores(rows[:, columns], shares)
-    # By a root, which leaves no variance below zero, however badly parameters are determined.
+            scores[np.ix_(columns, columns)] += _scores(rows[:, columns], correlations)
+    # By a square root, so that no variance is negative, however ill-conditioned the parameters.
     sizes = np.sqrt(np.maximum(np.diag(scores), 1e-300))
     values, vectors = np.linalg.eigh(scores / np.outer(sizes, sizes))
     root = white @ (sizes[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
     return np.asarray(root @ root.T)
 
 
-def _scores(rows: FloatArray, shares: FloatArray) -> FloatArray:
-    """`rows^T T rows`, where T has ones on its diagonal and `shares` beside it."""
-    # By the noise's spectrum, which cannot be negative, whatever cut-off correlations say.
-    if not len(shares):
+def _scores(rows: FloatArray, correlations: FloatArray) -> FloatArray:
+    """`rows^T T rows`, where T is the Toeplitz matrix of the correlations 1, `correlations`."""
+    # By the noise's spectrum, which is kept positive although the correlations are truncated.
+    if not len(correlations):
         return np.asarray(rows.T @ rows)
-    size = next_fast_len(len(rows) + len(shares), real=True)
+    size = next_fast_len(len(rows) + len(correlations), real=True)
     kernel = np.zeros(size)
     kernel[0] = 1.0
-    kernel[1 : len(shares) + 1] = kernel[-1 : -len(shares) - 1 : -1] = shares
+    kernel[1 : len(correlations) + 1] = kernel[-1 : -len(correlations) - 1 : -1] = correlations
     power = np.maximum(rfft(kernel).real, _LEAST_POWER)
-    # Of a real signal's spectrum all but the ends stand for two frequencies.
+    # All frequencies of a real signal's spectrum but the ends count twice.
     power[1 : (size + 1) // 2] *= 2.0
     waves = rfft(rows, size, axis=0) * np.sqrt(power / size)[:, None]
     return np.asarray(waves.real.T @ waves.real + waves.imag.T @ waves.imag)
 
 
-def _correlations(residuals: FloatArray, used: Mask, known: FloatArray) -> FloatArray:
-    """Correlations of the noise at lags 1, 2, ...: known ones, or of the residuals."""
+def _correlations(residuals: FloatArray, used: Mask, of_filter: FloatArray) -> FloatArray:
+    """Autocorrelation of the noise at lags 1, 2, ...: the filter's, or the residuals'."""
     size = float(residuals @ residuals)
     count = int(used.sum())
-    found = list(known)
+    correlations = list(of_filter)
     if not size or count < 20:
-        return known
+        return of_filter
     for lag in range(1, int(_FOLLOWED * count)):
-        seen = float(residuals[lag:] @ residuals[:-lag]) / size
-        expected = found[lag - 1] if lag <= len(found) else 0.0
-        if abs(seen - expected) * np.sqrt(count) < _LOST:
+        sample = float(residuals[lag:] @ residuals[:-lag]) / size
+        expected = correlations[lag - 1] if lag <= len(correlations) else 0.0
+        if abs(sample - expected) * np.sqrt(count) < _LOST:
             break
-        if lag <= len(found):
-            found[lag - 1] = seen
+        if lag <= len(correlations):
+            correlations[lag - 1] = sample
         else:
-            found.append(seen)
-    return np.array(found)
+            correlations.append(sample)
+    return np.array(correlations)

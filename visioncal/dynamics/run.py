@@ -1,4 +1,4 @@
-"""`visioncal dynamics identify`: from a session to its dynamics, and their proof."""
+"""`visioncal dynamics identify`: identification from a session, with its validation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -20,26 +20,26 @@ from visioncal.session import STREAMS, Session
 from visioncal.session.choosing import ARM, Choice
 from visioncal.session.selecting import check_one_of_each, select
 
-# The share of a motion's end that is predicted where no other motion is named.
+# Share of the fastest motion, at its end, held out for validation where no other stream is.
 HELD_OUT = 0.3
-# Rotors are there where with them an error of some joint's unseen torques falls to this share.
+# Rotors are kept where they reduce the error of some joint's held-out torques to this share.
 _ROTORS = 0.75
 
 
 @dataclass(frozen=True)
 class IdentificationRequest:
-    """What is asked for.
+    """Options of `identify_session`.
 
     Attributes:
         streams: Names of the streams to fit; all with torques or currents where empty.
         validate_on: The stream to predict; the end of the fastest motion where empty.
-        cutoff_hz: Of the low-pass [Hz]; by the motion where None.
-        gains_nm_a: Torque for a current, by joint, where currents were recorded [N m/A].
+        cutoff_hz: Cut-off of the low-pass [Hz]; by the motion where None.
+        gains_nm_a: Torque per current, by joint, where currents were recorded [N m/A].
         options: What is estimated.
-        rotors: Whether rotors' inertias are estimated; None to let the torques decide: those behind
-            the gears have none in them.
-        robot: Which robot of a whole cell; its streams are those that have or begin with its name.
-        lag_s: How much later torques come than their angles; sought where None [s].
+        rotors: Whether rotor inertias are estimated; None to decide by the held-out torques, since
+            torques sensed behind the gears do not include them.
+        robot: Which robot of a whole cell; its streams have, or begin with, its name.
+        lag_s: Delay of the torques behind the angles; estimated where None [s].
     """
 
     streams: tuple[str, ...] = ()
@@ -54,23 +54,18 @@ class IdentificationRequest:
 
 @dataclass(frozen=True, eq=False)
 class _Split:
-    """Streams without the end of the fastest motion, that, and whose it is."""
+    """Streams without the end of the fastest one, that held-out end, and the stream's index."""
 
-    rest: tuple[Conditioned, ...]
-    unseen: Conditioned
+    fitted: tuple[Conditioned, ...]
+    held_out: Conditioned
     fastest: int
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A result with its evidence.
+    """Identified dynamics of a session, the fit, and measured and predicted torques.
 
-    Attributes:
-        session: What it was identified from.
-        identified: The result.
-        identification: How it was fitted.
-        predicted: Torques that were not fitted, measured and predicted; None where there are none.
-        fitted: Those that were.
+    `fitted` are those of the fitted streams; `predicted` were not fitted, and may be None.
     """
 
     session: Session
@@ -81,7 +76,7 @@ class Run:
 
     @property
     def predictions(self) -> tuple[Prediction, ...]:
-        """All of them, those that were not fitted last."""
+        """All predictions, those that were not fitted last."""
         return self.fitted if self.predicted is None else (*self.fitted, self.predicted)
 
 
@@ -91,7 +86,7 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
 
     Args:
         session: With streams of angles and torques.
-        request: What is asked for.
+        request: Options.
 
     Raises:
         DataError: The session has no robot or no such stream, or a stream is wrong.
@@ -100,11 +95,8 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
     request = IdentificationRequest() if request is None else request
     session = of_one_arm(session, request.robot)
     robot = robot_of(session)
-    names = [
-        stream
-        for stream in _torque_streams(session, request.streams)
-        if stream != request.validate_on
-    ]
+    candidates = _torque_streams(session, request.streams)
+    names = [name for name in candidates if name != request.validate_on]
     if not names:
         raise DataError(
             f"session {session.name!r}: {request.validate_on} is its only stream of torques, and "
@@ -113,26 +105,26 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
             next_step="Leave --validate-on out: then the end of the motion is predicted.",
         )
     recorded = [_read(session, robot, name, request) for name in names]
-    streams, lag = _lagging(
+    streams, lag = _lag_corrected(
         robot, [_conditioned(robot, item, request) for item in recorded], request
     )
     request = replace(request, lag_s=request.lag_s if lag is None else lag.seconds)
     split = _split(robot, recorded, streams, request)
     options = _with_rotors(robot, split, request)
-    whole = identify(robot, streams, options)
-    proof, validation = None, None
+    identification = identify(robot, streams, options)
+    predicted, validation = None, None
     if request.validate_on:
-        other = _read(session, robot, request.validate_on, request)
-        proof = _predicted(whole, _conditioned(robot, other, request))
-        validation = validate(whole.identified, proof)
+        validation_samples = _read(session, robot, request.validate_on, request)
+        predicted = _predicted(identification, _conditioned(robot, validation_samples, request))
+        validation = validate(identification.identified, predicted)
     elif split is not None:
-        of_rest = identify(robot, split.rest, replace(options, checked=False))
-        proof = _predicted(of_rest, split.unseen, "the last 30 % of ")
-        # In a part of a motion a joint may bear the same torque all the time.
-        ranges_nm = whole.identified.streams[split.fastest].torque_nm
-        validation = replace(validate(whole.identified, proof), torque_nm=ranges_nm)
+        without_end = identify(robot, split.fitted, replace(options, checked=False))
+        predicted = _predicted(without_end, split.held_out, "the last 30 % of ")
+        # In a part of a motion a joint's torque may be constant.
+        ranges_nm = identification.identified.streams[split.fastest].torque_nm
+        validation = replace(validate(identification.identified, predicted), torque_nm=ranges_nm)
     identified = replace(
-        whole.identified,
+        identification.identified,
         validation=validation,
         lag=lag,
         facts={
@@ -140,15 +132,15 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
             "session": {"name": session.name, "sha256": session.digest()},
         },
     )
-    friction = friction_of_known(whole)
+    friction = friction_of_known(identification)
     fitted = tuple(predict(identified, stream, friction) for stream in streams)
-    return Run(session, identified, whole, proof, fitted)
+    return Run(session, identified, identification, predicted, fitted)
 
 
 def validate_session(
     session: Session, identified: Identified, request: IdentificationRequest
 ) -> list[Prediction]:
-    """Predicts the torques of a session's streams by dynamics that were identified before.
+    """Predicts the torques of a session's streams by earlier identified dynamics.
 
     Raises:
         DataError: The robot is another one, there is no such stream, or a stream is wrong.
@@ -162,7 +154,7 @@ def validate_session(
 def conditioned_streams(
     session: Session, identified: Identified, request: IdentificationRequest
 ) -> list[Conditioned]:
-    """Reads a session's streams, filtered as those from which an arm was identified.
+    """Reads a session's streams, filtered like those of an identification.
 
     Raises:
         DataError: The robot is another one, there is no such stream, or a stream is wrong.
@@ -173,7 +165,7 @@ def conditioned_streams(
     cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
     filtered = replace(request, cutoff_hz=cutoff_hz)
     streams = [_conditioned(robot, item, filtered) for item in recorded]
-    streams, lag = _lagging(robot, streams, request)
+    streams, lag = _lag_corrected(robot, streams, request)
     if lag is None:
         return streams
     return [
@@ -185,15 +177,9 @@ def conditioned_streams(
 def current_streams(
     session: Session, robot: Robot, cutoff_hz: float | None = None
 ) -> list[Conditioned]:
-    """Reads a session's streams of currents, for drives whose gains are not known.
+    """Reads a session's streams of currents, for drives of unknown gains; torques are currents [A].
 
-    Args:
-        session: The session.
-        robot: Its arm.
-        cutoff_hz: Of the low-pass [Hz]; by the motion where None.
-
-    Returns:
-        The streams, whose torques are currents [A].
+    The low-pass is chosen by the motion where no cut-off is given [Hz].
 
     Raises:
         DataError: There is no stream of currents, or one is wrong.
@@ -211,20 +197,12 @@ def current_streams(
 
 
 def of_one_arm(session: Session, robot: str | None = None) -> Session:
-    """Takes one robot with its streams out of a session of several.
-
-    Raises:
-        DataError: There is no such robot, or several are meant.
-    """
+    """Selects one robot and its streams from a session; raises DataError if that is ambiguous."""
     return select(session, Choice(robot=robot), ARM)
 
 
 def robot_of(session: Session) -> Robot:
-    """The session's robot.
-
-    Raises:
-        DataError: It names none that is known, or several.
-    """
+    """The session's robot; raises DataError if it names none that is known, or several."""
     check_one_of_each(session)
     if session.robot_document is None:
         raise DataError(
@@ -238,7 +216,7 @@ def robot_of(session: Session) -> Robot:
 
 
 def _torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
-    """Names of the streams that have torques or currents, or of those that are wanted."""
+    """Names of the wanted streams; by default of all with torques or currents."""
     for name in wanted:
         if name not in session.streams:
             raise DataError(
@@ -250,10 +228,12 @@ def _torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
     if wanted:
         return list(dict.fromkeys(wanted))
     drives = ("tau1_nm", "current1_a")
-    found = [
-        name for name, stream in session.streams.items() if any(one in stream for one in drives)
+    names = [
+        name
+        for name, stream in session.streams.items()
+        if any(column in stream for column in drives)
     ]
-    if not found:
+    if not names:
         raise DataError(
             f"session {session.name!r} has no stream with torques or currents: "
             f"{', '.join(session.streams) or 'it has no streams'}.",
@@ -261,7 +241,7 @@ def _torque_streams(session: Session, wanted: Sequence[str] = ()) -> list[str]:
             next_step=f"Put them into {STREAMS}/NAME.csv: stamp_s, q1_rad ..., and tau1_nm ... or "
             "current1_a ....",
         )
-    return found
+    return names
 
 
 def _read(
@@ -275,14 +255,14 @@ def _read(
 def _conditioned(
     robot: Robot, recorded: RecordedSamples, request: IdentificationRequest
 ) -> Conditioned:
-    found = condition(recorded, request.cutoff_hz, robot.torque_nm)
-    return found.advanced(request.lag_s) if request.lag_s else found
+    conditioned = condition(recorded, request.cutoff_hz, robot.torque_nm)
+    return conditioned.advanced(request.lag_s) if request.lag_s else conditioned
 
 
-def _lagging(
+def _lag_corrected(
     robot: Robot, streams: list[Conditioned], request: IdentificationRequest
 ) -> tuple[list[Conditioned], Lag | None]:
-    """The streams with their torques at the angles' times, and by how much they were later."""
+    """The streams with the torques' lag corrected, and the lag if it was estimated."""
     lag = None
     if request.lag_s is None:
         lag = find_lag(robot, streams, request.options.terms)
@@ -295,8 +275,8 @@ def _split(
     streams: Sequence[Conditioned],
     request: IdentificationRequest,
 ) -> _Split | None:
-    """Leaves the end of the fastest motion out; None where the rest determines too little."""
-    # Sweeps move one joint after the other: no part of them stands for the others.
+    """Holds out the end of the fastest motion; None where the rest determines too little."""
+    # Sweeps move one joint after the other: no part of them is representative.
     fastest = int(np.argmax([_speed(stream) for stream in streams]))
     filtered = replace(request, cutoff_hz=streams[fastest].cutoff_hz)
     begin = recorded[fastest].part(0.0, 1.0 - HELD_OUT)
@@ -305,38 +285,37 @@ def _split(
     try:
         rest[fastest] = _conditioned(robot, begin, filtered)
         split = _Split(tuple(rest), _conditioned(robot, end, filtered), fastest)
-        identify(robot, split.rest, _quick(request.options, request.rotors is not False))
+        identify(robot, split.fitted, _quick(request.options, request.rotors is not False))
     except (DataError, DegenerateError):
         return None
     return split
 
 
 def _with_rotors(robot: Robot, split: _Split | None, request: IdentificationRequest) -> Options:
-    """The options with rotors, where these are asked for, or predict by far better."""
+    """The options with rotors, where requested or where they predict far better."""
     options, rotors = request.options, request.rotors
     if rotors is None and split is not None:
         errors = []
-        for there in (False, True):
-            found = identify(robot, split.rest, _quick(options, there))
-            unseen = predict(found.identified, split.unseen)
-            errors.append(unseen.rms_nm(unseen.predicted_nm))
+        for with_rotors in (False, True):
+            fit = identify(robot, split.fitted, _quick(options, with_rotors))
+            predicted = predict(fit.identified, split.held_out)
+            errors.append(predicted.rms_nm(predicted.predicted_nm))
         rotors = bool(np.min(errors[1] / np.maximum(errors[0], 1e-12)) < _ROTORS)
     return replace(options, terms=replace(options.terms, motor_inertia=bool(rotors)))
 
 
 def _quick(options: Options, rotors: bool) -> Options:
-    """The same for base parameters alone."""
+    """Options for base parameters alone."""
     terms = replace(options.terms, motor_inertia=rotors)
     return Options(terms, stribeck=False, consistent=False, checked=False)
 
 
 def _speed(stream: Conditioned) -> FloatArray:
-    """How fast the slowest joint is [rad/s]."""
+    """Root mean square speed of the slowest joint [rad/s]."""
     speeds = np.concatenate([piece.measured.motion.dq for piece in stream.pieces])
     return np.asarray(np.sqrt(np.mean(speeds**2, axis=0)).min())
 
 
 def _predicted(identification: Identification, stream: Conditioned, which: str = "") -> Prediction:
-    friction = friction_of_known(identification)
-    found = predict(identification.identified, stream, friction)
-    return replace(found, label=f"{which}{stream.label}")
+    predicted = predict(identification.identified, stream, friction_of_known(identification))
+    return replace(predicted, label=f"{which}{stream.label}")

@@ -1,8 +1,9 @@
-"""What breaking loose takes: Stribeck's hump of dry friction at low speeds, and how wide it is.
+"""Fit of Stribeck friction: the hump of dry friction at low speeds.
 
 Dry friction is `(Fc + (Fs - Fc) exp(-(dq / vs)^2)) sign(dq)`. Where friction sets in gradually, as
-torque sensors behind a gear have it, the hump is a dip: Fs is less than Fc. All but the speeds vs
-are linear, and eliminated (Golub and Pereyra 1973, variable projection, in Kaufman's form of 1975).
+seen by torque sensors behind a gear, the hump is a dip: Fs is less than Fc. All parameters but the
+speeds vs are linear, and eliminated by variable projection (Golub and Pereyra 1973, in Kaufman's
+form of 1975).
 """
 
 from collections.abc import Sequence
@@ -20,22 +21,22 @@ from visioncal.dynamics.regression import NoiseBlock, Regression, regress
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_from, damped_step, gram
 
-# Where the search begins, and what it stays within [rad/s].
+# Start values and bounds of the Stribeck speed [rad/s].
 _STARTS, _SLOWEST, _FASTEST = (0.01, 0.03, 0.08), 1e-3, 0.5
 _SETTLED, _SETTLED_NOISE, _ROUNDS = 1e-6, 1e-2, 8
-# A hump is one where chance would gain as much in less than so many cases.
+# Significance level of a hump.
 _CHANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Stribeck:
-    """The humps of some joints.
+    """Stribeck humps of a joints.
 
     Attributes:
-        joints: (a,) which joints, from 0.
+        joints: (a,) indices of the joints, from 0.
         hump_nm: (a,) Fs - Fc [N m].
         speed_rad_s: (a,) vs [rad/s].
-        slow_rad_s: See `friction.sign`.
+        slow_rad_s: See `model.sign`.
     """
 
     joints: IntArray
@@ -45,22 +46,22 @@ class Stribeck:
 
     @classmethod
     def none(cls) -> Self:
-        """No joint has one."""
+        """No humps."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), 0.0)
 
     def shapes(self, motion: JointMotion) -> FloatArray:
-        """(m, a) torques of a hump of 1 N m."""
+        """Torques (m, a) of humps of 1 N m."""
         dq = motion.dq[:, self.joints]
         return np.asarray(sign(dq, self.slow_rad_s) * np.exp(-((dq / self.speed_rad_s) ** 2)))
 
     def torques(self, motion: JointMotion) -> FloatArray:
-        """(m, n) what the humps add to the joints' friction [N m]."""
+        """Friction torques (m, n) of the humps [N m]."""
         torques = np.zeros_like(motion.dq)
         torques[:, self.joints] = self.hump_nm * self.shapes(motion)
         return torques
 
     def jacobian(self, motion: JointMotion) -> FloatArray:
-        """(m, 2 a) derivatives by the hump, and by the logarithm of its speed."""
+        """(m, 2 a) derivatives over humps, and over the logarithms of their speeds."""
         shapes = self.shapes(motion)
         squares = (motion.dq[:, self.joints] / self.speed_rad_s) ** 2
         return np.concatenate([shapes, 2.0 * self.hump_nm * squares * shapes], axis=1)
@@ -71,84 +72,84 @@ def fit_stribeck(
     blocks: Sequence[NoiseBlock],
     plain: Regression,
     slow_rad_s: float,
-    sliding: IntArray,
+    coulomb_indices: IntArray,
 ) -> tuple[Stribeck, Regression]:
-    """Finds the humps that torques show.
+    """Fits significant Stribeck humps.
 
     Args:
         streams: The samples.
-        blocks: The same, as they were fitted without humps, to which humps may look like outliers.
-        plain: That fit.
-        slow_rad_s: See `friction.sign`.
-        sliding: (n,) which of its parameters is each joint's Fc.
+        blocks: Their rows with all samples: humps may look like outliers of the fit without.
+        plain: The fit without humps.
+        slow_rad_s: See `model.sign`.
+        coulomb_indices: (n,) index of each joint's Fc among its parameters.
 
     Returns:
         The humps, and the fit with them: its parameters are those of `plain`, humps [N m], and
-        logarithms of speeds, whose values are what is left to go and mean nothing.
+        logarithms of speeds, whose values are the remaining steps.
     """
     joints = np.arange(blocks[0].y.shape[1])
-    whole = _Weighted.of(streams, blocks, plain.sigmas)
+    problem = _Weighted.of(streams, blocks, plain.sigmas)
     while len(joints):
         ones = np.ones(len(joints))
         starts = [Stribeck(joints, ones, start * ones, slow_rad_s) for start in _STARTS]
-        tried = [_descended(whole, start) for start in starts]
-        found, fit = _polished(streams, blocks, min(tried, key=lambda value: value.cost).humps)
-        shown = _shown(found, fit, fit.values[sliding[joints]])
-        if shown.all():
-            return found, fit
-        joints = joints[shown]
+        candidates = [_optimised(problem, start) for start in starts]
+        humps, fit = _refined(streams, blocks, min(candidates, key=lambda value: value.cost).humps)
+        significant = _significant(humps, fit, fit.values[coulomb_indices[joints]])
+        if significant.all():
+            return humps, fit
+        joints = joints[significant]
     return Stribeck.none(), plain
 
 
-def _polished(
-    streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock], found: Stribeck
+def _refined(
+    streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock], humps: Stribeck
 ) -> tuple[Stribeck, Regression]:
-    """Descends again under the noise that is left with humps, until that stays the same."""
-    fit = regress(_with_humps(streams, blocks, found))
+    """Repeats the fit with the noise re-estimated with humps, until the noise converges."""
+    fit = regress(_with_humps(streams, blocks, humps))
     for _ in range(_ROUNDS):
-        found = _descended(_Weighted.of(streams, blocks, fit.sigmas), found).humps
-        before, fit = fit, regress(_with_humps(streams, blocks, found))
+        humps = _optimised(_Weighted.of(streams, blocks, fit.sigmas), humps).humps
+        before, fit = fit, regress(_with_humps(streams, blocks, humps))
         pairs = zip(before.sigmas, fit.sigmas, strict=True)
         if all(np.allclose(old, new, rtol=_SETTLED_NOISE) for old, new in pairs):
             break
-    return found, fit
+    return humps, fit
 
 
-def _shown(found: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> FloatArray:
-    """(a,) whether a hump is above chance and within the range of speeds."""
-    # Friction that would drive a joint at low speeds (Fs below 0) is none: something else is.
-    count = len(found.joints)
+def _significant(humps: Stribeck, fit: Regression, coulomb_nm: FloatArray) -> FloatArray:
+    """(a,) humps that are significant, within the bounds of speed, and resist the motion."""
+    # Fs below 0 would drive the joint at low speeds: something else is fitted then.
+    count = len(humps.joints)
     sigma = np.sqrt(np.diag(fit.covariance)[-2 * count : -count])
     limit = float(np.sqrt(chi2_limit(_CHANCE, 2.0)))
-    inside = (found.speed_rad_s > 1.01 * _SLOWEST) & (found.speed_rad_s < 0.99 * _FASTEST)
-    resists = coulomb_nm + found.hump_nm > 0.0
-    return np.asarray((np.abs(found.hump_nm) > limit * sigma) & inside & resists)
+    inside = (humps.speed_rad_s > 1.01 * _SLOWEST) & (humps.speed_rad_s < 0.99 * _FASTEST)
+    resists = coulomb_nm + humps.hump_nm > 0.0
+    return np.asarray((np.abs(humps.hump_nm) > limit * sigma) & inside & resists)
 
 
-def _descended(whole: "_Weighted", start: Stribeck) -> "_HumpFit":
-    """The humps that a descent from some speeds finds."""
+def _optimised(problem: "_Weighted", start: Stribeck) -> "_HumpFit":
+    """Optimises the speeds of humps from a start."""
 
     def linearise(logs: FloatArray) -> Linearised[FloatArray]:
-        look = whole.look(replace(start, speed_rad_s=np.exp(logs)))
+        fit = problem.solve(replace(start, speed_rad_s=np.exp(logs)))
 
         def step(damping: float) -> FloatArray:
-            by = np.clip(damped_step(look.information, look.gradient, damping), -1.0, 1.0)
-            return np.clip(logs + by, np.log(_SLOWEST), np.log(_FASTEST))
+            update = np.clip(damped_step(fit.information, fit.gradient, damping), -1.0, 1.0)
+            return np.clip(logs + update, np.log(_SLOWEST), np.log(_FASTEST))
 
-        return Linearised(logs, look.cost, step)
+        return Linearised(logs, fit.cost, step)
 
     logs, _ = levenberg_marquardt(np.log(start.speed_rad_s), linearise, _SETTLED)
-    return whole.look(replace(start, speed_rad_s=np.exp(logs)))
+    return problem.solve(replace(start, speed_rad_s=np.exp(logs)))
 
 
 @dataclass(frozen=True, eq=False)
 class _HumpFit:
-    """Humps of given speeds at their best.
+    """Best fit at given speeds of the humps.
 
     Attributes:
-        humps: The humps, with the given speeds.
-        cost: What is left with them, in units of the noise.
-        information: (a, a) by the logarithms of the speeds, all else being at its best.
+        humps: The fitted humps.
+        cost: Sum of squared residuals, in units of the noise.
+        information: (a, a) over the logarithms of the speeds, other parameters eliminated.
         gradient: (a,) of half the cost, likewise.
     """
 
@@ -160,15 +161,15 @@ class _HumpFit:
 
 @dataclass(frozen=True, eq=False)
 class _Weighted:
-    """The problem without humps, under given noise.
+    """The problem without humps, weighted by given noise.
 
     Attributes:
         streams: The samples.
-        blocks: The same in units of the noise.
-        weights: What these were multiplied by, (k, n) a block [1/(N m)].
-        information: (p, p) by the parameters without humps.
-        right: (p,) right side of their normal equations.
-        total: Sum of the squared torques.
+        blocks: Their rows in units of the noise.
+        weights: (k, n) weights of each block [1/(N m)].
+        information: (p, p) over the parameters without humps.
+        right: (p,) right-hand side of their normal equations.
+        total: Sum of squared weighted torques.
     """
 
     streams: Sequence[Conditioned]
@@ -185,7 +186,7 @@ class _Weighted:
         blocks: Sequence[NoiseBlock],
         sigmas: Sequence[FloatArray],
     ) -> Self:
-        """Weighs blocks by the noise of their joints."""
+        """Weights blocks by the noise of their joints."""
         weights = tuple(block.used / sigma for block, sigma in zip(blocks, sigmas, strict=True))
         weighted = tuple(
             replace(block, x=block.x * weight[:, :, None], y=block.y * weight)
@@ -200,8 +201,8 @@ class _Weighted:
             float(sum(np.sum(block.y**2) for block in weighted)),
         )
 
-    def look(self, at: Stribeck) -> _HumpFit:
-        """Solves for all that is linear at given speeds."""
+    def solve(self, at: Stribeck) -> _HumpFit:
+        """Solves for the linear parameters at given speeds."""
         count, size = len(at.joints), len(self.right)
         a, b = self._normal(replace(at, hump_nm=np.ones(count)))
         linear, speeds = slice(size + count), slice(size + count, None)
@@ -217,7 +218,7 @@ class _Weighted:
         )
 
     def _normal(self, humps: Stribeck) -> tuple[FloatArray, FloatArray]:
-        """Normal equations with humps and speeds behind the other parameters."""
+        """Normal equations; humps and speeds follow the other parameters."""
         count, size = len(humps.joints), len(self.right)
         a, b = np.zeros((size + 2 * count, size + 2 * count)), np.zeros(size + 2 * count)
         a[:size, :size], b[:size] = self.information, self.right
@@ -236,13 +237,13 @@ class _Weighted:
 def _with_humps(
     streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock], humps: Stribeck
 ) -> list[NoiseBlock]:
-    """Blocks with the columns of humps and of their speeds added."""
+    """Blocks with the columns of humps and of their speeds appended."""
     count = len(humps.joints)
-    added = []
+    extended = []
     for stream, block in zip(streams, blocks, strict=True):
         jacobian = stream.filtered(humps.jacobian)
-        more = np.zeros((*block.y.shape, 2 * count))
+        columns = np.zeros((*block.y.shape, 2 * count))
         for at, joint in enumerate(humps.joints):
-            more[:, joint, [at, count + at]] = jacobian[:, [at, count + at]]
-        added.append(replace(block, x=np.concatenate([block.x, more], axis=2)))
-    return added
+            columns[:, joint, [at, count + at]] = jacobian[:, [at, count + at]]
+        extended.append(replace(block, x=np.concatenate([block.x, columns], axis=2)))
+    return extended

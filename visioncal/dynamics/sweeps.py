@@ -1,7 +1,7 @@
-"""Sweeps at constant speed, one joint at a time: what friction is made of.
+"""Planning of sweeps at constant speed, one joint at a time, which show friction.
 
-At constant speed there is no inertia in a joint's torque, and between both directions gravity
-cancels: what is left is friction, speed by speed (Swevers, Verdonck and De Schutter 2007).
+At constant speed inertia does not contribute to a joint's torque, and gravity cancels between the
+two directions: friction remains, speed by speed (Swevers, Verdonck and De Schutter 2007).
 """
 
 from collections.abc import Iterator
@@ -16,31 +16,31 @@ from visioncal.dynamics.fourier import even_times
 from visioncal.dynamics.limits import Allowed, Kept, kept_limits
 from visioncal.dynamics.motion import JointMotion
 
-# Ramps last at least, and constant speed is held at least [s].
+# Least duration of ramps, and of constant speed [s].
 _SHORTEST_RAMP_S, _SHORTEST_HOLD_S = 0.15, 0.4
-# The arm rests after each stroke [s].
+# Rest after each stroke [s].
 REST_S = 0.2
-# Ways to where a sweep begins are driven at this share of the greatest speed.
+# Share of the greatest speed and acceleration for moves between sweeps.
 _UNHURRIED = 0.2
-# A joint sweeps at most so far [rad]; its room is felt for in steps [rad].
-_WIDEST_RAD, _FEELER_RAD = 2.4, 0.1
-# Postures that are tried, and those of them that are looked at closely.
-_POSTURES, _CLOSELY = 300, 20
-# A joint with less room cannot be swept [rad].
+# Greatest range of a sweep, and step of the search for a joint's free range [rad].
+_WIDEST_RAD, _STEP_RAD = 2.4, 0.1
+# Number of random postures, and of the best of them that are planned in full.
+_POSTURES, _PLANNED = 300, 20
+# Least range of a joint that is swept [rad].
 _LEAST_RAD = 0.2
-# Ways are looked at all along, ramps and speeds are exact: torques are what is left to look at.
+# Sampling of the check, for torques alone: paths are checked in full, ramps and speeds are exact.
 _FIGURES_HZ = 200.0
 
 
 @dataclass(frozen=True)
 class SweepRequest:
-    """What sweeps are wished.
+    """Options of planned sweeps.
 
     Attributes:
-        speeds: How many speeds a joint, evenly spaced in their logarithms.
+        speeds: Number of speeds of each joint, logarithmically spaced.
         slowest_rad_s: The least of them [rad/s].
-        hold_s: How long each is held, where there is room [s].
-        seed: Of the postures that are tried.
+        hold_s: Duration of constant speed, where the range allows it [s].
+        seed: Seed of the random postures.
     """
 
     speeds: int = 6
@@ -64,18 +64,18 @@ class SweepRequest:
 
 @dataclass(frozen=True)
 class Stroke:
-    """One joint's way from rest to rest: a ramp, constant speed, and the ramp back.
+    """One joint's move from rest to rest: a ramp, constant speed, and the ramp back.
 
-    The ramps are the fifth-order polynomials without acceleration at both ends, whose highest
-    coefficient vanishes as they reach full speed half as far as that speed would have gone.
+    The ramps are fifth-order polynomials without acceleration at both ends. They cover half the
+    distance of full speed, whence their highest coefficient is zero.
 
     Attributes:
-        joint: Which one, counted from 0.
-        begin: Where it begins [rad].
-        end: Where it ends [rad].
+        joint: Index of the joint, from 0.
+        begin: Start position [rad].
+        end: End position [rad].
         speed: The constant speed, above zero [rad/s].
-        ramp_s: How long it takes to reach it [s].
-        sweeps: Whether it is a sweep, or only the way to one.
+        ramp_s: Duration of a ramp [s].
+        sweeps: Whether it is a sweep, or only the move to one.
     """
 
     joint: int
@@ -87,22 +87,26 @@ class Stroke:
 
     @property
     def duration_s(self) -> float:
-        """How long it takes, without the rest after it [s]."""
+        """Duration, without the rest after it [s]."""
         return abs(self.end - self.begin) / self.speed + self.ramp_s
 
     def at(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Position, speed and acceleration (m,) at times from its beginning; rest after its end."""
-        far, whole, ramp = abs(self.end - self.begin), self.duration_s, self.ramp_s
-        late = times_s > 0.5 * whole
-        # The second half is the first one backwards.
-        since = np.clip(np.where(late, whole - times_s, times_s), 0.0, None)
+        """Position, speed, acceleration (m,) at times since the beginning; rest after the end."""
+        distance, duration, ramp = abs(self.end - self.begin), self.duration_s, self.ramp_s
+        second_half = times_s > 0.5 * duration
+        # The second half mirrors the first.
+        since = np.clip(np.where(second_half, duration - times_s, times_s), 0.0, None)
         share = np.minimum(since / ramp, 1.0)
-        gone = self.speed * (ramp * (share**3 - 0.5 * share**4) + np.maximum(since - ramp, 0.0))
+        covered = self.speed * (ramp * (share**3 - 0.5 * share**4) + np.maximum(since - ramp, 0.0))
         speed = self.speed * share**2 * (3.0 - 2.0 * share)
-        rising = self.speed / ramp * 6.0 * share * (1.0 - share)
-        sense = np.sign(self.end - self.begin)
-        position = self.begin + sense * np.where(late, far - gone, gone)
-        return position, sense * speed, sense * np.where(late, -rising, rising)
+        acceleration = self.speed / ramp * 6.0 * share * (1.0 - share)
+        direction = np.sign(self.end - self.begin)
+        position = self.begin + direction * np.where(second_half, distance - covered, covered)
+        return (
+            position,
+            direction * speed,
+            direction * np.where(second_half, -acceleration, acceleration),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +114,10 @@ class Sweeps:
     """Sweeps of all joints, from a posture and back to it.
 
     Attributes:
-        home: (n,) the posture that the other joints stay in [rad].
-        strokes: In their order.
-        kept: What they use of the limits.
-        left_out: Names of joints that have too little room.
+        home: (n,) posture of the other joints [rad].
+        strokes: The strokes in order.
+        kept: Extremes of the motion.
+        left_out: Names of joints with too little free range.
     """
 
     home: FloatArray
@@ -123,7 +127,7 @@ class Sweeps:
 
     @cached_property
     def begins_s(self) -> FloatArray:
-        """(k + 1,) when each stroke begins, and when all is done [s]."""
+        """(k + 1,) begin of each stroke, and the end of the last [s]."""
         return _begins(self.strokes)
 
     def sampled(self, rate_hz: float) -> JointMotion:
@@ -134,27 +138,27 @@ class Sweeps:
 def plan_sweeps(allowed: Allowed, request: SweepRequest) -> Sweeps:
     """Plans sweeps of every joint, at several speeds, in both directions.
 
-    The posture is, of many random ones, that in which the joint with the least room has most.
+    The home posture maximises the least free range of the joints, over random postures.
 
     Args:
-        allowed: What they must keep.
-        request: What is wished.
+        allowed: The limits.
+        request: Options.
 
     Raises:
-        DegenerateError: No posture leaves any joint room.
+        DegenerateError: No posture has joints with enough free range.
     """
     rng = np.random.default_rng(request.seed)
-    turn = np.minimum(np.pi, allowed.half)
-    drawn = allowed.middle + rng.uniform(-turn, turn, (_POSTURES, len(turn)))
+    half = np.minimum(np.pi, allowed.half)
+    drawn = allowed.middle + rng.uniform(-half, half, (_POSTURES, len(half)))
     clear = drawn[allowed.collisions.first_contact(drawn) < 0]
-    rooms = np.array([_room(allowed, value) for value in clear]).reshape(-1, len(turn), 2)
-    order = np.argsort(-np.sort(rooms[:, :, 1] - rooms[:, :, 0], axis=1)[:, 0], kind="stable")
+    ranges = np.array([_free_ranges(allowed, value) for value in clear]).reshape(-1, len(half), 2)
+    order = np.argsort(-np.sort(ranges[:, :, 1] - ranges[:, :, 0], axis=1)[:, 0], kind="stable")
     breaches: tuple[str, ...] = ("everywhere something is too near",)
-    for row in order[:_CLOSELY].tolist():
-        found = _in_posture(allowed, request, clear[row], rooms[row])
-        if found.strokes and not found.kept.breaches:
-            return found
-        breaches = found.kept.breaches or ("no joint has room",)
+    for row in order[:_PLANNED].tolist():
+        sweeps = _in_posture(allowed, request, clear[row], ranges[row])
+        if sweeps.strokes and not sweeps.kept.breaches:
+            return sweeps
+        breaches = sweeps.kept.breaches or ("no joint has room",)
     raise DegenerateError(
         f"robot {allowed.robot.name}: no posture was found from which its joints could sweep; of "
         f"the last one tried, {breaches[0]}.",
@@ -165,12 +169,12 @@ def plan_sweeps(allowed: Allowed, request: SweepRequest) -> Sweeps:
 
 
 def _in_posture(
-    allowed: Allowed, request: SweepRequest, home: FloatArray, room: FloatArray
+    allowed: Allowed, request: SweepRequest, home: FloatArray, ranges: FloatArray
 ) -> Sweeps:
     strokes: list[Stroke] = []
     left_out = []
     for joint, name in enumerate(allowed.robot.joint_names):
-        low, high = _surely(allowed, home, joint, *room[joint].tolist())
+        low, high = _checked_range(allowed, home, joint, *ranges[joint].tolist())
         if high - low < _LEAST_RAD:
             left_out.append(name)
             continue
@@ -182,50 +186,56 @@ def _in_posture(
 def _joint_strokes(
     allowed: Allowed, request: SweepRequest, joint: int, home: float, low: float, high: float
 ) -> Iterator[Stroke]:
-    """There and back at every speed, about the middle of the joint's room, and home again."""
-    hardest, middle, room = float(allowed.acceleration[joint]), 0.5 * (low + high), high - low
-    # The fastest that still leaves time between its ramps, each of 1.5 speeds per acceleration.
+    """Strokes there and back at every speed, about the centre of the joint's free range."""
+    acceleration, middle, free_range = (
+        float(allowed.acceleration[joint]),
+        0.5 * (low + high),
+        high - low,
+    )
+    # The fastest speed with time to hold it; a ramp takes 1.5 times speed over acceleration.
     least = _SHORTEST_RAMP_S + _SHORTEST_HOLD_S
-    fastest = (np.sqrt(least**2 + 6.0 * room / hardest) - least) * hardest / 3.0
+    fastest = (np.sqrt(least**2 + 6.0 * free_range / acceleration) - least) * acceleration / 3.0
     fastest = min(float(fastest), float(allowed.speed[joint]))
-    here = home
+    position = home
     for speed in np.geomspace(min(request.slowest_rad_s, fastest), fastest, request.speeds):
-        ramp_s = max(_SHORTEST_RAMP_S, 1.5 * float(speed) / hardest)
-        half = 0.5 * min(float(speed) * (ramp_s + request.hold_s), room)
+        ramp_s = max(_SHORTEST_RAMP_S, 1.5 * float(speed) / acceleration)
+        half = 0.5 * min(float(speed) * (ramp_s + request.hold_s), free_range)
         begin, end = middle - half, middle + half
-        yield from _way(allowed, joint, here, begin)
+        yield from _move(allowed, joint, position, begin)
         yield Stroke(joint, begin, end, float(speed), ramp_s, sweeps=True)
         yield Stroke(joint, end, begin, float(speed), ramp_s, sweeps=True)
-        here = begin
-    yield from _way(allowed, joint, here, home)
+        position = begin
+    yield from _move(allowed, joint, position, home)
 
 
-def _way(allowed: Allowed, joint: int, begin: float, end: float) -> Iterator[Stroke]:
-    """The way to where a sweep begins, if there is one."""
-    far, hardest = abs(end - begin), _UNHURRIED * float(allowed.acceleration[joint])
-    if far == 0.0:
+def _move(allowed: Allowed, joint: int, begin: float, end: float) -> Iterator[Stroke]:
+    """The move to the start of a sweep, if any."""
+    distance, acceleration = abs(end - begin), _UNHURRIED * float(allowed.acceleration[joint])
+    if distance == 0.0:
         return
-    # On a short way all is ramp, which takes as long as the way at full speed.
+    # A short move is ramps alone, each as long as the distance takes at full speed.
     speed = min(
         _UNHURRIED * float(allowed.speed[joint]),
-        float(np.sqrt(far * hardest / 1.5)),
-        far / _SHORTEST_RAMP_S,
+        float(np.sqrt(distance * acceleration / 1.5)),
+        distance / _SHORTEST_RAMP_S,
     )
-    ramp_s = max(_SHORTEST_RAMP_S, 1.5 * speed / hardest)
+    ramp_s = max(_SHORTEST_RAMP_S, 1.5 * speed / acceleration)
     yield Stroke(joint, begin, end, speed, ramp_s, sweeps=False)
 
 
-def _room(allowed: Allowed, home: FloatArray) -> FloatArray:
-    """(n, 2) how far each joint can turn from a clear posture, as lowest and highest [rad]."""
+def _free_ranges(allowed: Allowed, home: FloatArray) -> FloatArray:
+    """(n, 2) free range of each joint from a clear posture, as lowest and highest [rad]."""
     joints = range(len(home))
-    return np.array([[_feel(allowed, home, joint, sense) for sense in (-1, 1)] for joint in joints])
+    return np.array(
+        [[_free_end(allowed, home, joint, sense) for sense in (-1, 1)] for joint in joints]
+    )
 
 
-def _feel(allowed: Allowed, home: FloatArray, joint: int, sense: int) -> float:
-    """Where a joint stops on its way to one side, felt for in steps [rad]."""
+def _free_end(allowed: Allowed, home: FloatArray, joint: int, sense: int) -> float:
+    """End of a joint's free range to one side, searched in steps [rad]."""
     limit = (allowed.upper if sense > 0 else allowed.lower)[joint]
-    far = min(abs(float(limit - home[joint])), 0.5 * _WIDEST_RAD)
-    steps = np.append(np.arange(_FEELER_RAD, far, _FEELER_RAD), far)
+    distance = min(abs(float(limit - home[joint])), 0.5 * _WIDEST_RAD)
+    steps = np.append(np.arange(_STEP_RAD, distance, _STEP_RAD), distance)
     postures = np.repeat(home[None], len(steps), axis=0)
     postures[:, joint] += sense * steps
     hits = np.flatnonzero(allowed.collisions.first_contact(postures) >= 0)
@@ -233,18 +243,18 @@ def _feel(allowed: Allowed, home: FloatArray, joint: int, sense: int) -> float:
     return float(home[joint] + sense * (clear[-1] if len(clear) else 0.0))
 
 
-def _surely(
+def _checked_range(
     allowed: Allowed, home: FloatArray, joint: int, low: float, high: float
 ) -> tuple[float, float]:
-    """What is left of a joint's room where nothing is in the way between the steps either."""
+    """A joint's free range, reduced until its path is clear between the steps, too."""
     ends = []
     for end in (low, high):
-        far = home.copy()
-        far[joint] = end
-        while far[joint] != home[joint] and allowed.collisions.on_the_way(home, far) >= 0:
-            left = far[joint] - home[joint]
-            far[joint] = home[joint] + np.sign(left) * max(abs(left) - _FEELER_RAD, 0.0)
-        ends.append(float(far[joint]))
+        posture = home.copy()
+        posture[joint] = end
+        while posture[joint] != home[joint] and allowed.collisions.on_the_way(home, posture) >= 0:
+            offset = posture[joint] - home[joint]
+            posture[joint] = home[joint] + np.sign(offset) * max(abs(offset) - _STEP_RAD, 0.0)
+        ends.append(float(posture[joint]))
     return ends[0], ends[1]
 
 
@@ -260,7 +270,7 @@ def _sampled(home: FloatArray, strokes: tuple[Stroke, ...], rate_hz: float) -> J
     dq, ddq = np.zeros_like(q), np.zeros_like(q)
     rows = np.searchsorted(times, begins)
     for place, stroke in enumerate(strokes):
-        # The last sample of all belongs to the rest after the last stroke.
+        # The very last sample belongs to the rest after the last stroke.
         own = slice(rows[place], rows[place + 1] if place + 1 < len(strokes) else None)
         at = stroke.at(times[own] - begins[place])
         q[own, stroke.joint], dq[own, stroke.joint], ddq[own, stroke.joint] = at

@@ -1,4 +1,4 @@
-"""How well torques are predicted that no parameter was fitted to, and friction over speed."""
+"""Prediction of torques, its errors, and friction over speed."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -21,17 +21,17 @@ class Prediction:
     """Filtered torques of a stream, measured and predicted.
 
     Attributes:
-        label: The stream's place.
-        times_s: (k,) when [s].
+        label: The stream's file.
+        times_s: (k,) times [s].
         measured_nm: (k, n) [N m].
         predicted_nm: (k, n) by the base parameters [N m].
-        consistent_nm: (k, n) by the standard parameters of bodies; None without these.
-        known_nm: (k, n) by the robot's own inertias, with the friction that goes best with them;
-            None where it has none.
-        used: (k, n) which of the torques count.
+        consistent_nm: (k, n) by the consistent standard parameters [N m]; None without these.
+        known_nm: (k, n) by the robot's own inertias and friction fitted to them [N m]; None where
+            it has no inertias.
+        used: (k, n) mask of valid torques.
         q: (k, n) joint angles, filtered likewise [rad].
         dq: (k, n) their speeds [rad/s].
-        notes: What was found in the samples and done about it, in words.
+        notes: Messages on faults of the samples.
     """
 
     label: str
@@ -51,20 +51,19 @@ class Prediction:
 
     @property
     def torque_nm(self) -> FloatArray:
-        """(n,) how far the torques range, as a standard deviation [N m]."""
+        """(n,) standard deviation of the measured torques, as their range [N m]."""
         return spread_of(self.measured_nm, self.used)
 
 
 def predict(
     identified: Identified, stream: Conditioned, own_friction: FloatArray | None = None
 ) -> Prediction:
-    """Predicts a stream's torques, filtered as they are.
+    """Predicts a stream's filtered torques.
 
     Args:
         identified: The arm's dynamics.
         stream: The samples.
-        own_friction: (f,) parameters that go best with the robot's own inertias; see
-            `friction_of_known`.
+        own_friction: (f,) friction fitted to the robot's own inertias; see `friction_of_known`.
     """
     with_bodies = identified.consistent is not None
     known = None
@@ -98,11 +97,11 @@ def validate(identified: Identified, prediction: Prediction) -> TorqueValidation
 
 
 def friction_of_known(identification: Identification) -> FloatArray | None:
-    """The parameters of friction that go best with the robot's own inertias.
+    """Fits friction to the robot's own inertias.
 
     Returns:
-        (f,) as the model has them behind the links'; None where the robot has no inertias, or the
-        model no friction.
+        (f,) parameters in the model's order; None where the robot has no inertias, or the model no
+        friction.
     """
     identified = identification.identified
     robot, model = identified.robot, identified.base.model
@@ -132,7 +131,7 @@ def _known_torques(identified: Identified, friction: FloatArray, motion: JointMo
 
 
 def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:
-    """The friction of all joints at (m, n) speeds, without what rotors take: (m, n) [N m]."""
+    """Friction torques (m, n) of all joints at (m, n) speeds [N m]."""
     model = identified.base.model
     values = np.zeros(len(model.names))
     values[identified.base.independent] = identified.values
@@ -143,6 +142,6 @@ def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:
 
 
 def left_for_friction(identified: Identified, prediction: Prediction) -> FloatArray:
-    """What measured torques leave for friction: (k, n) its curve plus the errors [N m]."""
-    off = prediction.measured_nm - prediction.predicted_nm
-    return np.asarray(friction_at(identified, prediction.dq) + off)
+    """Measured torques less all predicted ones but friction's: (k, n) [N m]."""
+    error = prediction.measured_nm - prediction.predicted_nm
+    return np.asarray(friction_at(identified, prediction.dq) + error)

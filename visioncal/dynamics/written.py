@@ -1,4 +1,4 @@
-"""A plan to identify an arm's dynamics as files: tables, programs for a UR, and JSON."""
+"""Files of a plan to identify dynamics: tables, programs for a UR, and JSON."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,6 @@ import numpy as np
 from visioncal.core.files import one_line
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
-from visioncal.dynamics.base import Condition
 from visioncal.dynamics.excitation import Excitation
 from visioncal.dynamics.fourier import Series
 from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept
@@ -21,21 +20,15 @@ from visioncal.robot import Robot, has_ur_axes
 
 SCHEMA = 1
 MOTION_FILES = ("sweeps.script", "sweeps.csv", "excitation.script", "excitation.csv")
-# To where a motion begins the arm drives slowly, and rests there before it begins [rad/s, rad/s^2].
+# Speed [rad/s] and acceleration [rad/s^2] of the move to a motion's start, and rest there [s].
 _SPEED, _ACCELERATION, _SETTLING_S = 0.4, 0.6, 1.0
-# Of servoj: it looks ahead so far [s], and follows as stiffly as the controller allows by default.
+# servoj's lookahead time [s] and its default gain.
 _LOOKAHEAD_S, _GAIN = 0.1, 300
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPlan:
-    """What is to be driven.
-
-    Attributes:
-        allowed: What all of it keeps.
-        excitation: The exciting motion.
-        sweeps: Those for friction; None where they were not wished.
-    """
+    """Motions planned to identify an arm's dynamics; `sweeps` is None where not requested."""
 
     allowed: Allowed
     excitation: Excitation
@@ -43,18 +36,18 @@ class MotionPlan:
 
 
 def motion_files(plan: MotionPlan, rate_hz: float) -> dict[str, str]:
-    """Writes tables, and programs where the robot is one that takes them: content by file name."""
-    robot, found = plan.allowed.robot, {}
+    """Tables, and programs if the robot is a UR: content by file name."""
+    robot, files = plan.allowed.robot, {}
     programmed = has_ur_axes(robot)
     if plan.sweeps is not None:
-        found["sweeps.csv"] = _motion_table(plan.sweeps.sampled(rate_hz))
+        files["sweeps.csv"] = _motion_table(plan.sweeps.sampled(rate_hz))
         if programmed:
-            found["sweeps.script"] = sweeps_program(robot, plan.sweeps)
+            files["sweeps.script"] = sweeps_program(robot, plan.sweeps)
     series = plan.excitation.series
-    found["excitation.csv"] = _motion_table(series.sampled(rate_hz))
+    files["excitation.csv"] = _motion_table(series.sampled(rate_hz))
     if programmed:
-        found["excitation.script"] = excitation_program(robot, series)
-    return found
+        files["excitation.script"] = excitation_program(robot, series)
+    return files
 
 
 def _motion_table(motion: JointMotion) -> str:
@@ -68,14 +61,14 @@ def _motion_table(motion: JointMotion) -> str:
     ]
     text = io.StringIO()
     rows = np.column_stack([motion.times_s, motion.q, motion.dq, motion.ddq])
-    # A nanoradian is enough; a negative zero would only raise questions.
+    # A nanoradian is enough; adding 0.0 removes negative zeros.
     rows = np.round(rows, 9) + 0.0
     np.savetxt(text, rows, fmt="%.10g", delimiter=",", header=",".join(columns), comments="")
     return text.getvalue()
 
 
 def motion_document(plan: MotionPlan) -> dict[str, Any]:
-    """Builds the content of plan.json; what does not apply is absent."""
+    """Builds the content of plan.json; fields that do not apply are absent."""
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "kind": "dynamics",
@@ -94,38 +87,34 @@ def motion_document(plan: MotionPlan) -> dict[str, Any]:
     }
 
 
-def _excitation(found: Excitation) -> dict[str, Any]:
-    mean, sines, cosines = found.series.coefficients
-    request = found.request
-    search = {"seed": request.seed, "seconds": found.seconds, "starts": found.starts}
+def _excitation(excitation: Excitation) -> dict[str, Any]:
+    mean, sines, cosines = excitation.series.coefficients
+    request = excitation.request
+    search = {"seed": request.seed, "seconds": excitation.seconds, "starts": excitation.starts}
     if np.isfinite(request.seconds):
         search["wished_seconds"] = request.seconds
     return {
         "period_s": request.period_s,
         "harmonics": request.harmonics,
-        "start_rad": found.series.start.tolist(),
+        "start_rad": excitation.series.start.tolist(),
         "mean_rad": mean.tolist(),
         "sine_rad": sines.tolist(),
         "cosine_rad": cosines.tolist(),
-        "condition": _condition(found.condition),
-        "condition_random": _condition(found.random),
-        "base_parameters": list(found.base.names),
-        "weights": found.weights.tolist(),
-        "kept": _kept(found.kept) | {"rate_hz": CHECK_HZ},
+        "condition": vars(excitation.condition),
+        "condition_random": vars(excitation.random),
+        "base_parameters": list(excitation.base.names),
+        "weights": excitation.weights.tolist(),
+        "kept": _kept(excitation.kept) | {"rate_hz": CHECK_HZ},
         "search": search,
     }
 
 
-def _condition(found: Condition) -> dict[str, float]:
-    return {"weighted": found.weighted, "scaled": found.scaled, "raw": found.raw}
-
-
-def _sweeps(found: Sweeps) -> dict[str, Any]:
-    begins = found.begins_s.tolist()
+def _sweeps(sweeps: Sweeps) -> dict[str, Any]:
+    begins = sweeps.begins_s.tolist()
     document: dict[str, Any] = {
         "duration_s": begins[-1],
-        "home_rad": found.home.tolist(),
-        "kept": _kept(found.kept),
+        "home_rad": sweeps.home.tolist(),
+        "kept": _kept(sweeps.kept),
         "strokes": [
             {
                 "joint": stroke.joint + 1,
@@ -136,17 +125,17 @@ def _sweeps(found: Sweeps) -> dict[str, Any]:
                 "ramp_s": stroke.ramp_s,
                 "duration_s": stroke.duration_s,
             }
-            for stroke, begin in zip(found.strokes, begins[:-1], strict=True)
+            for stroke, begin in zip(sweeps.strokes, begins[:-1], strict=True)
             if stroke.sweeps
         ],
     }
-    if found.left_out:
-        document["left_out"] = list(found.left_out)
+    if sweeps.left_out:
+        document["left_out"] = list(sweeps.left_out)
     return document
 
 
 def _kept(kept: Kept) -> dict[str, Any]:
-    """The extremes of a motion, and what share of what is allowed they are."""
+    """Extremes of a motion, and the shares of the limits that they use."""
     document: dict[str, Any] = {
         "lowest_rad": kept.lowest.tolist(),
         "highest_rad": kept.highest.tolist(),
@@ -166,7 +155,7 @@ def _kept(kept: Kept) -> dict[str, Any]:
 
 
 def _limits(allowed: Allowed) -> dict[str, Any]:
-    """What was allowed, margins taken off."""
+    """The limits, margins included."""
     share = allowed.share
     document: dict[str, Any] = {
         "lower_rad": allowed.lower.tolist(),
@@ -188,7 +177,7 @@ def _limits(allowed: Allowed) -> dict[str, Any]:
 
 
 def excitation_program(robot: Robot, series: Series) -> str:
-    """Writes a program that drives an exciting motion: the series itself, not a table of it."""
+    """Writes a program that evaluates and drives the series of an exciting motion."""
     mean, sines, cosines = series.coefficients
     orders = range(1, series.harmonics.count + 1)
     lines = [
@@ -198,7 +187,7 @@ def excitation_program(robot: Robot, series: Series) -> str:
         f"  start = {_joints(series.start)}",
         *_begin(),
         "  t = 0.0",
-        # Sums of steps round: the last one must not be driven twice.
+        # Sums of steps are rounded: the last one must not be driven twice.
         "  while t < period - 0.5 * step:",
         "    w = 6.283185307179586 * t / period",
         *(f"    s{order} = sin({order}.0 * w)" for order in orders),
@@ -217,7 +206,7 @@ def excitation_program(robot: Robot, series: Series) -> str:
 
 
 def sweeps_program(robot: Robot, sweeps: Sweeps) -> str:
-    """Writes a program that drives sweeps: each is a line with its joint, ends, speed and ramp."""
+    """Writes a program that drives sweeps, one line per stroke: joint, ends, speed, ramp."""
     lines = [
         *_heading(robot, f"sweeps at constant speed, {sweeps.begins_s[-1]:.0f} s"),
         "def visioncal_sweeps():",
@@ -300,7 +289,7 @@ def _strokes(strokes: Sequence[Stroke]) -> Iterator[str]:
 
 
 def _servo(q: str) -> str:
-    """Sends the joints there, and waits for the controller's next step."""
+    """A servoj command, which also waits for the controller's next step."""
     return f"servoj({q}, 0, 0, step, {_LOOKAHEAD_S}, {_GAIN})"
 
 
@@ -317,5 +306,5 @@ def _joints(q: FloatArray) -> str:
 
 
 def _number(value: float) -> str:
-    """A nanoradian does not matter to an arm; an exponent would to its controller."""
+    """Writes a number without exponent, which the controller could not read."""
     return f"{value:.9f}"

@@ -1,6 +1,6 @@
 """Robot models: kinematics and their derivatives, from a DH table, a URDF or a calibration.
 
-This is the only package that knows Pinocchio, and it imports it where a model is built.
+Only this package uses Pinocchio, which it imports where a model is built.
 """
 
 from visioncal.robot.chain import FUNCTION_NAMES, Chain

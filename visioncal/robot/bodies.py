@@ -1,4 +1,4 @@
-"""What takes up room in a cell: convex bodies that hang on an arm's links or stand in its base."""
+"""Convex collision bodies of an arm's links and of its cell."""
 
 import itertools
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from visioncal.robot.model import BODY_KEYS, Robot
 
 Shape: TypeAlias = Literal["capsule", "cylinder", "box"]
 
-# Radius of the links over the length of all links: 0.065 m for a UR5e, 0.09 m for a UR10e. Small
-# arms are not thinner than the motors in them [m].
+# Default radius of links over the length of all links: 0.065 m for a UR5e, 0.09 m for a UR10e; its
+# least is that of the motors [m].
 _THICKNESS, _THINNEST_M = 0.05, 0.045
-# Links that are shorter lie inside their neighbours [m].
+# Shorter links are inside their neighbours, and get no body [m].
 _SHORTEST_M = 0.01
 
 
@@ -26,16 +26,15 @@ class Body:
     """A convex body.
 
     Attributes:
-        name: What it is, for messages.
-        link: The joint with which it moves, counted from 1; 0 for what stands in the base.
-        shape: Its form.
+        name: Name for messages.
+        link: The joint with which it moves, from 1; 0 for one fixed to the base.
+        shape: Its shape.
         size_m: (2,) radius and length of the axis (capsule and cylinder, along z) or (3,) full
             lengths (box) [m]. A capsule's caps come on top of its length.
-        link_from_body: (4, 4) the body's centre in the joint's frame after its motion, or in the
+        link_from_body: (4, 4) pose of the body in the joint's frame after its motion, or in the
             base [m].
         of_arm: Whether it is a part of the arm itself.
-        unsure_m: How much farther than others it stays from what is not of the arm: where it is,
-            is only guessed [m].
+        unsure_m: Additional distance to bodies that are not of the arm, for an uncertain pose [m].
     """
 
     name: str
@@ -48,7 +47,7 @@ class Body:
 
     @property
     def extent_m(self) -> float:
-        """Greatest distance of its points from the frame that it hangs on [m]."""
+        """Greatest distance of its points from its link's frame [m]."""
         if self.shape == "box":
             half = 0.5 * float(np.linalg.norm(self.size_m))
         else:
@@ -66,27 +65,27 @@ def capsule(
     of_arm: bool = False,
     unsure_m: float = 0.0,
 ) -> Body:
-    """A capsule about the line between two points of a link's frame [m]."""
-    between = end - start
-    length = float(np.linalg.norm(between))
-    along_z = _turned_to(between / length) if length > 0.0 else np.eye(3)
+    """Builds a capsule about the line between two points of a link's frame [m]."""
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    along_z = _turned_to(axis / length) if length > 0.0 else np.eye(3)
     pose = compose(along_z, 0.5 * (start + end))
     return Body(name, link, "capsule", np.array([radius_m, length]), pose, of_arm, unsure_m)
 
 
 def body_name(robot: Robot, link: int) -> str:
-    """What the bodies of a link are called; a link has the name of its joint."""
+    """Name of a link's bodies, from its joint."""
     return f"link {robot.joint_names[link - 1]}" if link else "base"
 
 
 def arm_bodies(robot: Robot) -> tuple[Body, ...]:
     """The bodies of an arm's links.
 
-    Each link is a capsule from its joint to the next one. A joint's table may say how thick its
-    link is, `body_radius_m`, and that it runs aside, `body_offset_m` along the joint's axis: many
-    arms have their upper arm beside the shoulder. Else the radius follows from the arm's length.
-    The way on which a prismatic joint slides is left out. A URDF's boxes, cylinders, capsules and
-    spheres are taken as they are, for the links that have some; its meshes are files elsewhere.
+    Each link is a capsule from its joint to the next one. A joint's table may state its link's
+    `body_radius_m`, and an offset `body_offset_m` along the joint's axis: many arms have their
+    upper arm beside the shoulder. By default the radius follows from the arm's length. The travel
+    of a prismatic joint has no body. Links with boxes, cylinders, capsules or spheres in a URDF
+    have these instead; meshes are not read.
 
     Returns:
         The bodies, from the base to the flange.
@@ -96,22 +95,24 @@ def arm_bodies(robot: Robot) -> tuple[Body, ...]:
     """
     from visioncal.robot.collision import urdf_bodies
 
-    own, undrawn = urdf_bodies(robot) if "urdf" in robot.document else ((), frozenset[int]())
-    drawn = {body.link for body in own} - undrawn
+    described, incomplete = (
+        urdf_bodies(robot) if "urdf" in robot.document else ((), frozenset[int]())
+    )
+    complete = {body.link for body in described} - incomplete
     lengths = np.linalg.norm(robot.chain.placements[1:, :3, 3], axis=1)
     usual = max(_THINNEST_M, _THICKNESS * float(lengths.sum()))
-    bodies = list(own)
+    bodies = list(described)
     for link, (radius, offset) in enumerate(_thickness(robot, usual)):
-        if link not in drawn:
+        if link not in complete:
             bodies += _link(robot, link, radius, offset)
     return tuple(sorted(bodies, key=lambda body: body.link))
 
 
 def _link(robot: Robot, link: int, radius_m: float, offset_m: float) -> list[Body]:
-    """The capsules of one link, 0 for what stands before the first joint."""
+    """Capsules of one link; link 0 is before the first joint."""
     end = robot.chain.placements[link][:3, 3]
-    aside = offset_m * robot.chain.axes[link - 1] if link else np.zeros(3)
-    knots = [np.zeros(3), aside, end + aside, end] if offset_m else [np.zeros(3), end]
+    offset = offset_m * robot.chain.axes[link - 1] if link else np.zeros(3)
+    knots = [np.zeros(3), offset, end + offset, end] if offset_m else [np.zeros(3), end]
     name = body_name(robot, link)
     if np.abs(np.diff(knots, axis=0)).sum() < _SHORTEST_M:
         return []
@@ -125,7 +126,7 @@ def _link(robot: Robot, link: int, radius_m: float, offset_m: float) -> list[Bod
 def _thickness(robot: Robot, usual_m: float) -> list[tuple[float, float]]:
     """Radius and offset of each link, the base first [m]."""
     rows = robot.document.get("joint", ())
-    found = [(usual_m, 0.0)]
+    sizes = [(usual_m, 0.0)]
     for place, name in enumerate(robot.joint_names):
         content = rows[place] if place < len(rows) else {}
         row = DocumentTable(content, f"robot {robot.name}, joint {name}")
@@ -138,12 +139,12 @@ def _thickness(robot: Robot, usual_m: float) -> list[tuple[float, float]]:
                 f"in metres, less than the arm's {length:.3g} m, are needed.",
                 culprits=[row.label],
             )
-        found.append((radius, offset))
-    return found
+        sizes.append((radius, offset))
+    return sizes
 
 
 def _turned_to(direction: FloatArray) -> FloatArray:
-    """A rotation (3, 3) that takes z to a unit vector."""
+    """A rotation (3, 3) that turns z to a unit vector."""
     aside = np.eye(3)[int(np.argmin(np.abs(direction)))]
     x = np.cross(aside, direction)
     x /= np.linalg.norm(x)

@@ -1,4 +1,4 @@
-"""A serial arm as placements and axes: the one form to which every description is brought."""
+"""Geometry of a serial arm as placements and axes, the common form of all descriptions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +14,10 @@ from visioncal.core.types import FloatArray, Mask
 # Columns of a joint's function: offset, ratio, sine, cosine.
 FUNCTION_NAMES = ("offset", "ratio", "sine", "cosine")
 IDENTITY_FUNCTION = (0.0, 1.0, 0.0, 0.0)
-# Printed to three digits, a rotation is within this of one; beyond, the numbers are something else.
+# Tolerance of rotation matrices, which may be printed to three digits.
 _ROTATION_TOLERANCE = 1e-3
-# Steps that invert a joint's function, and what it may be off before the last of them: the square
-# of it is beyond rounding.
+# Newton steps that invert a joint's function, and the error before the last: its square is
+# rounding.
 _INVERSIONS, _INVERTED = 20, 1e-8
 
 
@@ -26,17 +26,17 @@ class Chain:
     """The geometry of a serial arm with n joints.
 
     The pose of the tip is `placement_1 M_1 placement_2 M_2 ... placement_{n+1}`, where M_i turns
-    about (or moves along) axis i by the joint's effective position
-    `offset + ratio q + sine sin(q) + cosine cos(q)`: gear ratio and the eccentricity of an encoder
-    (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration), beside harmonics of
+    about (or moves along) axis i by the joint's effective position, a function of the encoder's q:
+    `offset + ratio q + sine sin(q) + cosine cos(q)`, with gear ratio and encoder eccentricity
+    (Mooring, Roth and Driels 1991, Fundamentals of Manipulator Calibration), and harmonics of
     higher order.
 
     Attributes:
         joint_names: The joints from the base to the tip.
         prismatic: (n,) whether a joint moves along its axis [m] instead of turning about it [rad].
         axes: (n, 3) unit vectors in the joints' frames.
-        placements: (n + 1, 4, 4) each joint's frame in the one before it (the first in the base),
-            before its own motion, and the tip in the last joint's [m].
+        placements: (n + 1, 4, 4) each joint's frame, before its own motion, in the previous
+            joint's (the first in the base), and the tip in the last joint's [m].
         lower: (n,) lower limits of q [rad or m]; -inf for a joint without limits.
         upper: (n,) upper limits of q [rad or m]; inf for a joint without limits.
         functions: (n, 4) offset [rad or m], ratio, sine and cosine [rad] of each joint.
@@ -57,77 +57,75 @@ class Chain:
 
     @property
     def twists(self) -> FloatArray:
-        """(n, 6) motions (rotation, translation) of the joints' frames for a unit of position."""
+        """(n, 6) twists (rotation, translation) of the joints' frames for a unit of position."""
         turning = np.where(self.prismatic[:, None], 0.0, self.axes)
         moving = np.where(self.prismatic[:, None], self.axes, 0.0)
         return np.concatenate([turning, moving], axis=1)
 
     def function_basis(self, q: FloatArray) -> FloatArray:
-        """Derivatives of the effective positions by the joints' functions.
-
-        Args:
-            q: (m, n) positions that the encoders report [rad or m].
+        """Derivatives of the effective positions over the joint function coefficients.
 
         Returns:
-            (m, n, 4): 1, q, sin(q), cos(q), the last two zero for a prismatic joint.
+            (m, n, 4) at encoder positions (m, n): 1, q, sin(q), cos(q), the last two zero for a
+            prismatic joint.
         """
         turning = np.where(self.prismatic, 0.0, 1.0)
         return np.stack([np.ones_like(q), q, turning * np.sin(q), turning * np.cos(q)], axis=-1)
 
     @property
     def is_periodic(self) -> bool:
-        """Whether effective positions have a part that repeats itself every turn."""
-        return bool(self._waves.any())
+        """Whether joint functions have a periodic part."""
+        return bool(self._amplitudes.any())
 
     def effective(self, q: FloatArray) -> FloatArray:
-        """Effective positions (m, n) of the joints where the encoders report (m, n) `q`."""
+        """Effective positions (m, n) of the joints at encoder positions (m, n) `q`."""
         offset, ratio = self.functions[:, 0], self.functions[:, 1]
         plain = offset + ratio * q
         return np.asarray(plain + self._periodic(q, 0) if self.is_periodic else plain)
 
     def encoded(self, positions: FloatArray) -> FloatArray:
-        """What encoders report (m, n) at effective positions (m, n) of the joints: the inverse.
+        """Encoder positions (m, n) at effective positions (m, n): the inverse of `effective`.
 
-        Newton's iteration; an eccentricity is some thousandths of the ratio: three steps do.
+        Newton's iteration; an eccentricity is some thousandths of the ratio: three steps suffice.
         """
         offset, ratio = self.functions[:, 0], self.functions[:, 1]
         q = (positions - offset) / ratio
         if not self.is_periodic:
             return np.asarray(q)
         for _ in range(_INVERSIONS):
-            off = offset + ratio * q + self._periodic(q, 0) - positions
-            q = q - off / (ratio + self._periodic(q, 1))
-            if np.abs(off).max(initial=0.0) < _INVERTED:
+            error = offset + ratio * q + self._periodic(q, 0) - positions
+            q = q - error / (ratio + self._periodic(q, 1))
+            if np.abs(error).max(initial=0.0) < _INVERTED:
                 break
         return np.asarray(q)
 
     def jacobian(self, q: FloatArray) -> FloatArray:
-        """Derivatives (m, n) of the effective positions by (m, n) `q`."""
+        """Derivatives (m, n) of the effective positions over (m, n) `q`."""
         return np.asarray(self.functions[:, 1] + self._periodic(q, 1))
 
     def curvatures(self, q: FloatArray) -> FloatArray:
-        """Second derivatives (m, n) of the effective positions by (m, n) `q`."""
+        """Second derivatives (m, n) of the effective positions over (m, n) `q`."""
         return self._periodic(q, 2)
 
     def _periodic(self, q: FloatArray, derivative: int) -> FloatArray:
-        """(m, n) what repeats itself every turn, or one of its derivatives."""
-        waves = self._waves
-        orders = np.arange(1, waves.shape[1] + 1)
-        # The derivative of a sine is one that leads by a quarter of a turn.
-        turned = orders * q[..., None] + derivative * np.pi / 2
-        moved = waves[..., 0] * np.sin(turned) + waves[..., 1] * np.cos(turned)
-        return np.asarray((moved * orders**derivative).sum(axis=-1))
+        """(m, n) periodic part of the joint functions, or one of its derivatives."""
+        amplitudes = self._amplitudes
+        orders = np.arange(1, amplitudes.shape[1] + 1)
+        # A derivative advances the phase by a quarter turn.
+        phases = orders * q[..., None] + derivative * np.pi / 2
+        values = amplitudes[..., 0] * np.sin(phases) + amplitudes[..., 1] * np.cos(phases)
+        return np.asarray((values * orders**derivative).sum(axis=-1))
 
     @property
-    def _waves(self) -> FloatArray:
-        """(n, k, 2) sine and cosine of the joints by order; a prismatic one has none."""
-        waves = self.functions[:, None, 2:]
+    def _amplitudes(self) -> FloatArray:
+        """(n, k, 2) sine and cosine amplitudes by order; zero for prismatic joints."""
+        amplitudes = self.functions[:, None, 2:]
         if self.harmonics is not None:
-            waves = np.concatenate([waves, self.harmonics], axis=1)
-        return np.where(self.prismatic[:, None, None], 0.0, waves)
+            amplitudes = np.concatenate([amplitudes, self.harmonics], axis=1)
+        return np.where(self.prismatic[:, None, None], 0.0, amplitudes)
 
     def with_offsets_placed(self) -> "Chain":
-        """The same arm with the functions' offsets in the placements."""
+        """The same arm with the joint function offsets moved into the placements."""
         steps = exp(self.twists * self.functions[:, :1])
         functions = self.functions.copy()
         functions[:, 0] = 0.0
@@ -138,7 +136,7 @@ class Chain:
 
 
 def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
-    """Writes a chain as a description that `Robot.from_document` reads back, to the last bit."""
+    """Writes a chain as a description that `Robot.from_document` reads back exactly."""
     joints = []
     for place, joint in enumerate(chain.joint_names):
         row: dict[str, Any] = {
@@ -164,10 +162,10 @@ def chain_document(name: str, tip: str, chain: Chain) -> dict[str, Any]:
 
 
 def chain_from_document(table: DocumentTable) -> Chain:
-    """Reads what `chain_document` writes.
+    """Reads a chain from a description of `chain_document`.
 
     Raises:
-        DataError: A field is missing or no number, axis or rigid transform.
+        DataError: A field is missing or invalid.
     """
     rows = joint_tables(table)
     names = tuple(name for name, _ in rows)
@@ -213,7 +211,7 @@ def _harmonics(rows: Sequence[DocumentTable]) -> FloatArray | None:
 
 
 def joint_tables(table: DocumentTable) -> list[tuple[str, DocumentTable]]:
-    """The rows of a table of joints with their names.
+    """Joint tables of a description, with their names.
 
     Raises:
         DataError: There is no row, or two of one name.
@@ -234,10 +232,10 @@ def joint_tables(table: DocumentTable) -> list[tuple[str, DocumentTable]]:
 
 
 def subtable(table: DocumentTable, key: str) -> DocumentTable:
-    """A table inside a table; empty where it is absent.
+    """A nested table; empty where it is absent.
 
     Raises:
-        DataError: It is something else.
+        DataError: The field is no table.
     """
     content = table.content.get(key, {})
     if not isinstance(content, Mapping):
@@ -246,10 +244,10 @@ def subtable(table: DocumentTable, key: str) -> DocumentTable:
 
 
 def joint_function(row: DocumentTable, keys: Sequence[str]) -> list[float]:
-    """A joint's function: offset, ratio, sine, cosine under the given keys; an empty one is left.
+    """Reads a joint function: offset, ratio, sine, cosine by key; the default for an empty key.
 
     Raises:
-        DataError: A value is no number, or the ratio is not above zero.
+        DataError: A value is no number, or the ratio is not positive.
     """
     return [
         row.number(key, none, positive=name == "ratio") if key else none
@@ -258,11 +256,7 @@ def joint_function(row: DocumentTable, keys: Sequence[str]) -> list[float]:
 
 
 def number_list(row: DocumentTable, key: str, size: int) -> FloatArray:
-    """A list of so many finite numbers.
-
-    Raises:
-        DataError: The field is something else.
-    """
+    """Reads a list of `size` finite numbers, or raises DataError."""
     return np.array(row.numbers(key, size))
 
 
@@ -278,18 +272,8 @@ def _placement(row: DocumentTable) -> FloatArray:
     needed = "a list of 4 rows of 4 numbers, a rigid transform [m]"
     if not isinstance(rows, Sequence) or isinstance(rows, str) or len(rows) != 4:
         raise row.refuse("placement", rows, needed)
-    matrix = np.array(
-        [
-            number_list(DocumentTable({"placement": value}, row.label), "placement", 4)
-            for value in rows
-        ]
-    )
-    _check_rigid(matrix, row.label)
-    return matrix
-
-
-def _check_rigid(matrix: FloatArray, label: str) -> None:
-    """Checks that (4, 4) numbers are a rigid transform."""
+    tables = [DocumentTable({"placement": value}, row.label) for value in rows]
+    matrix = np.array([number_list(table, "placement", 4) for table in tables])
     rotation = matrix[:3, :3]
     if (
         # Squares of the largest numbers overflow.
@@ -299,7 +283,8 @@ def _check_rigid(matrix: FloatArray, label: str) -> None:
         or matrix[3].tolist() != [0, 0, 0, 1]
     ):
         raise DataError(
-            f"{label}: placement is no rigid transform: a rotation, a position [m] and the last "
-            "row 0, 0, 0, 1 are needed.",
-            culprits=[f"{label}: placement"],
+            f"{row.label}: placement is no rigid transform: a rotation, a position [m] and the "
+            "last row 0, 0, 0, 1 are needed.",
+            culprits=[f"{row.label}: placement"],
         )
+    return matrix

@@ -1,6 +1,6 @@
-"""Distances between the bodies of an arm and what stands around it: Pinocchio's, with coal.
+"""Distances between the bodies of an arm and its cell, by Pinocchio and coal.
 
-This is the only module that knows coal, and it imports it when a cell is built.
+Only this module uses coal, which it imports when a cell is built.
 """
 
 from collections.abc import Sequence
@@ -15,25 +15,24 @@ from visioncal.robot.bodies import Body, body_name
 from visioncal.robot.model import Robot
 
 if TYPE_CHECKING:
-    import coal
     import pinocchio as pin
 
-# Stops keep so much more than the clearance, so that ways between them can leave and arrive [m].
+# Additional clearance of stops, so that paths between them can depart and arrive [m].
 SLACK_M = 0.004
-# Postures by which parts that are always near one another are separated from those that may meet.
+# Number of random postures that show which parts are always near one another.
 _SAMPLES = 300
-# Parts of an arm that are near one another in a larger share of all postures are so by design;
-# joint limits keep them apart, and thick capsules do not show it.
+# Parts of an arm that are near one another in a larger share of postures are so by design: joint
+# limits keep them apart, which the coarse capsules do not show.
 _OFTEN = 0.2
-# What counts as a joint's range where it has no limits [rad], [m].
+# Range of joints without limits, to either side [rad], [m].
 _TURN_RAD, _TRAVEL_M = np.pi, 5.0
-# What a joint's eccentricity may add to its speed.
+# Greatest factor of a joint's eccentricity on its speed.
 _FASTER = 1.02
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Two bodies whose distance is not looked at, and why."""
+    """Two bodies whose distance is not checked, and why."""
 
     first: str
     second: str
@@ -42,14 +41,14 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """What is kept apart: pairs of bodies, by their places in the list of bodies.
+    """Pairs of bodies whose distances are checked.
 
     Attributes:
-        bodies: (k, 2) places, the one on the later link second; one more than the last place is
-            the floor.
-        needed_m: (k,) distance that they keep [m].
-        levers: (k, n) how far a point of one moves, seen from the other, for a unit of each
-            joint's effective position, at most [m].
+        bodies: (k, 2) indices of the bodies, the one on the later link second; the index after the
+            last body is the floor.
+        needed_m: (k,) required distance [m].
+        levers: (k, n) greatest motion of a point of one, seen from the other, for a unit of each
+            joint's effective position [m].
     """
 
     bodies: IntArray
@@ -58,17 +57,16 @@ class _Pairs:
 
 
 class Collisions:
-    """An arm with what it carries, and what stands around it.
+    """Distances and contacts of an arm, its tool, and the bodies of its cell.
 
-    Links that follow one another are not kept apart, nor parts of the arm that are near one another
-    by design, nor the first link from what the arm stands on, nor what it carries from the link
-    that it is always near to.
+    Not checked are adjacent links, parts of the arm that are near one another by design, the first
+    link against the arm's pedestal, and a tool against links that it is always near to.
 
-    It holds Pinocchio's working memory: one object a thread.
+    It holds Pinocchio's working memory, so each thread needs its own.
 
     Attributes:
-        names: For each pair that is kept apart, the names of both.
-        left_out: The pairs that are not, and why.
+        names: Names of both bodies of each checked pair.
+        left_out: The pairs that are not checked, and why.
     """
 
     def __init__(
@@ -78,8 +76,8 @@ class Collisions:
 
         Args:
             robot: The arm.
-            bodies: All bodies: those of the arm, what it carries, and what stands in the cell.
-            clearance_m: The distance that all keep [m].
+            bodies: Bodies of the arm, its tool and the cell.
+            clearance_m: The required distance of all pairs [m].
             floor_m: Height of the floor in the base frame [m]; None for a cell without one.
         """
         import pinocchio as pin
@@ -89,79 +87,72 @@ class Collisions:
         self._geometry = _geometry(bodies, floor_m)
         names = [*(body.name for body in bodies), "floor"]
         pairs = _all_pairs(robot, bodies, clearance_m, floor_m is not None)
-        self._watch(pairs)
-        self._pairs, self.left_out = self._sifted(pairs, bodies, names)
-        self._watch(self._pairs)
+        self._set_pairs(pairs)
+        self._pairs, self.left_out = self._checked_pairs(pairs, bodies, names)
+        self._set_pairs(self._pairs)
         self.names = tuple((names[a], names[b]) for a, b in self._pairs.bodies)
 
     def first_contact(self, q: FloatArray) -> IntArray:
-        """Looks for bodies that are too near one another.
-
-        Args:
-            q: (m, n) joint angles [rad].
+        """Finds the nearest pair of bodies that are too near at each of (m, n) joint angles [rad].
 
         Returns:
-            (m,) the place in `names` of a pair that is nearer than the clearance, with a little
-            more for the ways to and from the posture; -1 where there is none.
+            (m,) index in `names`, by the clearance and the slack for paths to and from the posture;
+            -1 where no pair is too near.
         """
         import pinocchio as pin
 
-        found = np.full(len(q), -1, dtype=np.int64)
+        contacts = np.full(len(q), -1, dtype=np.int64)
         for row, positions in enumerate(self._robot.chain.effective(np.asarray(q, dtype=float))):
             touching = pin.computeCollisions(
                 self._model, self._data, self._geometry, self._memory, positions, True
             )
             if touching:
                 margin_m = self._distances(positions) - self._pairs.needed_m
-                found[row] = int(margin_m.argmin())
-        return found
+                contacts[row] = int(margin_m.argmin())
+        return contacts
 
     def distances(self, q: FloatArray) -> FloatArray:
-        """Distances (k,) of the pairs in `names` at (n,) joint angles, below zero inside [m]."""
+        """Distances (k,) of the pairs in `names` at (n,) joint angles; negative inside [m]."""
         return self._distances(self._robot.chain.effective(np.asarray(q, dtype=float)[None])[0])
 
     def needed_m(self) -> FloatArray:
-        """Distances (k,) that the pairs in `names` keep [m]."""
+        """Required distances (k,) of the pairs in `names` [m]."""
         return self._pairs.needed_m.copy()
 
     def on_the_way(self, start: FloatArray, end: FloatArray) -> int:
-        """Looks for bodies that come too near one another while all joints move evenly.
+        """Finds a pair of bodies that come too near while all joints move linearly.
 
-        Conservative advancement (Mirtich 1996): from each posture the next one that is looked at
-        is so near that no pair can use up, in between, what it has left. So the clearance is kept
-        everywhere, not only at samples.
-
-        Args:
-            start: (n,) joint angles [rad].
-            end: (n,) joint angles [rad].
+        Conservative advancement (Mirtich 1996): the step from each posture to the next is bounded
+        so that no pair can use up its margin in between. So the clearance is kept everywhere, not
+        only at samples.
 
         Returns:
-            The place in `names` of the first pair in the way; -1 for a clear way.
+            Index in `names` of the first pair that comes too near; -1 for a clear path.
         """
         begin, stop = self._robot.chain.effective(np.array([start, end], dtype=float))
         needed = self._pairs.needed_m
         speeds = _FASTER * self._pairs.levers @ np.abs(stop - begin)
-        at = 0.0
+        fraction = 0.0
         while True:
-            left = self._distances(begin + at * (stop - begin)) - needed
-            worst = int(left.argmin()) if len(left) else -1
-            if worst >= 0 and left[worst] < 0.5 * SLACK_M:
+            margin_m = self._distances(begin + fraction * (stop - begin)) - needed
+            worst = int(margin_m.argmin()) if len(margin_m) else -1
+            if worst >= 0 and margin_m[worst] < 0.5 * SLACK_M:
                 return worst
-            if at == 1.0:
+            if fraction == 1.0:
                 return -1
             moving = speeds > 0.0
-            at = min(1.0, at + float(np.min(left[moving] / speeds[moving], initial=1.0)))
+            fraction = min(
+                1.0, fraction + float(np.min(margin_m[moving] / speeds[moving], initial=1.0))
+            )
 
     def _distances(self, positions: FloatArray) -> FloatArray:
         import pinocchio as pin
 
         pin.computeDistances(self._model, self._data, self._geometry, self._memory, positions)
-        return np.array(
-            [distanceresult.min_distance for distanceresult in self._memory.distanceResults]
-        )
+        return np.array([result.min_distance for result in self._memory.distanceResults])
 
-    def _watch(self, pairs: _Pairs) -> None:
-        """Makes these the pairs that are looked at."""
+    def _set_pairs(self, pairs: _Pairs) -> None:
+        """Sets the pairs that Pinocchio checks."""
         import pinocchio as pin
 
         self._geometry.removeAllCollisionPairs()
@@ -171,60 +162,64 @@ class Collisions:
         for place, needed in enumerate(pairs.needed_m.tolist()):
             self._memory.collisionRequests[place].security_margin = needed + SLACK_M
 
-    def _sifted(
+    def _checked_pairs(
         self, pairs: _Pairs, bodies: Sequence[Body], names: Sequence[str]
     ) -> tuple[_Pairs, tuple[LeftOut, ...]]:
-        """The pairs that can be kept apart, and the others."""
+        """The pairs to check, and those to leave out."""
         rng = np.random.default_rng(0)
         chain = self._robot.chain
-        most = np.where(chain.prismatic, _TRAVEL_M, _TURN_RAD)
-        lower, upper = np.maximum(chain.lower, -most), np.minimum(chain.upper, most)
+        range_ = np.where(chain.prismatic, _TRAVEL_M, _TURN_RAD)
+        lower, upper = np.maximum(chain.lower, -range_), np.minimum(chain.upper, range_)
         postures = chain.effective(rng.uniform(lower, upper, (_SAMPLES, len(chain))))
         margin_m = np.array([self._distances(posture) for posture in postures]) - pairs.needed_m
-        often = (margin_m < SLACK_M).mean(axis=0)
-        parts = np.array([*(body.of_arm for body in bodies), False])[pairs.bodies].all(axis=1)
-        carried = np.array([*(body.link > 0 for body in bodies), False])[pairs.bodies].all(axis=1)
-        stands = np.array([*(body.link == 1 for body in bodies), False])[pairs.bodies].any(axis=1)
-        # What a later link touches in every posture is an error of the cell, which must show.
-        never = (often == 1.0) & (parts | carried | stands)
-        out = never | (parts & (often > _OFTEN))
-        left = tuple(
-            LeftOut(names[a], names[b], f"too near in {100 * share:.0f} % of all postures")
-            for (a, b), share in zip(pairs.bodies[out].tolist(), often[out].tolist(), strict=True)
+        near_share = (margin_m < SLACK_M).mean(axis=0)
+        of_arm = np.array([*(body.of_arm for body in bodies), False])[pairs.bodies].all(axis=1)
+        moving = np.array([*(body.link > 0 for body in bodies), False])[pairs.bodies].all(axis=1)
+        on_first_link = np.array([*(body.link == 1 for body in bodies), False])[pairs.bodies].any(
+            axis=1
         )
-        kept = _Pairs(pairs.bodies[~out], pairs.needed_m[~out], pairs.levers[~out])
-        return kept, left
+        # A cell body that a later link touches in every posture is an error, and must be reported.
+        always_near = (near_share == 1.0) & (of_arm | moving | on_first_link)
+        excluded = always_near | (of_arm & (near_share > _OFTEN))
+        left_out = tuple(
+            LeftOut(names[a], names[b], f"too near in {100 * share:.0f} % of all postures")
+            for (a, b), share in zip(
+                pairs.bodies[excluded].tolist(), near_share[excluded].tolist(), strict=True
+            )
+        )
+        kept = _Pairs(pairs.bodies[~excluded], pairs.needed_m[~excluded], pairs.levers[~excluded])
+        return kept, left_out
 
 
 def _all_pairs(robot: Robot, bodies: Sequence[Body], clearance_m: float, floor: bool) -> _Pairs:
-    """All pairs of bodies that move against one another, but for links that share a joint."""
-    found: list[tuple[int, int]] = []
+    """All pairs of bodies that move relative to one another, without adjacent links."""
+    found_pairs: list[tuple[int, int]] = []
     needed: list[float] = []
-    places = sorted(range(len(bodies)), key=lambda place: bodies[place].link)
-    for at, a in enumerate(places):
-        for b in places[at + 1 :]:
-            apart = bodies[b].link - bodies[a].link
-            if apart == 0 or (apart == 1 and bodies[a].of_arm and bodies[b].of_arm):
+    order = sorted(range(len(bodies)), key=lambda index: bodies[index].link)
+    for at, a in enumerate(order):
+        for b in order[at + 1 :]:
+            links_between = bodies[b].link - bodies[a].link
+            if links_between == 0 or (links_between == 1 and bodies[a].of_arm and bodies[b].of_arm):
                 continue
-            unsure = np.hypot(bodies[a].unsure_m, bodies[b].unsure_m)
-            found.append((a, b))
-            needed.append(clearance_m + (unsure if bodies[a].link == 0 else 0.0))
+            uncertainty_m = np.hypot(bodies[a].unsure_m, bodies[b].unsure_m)
+            found_pairs.append((a, b))
+            needed.append(clearance_m + (uncertainty_m if bodies[a].link == 0 else 0.0))
     if floor:
-        moving = [place for place in places if bodies[place].link > 0]
-        found += [(len(bodies), place) for place in moving]
-        needed += [clearance_m + bodies[place].unsure_m for place in moving]
+        moving = [index for index in order if bodies[index].link > 0]
+        found_pairs += [(len(bodies), index) for index in moving]
+        needed += [clearance_m + bodies[index].unsure_m for index in moving]
     links = np.array([*(body.link for body in bodies), 0])
-    pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+    pairs = np.array(found_pairs, dtype=np.int64).reshape(-1, 2)
     levers = [_levers(robot, links[a], bodies[b]) for a, b in pairs.tolist()]
     return _Pairs(pairs, np.array(needed), np.array(levers).reshape(-1, len(robot.chain)))
 
 
 def _levers(robot: Robot, before: int, body: Body) -> FloatArray:
-    """How far points of a body move, at most, seen from an earlier link, by (n,) joints [m]."""
+    """Greatest motion (n,) of a body's points, seen from an earlier link, per joint [m]."""
     chain = robot.chain
     lengths = np.linalg.norm(chain.placements[:-1, :3, 3], axis=1)
-    most = np.maximum(np.abs(chain.lower), np.abs(chain.upper))
-    lengths += np.where(chain.prismatic, np.where(np.isfinite(most), most, _TRAVEL_M), 0.0)
+    travel = np.maximum(np.abs(chain.lower), np.abs(chain.upper))
+    lengths += np.where(chain.prismatic, np.where(np.isfinite(travel), travel, _TRAVEL_M), 0.0)
     levers = np.zeros(len(chain))
     lever = body.extent_m
     for joint in range(body.link - 1, before - 1, -1):
@@ -234,42 +229,32 @@ def _levers(robot: Robot, before: int, body: Body) -> FloatArray:
 
 
 def _geometry(bodies: Sequence[Body], floor_m: float | None) -> "pin.GeometryModel":
-    """Pinocchio's model of the bodies, the floor last."""
+    """Pinocchio's geometry model of the bodies, the floor last."""
     import coal
     import pinocchio as pin
 
+    shapes = {"box": coal.Box, "capsule": coal.Capsule, "cylinder": coal.Cylinder}
     model = pin.GeometryModel()
-    for place, body in enumerate(bodies):
-        model.addGeometryObject(
-            pin.GeometryObject(
-                f"{place} {body.name}", body.link, pin.SE3(body.link_from_body), _shape(body)
-            )
-        )
+    for index, body in enumerate(bodies):
+        pose, shape = pin.SE3(body.link_from_body), shapes[body.shape](*body.size_m.tolist())
+        item = pin.GeometryObject(f"{index} {body.name}", body.link, pose, shape)
+        model.addGeometryObject(item)
     if floor_m is not None:
         below = coal.Halfspace(np.array([0.0, 0.0, 1.0]), floor_m)
         model.addGeometryObject(pin.GeometryObject("floor", 0, pin.SE3.Identity(), below))
     return model
 
 
-def _shape(body: Body) -> "coal.ShapeBase":
-    import coal
-
-    if body.shape == "box":
-        return coal.Box(*body.size_m.tolist())
-    kind = coal.Capsule if body.shape == "capsule" else coal.Cylinder
-    return kind(*body.size_m.tolist())
-
-
 def urdf_bodies(robot: Robot) -> tuple[tuple[Body, ...], frozenset[int]]:
-    """The boxes, cylinders and spheres that a URDF gives to its links for collisions.
+    """Collision boxes, cylinders and spheres of a URDF.
 
     Returns:
-        The bodies, and the joints with which links move whose form is in files elsewhere.
+        The bodies, and the links that have meshes, which are not read.
     """
     import pinocchio as pin
 
     root = ElementTree.fromstring(robot.document["urdf"])
-    elsewhere = set()
+    with_meshes = set()
     for link in root.findall("link"):
         for collision in link.findall("collision"):
             shape = collision.find("geometry")
@@ -277,23 +262,23 @@ def urdf_bodies(robot: Robot) -> tuple[tuple[Body, ...], frozenset[int]]:
                 shape.find(name) is None for name in ("box", "cylinder", "sphere")
             ):
                 link.remove(collision)
-                elsewhere.add(link.get("name"))
+                with_meshes.add(link.get("name"))
     text = ElementTree.tostring(root, encoding="unicode")
     model = pin.buildModelFromXML(text)
     geometry = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
-    places = {name: place for place, name in enumerate(robot.joint_names, start=1)}
-    others = [joint for joint in range(1, model.njoints) if model.names[joint] not in places]
+    numbers = {name: number for number, name in enumerate(robot.joint_names, start=1)}
+    others = [joint for joint in range(1, model.njoints) if model.names[joint] not in numbers]
     model, reduced = pin.buildReducedModel(model, [geometry], others, pin.neutral(model))
     bodies = [
-        _body(geometryobject, places.get(model.names[geometryobject.parentJoint], 0), robot)
-        for geometryobject in reduced[0].geometryObjects
+        _body(item, numbers.get(model.names[item.parentJoint], 0), robot)
+        for item in reduced[0].geometryObjects
     ]
-    undrawn = {
-        places.get(model.names[frame.parentJoint], 0)
+    incomplete = {
+        numbers.get(model.names[frame.parentJoint], 0)
         for frame in model.frames
-        if frame.name in elsewhere
+        if frame.name in with_meshes
     }
-    return tuple(bodies), frozenset(undrawn)
+    return tuple(bodies), frozenset(incomplete)
 
 
 def _body(item: "pin.GeometryObject", link: int, robot: Robot) -> Body:

@@ -1,8 +1,8 @@
-"""Between the conventions of joint tables, which one a table is in, and from any chain to a table.
+"""Conversion between the conventions of joint tables, and of any chain to a joint table.
 
-What a row has to say of two consecutive axes is how the next one lies in the frame of the last.
-`_between` finds its numbers; what is left is a turn about and a way along the next axis, which
-commute with its joint and go into its row.
+A row places an axis in the frame of the one before. `_between` finds its numbers; there remains a
+screw about the next axis (rotation about it, translation along it), which commutes with that axis'
+joint and goes into its row.
 """
 
 from collections.abc import Mapping
@@ -26,12 +26,12 @@ from visioncal.robot.tables import (
     table_from_document,
 )
 
-# Consecutive axes closer than this to parallel get Hayati's beta [rad]. Their common normal lies
-# at a distance of their offset over the angle, and so do the errors of d grow against those of a.
+# Consecutive axes within this of parallel get Hayati's beta [rad]. Their common normal is at their
+# offset over the angle, which magnifies errors of d against those of a.
 PARALLEL_RAD = float(np.deg2rad(5.0))
 _UR_JOINTS = 6
-# Axes closer than this are parallel [rad], and meet when they pass so close [m]: a common normal at
-# 1e8 times their offset has lost as many digits as the angle that is neglected.
+# Axes within this angle are parallel [rad], and within this distance intersect [m]: a common normal
+# at 1e8 times their offset has lost as many digits as the neglected angle.
 EXACTLY = 1e-8
 # Rounding of a product of a few transforms with entries near 1.
 _ROUNDING = 1e-12
@@ -57,33 +57,29 @@ class _DhRow:
 
 
 def convert_table(table: DHTable, convention: Convention) -> DHTable:
-    """Writes a table in another convention; the arm stays the same.
+    """Converts a table to another convention.
 
-    Between standard and modified no number changes, only its row. In Hayati's form beta takes the
-    place of d where axes are nearly, not exactly, parallel. Back from it d is again the way to the
+    Between standard and modified, numbers only change their row. In Hayati's form beta replaces d
+    where axes are nearly, not exactly, parallel. Converted back, d is again the distance to the
     common normal, some hundred metres for a milliradian.
-
-    Args:
-        table: The table.
-        convention: The convention that is wanted.
 
     Returns:
         The table. Poses agree to 1e-12, or 1e-8 where axes are less than 1e-4 and more than 0 rad
-        from parallel; converted back it is the same table again.
+        from parallel; converting back gives the original table.
     """
     if convention == table.convention:
         return table
-    off = _off_parallel(table.along_x[:, :3, 2])
-    # Before the first axis and behind the last there is no other to be parallel to.
-    off[[0, -1]] = np.inf
-    parallel = (off < PARALLEL_RAD) & (convention == "hayati")
-    rows, moved = [], np.zeros(2)
-    for place, row in enumerate(_rows(table)):
-        link = replace(row, theta=row.theta + moved[0], d=row.d + moved[1])
-        flat = bool(parallel[place + 1])
-        keeps = link.d == 0.0 or bool(off[place + 1] < EXACTLY) if flat else link.beta == 0.0
-        rows.append(link if keeps else _between(link.transform, link, flat=flat))
-        moved = np.zeros(2) if keeps else _left_over(link.transform, rows[-1])
+    angles = _off_parallel(table.along_x[:, :3, 2])
+    # The first and last X_i have no second axis.
+    angles[[0, -1]] = np.inf
+    parallel = (angles < PARALLEL_RAD) & (convention == "hayati")
+    rows, carried = [], np.zeros(2)
+    for index, row in enumerate(_rows(table)):
+        link = replace(row, theta=row.theta + carried[0], d=row.d + carried[1])
+        hayati = bool(parallel[index + 1])
+        keeps = link.d == 0.0 or bool(angles[index + 1] < EXACTLY) if hayati else link.beta == 0.0
+        rows.append(link if keeps else _between(link.transform, link, hayati=hayati))
+        carried = np.zeros(2) if keeps else _remaining_screw(link.transform, rows[-1])
     return _with_rows(replace(table, convention=convention, parallel=parallel), rows)
 
 
@@ -93,34 +89,34 @@ def table_of(
     *,
     like: DHTable | None = None,
 ) -> DHTable:
-    """Writes any robot as a joint table.
+    """Converts any robot to a joint table.
 
-    The rows follow from the joints' axes alone. What rows cannot hold is constant: `base` before
-    the first axis and `flange` behind the last. Both are as small as they can be; where the first
-    axis is the base's z and the last one the flange's, they are the identity.
+    The rows follow from the joints' axes alone; the constants `base` before the first axis and
+    `flange` after the last take the rest. Both are as small as possible, and the identity where the
+    first axis is the base's z and the last one the flange's.
 
     Args:
         robot: The robot, of a URDF, a table or a calibration.
-        convention: The convention that is wanted.
-        like: A table of nearly the same arm, whose choices are kept: which way each x points, d
+        convention: The wanted convention.
+        like: A table of nearly the same arm, whose free choices are kept: the sense of each x, d
             between parallel axes, and the nominal base and flange. None for the x that turns least
             from the one before.
 
     Returns:
-        The table. Offsets of the joints' functions are in its theta and d.
+        The table. Joint function offsets are in its theta and d.
     """
     chain = _about_z(robot.chain.with_offsets_placed())
     like = None if like is None else convert_table(like, convention)
     hints = [_DhRow()] * len(chain) if like is None else _rows(like)
     first = np.eye(4) if like is None else like.along_x[0]
     base = _base(chain.placements[0], np.eye(4) if like is None else like.base, first)
-    rows, flats = [], []
+    rows, hayati_rows = [], []
     rest = invert(base @ first) @ chain.placements[0]
     for hint, placement in zip(hints[:-1], chain.placements[1:-1], strict=True):
         link = rest @ placement
-        near = bool(_off_parallel(link[:3, 2]) < PARALLEL_RAD)
-        flats.append(near and convention == "hayati")
-        rows.append(_between(link, hint, flat=flats[-1]))
+        nearly_parallel = bool(_off_parallel(link[:3, 2]) < PARALLEL_RAD)
+        hayati_rows.append(nearly_parallel and convention == "hayati")
+        rows.append(_between(link, hint, hayati=hayati_rows[-1]))
         rest = invert(rows[-1].transform) @ link
     last, flange = _last_row(rest @ chain.placements[-1], hints[-1], like)
     count, none = len(chain), np.zeros(len(chain) + 1)
@@ -135,7 +131,7 @@ def table_of(
         a_m=none if like is None else like.a_m,
         alpha_rad=none if like is None else like.alpha_rad,
         beta_rad=none,
-        parallel=np.array([False, *flats, False]),
+        parallel=np.array([False, *hayati_rows, False]),
         base=base,
         flange=flange,
         lower=chain.lower,
@@ -146,15 +142,7 @@ def table_of(
 
 
 def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
-    """Builds the same arm as it is seen from another frame than its base.
-
-    Args:
-        robot: The robot; one that is described by a table stays so.
-        parent_from_base: (4, 4) where its base is in that frame [m].
-
-    Returns:
-        The robot, whose base is the other frame.
-    """
+    """Builds the same arm in a new base frame, in which its base is at (4, 4) [m]."""
     gravity = {"gravity_m_s2": (parent_from_base[:3, :3] @ robot.gravity).tolist()}
     table = _described(robot)
     if table is not None:
@@ -167,12 +155,7 @@ def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
 
 
 def with_zeros(robot: Robot, zeros_rad: FloatArray) -> Robot:
-    """Builds the arm whose joints read zero elsewhere.
-
-    Args:
-        robot: The robot; one that is described by a table stays so.
-        zeros_rad: (n,) what is to be added to the angles that the joints report [rad].
-    """
+    """Builds the arm with (n,) offsets added to its reported joint angles [rad]."""
     added = robot.chain.functions[:, 1] * zeros_rad
     table = _described(robot)
     if table is not None and not added[table.prismatic].any():
@@ -181,16 +164,16 @@ def with_zeros(robot: Robot, zeros_rad: FloatArray) -> Robot:
 
 
 def _described(robot: Robot) -> DHTable | None:
-    """The table that describes a robot; None where something else does."""
+    """The table that describes a robot; None where it has another description."""
     return table_from_document(robot.document) if "convention" in robot.document else None
 
 
 def _of_table(
     robot: Robot, table: DHTable, gravity: Mapping[str, Any] = MappingProxyType({})
 ) -> Robot:
-    """The robot with the numbers of a table of its own form; its links' bodies stay what they are.
+    """The robot with the numbers of another table of its convention, and its own link data.
 
-    A mass is stated where a joint's row ends, and stays there.
+    A mass is stated in the frame in which a joint's row ends, and stays in it.
     """
     source = str(robot.document.get("source", ""))
     document = table_document(table, source)
@@ -201,15 +184,15 @@ def _of_table(
 
 
 def parallel_axes(robot: Robot) -> Mask:
-    """(n - 1,) which consecutive axes of a robot are nearly parallel."""
+    """(n - 1,) mask of nearly parallel consecutive axes."""
     links = _about_z(robot.chain).placements[1:-1]
     return np.asarray(_off_parallel(links[:, :3, 2]) < PARALLEL_RAD)
 
 
 def has_ur_axes(robot: Robot) -> bool:
-    """Whether a robot's axes are laid out as a UR's: six that turn, the middle three parallel.
+    """Whether a robot has a UR's axes: six revolute ones, the second to fourth parallel.
 
-    Other arms of six joints take no program of a UR.
+    Other arms of six joints cannot run a UR's program.
     """
     if robot.joint_count != _UR_JOINTS or robot.chain.prismatic.any():
         return False
@@ -217,13 +200,13 @@ def has_ur_axes(robot: Robot) -> bool:
 
 
 def _rows(table: DHTable) -> list[_DhRow]:
-    """The table as Z_i X_i, whatever its convention."""
+    """Numbers of each Z_i X_i, in any convention."""
     columns = (table.theta_rad, table.d_m, table.a_m[1:], table.alpha_rad[1:], table.beta_rad[1:])
     return [_DhRow(*map(float, numbers)) for numbers in zip(*columns, strict=True)]
 
 
 def _with_rows(table: DHTable, rows: list[_DhRow]) -> DHTable:
-    """A table with other Z_i X_i; X_0 stays."""
+    """The table with other numbers of Z_i X_i; X_0 stays."""
     return replace(
         table,
         theta_rad=np.array([row.theta for row in rows]),
@@ -235,7 +218,7 @@ def _with_rows(table: DHTable, rows: list[_DhRow]) -> DHTable:
 
 
 def _about_z(chain: Chain) -> Chain:
-    """The chain with each joint's frame turned so that its axis is z."""
+    """The chain with each joint's frame rotated so that its axis is z."""
     turns = np.array([np.eye(4), *map(swing, chain.axes), np.eye(4)])
     return replace(
         chain,
@@ -245,7 +228,7 @@ def _about_z(chain: Chain) -> Chain:
 
 
 def swing(direction: FloatArray) -> FloatArray:
-    """The least rotation (4, 4) that takes z to a unit vector."""
+    """The smallest rotation (4, 4) that turns z to a unit vector."""
     x, y, z = direction
     if z < EXACTLY - 1.0:
         return np.diag([1.0, -1.0, -1.0, 1.0])
@@ -254,28 +237,28 @@ def swing(direction: FloatArray) -> FloatArray:
 
 
 def _off_parallel(directions: FloatArray) -> FloatArray:
-    """(...,) angles [rad] of (..., 3) unit vectors against the line of z."""
+    """(...,) acute angles [rad] between (..., 3) unit vectors and the z axis."""
     return np.arctan2(np.hypot(directions[..., 0], directions[..., 1]), np.abs(directions[..., 2]))
 
 
-def _left_over(link: FloatArray, row: _DhRow) -> FloatArray:
-    """Turn about [rad] and way along [m] the next axis that a row leaves to it."""
+def _remaining_screw(link: FloatArray, row: _DhRow) -> FloatArray:
+    """Rotation about [rad] and translation along [m] the next axis that a row leaves."""
     rest = invert(row.transform) @ link
     return np.array([np.arctan2(rest[1, 0], rest[0, 0]), rest[2, 3]])
 
 
-def _between(link: FloatArray, hint: _DhRow, *, flat: bool) -> _DhRow:
+def _between(link: FloatArray, hint: _DhRow, *, hayati: bool) -> _DhRow:
     """The row from an axis to the next.
 
     Args:
         link: (4, 4) the next axis' frame in the frame of this one, z along the axes.
-        hint: Numbers nearby: of the two ways that x can point, the one nearer to its theta is
-            taken, and its d where axes are exactly parallel.
-        flat: Whether the row is Hayati's, with beta and d = 0.
+        hint: Similar numbers: of the two senses of x, the one nearer to its theta is taken, and its
+            d where axes are exactly parallel.
+        hayati: Whether the row is Hayati's, with beta and d = 0.
     """
     direction, position = link[:3, 2], link[:3, 3]
     parallel = bool(_off_parallel(direction) < EXACTLY)
-    if not (flat or parallel):
+    if not (hayati or parallel):
         return _common_normal(direction, position, hint)
     d = hint.d if parallel else 0.0
     x, y, _ = position - direction * (position[2] - d) / direction[2]
@@ -294,7 +277,7 @@ def _between(link: FloatArray, hint: _DhRow, *, flat: bool) -> _DhRow:
 
 
 def _common_normal(direction: FloatArray, position: FloatArray, hint: _DhRow) -> _DhRow:
-    """The row with x along the common normal of z and another axis (Denavit, Hartenberg 1955)."""
+    """The row with x along the common normal of two axes (Denavit and Hartenberg 1955)."""
     sine = np.hypot(direction[0], direction[1])
     normal = np.array([-direction[1], direction[0]]) / sine
     a, alpha = float(position[:2] @ normal), float(np.arctan2(sine, direction[2]))
@@ -306,28 +289,32 @@ def _common_normal(direction: FloatArray, position: FloatArray, hint: _DhRow) ->
 
 
 def _near(angle: float, to: float) -> float:
-    """The angle plus those turns that bring it nearest to another."""
-    away = float(np.remainder(angle - to + np.pi, 2.0 * np.pi) - np.pi)
-    # Half a turn either way is the same; tables print +pi.
-    return to + (abs(away) if np.isclose(abs(away), np.pi, rtol=0, atol=_ROUNDING) else away)
+    """The angle plus the whole turns that bring it nearest to another."""
+    difference = float(np.remainder(angle - to + np.pi, 2.0 * np.pi) - np.pi)
+    # A difference of half a turn is ambiguous; tables print +pi.
+    return to + (
+        abs(difference)
+        if np.isclose(abs(difference), np.pi, rtol=0, atol=_ROUNDING)
+        else difference
+    )
 
 
 def _nearer(theta: float, hint: float, *, forward: bool) -> tuple[float, float]:
-    """The one of theta and its opposite that is nearer to a hint, and the sign that goes with it.
+    """Theta or its opposite, whichever is nearer to a hint, and the sign of a and alpha with it.
 
-    Where both are a quarter turn away it is the one that is `forward`.
+    Where both are a quarter turn away, `forward` decides.
     """
-    way, back = _near(theta, hint), _near(theta + np.pi, hint)
-    gain = abs(back - hint) - abs(way - hint)
+    same, opposite = _near(theta, hint), _near(theta + np.pi, hint)
+    gain = abs(opposite - hint) - abs(same - hint)
     if abs(gain) < EXACTLY:
         gain = 1.0 if forward else -1.0
-    return (way, 1.0) if gain > 0.0 else (back, -1.0)
+    return (same, 1.0) if gain > 0.0 else (opposite, -1.0)
 
 
 def _base(placement: FloatArray, nominal: FloatArray, first: FloatArray) -> FloatArray:
-    """The base so that the first axis is z behind it and X_0, as near to the nominal as can be."""
-    away = invert(nominal @ first) @ placement
-    direction, position = away[:3, 2], away[:3, 3]
+    """The base nearest to the nominal after which, and X_0, the first axis is z."""
+    deviation = invert(nominal @ first) @ placement
+    direction, position = deviation[:3, 2], deviation[:3, 3]
     tilt = swing(direction)
     tilt[:3, 3] = position - direction * (position @ direction)
     if np.abs(tilt - np.eye(4)).max() < _ROUNDING:
@@ -338,28 +325,31 @@ def _base(placement: FloatArray, nominal: FloatArray, first: FloatArray) -> Floa
 def _last_row(link: FloatArray, hint: _DhRow, like: DHTable | None) -> tuple[_DhRow, FloatArray]:
     """The last row, and the flange behind it."""
     if like is None and _off_parallel(link[:3, 2]) >= PARALLEL_RAD:
-        row = _between(link, hint, flat=False)
+        row = _between(link, hint, hayati=False)
         return row, invert(row.transform) @ link
     flange = np.eye(4) if like is None else like.flange
-    away = link @ invert(hint.across @ flange)
-    # The turn about z next to a tilt: the quaternion's z over its w.
-    theta = _near(float(np.arctan2(away[1, 0] - away[0, 1], away[0, 0] + away[1, 1])), hint.theta)
-    row = replace(hint, theta=theta, d=float(away[2, 3]))
-    left = invert(row.transform) @ link
-    return row, flange if np.abs(left - flange).max() < _ROUNDING else left
+    deviation = link @ invert(hint.across @ flange)
+    # Rotation about z beside a tilt: the quaternion's z over its w.
+    theta = _near(
+        float(np.arctan2(deviation[1, 0] - deviation[0, 1], deviation[0, 0] + deviation[1, 1])),
+        hint.theta,
+    )
+    row = replace(hint, theta=theta, d=float(deviation[2, 3]))
+    rest = invert(row.transform) @ link
+    return row, flange if np.abs(rest - flange).max() < _ROUNDING else rest
 
 
 def other_convention(robot: Robot) -> tuple[Robot, Convention] | None:
-    """The arm that the numbers of a robot's table are in the convention that was not declared.
+    """The arm that a robot's table describes if read in the other convention.
 
-    Its base and flange may be other constants than the table's.
+    Base and flange are the identity.
 
     Returns:
         The arm and its convention; None where the robot is not described by a table.
     """
-    if "convention" not in robot.document:
+    declared = _described(robot)
+    if declared is None:
         return None
-    declared = table_from_document(robot.document)
     standard, modified = _readings(declared)
     other = standard if declared.convention == "modified" else modified
     document = chain_document(robot.name, robot.tip, chain_of_table(other))
@@ -367,7 +357,7 @@ def other_convention(robot: Robot) -> tuple[Robot, Convention] | None:
 
 
 def _readings(table: DHTable) -> tuple[DHTable, DHTable]:
-    """The printed rows as both orders read them."""
+    """The table's rows read as standard (or Hayati's) and as modified."""
     rows = slice(None, -1) if table.convention == "modified" else slice(1, None)
     columns = np.array([table.a_m, table.alpha_rad, table.beta_rad])[:, rows]
     bare = replace(

@@ -1,4 +1,4 @@
-"""The robots that come with visioncal, and the files that describe others."""
+"""Built-in robots, and files that describe robots."""
 
 import json
 from collections.abc import Mapping
@@ -12,20 +12,20 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import find_described, read_text, read_toml
 from visioncal.robot.model import Robot
 
-# Far above any arm's URDF; a larger file is something else.
+# Far above the size of any arm's URDF.
 _MAX_URDF_BYTES = 10_000_000
-# How the name of a robot's file ends; a .json is a chain, as a calibration writes it.
+# Suffixes of robot files; a .json is a chain, as a calibration writes it.
 ROBOT_SUFFIXES = (".toml", ".urdf", ".json")
 
 
 def _shipped() -> dict[str, Path]:
-    """The robots that come with visioncal, by name."""
+    """Files of the built-in robots, by name."""
     folder = Path(__file__).resolve().parent / "models"
     return {path.stem: path for path in folder.glob("*.toml")}
 
 
 def robot_names() -> tuple[str, ...]:
-    """Lists the names of the robots that come with visioncal."""
+    """Names of the built-in robots."""
     return tuple(sorted(_shipped()))
 
 
@@ -37,15 +37,15 @@ def read_robot_document(
     Args:
         name_or_path: A name among `robot_names()`, or the path of a DH `.toml`, a `.urdf` or the
             `.json` of a corrected arm.
-        tip: The frame that poses are of. A DH table or a chain has one end, which gets this name;
-            in a URDF it is a link or joint.
+        tip: The frame of reported poses: a link or joint of a URDF, or the name that the end of a
+            DH table or chain gets.
         folder: Relative paths start here; the working directory where None.
 
     Returns:
-        What `Robot.from_document` needs, with nothing else; it can be written as JSON.
+        A self-contained document for `Robot.from_document`, which can be written as JSON.
 
     Raises:
-        DataError: There is no such robot, or its file is too large, no TOML or no JSON.
+        DataError: There is no such robot, or its file is too large or malformed.
     """
     path = find_described(
         name_or_path, what="robot", shipped=_shipped(), suffixes=ROBOT_SUFFIXES, folder=folder
@@ -64,9 +64,9 @@ def read_robot_document(
 
 
 def _parse_json(text: str, label: str) -> dict[str, Any]:
-    found = parse_json(text, label)
-    if isinstance(found, dict) and "kind" in found:
-        return found
+    document = parse_json(text, label)
+    if isinstance(document, dict) and "kind" in document:
+        return document
     raise DataError(
         f"{label} describes no robot: an object of kind chain is needed.",
         culprits=[label],
@@ -77,9 +77,7 @@ def _parse_json(text: str, label: str) -> dict[str, Any]:
 def robot_file(document: Mapping[str, Any], named: str = "") -> tuple[str, str]:
     """Writes a robot's description as a file that `load_robot` reads: (file name, content).
 
-    Args:
-        document: The description.
-        named: The name of the file that it was read from, whose form is kept.
+    The format is that of the file `named`, from which it was read.
     """
     if "urdf" in document:
         return "robot.urdf", str(document["urdf"])
@@ -92,6 +90,6 @@ def load_robot(name_or_path: str, tip: str | None = None, folder: Path | None = 
     """Loads a robot's model; the arguments are those of `read_robot_document`.
 
     Raises:
-        DataError: There is no such robot, or its description is wrong.
+        DataError: There is no such robot, or its description is invalid.
     """
     return Robot.from_document(read_robot_document(name_or_path, tip=tip, folder=folder))

@@ -1,9 +1,9 @@
-"""How the links of an arm resist being moved: mass, first moments and second moments.
+"""Inertial parameters of links: mass, first moments and second moments.
 
-The pseudo-inertia of a body is positive, and so has a root: log-Cholesky coordinates (Rucker and
-Wensing 2022, Smooth parameterization of rigid-body inertia) are the entries of that root, those on
-its diagonal as logarithms. Here they are given relative to a body that is known, which lies at
-zero: then a change of 0.1 is one of ten percent, whatever the body's size and place.
+The pseudo-inertia of a body is positive definite, and has a Cholesky factor: log-Cholesky
+coordinates (Rucker and Wensing 2022, Smooth parameterization of rigid-body inertia) are the entries
+of that factor, with logarithms on the diagonal. Here they are relative to a known body, which is at
+zero: a change of 0.1 is one of ten percent, whatever the body's size and position.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from visioncal.core.types import FloatArray
 from visioncal.robot.chain import number_list
 from visioncal.robot.loads import MASS_KEYS, Masses
 
-# What a joint's table says of its link's inertia, beside its mass.
+# Key of a link's inertia in a joint's table.
 INERTIA_KEY = "inertia_kg_m2"
 # The ten parameters of a body; {} is the number of its joint.
 PARAMETER_NAMES = (
@@ -34,9 +34,9 @@ PARAMETER_NAMES = (
     "Iyz{0}",
     "Izz{0}",
 )
-# Where xx, xy, yy, xz, yz, zz stand in a symmetric matrix.
+# Indices of xx, xy, yy, xz, yz, zz in a symmetric matrix.
 _ROWS, _COLUMNS = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
-# A body without extent in some direction gets this share of its largest [-].
+# Least eigenvalue of a pseudo-inertia over its greatest, for bodies without extent [-].
 _THIN = 1e-6
 
 
@@ -45,8 +45,8 @@ class Inertias:
     """The inertial parameters of an arm's n links.
 
     Attributes:
-        values: (n, 10) of what moves with each joint: mass [kg], first moments [kg m], and the
-            inertia xx, xy, yy, xz, yz, zz [kg m^2]; in the joint's frame after its motion and
+        values: (n, 10) mass [kg], first moments [kg m] and inertia xx, xy, yy, xz, yz, zz
+            [kg m^2] of all that moves with each joint; in the joint's frame after its motion and
             about that frame's origin.
     """
 
@@ -54,7 +54,7 @@ class Inertias:
 
     @classmethod
     def of_bodies(cls, kg: FloatArray, centres_m: FloatArray, about: FloatArray) -> "Inertias":
-        """Of masses (n,) [kg], centres (n, 3) [m] and inertias about these (n, 3, 3) [kg m^2]."""
+        """From masses (n,) [kg], centres (n, 3) [m], inertias about these (n, 3, 3) [kg m^2]."""
         turned = np.array([skew(centre) for centre in centres_m])
         about_origin = about - kg[:, None, None] * turned @ turned
         moments = kg[:, None] * centres_m
@@ -62,7 +62,7 @@ class Inertias:
 
     @property
     def masses(self) -> Masses:
-        """Masses and their centres; the centre of what weighs nothing is the frame's origin."""
+        """Masses and their centres; a link without mass has its centre at the frame's origin."""
         kg = self.values[:, 0]
         weighs = np.where(kg == 0.0, 1.0, kg)
         return Masses(kg, np.where(kg[:, None] == 0.0, 0.0, self.values[:, 1:4] / weighs[:, None]))
@@ -77,38 +77,38 @@ class Inertias:
 
     @property
     def consistent(self) -> bool:
-        """Whether each link can be a body: its pseudo-inertia is not negative (Wensing 2018)."""
+        """Whether all links are physically consistent: pseudo-inertias >= 0 (Wensing 2018)."""
         eigenvalues = np.linalg.eigvalsh(pseudo_inertias(self.values))
         return bool((eigenvalues[:, 0] >= -1e-12 * np.abs(eigenvalues[:, -1])).all())
 
     def rows(self) -> list[dict[str, Any]]:
-        """The joints' entries in a description whose rows are the joints' frames."""
+        """Entries of the joints' tables, for a description whose rows end in the joints' frames."""
         about = entries(self.about_centres).tolist()
         rows = zip(self.masses.rows(), about, strict=True)
         return [mass | {INERTIA_KEY: value} for mass, value in rows]
 
 
 def entries(full: FloatArray) -> FloatArray:
-    """The (..., 6) xx, xy, yy, xz, yz, zz of (..., 3, 3) symmetric matrices."""
+    """Entries (..., 6) xx, xy, yy, xz, yz, zz of (..., 3, 3) symmetric matrices."""
     return np.asarray(full[..., _ROWS, _COLUMNS])
 
 
 def matrices(six: FloatArray) -> FloatArray:
-    """(..., 3, 3) symmetric matrices of their (..., 6) xx, xy, yy, xz, yz, zz."""
+    """Symmetric matrices (..., 3, 3) of (..., 6) entries xx, xy, yy, xz, yz, zz."""
     full = np.empty((*six.shape[:-1], 3, 3))
     full[..., _ROWS, _COLUMNS] = full[..., _COLUMNS, _ROWS] = six
     return full
 
 
 def pseudo_inertias(values: FloatArray) -> FloatArray:
-    """Writes (..., 10) inertial parameters as pseudo-inertias.
+    """Pseudo-inertias of (..., 10) inertial parameters.
 
-    A body moved by (4, 4) X has X P X^T; parameters are those of a body where it is positive
+    A body moved by (4, 4) X has X P X^T; parameters are physically consistent where P is positive
     (Wensing, Kim and Slotine 2018, Linear matrix inequalities for physically consistent inertial
     parameter identification).
 
     Returns:
-        (..., 4, 4) second moments of the mass [kg m^2], bordered by its first moments and itself.
+        (..., 4, 4) second moments of mass [kg m^2], bordered by first moments and mass.
     """
     inertia = matrices(values[..., 4:])
     half = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)
@@ -120,7 +120,7 @@ def pseudo_inertias(values: FloatArray) -> FloatArray:
 
 
 def parameters_of(pseudo: FloatArray) -> FloatArray:
-    """The (..., 10) inertial parameters of (..., 4, 4) pseudo-inertias."""
+    """Inertial parameters (..., 10) of (..., 4, 4) pseudo-inertias."""
     second = pseudo[..., :3, :3]
     trace = np.trace(second, axis1=-2, axis2=-1)
     inertia = trace[..., None, None] * np.eye(3) - second
@@ -129,11 +129,7 @@ def parameters_of(pseudo: FloatArray) -> FloatArray:
 
 
 def moving(link_from_body: FloatArray) -> FloatArray:
-    """(10, 10) matrix that takes a body's parameters in its own frame to those in a link's.
-
-    Args:
-        link_from_body: (4, 4) the body's frame in the link's [m].
-    """
+    """Matrix (10, 10) that transforms a body's parameters from its own frame to a link's."""
     units = pseudo_inertias(np.eye(10))
     return np.asarray(parameters_of(link_from_body @ units @ link_from_body.T).T)
 
@@ -147,20 +143,20 @@ def inertias_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) 
         joint_from_row: (n, 4, 4) these frames in the joints' frames after their motion.
 
     Returns:
-        The inertias; None where no joint states one, or none its mass.
+        The inertias; None where no joint states an inertia, or none a mass.
 
     Raises:
-        DataError: Some joints state their inertia and others do not, or it is no list of numbers.
+        DataError: Only some joints state their inertia, or one is no list of numbers.
     """
     if not all(any(key in row.content for row in rows) for key in (INERTIA_KEY, MASS_KEYS[0])):
         return None
     kg = np.array([row.number(MASS_KEYS[0]) for row in rows])
     centres = np.array([number_list(row, MASS_KEYS[1], 3) for row in rows])
     about = matrices(np.array([number_list(row, INERTIA_KEY, 6) for row in rows]))
-    rotation, place = joint_from_row[:, :3, :3], joint_from_row[:, :3, 3]
+    rotation, position = joint_from_row[:, :3, :3], joint_from_row[:, :3, 3]
     return Inertias.of_bodies(
         kg,
-        (rotation @ centres[:, :, None])[:, :, 0] + place,
+        (rotation @ centres[:, :, None])[:, :, 0] + position,
         rotation @ about @ np.swapaxes(rotation, 1, 2),
     )
 
@@ -170,27 +166,29 @@ class LogCholesky:
     """Log-Cholesky coordinates around n bodies.
 
     Attributes:
-        maps: (n, 10, 10) from the parameters of the body that Pinocchio's coordinates describe, by
-            congruence with the root of the known body, to those of the link.
+        maps: (n, 10, 10) from the parameters of Pinocchio's coordinates to those of the link, by
+            congruence with the Cholesky factor of the known body.
     """
 
     maps: FloatArray
 
     @classmethod
     def around(cls, known: Inertias) -> Self:
-        """Coordinates that are zero at known bodies.
+        """Builds coordinates that are zero at known bodies.
 
         Raises:
-            DataError: One of them can be no body.
+            DataError: One of them is physically inconsistent.
         """
         pseudo = pseudo_inertias(known.values)
         values, vectors = np.linalg.eigh(pseudo)
-        wrong = np.flatnonzero((values[:, 0] < -1e-9 * values[:, -1]) | (values[:, -1] <= 0.0))
-        if len(wrong):
+        inconsistent = np.flatnonzero(
+            (values[:, 0] < -1e-9 * values[:, -1]) | (values[:, -1] <= 0.0)
+        )
+        if len(inconsistent):
             raise DataError(
-                f"robot: the inertia stated for link {wrong[0] + 1} is that of no body: its "
+                f"robot: the inertia stated for link {inconsistent[0] + 1} is that of no body: its "
                 "second moments of mass are negative.",
-                culprits=[f"joint {index + 1}" for index in wrong],
+                culprits=[f"joint {index + 1}" for index in inconsistent],
                 next_step="Check mass_kg, com_m and inertia_kg_m2 (about the centre of mass).",
             )
         raised = np.maximum(values, _THIN * values[:, -1:])
@@ -200,7 +198,7 @@ class LogCholesky:
         return cls(np.swapaxes(parameters_of(moved), 1, 2))
 
     def values(self, coordinates: FloatArray) -> FloatArray:
-        """(n, 10) inertial parameters of (n, 10) coordinates."""
+        """Inertial parameters (n, 10) of (n, 10) coordinates."""
         import pinocchio as pin
 
         own = [
@@ -210,7 +208,7 @@ class LogCholesky:
         return np.asarray((self.maps @ np.array(own)[:, :, None])[:, :, 0])
 
     def jacobians(self, coordinates: FloatArray) -> FloatArray:
-        """(n, 10, 10) derivatives of the parameters by the coordinates."""
+        """Jacobians (n, 10, 10) of the parameters over the coordinates."""
         import pinocchio as pin
 
         own = [

@@ -1,11 +1,11 @@
-"""Inverse kinematics: joint positions that bring an arm's flange where it is wanted.
+"""Inverse kinematics.
 
-One posture at a time: Pinocchio evaluates one in a microsecond, less than numpy needs to look at a
-batch of one, and each target is best started from the posture of the one before. Only where many
-poses come together, each with a posture near to it, numpy goes to all at once.
+Poses are solved one at a time: Pinocchio evaluates a posture in a microsecond, less than numpy's
+overhead, and the posture of the target before is the best start. Only many poses with a near
+posture each are solved in a batch.
 
-Joints stand at their effective positions here (`Chain.effective`, `Chain.encoded`): in these a turn
-is exactly two pi, whatever the gear's ratio.
+Joint positions are effective ones here (`Chain.effective`, `Chain.encoded`): in these a turn is
+exactly two pi, whatever the gear ratio.
 """
 
 import math
@@ -23,43 +23,42 @@ from visioncal.robot.model import Robot
 if TYPE_CHECKING:
     import pinocchio as pin
 
-# A pose counts as reached from here on [m] and [rad]: rounding leaves a thousandth of it.
+# Greatest error of a reached pose [m] and [rad]; rounding is a thousandth of it.
 _REACHED = 1e-9
-# The sum of squares [m^2 + rad^2] at which a pose is reached beyond doubt; one more step would be
-# lost in rounding.
+# Sum of squared errors [m^2 + rad^2] at which iterations end; another step would be rounding.
 _DONE = 1e-20
-# With fewer than six joints the position is kept and the rotation is what is left. Beyond this
-# [rad] the target was never one of the arm's: errors of links are far smaller.
+# With fewer than six joints the position is reached, and the rotation may be off by this [rad]:
+# errors of links are far smaller.
 _TURN_LEFT_RAD = float(np.deg2rad(1.0))
-# What a radian then counts against a metre, once both are near: what is left of the rotation moves
-# the position by the square of it.
-_LIGHT = 1e-4
-# Postures to start from where the seed does not lead there; an arm of six joints has up to sixteen
-# solutions, and half of the starts find one.
+# Weight of a radian against a metre for these arms, near the solution: the rotation error moves the
+# position by its square.
+_ROTATION_WEIGHT = 1e-4
+# Random starts where the given one does not converge to the pose; an arm of six joints has up to
+# sixteen solutions, and half of the starts find one.
 _STARTS = 40
 _STEPS = 80
-# A search ends where a step gains less than this share of the sum of squares; the nearest of many
-# is then followed to the second.
+# Relative gain in the sum of squares at which a search ends, and the final search from the nearest
+# posture.
 _SEARCH, _POLISH = 1e-3, 1e-9
-_MILDEST, _HARSHEST = 1e-4, 1e8
-# How far starts spread where a joint has no limits [rad or m].
+_LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e8
+# Half range of random starts for joints without limits [rad or m].
 _SPREAD = float(np.pi)
 _TURN = 2 * np.pi
-# Keeps a singular system solvable; far below the square of any singular value that matters.
+# Regularises singular systems; far below the square of any relevant singular value.
 _FLOOR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """The distance between a pose and the nearest that an arm reaches.
+    """A solution of the inverse kinematics, or the nearest posture.
 
     Attributes:
         positions: (n,) effective positions of the joints [rad or m].
-        off_m: Distance of the flange from where it is wanted [m].
-        off_rad: Angle between the flange and how it is wanted [rad].
-        reached: Whether it is there, within the joints' limits.
-        beyond: Where it is not, the joints whose limits alone are in the way; empty where no
-            posture at all would do.
+        off_m: Position error of the flange [m].
+        off_rad: Rotation error of the flange [rad].
+        reached: Whether the pose is reached within the joints' limits.
+        beyond: If not, the joints whose limits alone prevent it; empty where the pose is out of
+            reach without limits, too.
     """
 
     positions: FloatArray
@@ -71,14 +70,14 @@ class Posture:
 
 @dataclass(frozen=True, eq=False)
 class _Bounds:
-    """Limits of the effective positions, (n,) each, infinite where there are none."""
+    """Limits (n,) of the effective positions, infinite where there are none."""
 
     lower: FloatArray
     upper: FloatArray
     turning: Mask
 
     def nearest(self, positions: FloatArray, wanted: FloatArray) -> FloatArray:
-        """Turns joints by whole turns, within the limits, as near to `wanted` as can be."""
+        """Positions turned by whole turns within the limits, nearest to `wanted`."""
         # Positions within the limits stay so.
         turns = np.round((wanted - positions) / _TURN)
         if not turns.any():
@@ -88,14 +87,13 @@ class _Bounds:
         turns = np.where(self.turning, np.minimum(np.maximum(turns, least), most), 0.0)
         return np.asarray(positions + _TURN * turns)
 
-    def apart(self, turned: FloatArray) -> float:
-        """How far postures are apart that differ by (n,) positions; whole turns do not count."""
-        # A posture that is a whole turn away is the same branch of the arm; any other is not.
-        turns = np.where(self.turning, np.round(turned / _TURN), 0.0)
-        return float(np.linalg.norm(turned - _TURN * turns))
+    def apart(self, difference: FloatArray) -> float:
+        """Norm of a difference (n,) of postures, modulo whole turns, which keep the branch."""
+        turns = np.where(self.turning, np.round(difference / _TURN), 0.0)
+        return float(np.linalg.norm(difference - _TURN * turns))
 
     def middle_and_half(self, around: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Middle (n,) and half (n,) of the range; about the given positions if unlimited."""
+        """Centre (n,) and half width (n,) of the ranges, about given positions if unlimited."""
         known = np.isfinite(self.lower) & np.isfinite(self.upper)
         lower, upper = (np.where(known, array, 0.0) for array in (self.lower, self.upper))
         half = np.where(known, 0.5 * (upper - lower), _SPREAD)
@@ -103,21 +101,20 @@ class _Bounds:
         return np.where(known, 0.5 * (lower + upper), around), half
 
     def beyond(self, positions: FloatArray) -> FloatArray:
-        """How far (n,) positions are beyond the limits [rad or m]."""
+        """Excess (n,) of positions over the limits [rad or m]."""
         return np.maximum(np.maximum(self.lower - positions, positions - self.upper), 0.0)
 
 
 class Inverse:
     """The inverse kinematics of one arm.
 
-    Method: Levenberg and Marquardt's, with a damping that follows the remaining error and so
-    vanishes at the end (Sugihara 2011, Solvability-unconcerned inverse kinematics): quadratic where
-    the pose can be reached; where it cannot, the end is the nearest pose. Joints at a limit that
-    would leave it are held. Of an arm with more than six joints the step is the shortest one, so
-    that it stays near to where it started. With fewer than six the position is reached, and the
-    rotation is as near as it can be.
+    Levenberg-Marquardt with damping in proportion to the squared error (Sugihara 2011,
+    Solvability-unconcerned inverse kinematics): convergence is quadratic where the pose can be
+    reached, and to the nearest pose where it cannot. Joints at a limit that would leave it are
+    held. An arm with more than six joints takes the shortest step, so that it stays near its start;
+    with fewer than six the position is reached, and the rotation as nearly as possible.
 
-    It holds Pinocchio's working memory: one object a thread.
+    It holds Pinocchio's working memory, so each thread needs its own.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -132,79 +129,75 @@ class Inverse:
     def solve(
         self, base_from_flange: FloatArray, wanted: FloatArray, *, widest_rad: float = np.inf
     ) -> Posture:
-        """Finds the posture that reaches a pose, near to a given one.
+        """Finds the posture that reaches a pose, near a given one.
 
         Args:
             base_from_flange: (4, 4) the pose [m].
             wanted: (n,) effective positions to start from [rad or m].
-            widest_rad: Where a joint turns farther than this from there, other postures are looked
-                for, and the nearest of all is taken, but for whole turns [rad].
+            widest_rad: Where a joint turns farther than this from there, other solutions are
+                searched, and the nearest one, modulo whole turns, is taken [rad].
 
         Returns:
-            The posture; where none reaches the pose, the one that comes nearest.
+            The posture; where none reaches the pose, the nearest one.
         """
         import pinocchio as pin
 
         goal, bounds = pin.SE3(base_from_flange), self._bounds
         first = self._descend(goal, wanted, bounds, wanted)
-        if first.reached and _widest(first.positions - wanted, bounds) <= widest_rad:
+        turns = np.abs(first.positions - wanted)[bounds.turning]
+        if first.reached and turns.max(initial=0.0) <= widest_rad:
             return first
-        tries = [first, *self._from_everywhere(goal, bounds, wanted)]
-        reached = [posture for posture in tries if posture.reached]
+        candidates = [first, *self._from_random_starts(goal, bounds, wanted)]
+        reached = [posture for posture in candidates if posture.reached]
         if reached:
             return min(reached, key=lambda value: bounds.apart(value.positions - wanted))
-        nearest = min(tries, key=lambda value: value.off_m**2 + value.off_rad**2)
+        nearest = min(candidates, key=lambda value: value.off_m**2 + value.off_rad**2)
         nearest = self._descend(goal, nearest.positions, bounds, wanted, settle=_POLISH)
-        return replace(nearest, beyond=self._in_the_way(goal, wanted))
+        return replace(nearest, beyond=self._limiting_joints(goal, wanted))
 
     def from_starts(
         self, base_from_flange: FloatArray, starts: FloatArray
     ) -> tuple[FloatArray, Mask]:
-        """Goes to poses from postures near to them: quick, for poses that may be left out.
-
-        Args:
-            base_from_flange: (m, 4, 4) the poses [m].
-            starts: (m, n) effective positions to start from [rad or m]; six joints or more.
+        """Solves many poses (m, 4, 4) [m] from near starts, for six joints or more; some may fail.
 
         Returns:
-            (m, n) positions with joints turned as little as can be from zero, and whether the pose
-            was reached there (m,).
+            (m, n) effective positions, by whole turns nearest to zero, and (m,) whether reached.
         """
         bounds = self._bounds
-        found, reached = reached_from(
+        positions, reached = reached_from(
             self._chain, base_from_flange, starts, (bounds.lower, bounds.upper), _REACHED
         )
-        return bounds.nearest(found, np.zeros(len(self._names))), reached
+        return bounds.nearest(positions, np.zeros(len(self._names))), reached
 
     def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draws (count, n) effective positions all over the joints' range [rad or m]."""
-        middle, half = self._bounds.middle_and_half(np.zeros(len(self._names)))
-        return np.asarray(middle + rng.uniform(-1.0, 1.0, (count, len(half))) * half)
+        """Draws (count, n) effective positions over the joints' ranges [rad or m]."""
+        centre, half = self._bounds.middle_and_half(np.zeros(len(self._names)))
+        return np.asarray(centre + rng.uniform(-1.0, 1.0, (count, len(half))) * half)
 
-    def _from_everywhere(
+    def _from_random_starts(
         self, goal: "pin.SE3", bounds: _Bounds, wanted: FloatArray
     ) -> Iterator[Posture]:
-        """What is found from postures all over the joints' range, the same ones every time."""
+        """Results of searches from random postures, the same ones every time."""
         rng = np.random.default_rng(0)
-        middle, half = self._bounds.middle_and_half(wanted)
+        centre, half = self._bounds.middle_and_half(wanted)
         for share in rng.uniform(-1.0, 1.0, (_STARTS, len(wanted))):
-            start = middle + share * half
+            start = centre + share * half
             yield self._descend(goal, start, bounds, wanted)
 
-    def _in_the_way(self, goal: "pin.SE3", wanted: FloatArray) -> tuple[str, ...]:
-        """The joints whose limits alone keep the arm from a pose, for the nearest such posture."""
+    def _limiting_joints(self, goal: "pin.SE3", wanted: FloatArray) -> tuple[str, ...]:
+        """The joints whose limits the solution without limits exceeds least; empty for none."""
         free = replace(
             self._bounds,
             lower=np.full_like(self._bounds.lower, -np.inf),
             upper=np.full_like(self._bounds.upper, np.inf),
         )
-        middle, _ = self._bounds.middle_and_half(wanted)
-        tries = [
-            posture for posture in self._from_everywhere(goal, free, middle) if posture.reached
+        centre, _ = self._bounds.middle_and_half(wanted)
+        candidates = [
+            posture for posture in self._from_random_starts(goal, free, centre) if posture.reached
         ]
-        if not tries:
+        if not candidates:
             return ()
-        excess = [self._bounds.beyond(posture.positions) for posture in tries]
+        excess = [self._bounds.beyond(posture.positions) for posture in candidates]
         least = min(excess, key=lambda value: float(np.sum(value)))
         names = zip(self._names, least, strict=True)
         return tuple(name for name, value in names if value > 0.0)
@@ -218,32 +211,32 @@ class Inverse:
         *,
         settle: float = _SEARCH,
     ) -> Posture:
-        """Goes downhill from a start, and turns what it finds towards what is wanted."""
-        few = len(start) < 6
+        """Searches from a start; the result is turned by whole turns towards `wanted`."""
+        underactuated = len(start) < 6
         begin = np.minimum(np.maximum(start, bounds.lower), bounds.upper)
         positions, error = self._downhill(goal, begin, bounds, 1.0, settle)
-        if few:
-            settle = _POLISH * _LIGHT**2
-            positions, error = self._downhill(goal, positions, bounds, _LIGHT, settle)
-            error[3:] /= _LIGHT
+        if underactuated:
+            settle = _POLISH * _ROTATION_WEIGHT**2
+            positions, error = self._downhill(goal, positions, bounds, _ROTATION_WEIGHT, settle)
+            error[3:] /= _ROTATION_WEIGHT
         off_m, off_rad = math.hypot(*error[:3]), math.hypot(*error[3:])
-        reached = off_m < _REACHED and off_rad < (_TURN_LEFT_RAD if few else _REACHED)
+        reached = off_m < _REACHED and off_rad < (_TURN_LEFT_RAD if underactuated else _REACHED)
         return Posture(bounds.nearest(positions, wanted), off_m, off_rad, reached)
 
     def _downhill(
-        self, goal: "pin.SE3", positions: FloatArray, bounds: _Bounds, light: float, settle: float
+        self, goal: "pin.SE3", positions: FloatArray, bounds: _Bounds, weight: float, settle: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Levenberg and Marquardt's iteration: (the positions, what is left there)."""
+        """Levenberg-Marquardt iteration: positions, and the error there."""
         damping = 1.0
-        error, rotation = self._left(goal, positions, light)
+        error, rotation = self._error(goal, positions, weight)
         size = float(error @ error)
         for _ in range(_STEPS):
-            if size < _DONE or damping > _HARSHEST:
+            if size < _DONE or damping > _MOST_DAMPING:
                 break
-            jacobian = self._jacobian(rotation, light)
-            while damping <= _HARSHEST:
+            jacobian = self._jacobian(rotation, weight)
+            while damping <= _MOST_DAMPING:
                 moved = _moved(positions, error, jacobian, damping * size + _FLOOR, bounds)
-                next_error, rotation = self._left(goal, moved, light)
+                next_error, rotation = self._error(goal, moved, weight)
                 next_size = float(next_error @ next_error)
                 if next_size < size:
                     break
@@ -252,39 +245,34 @@ class Inverse:
                 break
             gained = size - next_size
             positions, error, size = moved, next_error, next_size
-            damping = max(damping / 8.0, _MILDEST)
+            damping = max(damping / 8.0, _LEAST_DAMPING)
             if gained < settle * (size + gained):
                 break
         return positions, error
 
-    def _left(
-        self, goal: "pin.SE3", positions: FloatArray, light: float
+    def _error(
+        self, goal: "pin.SE3", positions: FloatArray, weight: float
     ) -> tuple[FloatArray, FloatArray]:
-        """What is left to the goal, seen from it: (6,) and the rotation itself (3, 3)."""
-        # In Pinocchio's order, translations [m] first; rotations [rad] count by `light`.
+        """Error (6,) of a posture in the goal's frame, and its rotation (3, 3)."""
+        # In Pinocchio's order, translation [m] first; the rotation [rad] is weighted.
         import pinocchio as pin
 
         pin.computeJointJacobians(self._model, self._data, positions)
         pose = pin.updateFramePlacement(self._model, self._data, self._frame)
         goal_from_flange = goal.actInv(pose)
         rotation, error = goal_from_flange.rotation, np.empty(6)
-        error[:3], error[3:] = goal_from_flange.translation, light * pin.log3(rotation)
+        error[:3], error[3:] = goal_from_flange.translation, weight * pin.log3(rotation)
         return error, rotation
 
-    def _jacobian(self, rotation: FloatArray, light: float) -> FloatArray:
-        """How the joints change what is left (6, n), where `_left` was called last."""
+    def _jacobian(self, rotation: FloatArray, weight: float) -> FloatArray:
+        """Jacobian (6, n) of the error at the posture of the last call of `_error`."""
         import pinocchio as pin
 
         own = pin.getFrameJacobian(self._model, self._data, self._frame, pin.LOCAL)
         jacobian: FloatArray = np.empty_like(own)
         np.matmul(rotation, own[:3], out=jacobian[:3])
-        np.matmul(light * pin.Jlog3(rotation), own[3:], out=jacobian[3:])
+        np.matmul(weight * pin.Jlog3(rotation), own[3:], out=jacobian[3:])
         return jacobian
-
-
-def _widest(turned: FloatArray, bounds: _Bounds) -> float:
-    """The largest of (n,) turns; a prismatic joint has none [rad]."""
-    return float(np.abs(turned[bounds.turning]).max(initial=0.0))
 
 
 def _moved(
@@ -292,12 +280,12 @@ def _moved(
 ) -> FloatArray:
     """One damped step within the bounds; joints that would leave them from a limit are held."""
     for _ in range(len(positions)):
-        wish = positions - _step(jacobian, error, damping)
-        moved = np.minimum(np.maximum(wish, bounds.lower), bounds.upper)
-        cut = moved != wish
-        if not cut.any():
+        wanted = positions - _step(jacobian, error, damping)
+        moved = np.minimum(np.maximum(wanted, bounds.lower), bounds.upper)
+        limited = moved != wanted
+        if not limited.any():
             break
-        held = cut & (moved == positions)
+        held = limited & (moved == positions)
         if not held.any():
             break
         jacobian = np.where(held, 0.0, jacobian)
@@ -305,8 +293,8 @@ def _moved(
 
 
 def _step(jacobian: FloatArray, error: FloatArray, damping: float) -> FloatArray:
-    """The damped step; of the two equal forms the one with the smaller system."""
-    # LAPACK itself: numpy's way to it takes as long as the rest of a step.
+    """The damped step, by the smaller of the two equivalent systems."""
+    # LAPACK directly: numpy's overhead would double the time of a step.
     rows, columns = jacobian.shape
     long = columns > rows
     gram = jacobian @ jacobian.T if long else jacobian.T @ jacobian
@@ -319,5 +307,5 @@ def _effective_limits(robot: Robot) -> tuple[FloatArray, FloatArray]:
     """Lower and upper limits (n,) of the effective positions."""
     limits = np.array([robot.lower_rad, robot.upper_rad])
     known = np.isfinite(limits)
-    moved = np.where(known, robot.chain.effective(np.where(known, limits, 0.0)), limits)
-    return moved[0], moved[1]
+    effective = np.where(known, robot.chain.effective(np.where(known, limits, 0.0)), limits)
+    return effective[0], effective[1]

@@ -1,9 +1,9 @@
-"""How the numbers of a joint table move with an arm's geometry, and the arm with the numbers.
+"""Jacobians of a joint table's numbers over the geometry, and of the arm over the numbers.
 
-Both follow from one 6 x 5 matrix a row: how the end of `Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)`
-moves with its five numbers. Four of them at a time, and a screw about the next axis that goes into
-the next row, span all motions; so each row takes what it can of a link's motion and hands on the
-rest, as `table_of` does with finite ones.
+Both follow from the 6 x 5 Jacobian of each row's `Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)` over
+its five numbers. Four of them and a screw about the next axis, which goes into the next row, span
+all motions; so each row takes its part of a link's motion and passes on the screw, as `table_of`
+does with finite motions.
 """
 
 from dataclasses import replace
@@ -17,77 +17,73 @@ from visioncal.robot.conversion import EXACTLY, swing
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, about_x, chain_of_table
 
-# The numbers of a row, in the order of the last axis of what is returned here.
+# The numbers of a row, in the order of the Jacobians' last axis.
 ROW_NAMES = ("theta", "d", "a", "alpha", "beta")
 _THETA, _D, _A, _ALPHA, _BETA = range(5)
-# A screw's turn about and way along z, as rows of a twist.
+# Rotation about and translation along z in a twist.
 _Z = [2, 5]
 
 
 def table_moves(
     robot: Robot, table: DHTable, placements: FloatArray, functions: FloatArray
 ) -> FloatArray:
-    """How a robot's table moves with its geometry.
+    """Derivatives of a robot's table over its geometry.
 
     Args:
         robot: The robot.
-        table: `table_of(robot, ..., like=...)`: what the derivatives are of.
+        table: `table_of(robot, ..., like=...)`.
         placements: (p, n + 1, 6) twists of the placements, as `Robot.corrected` takes them.
         functions: (p, n, 4) changes of the joints' functions that go with them.
 
     Returns:
-        (p, n, 5) derivatives of theta, d, a, alpha and beta of each Z_i X_i [rad and m]. What a
-        row keeps by the table's convention has zeros: beta or d, and a and alpha behind the last
-        axis, where the flange takes all that is not about or along it.
+        (p, n, 5) derivatives of theta, d, a, alpha and beta of each Z_i X_i [rad and m]. Numbers
+        that the convention fixes have zeros: beta or d, and a and alpha after the last axis, where
+        the flange takes all but the screw about it.
     """
     count, chain = len(table), robot.chain
-    twists = _seen_about_z(chain, placements, functions)
-    moves = np.zeros((len(placements), count, 5))
+    twists = _twists_about_z(chain, placements, functions)
+    derivatives = np.zeros((len(placements), count, 5))
     frames = _LinkFrames(table, chain)
-    # What a row hands on: a turn about the next axis and a way along it, (p, 2).
+    # The screw about the next axis that a row passes on, (p, 2).
     screw = (twists[:, 0] @ adjoint(frames.rest[0]).T)[:, _Z]
     for row in range(count - 1):
         link = twists[:, row + 1] + screw @ adjoint(invert(frames.links[row]))[:, _Z].T
-        held = _columns(table, row)
-        basis = np.concatenate([_row_jacobian(table, row)[:, held], np.eye(6)[:, _Z]], axis=1)
-        seen = link @ adjoint(frames.rest[row + 1]).T
-        found = np.linalg.lstsq(basis, seen.T, rcond=None)[0].T
-        moves[:, row, held], screw = found[:, :-2], found[:, -2:]
+        free = _free_columns(table, row)
+        basis = np.concatenate([_row_jacobian(table, row)[:, free], np.eye(6)[:, _Z]], axis=1)
+        motion = link @ adjoint(frames.rest[row + 1]).T
+        solution = np.linalg.lstsq(basis, motion.T, rcond=None)[0].T
+        derivatives[:, row, free], screw = solution[:, :-2], solution[:, -2:]
     last = twists[:, count] + screw @ adjoint(invert(frames.links[-1]))[:, _Z].T
     across = about_x(table.a_m[-1], table.alpha_rad[-1], table.beta_rad[-1])
-    moves[:, -1, [_THETA, _D]] = (last @ adjoint(across @ table.flange).T)[:, _Z]
-    return moves
+    derivatives[:, -1, [_THETA, _D]] = (last @ adjoint(across @ table.flange).T)[:, _Z]
+    return derivatives
 
 
 def number_jacobian(table: DHTable, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How the flange moves with the numbers of a table.
-
-    Args:
-        table: The table.
-        q: (m, n) joint angles [rad or m].
+    """Jacobian of the flange over the numbers of a table, at (m, n) joint angles [rad or m].
 
     Returns:
         (m, 6, n + 1, 5) right perturbations of `base_from_flange` for a unit of theta, d, a, alpha
         and beta; first those of X_0, which has no theta and d, then of each Z_i X_i. And
-        (m, 6, n, 4) for a unit of the joints' functions.
+        (m, 6, n, 4) for a unit of the joint function coefficients.
     """
-    # All conventions are one product of their numbers; this one may have a beta or none.
+    # All conventions are the same product of their numbers; this one may have a beta.
     chain = chain_of_table(replace(table, convention="hayati"))
     robot = Robot.from_document(chain_document(table.name, table.tip, chain))
-    moved = robot.placement_jacobian(q).reshape(len(q), 6, len(table) + 1, 6)
+    placement_jacobian = robot.placement_jacobian(q).reshape(len(q), 6, len(table) + 1, 6)
     ends = np.array([_row_jacobian(table, row) for row in range(-1, len(table))])
     ends[0, :, [_THETA, _D]] = 0.0
     ends[-1] = adjoint(invert(table.flange)) @ ends[-1]
     functions = robot.function_jacobian(q).reshape(len(q), 6, len(table), -1)
-    return np.einsum("mirj,rjk->mirk", moved, ends), functions
+    return np.einsum("mirj,rjk->mirk", placement_jacobian, ends), functions
 
 
 class _LinkFrames:
-    """A table's links as its robot has them, in frames with z along the axes.
+    """A robot's links in frames with z along the axes, against its table.
 
     Attributes:
-        rest: (n, 4, 4) what each row, the first of the base, leaves to the next axis.
-        links: (n, 4, 4) the placements behind each joint, turned so that axes are z.
+        rest: (n, 4, 4) the screw that each row, the first of the base, leaves to the next axis.
+        links: (n, 4, 4) the placements after each joint.
     """
 
     def __init__(self, table: DHTable, chain: Chain) -> None:
@@ -101,10 +97,10 @@ class _LinkFrames:
         self.rest, self.links = np.array(rest), placements[1:]
 
 
-def _seen_about_z(chain: Chain, placements: FloatArray, functions: FloatArray) -> FloatArray:
-    """Twists (p, n + 1, 6) with the functions' offsets in them, in frames with z along the axes."""
+def _twists_about_z(chain: Chain, placements: FloatArray, functions: FloatArray) -> FloatArray:
+    """Twists (p, n + 1, 6) including function offsets, in frames with z along the axes."""
     twists = np.array(placements)
-    # A joint's offset is placed behind the twist of its frame.
+    # A joint's offset comes after the twist of its frame.
     placed = exp(chain.twists * chain.functions[:, :1])
     twists[:, :-1] = np.einsum("nij,pnj->pni", adjoint(invert(placed)), twists[:, :-1])
     twists[:, :-1] += functions[:, :, :1] * chain.twists
@@ -113,7 +109,7 @@ def _seen_about_z(chain: Chain, placements: FloatArray, functions: FloatArray) -
 
 
 def _row_jacobian(table: DHTable, row: int) -> FloatArray:
-    """(6, 5) twists of the end of Z_i X_i by theta, d, a, alpha and beta; row -1 is X_0 alone."""
+    """Jacobian (6, 5) of Z_i X_i over theta, d, a, alpha and beta; row -1 is X_0 alone."""
     a, alpha, beta = table.a_m[row + 1], table.alpha_rad[row + 1], table.beta_rad[row + 1]
     zero = np.zeros(())
     behind_z, behind_a = about_x(a, alpha, beta), about_x(zero, alpha, beta)
@@ -129,9 +125,9 @@ def _row_jacobian(table: DHTable, row: int) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def _columns(table: DHTable, row: int) -> list[int]:
-    """Which numbers of a row move; the others stay by the convention or are not identifiable."""
-    # Between exactly parallel axes d stays, and theta too where the axes are one.
+def _free_columns(table: DHTable, row: int) -> list[int]:
+    """Numbers of a row that are free; the convention fixes others, or they are unidentifiable."""
+    # Between exactly parallel axes d is fixed, and theta too where the axes coincide.
     has_beta = bool(table.parallel[row + 1])
     alpha, beta = table.alpha_rad[row + 1], table.beta_rad[row + 1]
     next_axis = about_x(np.zeros(()), alpha, beta)[:3, 2]

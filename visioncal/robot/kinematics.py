@@ -1,4 +1,4 @@
-"""Pinocchio's models of an arm: the only place that knows the library, imported when needed."""
+"""Kinematics and statics by Pinocchio, which is imported when needed."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,7 +17,7 @@ from visioncal.robot.rates import Rates
 if TYPE_CHECKING:
     import pinocchio as pin
 
-# The tips by which arms commonly call the frame of the reported poses, the best first.
+# Usual names of the frame of the reported poses, in order of preference.
 _USUAL_TIPS = ("tool0", "flange")
 
 
@@ -29,19 +29,15 @@ def build_model(name: str, tip: str, chain: Chain, masses: Masses | None = None)
     model, last = pin.Model(), 0
     model.name = name
     for place, joint in enumerate(chain.joint_names):
-        kind = "P" if chain.prismatic[place] else "R"
+        kind = "Prismatic" if chain.prismatic[place] else "Revolute"
         letter = along.get(tuple(chain.axes[place].tolist()))
-        unaligned = (
-            pin.JointModelPrismaticUnaligned if kind == "P" else pin.JointModelRevoluteUnaligned
-        )
-        motion = (
-            unaligned(chain.axes[place])
-            if letter is None
-            else getattr(pin, f"JointModel{kind}{letter}")()
-        )
+        if letter is None:
+            motion = getattr(pin, f"JointModel{kind}Unaligned")(chain.axes[place])
+        else:
+            motion = getattr(pin, f"JointModel{kind[0]}{letter}")()
         last = model.addJoint(last, motion, pin.SE3(chain.placements[place]), joint)
         if masses is not None:
-            # How a mass resists being turned does not matter to an arm at rest.
+            # The rotational inertia does not matter to an arm at rest.
             body = pin.Inertia(masses.kg[place], masses.centres_m[place], np.zeros((3, 3)))
             model.appendBodyToJoint(last, body, pin.SE3.Identity())
     tip_placement = pin.SE3(chain.placements[-1])
@@ -50,16 +46,7 @@ def build_model(name: str, tip: str, chain: Chain, masses: Masses | None = None)
 
 
 def flange_poses(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
-    """Forward kinematics.
-
-    Args:
-        model: Of `build_model`.
-        tip: Its frame.
-        positions: (m, n) effective positions [rad or m].
-
-    Returns:
-        (m, 4, 4) `base_from_tip` [m].
-    """
+    """Forward kinematics: (m, 4, 4) `base_from_tip` [m] at (m, n) effective positions."""
     import pinocchio as pin
 
     data, frame = model.createData(), model.getFrameId(tip)
@@ -71,7 +58,7 @@ def flange_poses(model: "pin.Model", tip: str, positions: FloatArray) -> FloatAr
 
 
 def joint_frames(model: "pin.Model", positions: FloatArray) -> FloatArray:
-    """The (n, 4, 4) frames of the joints in the base, after their motion, at (n,) positions."""
+    """Joint frames (n, 4, 4) in the base, after their motion, at (n,) effective positions."""
     import pinocchio as pin
 
     data = model.createData()
@@ -80,16 +67,11 @@ def joint_frames(model: "pin.Model", positions: FloatArray) -> FloatArray:
 
 
 def placement_derivatives(model: "pin.Model", tip: str, positions: FloatArray) -> FloatArray:
-    """How the tip moves with the joints' placements: Pinocchio's kinematic regressor.
-
-    Args:
-        model: Of `build_model`.
-        tip: Its frame.
-        positions: (m, n) effective positions [rad or m].
+    """Jacobian of the tip over the joints' placements: Pinocchio's kinematic regressor.
 
     Returns:
-        (m, 6, 6 n) right perturbations of `base_from_tip` by right perturbations of the placements,
-        both (rotation, translation).
+        (m, 6, 6 n) right perturbations of `base_from_tip` for right perturbations of the
+        placements, both (rotation, translation), at (m, n) effective positions [rad or m].
     """
     import pinocchio as pin
 
@@ -106,34 +88,27 @@ def placement_derivatives(model: "pin.Model", tip: str, positions: FloatArray) -
 
 
 def gravity_torques(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
-    """What the joints have to hold against the weight of their links.
+    """Joint torques (m, n) that hold the weight of the model's links [N m, or N if prismatic].
 
-    Args:
-        model: Of `build_model`, with masses.
-        positions: (m, n) effective positions [rad or m].
-        gravity: (3,) in the base's frame [m/s^2].
-
-    Returns:
-        (m, n) [N m, or N for a prismatic joint].
+    Positions are effective ones (m, n) [rad or m], gravity is in the base's frame (3,) [m/s^2].
     """
     import pinocchio as pin
 
     model.gravity.linear = gravity
     data = model.createData()
-    held = [pin.computeGeneralizedGravity(model, data, position).copy() for position in positions]
-    return np.array(held).reshape(positions.shape)
+    torques = [
+        pin.computeGeneralizedGravity(model, data, position).copy() for position in positions
+    ]
+    return np.array(torques).reshape(positions.shape)
 
 
 def weight_jacobian(model: "pin.Model", positions: FloatArray, gravity: FloatArray) -> FloatArray:
-    """How the joints would be turned by the weight of what hangs on them.
+    """Derivatives of the joint torques by weight over masses and first moments.
 
-    Args:
-        model: Of `build_model`.
-        positions: (m, n) effective positions [rad or m].
-        gravity: (3,) in the base's frame [m/s^2].
+    Positions are effective ones (m, n) [rad or m], gravity is in the base's frame (3,) [m/s^2].
 
     Returns:
-        (m, n, 4 n) derivatives of the torques by each body's mass [kg] and first moments [kg m].
+        (m, n, 4 n) for the mass [kg] and first moments [kg m] of each joint's body.
     """
     import pinocchio as pin
 
@@ -142,16 +117,16 @@ def weight_jacobian(model: "pin.Model", positions: FloatArray, gravity: FloatArr
     still = np.zeros(count)
     rows = np.empty((len(positions), count, count, 4))
     for row, configuration in enumerate(positions):
-        found = pin.computeJointTorqueRegressor(model, data, configuration, still, still)
-        # Ten a body: mass, first moments, and inertias, which do not matter at rest.
-        rows[row] = -found.reshape(count, count, 10)[:, :, :4]
+        regressor = pin.computeJointTorqueRegressor(model, data, configuration, still, still)
+        # Ten parameters a body: mass, first moments, and inertias, which do not matter at rest.
+        rows[row] = -regressor.reshape(count, count, 10)[:, :, :4]
     return rows.reshape(len(positions), count, 4 * count)
 
 
 def regressors(
     model: "pin.Model", gravity: FloatArray, states: tuple[FloatArray, FloatArray, FloatArray]
 ) -> Iterator[FloatArray]:
-    """Walks through the derivatives of the torques by the bodies' inertial parameters.
+    """Iterates over the torque regressors of states, for the bodies' inertial parameters.
 
     Args:
         model: Of `build_model`.
@@ -159,26 +134,26 @@ def regressors(
         states: (m, n) effective positions, speeds and accelerations.
 
     Yields:
-        (10 n, n) for each state; the same memory each time, which the next state overwrites.
+        (10 n, n) for each state, in memory that the next state overwrites.
     """
     import pinocchio as pin
 
     model.gravity.linear = gravity
     data, compute = model.createData(), pin.computeJointTorqueRegressor
-    # What the function returns is a copy; this is the place where it is computed.
-    found = data.jointTorqueRegressor.T
+    # The function's return value is a copy of this array.
+    regressor = data.jointTorqueRegressor.T
     for q, dq, ddq in zip(*states, strict=True):
         compute(model, data, q, dq, ddq)
-        yield found
+        yield regressor
 
 
-# A hall with its conveyors has hundreds; the parser, which calls itself for each, ends the process
-# on some ten thousand.
+# A plant with its conveyors has hundreds; the recursive parser crashes the process at some ten
+# thousand.
 _MOST_JOINTS = 2000
 
 
 class UrdfArm(NamedTuple):
-    """What a URDF says of the arm from its root to the tip; None where it states no mass."""
+    """The arm of a URDF from its root to the tip; masses are None where it states none."""
 
     chain: Chain
     tip: str
@@ -214,8 +189,8 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
             "the place.",
         ) from error
     tip = _find_tip(table, [frame.name for frame in model.frames][1:])
-    on_way = list(model.supports[model.frames[model.getFrameId(tip)].parentJoint])[1:]
-    for joint in on_way:
+    arm_joints = list(model.supports[model.frames[model.getFrameId(tip)].parentJoint])[1:]
+    for joint in arm_joints:
         if model.joints[joint].nv != 1:
             raise DataError(
                 f"{table.label}: joint {model.names[joint]} before {tip} has "
@@ -223,13 +198,13 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
                 "joints are read.",
                 culprits=[model.names[joint]],
             )
-    if not on_way:
+    if not arm_joints:
         raise DataError(
             f"{table.label}: no joint lies between the URDF's root and {tip}.",
             culprits=[f"{table.label}: tip"],
             next_step="Name the frame of the reported poses as tip in [robot].",
         )
-    others = [joint for joint in range(1, model.njoints) if joint not in on_way]
+    others = [joint for joint in range(1, model.njoints) if joint not in arm_joints]
     arm = pin.buildReducedModel(model, others, pin.neutral(model))
     bodies = list(arm.inertias)[1:]
     kg = np.array([body.mass for body in bodies])
@@ -241,7 +216,7 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
 
 
 def _rates_of_model(model: "pin.Model") -> Rates:
-    """The limits of the joints' drives; a URDF that does not know one writes zero."""
+    """Limits of the joints' drives; zero in a URDF means unknown."""
     known = [
         np.where(value > 0.0, value, np.inf) for value in (model.velocityLimit, model.effortLimit)
     ]
@@ -250,7 +225,7 @@ def _rates_of_model(model: "pin.Model") -> Rates:
 
 
 def _chain_of_model(model: "pin.Model", tip: str) -> Chain:
-    """Takes the chain out of a model that holds no joint besides."""
+    """Extracts the chain from a model that has no other joints."""
     import pinocchio as pin
 
     neutral, axes, prismatic = pin.neutral(model), [], []
@@ -262,21 +237,21 @@ def _chain_of_model(model: "pin.Model", tip: str) -> Chain:
         axes.append(moving if prismatic[-1] else turning)
     joints = list(model.joints)[1:]
     unbounded = np.array([joint.nq == 2 for joint in joints])
-    places = [joint.idx_q for joint in joints]
+    indices = [joint.idx_q for joint in joints]
     placements = [*list(model.jointPlacements)[1:], model.frames[model.getFrameId(tip)].placement]
     return Chain(
         tuple(model.names)[1:],
         np.array(prismatic),
         np.array(axes),
         np.array([placement.homogeneous for placement in placements]),
-        np.where(unbounded, -np.inf, model.lowerPositionLimit[places]),
-        np.where(unbounded, np.inf, model.upperPositionLimit[places]),
+        np.where(unbounded, -np.inf, model.lowerPositionLimit[indices]),
+        np.where(unbounded, np.inf, model.upperPositionLimit[indices]),
         np.tile(IDENTITY_FUNCTION, (len(joints), 1)),
     )
 
 
 def _find_tip(table: DocumentTable, frames: list[str]) -> str:
-    """Finds the tip among a URDF's frames; one that is not named is the usual one."""
+    """Finds the tip among a URDF's frames; by default a usual name."""
     tip = table.text("tip", "")
     usual = [name for name in _USUAL_TIPS if name in frames]
     if not tip and usual:

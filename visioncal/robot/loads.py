@@ -1,7 +1,7 @@
-"""What pulls at an arm: the weight of its links, its payload and an external force.
+"""Loads on an arm, and the deflection of its joints: links' weight, payload, external force.
 
-A torque is what a load does to a joint, positive in the joint's sense: the motor holds against it,
-and a gear yields to it.
+A load's torque on a joint is positive in the joint's sense: the motor holds against it, and the
+gear yields to it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,20 +19,20 @@ from visioncal.robot.chain import number_list
 if TYPE_CHECKING:
     from visioncal.robot.model import Robot
 
-# What a joint's table says of its link's weight.
+# Keys of a link's mass in a joint's table.
 MASS_KEYS = ("mass_kg", "com_m")
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
-# An arm that yields by an angle changes its torques by about as large a share: two more looks at
-# the bent arm leave less than the cube of it.
-_LOOKS = 3
+# Fixed-point iterations of the deflection: a deflection changes torques by about as large a share,
+# so that the remaining error is below its cube.
+_ITERATIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Masses:
-    """What the links of an arm weigh.
+    """Masses of an arm's links.
 
     Attributes:
-        kg: (n,) mass of what moves with each joint [kg].
+        kg: (n,) mass that moves with each joint [kg].
         centres_m: (n, 3) its centre, in the joint's frame after its motion [m].
     """
 
@@ -40,21 +40,21 @@ class Masses:
     centres_m: FloatArray
 
     def rows(self) -> list[dict[str, Any]]:
-        """The joints' entries in a description whose rows are the joints' frames."""
+        """Entries of the joints' tables, for a description whose rows end in the joints' frames."""
         columns = zip(self.kg.tolist(), self.centres_m.tolist(), strict=True)
         return [dict(zip(MASS_KEYS, column, strict=True)) for column in columns]
 
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """What an arm carries and is pushed by at m stops, and from where it came there.
+    """Payload, external force and direction of approach of an arm at m stops.
 
     Attributes:
-        payload_kg: (m,) mass that the flange carries [kg].
+        payload_kg: (m,) mass of the payload [kg].
         payload_m: (m, 3) its centre, in the flange's frame [m].
         force_n: (m, 3) external force on the flange's origin, in the base's frame [N].
-        side: (m,) the side from which the joints came to the stop, +1 from above, -1 from below;
-            0 where that is not known, in the middle of their play.
+        side: (m,) the side from which the joints approached the stop, +1 from above, -1 from below;
+            0 where unknown: the middle of their backlash.
     """
 
     payload_kg: FloatArray
@@ -64,7 +64,7 @@ class Loads:
 
     @classmethod
     def none(cls, count: int) -> Self:
-        """No load but the arm's own weight."""
+        """No loads but the arm's own weight."""
         return cls.alike(count, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     @classmethod
@@ -76,7 +76,7 @@ class Loads:
         payload_m: FloatArray | Sequence[float],
         force_n: FloatArray | Sequence[float],
     ) -> Self:
-        """The same loads at so many stops, or one each.
+        """Loads of `count` stops, each value for all or one per stop.
 
         Raises:
             DataError: A mass is negative, a number is not finite, or a shape does not fit.
@@ -104,39 +104,36 @@ class Loads:
 
     @property
     def any(self) -> bool:
-        """Whether a stop has a load beside the arm's own weight."""
+        """Whether any stop has a payload or force."""
         return bool(self.payload_kg.any() or self.force_n.any())
 
     def chosen(self, rows: IntArray | Mask) -> "Loads":
-        """The loads of some of the stops, by their places or a mask."""
+        """The loads of given stops."""
         parts = (self.payload_kg, self.payload_m, self.force_n, self.side)
         return Loads(*(part[rows] for part in parts))
 
     @property
     def rows(self) -> FloatArray:
-        """(m, 8) all that is said of each stop, for comparison."""
+        """(m, 8) all values of each stop, for comparison."""
         parts = [self.payload_kg[:, None], self.payload_m, self.force_n, self.side[:, None]]
         return np.concatenate(parts, axis=1)
 
     @property
     def from_both_sides(self) -> bool:
-        """Whether stops were approached from either side: only that separates play from offset."""
+        """Whether stops were approached from both sides, which separates backlash from offset."""
         return bool((self.side > 0.0).any() and (self.side < 0.0).any())
 
 
 def masses_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) -> Masses | None:
-    """Reads `mass_kg` and `com_m` of a table of joints.
+    """Reads `mass_kg` and `com_m` of a table of joints; None where no joint states one.
 
     Args:
         rows: The joints' tables.
         joint_from_row: (n, 4, 4) the frames in which the centres are stated, in the joints' frames
             after their motion.
 
-    Returns:
-        The masses; None where no joint states one.
-
     Raises:
-        DataError: Some joints state their mass and others do not, or one is not a mass.
+        DataError: Only some joints state their mass, or one is invalid.
     """
     stated = [row for row in rows if any(key in row.content for key in MASS_KEYS)]
     if not stated:
@@ -152,10 +149,10 @@ def masses_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) ->
 
 
 def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
-    """(3,) acceleration of gravity in the base's frame; along -z where nothing is said [m/s^2].
+    """(3,) gravitational acceleration in the base's frame; along -z by default [m/s^2].
 
     Raises:
-        DataError: It is no vector of three numbers, or is not that of the Earth.
+        DataError: It is no vector of three numbers, or not that of the Earth.
     """
     if "gravity_m_s2" not in document:
         return np.array(STANDARD_GRAVITY)
@@ -171,18 +168,11 @@ def gravity_of(document: Mapping[str, Any], label: str) -> FloatArray:
 
 
 def load_torques(robot: "Robot", q: FloatArray, loads: Loads | None = None) -> FloatArray:
-    """Torques by which weight, payload and force turn the joints.
+    """Torques (m, n) of weight, payload and force on the joints [N m, or N for a prismatic joint].
 
     That of the links' weight is the negative of Pinocchio's generalised gravity (Featherstone 2008,
-    section 5.3); those at the flange follow by the transpose of the geometric Jacobian.
-
-    Args:
-        robot: The arm; one whose masses are unknown is taken for weightless.
-        q: (m, n) joint angles [rad].
-        loads: What it carries; nothing where None.
-
-    Returns:
-        (m, n) [N m, or N for a prismatic joint].
+    section 5.3), zero where masses are unknown; those at the flange follow by the transpose of the
+    geometric Jacobian.
     """
     torques = np.zeros((len(q), robot.joint_count))
     if robot.masses is not None:
@@ -204,36 +194,36 @@ def bent_joints(
     loads: Loads | None = None,
     moments: FloatArray | None = None,
 ) -> FloatArray:
-    """Where the joints stand under their loads.
+    """Joint angles under load: iterates `bends` to its fixed point.
 
     Args:
-        robot: The arm as it is without a load.
-        q: (m, n) joint angles as the encoders have them [rad].
-        compliance: (n,) what each joint yields to a torque [rad/(N m)].
-        loads: What it carries; nothing where None.
-        moments: (n, 4 n) compliance times masses and first moments of links that weigh what is not
-            known, joint by joint; None where it is known, or they weigh nothing.
+        robot: The rigid arm.
+        q: (m, n) joint angles of the encoders [rad].
+        compliance: (n,) compliance of each joint [rad/(N m)].
+        loads: Payloads and forces; none where None.
+        moments: (n, 4 n) compliance times mass and first moments of links of unknown mass, joint by
+            joint; None where masses are known or neglected.
 
     Returns:
-        (m, n) joint angles of the rigid arm that stands likewise [rad].
+        (m, n) joint angles of the rigid arm in the same posture [rad].
     """
     bent = np.asarray(q, dtype=float)
     if not compliance.any() and moments is None:
         return bent
-    for _ in range(_LOOKS):
+    for _ in range(_ITERATIONS):
         bent = q + bends(robot, bent, compliance, loads, moments)
     return bent
 
 
 def bends(
     robot: "Robot",
-    stands: FloatArray,
+    q: FloatArray,
     compliance: FloatArray,
     loads: Loads | None = None,
     moments: FloatArray | None = None,
 ) -> FloatArray:
-    """How far the joints (m, n) yield where they stand at (m, n) [rad]; see `bent_joints`."""
-    yields = compliance * load_torques(robot, stands, loads)
+    """Deflections (m, n) of the joints at (m, n) angles under load [rad]; see `bent_joints`."""
+    deflections = compliance * load_torques(robot, q, loads)
     if moments is None:
-        return np.asarray(yields)
-    return np.asarray(yields + np.einsum("mjk,jk->mj", robot.weight_jacobian(stands), moments))
+        return np.asarray(deflections)
+    return np.asarray(deflections + np.einsum("mjk,jk->mj", robot.weight_jacobian(q), moments))

@@ -1,4 +1,4 @@
-"""Robot models: kinematics of a serial arm, and its derivatives by what a calibration changes.
+"""Robot models: kinematics of a serial arm, and Jacobians over its calibrated parameters.
 
 The base frame is that of the table's first row or the URDF's root link; for a UR's table it is the
 frame that the controller calls base.
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
 
-# What a joint's table may say of its link's body.
+# Optional keys of a link's collision body in a joint's table.
 BODY_KEYS = ("body_radius_m", "body_offset_m")
-# What a joint's table may say of its link and its drive: all that is no geometry.
+# Optional keys of link and drive in a joint's table: all that is not geometry.
 LINK_KEYS = (*BODY_KEYS, *MASS_KEYS, INERTIA_KEY, *RATE_KEYS)
 
-# Axes of a calibrated arm are parallel to this share.
+# Tolerance of parallel axes, for calibrated arms.
 _PARALLEL = 0.05
 
 
@@ -47,17 +47,18 @@ class Robot:
     """A serial arm with its nominal or corrected geometry.
 
     Joints are those between the base and the tip, in this order; others are held at their neutral
-    position. A prismatic joint's "angle" and limits are lengths [m].
+    position. A prismatic joint's "angle" and limits are lengths [m]. All methods of joint angles
+    `q`, (m, n) or (n,) [rad], raise DataError where their number differs from the robot's.
 
     Attributes:
         name: The robot's name.
         tip: The frame of its end, called flange here.
-        document: What recreates it: `Robot.from_document(document)`.
+        document: The description that recreates it by `Robot.from_document`.
         chain: Its geometry.
-        masses: What its links weigh; None where that is not known.
-        inertias: The inertial parameters of its links; None where they are not known.
-        rates: The limits of its drives.
-        gravity: (3,) in the base's frame [m/s^2].
+        masses: Masses of its links; None where unknown.
+        inertias: Inertial parameters of its links; None where unknown.
+        rates: Limits of its drives.
+        gravity: (3,) gravitational acceleration in the base's frame [m/s^2].
     """
 
     name: str
@@ -78,8 +79,8 @@ class Robot:
             document: A DH table (name, tip, convention, [[joint]], base, flange); or name, tip and
                 the URDF's text; or a chain as `corrected` writes it. A table's or a chain's joints
                 may state their links' `mass_kg` and its centre `com_m`, in the frame in which the
-                joint's row ends, their `inertia_kg_m2` about it, and how fast and strong their
-                drives are; any description the `gravity_m_s2` in its base.
+                joint's row ends, their `inertia_kg_m2` about it, and limits of their drives; any
+                description the `gravity_m_s2` in its base.
 
         Raises:
             DataError: A field is missing or out of range, the URDF cannot be parsed, or it lacks
@@ -109,12 +110,12 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The joints' names."""
+        """Names of the joints."""
         return self.chain.joint_names
 
     @property
     def joint_count(self) -> int:
-        """The number n of joints between base and tip."""
+        """The number n of joints."""
         return len(self.chain)
 
     @property
@@ -129,185 +130,116 @@ class Robot:
 
     @property
     def velocity_rad_s(self) -> FloatArray:
-        """(n,) greatest speeds [rad/s]; inf where nothing is said."""
+        """(n,) greatest speeds [rad/s]; inf where unknown."""
         return self.rates.velocity
 
     @property
     def acceleration_rad_s2(self) -> FloatArray:
-        """(n,) greatest accelerations [rad/s^2]; inf where nothing is said."""
+        """(n,) greatest accelerations [rad/s^2]; inf where unknown."""
         return self.rates.acceleration
 
     @property
     def torque_nm(self) -> FloatArray:
-        """(n,) greatest torques [N m]; inf where nothing is said."""
+        """(n,) greatest torques [N m]; inf where unknown."""
         return self.rates.torque
 
     @property
     def pinocchio_model(self) -> "pin.Model":
-        """Pinocchio's model, whose positions are the joints' effective ones; of this package."""
+        """Pinocchio's model, over effective joint positions; for use in this package only."""
         return self._model
 
     def base_from_flange(self, q: FloatArray) -> FloatArray:
-        """Computes the forward kinematics.
-
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, 4, 4) `base_from_flange` [m].
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Forward kinematics: (m, 4, 4) `base_from_flange` [m] at (m, n) joint angles [rad]."""
         return flange_poses(self._model, self.tip, self._effective(q))
 
     def link_frames(self, q: FloatArray) -> FloatArray:
-        """Computes where the joints and the flange are, for drawing.
-
-        Args:
-            q: (n,) joint angles [rad].
-
-        Returns:
-            (n + 1, 4, 4) the joints' frames, after their motion, and the flange in the base [m].
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Frames (n + 1, 4, 4) of the joints, after their motion, and of the flange [m]."""
         joints = joint_frames(self._model, self._effective(np.asarray(q)[None])[0])
         return np.array([*joints, joints[-1] @ self.chain.placements[-1]])
 
     def placement_jacobian(self, q: FloatArray) -> FloatArray:
-        """How the flange moves when links are placed otherwise.
+        """Jacobian of the flange over the placements of the links.
 
         Placements are those of `chain.placements`: six columns (rotation [rad], translation [m])
         for each joint's frame in the one before it, and six for the flange in the last. Both the
-        flange and the placements are perturbed on the right, so each column is an adjoint of the
-        flange seen from a joint (Pinocchio, computeFrameKinematicRegressor), and the last six are
+        flange and the placements are perturbed on the right, so each block is the adjoint of the
+        flange seen from a joint (Pinocchio, computeFrameKinematicRegressor), and the last one is
         the identity.
-
-        Args:
-            q: (m, n) joint angles [rad].
 
         Returns:
             (m, 6, 6 (n + 1)) derivatives of `log(base_from_flange^-1 base_from_flange(step))`.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
         """
         links = placement_derivatives(self._model, self.tip, self._effective(q))
         own = np.broadcast_to(np.eye(6), (len(links), 6, 6))
         return np.concatenate([links, own], axis=2)
 
     def joint_jacobian(self, q: FloatArray) -> FloatArray:
-        """How the flange moves with the joints.
+        """Jacobian (m, 6, n) of the flange over the joint angles, in the flange's frame.
 
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, 6, n) right perturbations (rotation, translation) of `base_from_flange` for each
-            joint, in the flange's frame [rad and m for 1 rad].
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
+        Right perturbations (rotation, translation) of `base_from_flange` [rad and m for 1 rad].
         """
         return self.axis_jacobian(q) * self.chain.jacobian(np.asarray(q, dtype=float))[:, None, :]
 
     @property
     def can_tilt(self) -> bool:
-        """Whether the flange turns about more than one direction: arms of four axes do not."""
+        """Whether the flange can rotate about more than one direction, unlike a four-axis arm's."""
         axes = self.joint_jacobian(np.zeros((1, self.joint_count)))[0, :3]
         sizes = np.linalg.svd(axes, compute_uv=False)
         return int(np.sum(sizes > _PARALLEL * sizes[0])) > 1
 
     def function_jacobian(self, q: FloatArray) -> FloatArray:
-        """How the flange moves when the joints' functions change.
-
-        Args:
-            q: (m, n) joint angles [rad].
+        """Jacobian of the flange over the joint function coefficients.
 
         Returns:
             (m, 6, 4 n) right perturbations of `base_from_flange` for each joint's offset [rad],
             ratio, sine and cosine [rad], as `chain.functions` has them.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
         """
-        moved = self.axis_jacobian(q)
+        axes = self.axis_jacobian(q)
         basis = self.chain.function_basis(np.asarray(q, dtype=float))
-        columns = moved[:, :, :, None] * basis[:, None]
-        return columns.reshape(*moved.shape[:2], 4 * self.joint_count)
+        columns = axes[:, :, :, None] * basis[:, None]
+        return columns.reshape(*axes.shape[:2], 4 * self.joint_count)
 
     def axis_jacobian(self, q: FloatArray) -> FloatArray:
-        """How the flange moves with the joints' effective positions.
+        """Jacobian (m, 6, n) of the flange over effective joint positions, as right perturbations.
 
-        A joint's motion commutes with a turn of its placement about the same axis.
-
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, 6, n) right perturbations (rotation, translation) of `base_from_flange`.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
+        A joint's motion commutes with a rotation of its placement about the same axis.
         """
         links = placement_derivatives(self._model, self.tip, self._effective(q))
         columns = links.reshape(-1, 6, self.joint_count, 6)
         return np.asarray(np.einsum("mijk,jk->mij", columns, self.chain.twists))
 
     def gravity_torques(self, q: FloatArray) -> FloatArray:
-        """What the joints have to hold against the weight of their links.
-
-        Args:
-            q: (m, n) joint angles [rad].
-
-        Returns:
-            (m, n) [N m]; zero where the masses are not known.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
-        """
+        """Joint torques (m, n) that hold the links' weight [N m]; zero where masses are unknown."""
         return gravity_torques(self._model, self._effective(q), self.gravity)
 
     def weight_jacobian(self, q: FloatArray) -> FloatArray:
-        """How the weight of what hangs on the joints turns them.
-
-        Args:
-            q: (m, n) joint angles [rad].
+        """Derivatives of the joint torques by weight over masses and first moments.
 
         Returns:
-            (m, n, 4 n) derivatives of the torques [N m] by mass [kg] and first moments [kg m] of
-            what moves with each joint.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
+            (m, n, 4 n) for mass [kg] and first moments [kg m] of all that moves with each joint.
         """
         return weight_jacobian(self._model, self._effective(q), self.gravity)
 
     def load_torques(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
-        """What weight, payload and force turn the joints by; see `loads.load_torques`."""
+        """Torques of weight, payload and force on the joints; see `loads.load_torques`."""
         return load_torques(self, q, loads)
 
     def harmonic_jacobian(self, q: FloatArray, orders: int) -> FloatArray:
-        """How the flange moves with harmonics of the joints' functions.
+        """Jacobian of the flange over the harmonics of the joint functions.
 
         Args:
             q: (m, n) joint angles [rad].
-            orders: How many orders k there are, from 2 on.
+            orders: The number k of orders, from 2 on.
 
         Returns:
             (m, 6, 2 n k) right perturbations of `base_from_flange` for each joint's sine and cosine
             of each order [rad], as `chain.harmonics` has them; none for a prismatic joint.
-
-        Raises:
-            DataError: The number of joints differs from the robot's.
         """
-        moved = np.where(self.chain.prismatic, 0.0, self.axis_jacobian(q))
-        turned = np.arange(2, orders + 2) * np.asarray(q, dtype=float)[:, :, None]
-        waves = np.stack([np.sin(turned), np.cos(turned)], axis=-1)
-        columns = moved[:, :, :, None, None] * waves[:, None]
-        return np.asarray(columns.reshape(*moved.shape[:2], 2 * orders * self.joint_count))
+        axes = np.where(self.chain.prismatic, 0.0, self.axis_jacobian(q))
+        phases = np.arange(2, orders + 2) * np.asarray(q, dtype=float)[:, :, None]
+        waves = np.stack([np.sin(phases), np.cos(phases)], axis=-1)
+        columns = axes[:, :, :, None, None] * waves[:, None]
+        return np.asarray(columns.reshape(*axes.shape[:2], 2 * orders * self.joint_count))
 
     def corrected(
         self,
@@ -315,21 +247,21 @@ class Robot:
         functions: FloatArray | None = None,
         harmonics: FloatArray | None = None,
     ) -> "Robot":
-        """Builds the robot with another geometry.
+        """Builds the robot with a changed geometry.
 
         Args:
             placements: (n + 1, 6) twists (rotation [rad], translation [m]); each placement is
                 multiplied on the right by its exponential. None leaves them.
-            functions: (n, 4) what is added to each joint's offset [rad], ratio, sine and cosine
-                [rad]. None leaves them.
-            harmonics: (n, k, 2) what is added to each joint's sine and cosine [rad] of the orders
-                from 2 on. None leaves them.
+            functions: (n, 4) additions to each joint's offset [rad], ratio, sine and cosine [rad].
+                None leaves them.
+            harmonics: (n, k, 2) additions to each joint's sine and cosine [rad] of the orders from
+                2 on. None leaves them.
 
         Returns:
-            The robot, whose document stands alone and gives it back to the last bit.
+            The robot, with a self-contained document that recreates it exactly.
 
         Raises:
-            DataError: A shape is wrong, a ratio is not above zero, or a prismatic joint has
+            DataError: A shape is wrong, a ratio is not positive, or a prismatic joint has
                 eccentricity.
         """
         chain = self.chain
@@ -360,7 +292,7 @@ class Robot:
         return Robot.from_document(self.weighted(document))
 
     def weighted(self, document: Mapping[str, Any]) -> dict[str, Any]:
-        """Adds this arm's weight, drives and gravity to the description of its chain."""
+        """Adds this arm's masses, inertias, drive limits and gravity to a chain's description."""
         weighted = dict(document)
         bodies = self.masses if self.inertias is None else self.inertias
         nothing: list[dict[str, Any]] = [{} for _ in document["joint"]]
@@ -373,7 +305,7 @@ class Robot:
         return weighted
 
     def _effective(self, q: FloatArray) -> FloatArray:
-        """The effective positions (m, n) of (m, n) joint angles, whose shape is checked."""
+        """Effective positions (m, n) of (m, n) joint angles, after a check of the shape."""
         q = np.asarray(q, dtype=float)
         if q.ndim != 2 or q.shape[1] != self.joint_count:
             raise DataError(

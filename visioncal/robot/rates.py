@@ -1,4 +1,4 @@
-"""How fast and how strong the joints of an arm are."""
+"""Limits of an arm's drives."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,15 +9,13 @@ import numpy as np
 from visioncal.core.files import DocumentTable
 from visioncal.core.types import FloatArray
 
-# What a joint's table says of its drive.
+# Keys of the limits in a joint's table.
 RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")
 
 
 @dataclass(frozen=True, eq=False)
 class Rates:
-    """The limits of an arm's drives; inf where nothing is said.
-
-    Of a prismatic joint they are m/s, m/s^2 and N.
+    """Limits of an arm's drives; inf where unknown, in m/s, m/s^2 and N for prismatic joints.
 
     Attributes:
         velocity: (n,) greatest speeds [rad/s].
@@ -34,16 +32,16 @@ class Rates:
         """Reads the limits from a table of joints.
 
         Raises:
-            DataError: One is not above zero.
+            DataError: One is not positive.
         """
-        found = [
+        limits = [
             [row.number(key, positive=True) if key in row.content else np.inf for key in RATE_KEYS]
             for row in rows
         ]
-        return cls(*np.array(found).T)
+        return cls(*np.array(limits).T)
 
     def rows(self) -> list[dict[str, Any]]:
-        """The joints' entries in a description."""
+        """Entries of the joints' tables."""
         columns = np.stack([self.velocity, self.acceleration, self.torque], axis=1)
         return [
             {

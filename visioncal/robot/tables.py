@@ -1,4 +1,4 @@
-"""Tables of joints after Denavit and Hartenberg, and the documents that hold them."""
+"""Denavit-Hartenberg tables, and their documents."""
 
 import math
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ from visioncal.core.transforms import compose
 from visioncal.core.types import FloatArray, Mask
 from visioncal.robot.chain import Chain, joint_function, joint_tables, number_list, subtable
 
-# The offset is theta_offset_rad or d_m.
+# Keys of a joint function; the offset is in theta_offset_rad or d_m.
 _FUNCTION_KEYS = ("", "gear_ratio", "sine_rad", "cosine_rad")
 _POSE_KEYS = ("xyz_m", "rpy_rad")
-# No link is as long [m]; offsets along axes that are nearly parallel are any number.
+# Greatest length a of a link [m]; d of nearly parallel axes is not limited.
 _LONGEST_M = 20.0
 
 
@@ -28,31 +28,31 @@ class DHTable:
 
     All three are the same product
     `base X_0 Z_1(q_1) X_1 Z_2(q_2) ... Z_n(q_n) X_n flange` with
-    `Z_i = Rz(theta_i + q_i) Tz(d_i)` and `X_i = Tx(a_i) Rx(alpha_i) Ry(beta_i)`; they differ in
-    what stands in one row:
+    `Z_i = Rz(theta_i + q_i) Tz(d_i)` and `X_i = Tx(a_i) Rx(alpha_i) Ry(beta_i)`; they differ in the
+    factors of a row:
 
     - `standard` (Denavit and Hartenberg 1955): row i is Z_i X_i; X_0 belongs to the base.
     - `modified` (Craig 1986; Khalil and Kleinfinger 1986): row i is X_{i-1} Z_i; X_n belongs to
       the flange.
-    - `hayati` (Hayati and Mirmirani 1985): as standard, and where axes i and i + 1 are nearly
-      parallel, beta_i stands for d_i, which has no meaning there: the common normal of such axes
-      may lie anywhere, and the plane through the origin across axis i takes its place. A d_i of
-      exactly parallel axes is kept as it is.
+    - `hayati` (Hayati and Mirmirani 1985): as standard, but where axes i and i + 1 are nearly
+      parallel, beta_i replaces d_i: the position of their common normal is ill-defined, and the
+      plane through the origin normal to axis i is used instead. A d_i of exactly parallel axes is
+      kept.
 
     Attributes:
         name: The robot's name.
         tip: The frame at its end.
-        convention: How rows are formed.
+        convention: The convention of its rows.
         joint_names: The joints from the base to the tip.
         prismatic: (n,) whether q adds to d [m] instead of theta [rad].
-        theta_rad: (n,) turns about z.
-        d_m: (n,) ways along z.
-        a_m: (n + 1,) ways along x; the first is of X_0.
-        alpha_rad: (n + 1,) turns about x.
-        beta_rad: (n + 1,) turns about y; zero but for Hayati's parallel rows.
-        parallel: (n + 1,) which X_i lie between axes that count as parallel; only in `hayati`.
+        theta_rad: (n,) rotations about z.
+        d_m: (n,) translations along z.
+        a_m: (n + 1,) translations along x; the first is of X_0.
+        alpha_rad: (n + 1,) rotations about x.
+        beta_rad: (n + 1,) rotations about y; zero but for Hayati's parallel rows.
+        parallel: (n + 1,) mask of the X_i between nearly parallel axes; only in `hayati`.
         base: (4, 4) the constant before X_0 [m].
-        flange: (4, 4) the constant behind X_n [m].
+        flange: (4, 4) the constant after X_n [m].
         lower: (n,) lower limits of q [rad or m], -inf for none.
         upper: (n,) upper limits of q [rad or m], inf for none.
         functions: (n, 4) the joints' functions as in `Chain`, their offsets zero.
@@ -108,10 +108,10 @@ def about_x(a_m: FloatArray, alpha_rad: FloatArray, beta_rad: FloatArray) -> Flo
 
 
 def chain_of_table(table: DHTable) -> Chain:
-    """The geometry of a table, with all joints about z.
+    """Chain of a table, with all joints about z.
 
-    A joint's frame before its motion is where its row begins (standard, hayati), or where its row
-    ends but for q (modified); Rz and Tz commute, so both are the same arm.
+    A joint's frame before its motion is at the begin of its row (standard, hayati), or at its end
+    without q (modified); Rz and Tz commute, so both are the same arm.
     """
     along_z, along_x, count = table.along_z, table.along_x, len(table)
     last = along_x[-1] @ table.flange
@@ -132,9 +132,9 @@ def chain_of_table(table: DHTable) -> Chain:
 
 
 def row_frames(table: DHTable) -> FloatArray:
-    """(n, 4, 4) the frames in which a table's rows end, in the joints' frames after their motion.
+    """Frames (n, 4, 4) in which a table's rows end, in the joints' frames after their motion.
 
-    Makers state the centres of their links' masses in them.
+    Manufacturers state the centres of mass of links in these frames.
     """
     if table.convention == "modified":
         return np.broadcast_to(np.eye(4), (len(table), 4, 4))
@@ -189,7 +189,7 @@ def table_document(table: DHTable, source: str = "") -> dict[str, Any]:
     """Writes a table as a description that `table_from_document` reads.
 
     Returns:
-        The description. What a convention has no row for goes into `[base]` and `[flange]`.
+        The description. Constants that have no row go into `[base]` and `[flange]`.
     """
     modified = table.convention == "modified"
     before = table.base if modified else table.base @ table.along_x[0]
@@ -236,7 +236,7 @@ def _is_prismatic(row: DocumentTable) -> bool:
 
 
 def _limits(row: DocumentTable) -> tuple[float, float]:
-    """The limits of q [rad or m]; an angle may be infinite, as TOML writes it."""
+    """Limits of q [rad or m]; angles may be infinite."""
     if _is_prismatic(row):
         keys = ("lower_m", "upper_m")
         lower, upper = (
@@ -278,7 +278,7 @@ def _across(row: DocumentTable, convention: Convention) -> tuple[float, float, f
 
 
 def _flange(row: DocumentTable, convention: Convention) -> tuple[FloatArray, FloatArray]:
-    """The constant behind X_n, and X_n as (1, 4) where the convention leaves it to the flange."""
+    """The constant after X_n, and X_n as (1, 4) where the convention has no row for it."""
     nothing = np.zeros((1, 4))
     if not row.content or any(key in row.content for key in _POSE_KEYS):
         return _pose(row), nothing
@@ -291,7 +291,7 @@ def _flange(row: DocumentTable, convention: Convention) -> tuple[FloatArray, Flo
 
 
 def _flange_row(table: DHTable) -> dict[str, Any]:
-    """`[flange]` of a modified table: a row where one is enough, else a pose."""
+    """`[flange]` of a modified table: a row where possible, else a pose."""
     flange = table.flange
     theta = math.atan2(flange[1, 0], flange[0, 0])
     if np.array_equal(flange, about_z(np.asarray(theta), flange[2, 3])):
@@ -312,6 +312,6 @@ def _pose(row: DocumentTable) -> FloatArray:
 
 
 def _pose_document(pose: FloatArray) -> dict[str, Any]:
-    # A negative zero would only raise questions.
+    # Adding 0.0 removes negative zeros.
     numbers = (write_pose(pose, POSE_FORMS["rpy"]) + 0.0).tolist()
     return {"xyz_m": numbers[:3], "rpy_rad": numbers[3:]}

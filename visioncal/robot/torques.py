@@ -1,7 +1,6 @@
-"""Torques of a moving arm, linear in its links' inertial parameters, and its momentum.
+"""Inverse dynamics of an arm with rigid links, linear in inertial parameters, and its momentum.
 
-Joint angles are those of the encoders; torques are about the joints' axes. Rigid bodies, no
-friction, and gravity as the robot's description has it.
+Joint angles are those of the encoders, torques are about the joints' axes, without friction.
 """
 
 from typing import TYPE_CHECKING
@@ -26,15 +25,15 @@ def torque_regressor(
     columns: IntArray | None = None,
     out: FloatArray | None = None,
 ) -> FloatArray:
-    """Derivatives of the joints' torques by the links' inertial parameters.
+    """Regressor of the joint torques over the links' inertial parameters.
 
     Args:
         robot: The arm.
         q: (m, n) joint angles [rad].
         dq: (m, n) their speeds [rad/s].
         ddq: (m, n) their accelerations [rad/s^2].
-        columns: (c,) which parameters are wanted; all where None.
-        out: (m, c or more, n) where to write them, parameters before joints; new where None.
+        columns: (c,) indices of the parameters; all where None.
+        out: (m, c or more, n) array to be filled, parameters before joints; new where None.
 
     Returns:
         (m, n, c) in the order of `Inertias.values` [N m for a unit of each].
@@ -47,9 +46,9 @@ def torque_regressor(
     wanted = np.arange(count) if columns is None else columns
     rows = np.empty((len(q), len(wanted), robot.joint_count)) if out is None else out
     rows = rows[:, : len(wanted)]
-    found = regressors(robot.pinocchio_model, robot.gravity, states)
-    for row, values in zip(rows, found, strict=True):
-        # This loop runs for every sample: a checked copy would take as long as the dynamics.
+    matrices = regressors(robot.pinocchio_model, robot.gravity, states)
+    for row, values in zip(rows, matrices, strict=True):
+        # For every sample: a copy with bounds checking would take as long as the dynamics.
         values.take(wanted, 0, row, "clip")
     return np.swapaxes(rows, 1, 2)
 
@@ -57,35 +56,23 @@ def torque_regressor(
 def joint_torques(
     robot: Robot, inertias: Inertias, q: FloatArray, dq: FloatArray, ddq: FloatArray
 ) -> FloatArray:
-    """Computes the torques that move an arm.
+    """Inverse dynamics: joint torques (m, n) [N m] of a motion as in `torque_regressor`.
 
-    Args:
-        robot: The arm.
-        inertias: Of its links; any numbers, not only those of bodies.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-        ddq: (m, n) their accelerations [rad/s^2].
-
-    Returns:
-        (m, n) [N m].
+    The inertias need not be physically consistent.
 
     Raises:
         DataError: A shape is wrong.
     """
     states = effective_states(robot, q, dq, ddq)
     parameters = inertias.values.ravel()
-    found = regressors(robot.pinocchio_model, robot.gravity, states)
-    return np.array([parameters @ array for array in found]).reshape(np.shape(q))
+    matrices = regressors(robot.pinocchio_model, robot.gravity, states)
+    return np.array([parameters @ array for array in matrices]).reshape(np.shape(q))
 
 
 def body_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:
-    """Derivatives of the joints' torques by the inertial parameters of a body on the flange.
+    """Regressor of the joint torques over the inertial parameters of a body on the flange.
 
-    Args:
-        robot: The arm.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-        ddq: (m, n) their accelerations [rad/s^2].
+    The motion is as in `torque_regressor`.
 
     Returns:
         (m, n, 10) for mass [kg], first moments [kg m] and inertia xx, xy, yy, xz, yz, zz
@@ -101,7 +88,7 @@ def body_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray)
 def effective_states(
     robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Positions, speeds and accelerations (m, n) of the joints' axes, where encoders report (m, n).
+    """Effective positions, speeds and accelerations (m, n) at encoder values (m, n).
 
     Raises:
         DataError: A shape is wrong.
@@ -124,22 +111,14 @@ def effective_states(
 def momenta(
     robot: Robot, inertias: Inertias, q: FloatArray, dq: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Computes the generalised momentum of an arm, and how it changes where nothing drives it.
+    """Generalised momentum (m, n) [N m s] of an arm, and its rate without joint torques [N m].
 
-    `p = M dq` and `C^T dq - g`: the derivative of p is the latter plus all torques (De Luca and
-    Mattone 2003, Actuator failure detection and isolation using generalized momenta).
-
-    Args:
-        robot: The arm.
-        inertias: Of its links; each has a mass above zero, or neither mass nor first moments.
-        q: (m, n) joint angles [rad].
-        dq: (m, n) their speeds [rad/s].
-
-    Returns:
-        (m, n) momenta [N m s] and (m, n) rates [N m].
+    `p = M dq` and `C^T dq - g`, at (m, n) joint angles [rad] and speeds [rad/s]: the derivative of
+    p is the latter plus all torques (De Luca and Mattone 2003, Actuator failure detection and
+    isolation using generalized momenta).
 
     Raises:
-        DataError: The number of joints differs from the robot's, or an inertia is of no mass.
+        DataError: The number of joints differs from the robot's, or first moments have no mass.
     """
     import pinocchio as pin
 
@@ -150,13 +129,13 @@ def momenta(
     for row, (position, speed) in enumerate(zip(positions, speeds, strict=True)):
         upper = np.triu(pin.crba(model, data, position))
         momentum[row] = upper @ speed + np.triu(upper, 1).T @ speed
-        held = pin.computeGeneralizedGravity(model, data, position)
-        rate[row] = pin.computeCoriolisMatrix(model, data, position, speed).T @ speed - held
+        gravity = pin.computeGeneralizedGravity(model, data, position)
+        rate[row] = pin.computeCoriolisMatrix(model, data, position, speed).T @ speed - gravity
     return momentum, rate
 
 
 def weighed_model(robot: Robot, inertias: Inertias) -> "pin.Model":
-    """Pinocchio's model of an arm with these bodies; of this package.
+    """Pinocchio's model of an arm with given inertias.
 
     Raises:
         DataError: First moments have no mass.
@@ -164,9 +143,9 @@ def weighed_model(robot: Robot, inertias: Inertias) -> "pin.Model":
     import pinocchio as pin
 
     masses = inertias.masses
-    lost = (masses.kg == 0.0) & inertias.values[:, 1:4].any(axis=1)
-    if lost.any():
-        names = [name for name, value in zip(robot.joint_names, lost, strict=True) if value]
+    inconsistent = (masses.kg == 0.0) & inertias.values[:, 1:4].any(axis=1)
+    if inconsistent.any():
+        names = [name for name, value in zip(robot.joint_names, inconsistent, strict=True) if value]
         raise DataError(
             f"robot {robot.name}: {', '.join(names)} have first moments and no mass.",
             culprits=names,

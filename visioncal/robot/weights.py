@@ -1,7 +1,7 @@
-"""How the weight of links of unknown masses may turn the joints.
+"""Basis functions of the gravity torques of links with unknown masses.
 
-Its torque on a joint is linear in mass and first moments of what hangs on the joint (Khalil and
-Dombre 2002, chapter 9): so many functions of the posture as these have independent effects.
+The torque on a joint is linear in mass and first moments of all that moves with it (Khalil and
+Dombre 2002, chapter 9); the independent combinations of these are functions of the posture.
 """
 
 from collections.abc import Sequence
@@ -12,16 +12,16 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.robot.model import Robot
 
-# Postures that stand for all, and from where on a function is another's multiple.
+# Number of random postures, and relative singular value below which functions are dependent.
 _POSTURES, _RANK = 200, 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class WeightFunctions:
-    """The functions of the posture that the weight of links can be, joint by joint.
+    """Independent gravity torque functions of each joint.
 
     Attributes:
-        parts: One (4 n, r) matrix a joint: which masses and first moments make up each of its r
+        parts: For each joint (4 n, r), the combinations of masses and first moments of its r
             functions, whose root mean square over postures is 1.
     """
 
@@ -29,18 +29,18 @@ class WeightFunctions:
 
     @classmethod
     def of(cls, robot: Robot) -> "WeightFunctions":
-        """Finds the functions of an arm, by postures all around."""
+        """Finds the functions of an arm, over random postures."""
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, robot.joint_count))
         jacobian = np.moveaxis(robot.weight_jacobian(q), 1, 0)
         return cls(tuple(_independent(value) for value in jacobian))
 
     @property
     def size(self) -> int:
-        """How many functions there are in all."""
+        """Total number of functions."""
         return sum(part.shape[1] for part in self.parts)
 
     def bends(self, robot: Robot, q: FloatArray) -> FloatArray:
-        """The functions' values at (m, n) joint angles: (m, n, size), each for its joint alone."""
+        """Values (m, n, size) of the functions at (m, n) joint angles, zero for other joints."""
         jacobian = robot.weight_jacobian(q)
         values, at = np.zeros((*q.shape, self.size)), 0
         for joint, part in enumerate(self.parts):
@@ -49,7 +49,7 @@ class WeightFunctions:
         return values
 
     def moments(self, values: Sequence[float] | FloatArray) -> FloatArray:
-        """The (n, 4 n) masses and moments times compliances that (size,) shares stand for."""
+        """Compliances times masses and moments, (n, 4 n), of (size,) coefficients."""
         rows, at = [], 0
         for part in self.parts:
             rows.append(part @ np.asarray(values)[at : at + part.shape[1]])
@@ -58,7 +58,7 @@ class WeightFunctions:
 
 
 def _independent(jacobian: FloatArray) -> FloatArray:
-    """Combinations (4 n, r) of columns of (m, 4 n) slopes that are independent, of unit size."""
-    _, sizes, across = np.linalg.svd(jacobian, full_matrices=False)
+    """Independent combinations (4 n, r) of the columns of (m, 4 n) derivatives, of unit rms."""
+    _, sizes, vectors = np.linalg.svd(jacobian, full_matrices=False)
     kept = sizes > _RANK * max(float(sizes.max(initial=0.0)), 1.0)
-    return np.asarray(np.sqrt(len(jacobian)) * across[kept].T / sizes[kept])
+    return np.asarray(np.sqrt(len(jacobian)) * vectors[kept].T / sizes[kept])

@@ -1,4 +1,4 @@
-"""A robot's geometry as files: joint tables, URDFs small or given, UR's kinematics."""
+"""Writing of robots as files: joint tables, URDFs, ur_description's kinematics."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,49 +16,41 @@ from visioncal.core.files import one_line
 from visioncal.core.transforms import compose, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import FUNCTION_NAMES, IDENTITY_FUNCTION, chain_document
-from visioncal.robot.conversion import parallel_axes, table_of
+from visioncal.robot.conversion import has_ur_axes, table_of
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.model import Robot
 from visioncal.robot.tables import DHTable, row_frames, table_document, table_from_document
 
-# The links of ur_description in its file of kinematics, in order.
+# Links and their fields in ur_description's kinematics file, in order.
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 _UR_FIELDS = ("x", "y", "z", "roll", "pitch", "yaw")
-# Which consecutive axes of a UR are parallel: those of shoulder, elbow and first wrist.
-_UR_PARALLEL = (False, True, True, False, False)
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
-# A radian counts as what carries its tip so far away [m].
+# Lever by which rotations are weighted against positions [m].
 _LEVER_M = 0.3
-# Links move with the square of a thousandth; the second step is off by less than a micrometre.
+# Gauss-Newton steps; corrections are some thousandths, so that two suffice for a micrometre.
 _STEPS = 4
-# Twists of links that no joint tells from offsets, or hardly moves the tip by, stay.
+# Relative singular value below which twists of links are undetermined, and stay.
 _DETERMINED = 1e-6
 
 
 def table_toml(table: DHTable, source: str, notes: Sequence[str] = ()) -> str:
-    """Writes a joint table as a `.toml` that `load_robot` reads.
-
-    Args:
-        table: The table.
-        source: Where its values come from.
-        notes: Lines for a comment at its head.
-    """
+    """Writes a joint table, with origin and notes, as a `.toml` that `load_robot` reads."""
     head = "".join(f"# {one_line(note)}\n" for note in notes)
     return head + tomli_w.dumps(table_document(table, source))
 
 
 def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:
-    """Writes a (4, 4) pose [m] as xyz and rpy, each number so that it reads back the same."""
-    # A negative zero would only raise questions.
+    """Writes a (4, 4) pose [m] as xyz and rpy, with numbers that read back exactly."""
+    # Adding 0.0 removes negative zeros.
     numbers = [repr(value) for value in (write_pose(pose, POSE_FORMS["rpy"]) + 0.0).tolist()]
     return numbers[:3], numbers[3:]
 
 
 def unwritten(robot: Robot) -> tuple[str, ...]:
-    """What a corrected robot has that neither a URDF nor a table of others can hold, in words."""
-    said, harmonics = [], robot.chain.harmonics
-    for at, (joint, function) in enumerate(
+    """Texts on joint functions of a corrected robot that other formats cannot hold."""
+    texts, harmonics = [], robot.chain.harmonics
+    for index, (joint, function) in enumerate(
         zip(robot.joint_names, robot.chain.functions, strict=True)
     ):
         parts = [
@@ -66,21 +58,21 @@ def unwritten(robot: Robot) -> tuple[str, ...]:
             for name, value, none in zip(FUNCTION_NAMES, function, IDENTITY_FUNCTION, strict=True)
             if name != "offset" and value != none
         ]
-        if harmonics is not None and harmonics[at].any():
-            rms_mrad = 1e3 * float(np.sqrt(np.sum(harmonics[at] ** 2) / 2))
+        if harmonics is not None and harmonics[index].any():
+            rms_mrad = 1e3 * float(np.sqrt(np.sum(harmonics[index] ** 2) / 2))
             parts.append(f"harmonics from order 2 on of {rms_mrad:.2g} mrad rms")
-        said += [f"{joint}: {', '.join(parts)}"] if parts else []
-    return tuple(said)
+        texts += [f"{joint}: {', '.join(parts)}"] if parts else []
+    return tuple(texts)
 
 
 def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
-    """Writes a URDF of bare links: the joints with their axes and limits, and the tip.
+    """Writes a URDF without shapes: joints with axes and limits, links with inertias, the tip.
 
-    Links have their inertias where the robot states them. Joint offsets go into the origins. A URDF
-    has no place for gear ratio, eccentricity and harmonics; a comment says which are missing.
+    Joint offsets go into the origins. A URDF cannot hold gear ratio, eccentricity and harmonics; a
+    comment lists those that are missing.
     """
     chain = robot.chain.with_offsets_placed()
-    links = ["base", *(f"link_{place}" for place in range(1, len(chain) + 1))]
+    links = ["base", *(f"link_{index}" for index in range(1, len(chain) + 1))]
     lines = [
         '<?xml version="1.0"?>',
         f"<robot name={quoteattr(robot.name)}>",
@@ -91,20 +83,20 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
         lines += [f"  <link name={quoteattr(link)}>", *inertial, "  </link>"]
     lines.append(f"  <link name={quoteattr(robot.tip)}/>")
     rates = np.column_stack([robot.torque_nm, robot.velocity_rad_s])
-    # A URDF needs both; zero stands for what is not known.
+    # A URDF needs both; zero means unknown.
     rates = np.where(np.isfinite(rates), rates, 0.0)
-    for place, joint in enumerate(chain.joint_names):
-        limits = (chain.lower[place], chain.upper[place])
+    for index, joint in enumerate(chain.joint_names):
+        limits = (chain.lower[index], chain.upper[index])
         bounded = bool(np.isfinite(limits).all())
-        turning = "revolute" if bounded else "continuous"
-        kind = "prismatic" if chain.prismatic[place] else turning
+        rotary = "revolute" if bounded else "continuous"
+        kind = "prismatic" if chain.prismatic[index] else rotary
         lines.append(f'  <joint name={quoteattr(joint)} type="{kind}">')
-        lines += _joint_lines(links[place], links[place + 1], chain.placements[place])
-        axis = " ".join(repr(axis) for axis in chain.axes[place].tolist())
+        lines += _joint_lines(links[index], links[index + 1], chain.placements[index])
+        axis = " ".join(repr(axis) for axis in chain.axes[index].tolist())
         lines.append(f'    <axis xyz="{axis}"/>')
         if bounded:
             lower, upper = map(float, limits)
-            effort, velocity = rates[place].tolist()
+            effort, velocity = rates[index].tolist()
             lines.append(
                 f'    <limit lower="{lower!r}" upper="{upper!r}" effort="{effort:g}" '
                 f'velocity="{velocity!r}"/>'
@@ -116,7 +108,7 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
 
 
 def inertial_lines(kg: float, centre_m: FloatArray, about: FloatArray) -> list[str]:
-    """Writes a body in its link's frame: mass, centre (3,), and inertia (3, 3) about the centre."""
+    """Writes an `<inertial>`: mass, centre (3,), and inertia (3, 3) about the centre."""
     xyz = " ".join(repr(value) for value in (centre_m + 0.0).tolist())
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     numbers = about[np.triu_indices(3)].tolist()
@@ -131,7 +123,7 @@ def inertial_lines(kg: float, centre_m: FloatArray, about: FloatArray) -> list[s
 
 
 def _inertials(robot: Robot) -> list[list[str]]:
-    """Each link's body as lines; none where the robot states no inertias."""
+    """Lines of each link's `<inertial>`; none where the robot states no inertias."""
     if robot.inertias is None:
         return [[] for _ in robot.joint_names]
     masses = robot.inertias.masses
@@ -140,7 +132,7 @@ def _inertials(robot: Robot) -> list[list[str]]:
 
 
 def comment_lines(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
-    """Lines of XML comments: the notes, and what is missing where something is."""
+    """Lines of XML comments: the notes, and joint functions that are missing."""
     missing = unwritten(robot)
     said = f"Not in this file, for URDF cannot say it: {'; '.join(missing)}"
     # XML ends a comment at two hyphens.
@@ -169,28 +161,30 @@ def ur_kinematics_yaml(
     """Writes the `kinematics` file that ur_description takes as `kinematics_params_file`.
 
     Each link's x, y, z [m] and roll, pitch, yaw [rad] place its joint in the link before it, the
-    shoulder in base_link_inertia, which is the controller's base; joints turn about z. wrist_3 is
+    shoulder in base_link_inertia, which is the controller's base; joints rotate about z. wrist_3 is
     the flange, tool0 (ur_description, urdf/ur_macro.xacro and config/ur*/default_kinematics.yaml).
-    What `ur_flange` gives has no field there: a comment says it.
+    The pose of `ur_flange` has no field there, and is written as a comment.
 
     Args:
-        robot: The robot. Where its base is ROS's base_link, a half turn before base_link_inertia,
+        robot: The robot. Where its base is ROS's base_link, half a turn from base_link_inertia,
             that turn is left out.
-        calibration_hash: The `hash` of the arm's own file, as ur_calibration extracts it; the
-            driver compares it with the arm it is connected to and complains of another. It must be
-            there: ur_description reads it (urdf/inc/ur_common.xacro).
-        like: The nominal table, so that the links lie as they do there.
+        calibration_hash: The `hash` of the arm's own file, as ur_calibration extracts it. It is
+            required by ur_description (urdf/inc/ur_common.xacro), and the driver warns if the
+            connected arm has another.
+        like: The nominal table, for the same choice of link frames.
         notes: Lines for a comment at its head.
 
     Raises:
-        DataError: The robot has not six revolute joints with a UR's parallel axes.
+        DataError: The robot does not have a UR's axes.
     """
     table = _ur_table(robot, like)
     placements = table.along_x[:-1] @ table.along_z
     placements[0] = table.base @ placements[0]
     missing = unwritten(robot)
-    said = [f"Not in this file, which has no field for it: {'; '.join(missing)}"] if missing else []
-    lines = [f"# {one_line(note)}" for note in (*notes, *said)]
+    unsaid = (
+        [f"Not in this file, which has no field for it: {'; '.join(missing)}"] if missing else []
+    )
+    lines = [f"# {one_line(note)}" for note in (*notes, *unsaid)]
     rest = table.along_x[-1] @ table.flange
     if np.abs(rest - np.eye(4)).max() > 0.0:
         xyz, rpy = numbers_text(rest)
@@ -204,19 +198,18 @@ def ur_kinematics_yaml(
 
 
 def ur_flange(robot: Robot, like: DHTable | None = None) -> FloatArray:
-    """(4, 4) the flange in the last link of `ur_kinematics_yaml`, which takes it for the flange.
+    """Flange pose (4, 4) in the last link of `ur_kinematics_yaml`, which ROS takes for the flange.
 
     Raises:
-        DataError: The robot is no UR.
+        DataError: The robot does not have a UR's axes.
     """
     table = _ur_table(robot, like)
     return np.asarray(table.along_x[-1] @ table.flange)
 
 
 def _ur_table(robot: Robot, like: DHTable | None) -> DHTable:
-    """The robot as Hayati's table in the controller's base."""
-    six = robot.joint_count == len(_UR_LINKS) and not robot.chain.prismatic.any()
-    if not six or tuple(parallel_axes(robot)) != _UR_PARALLEL:
+    """The robot's Hayati table in the controller's base."""
+    if not has_ur_axes(robot):
         raise DataError(
             f"robot {robot.name}: ur_description's kinematics are of six revolute joints, the "
             f"second, third and fourth axis parallel, and {', '.join(robot.joint_names)} are not.",
@@ -227,7 +220,7 @@ def _ur_table(robot: Robot, like: DHTable | None) -> DHTable:
 
 
 def _in_controllers_base(robot: Robot) -> Robot:
-    """A UR with the controller's base: at zero its arm points along -x there, along x in ROS's."""
+    """The UR in the controller's base, where it points along -x at zero; in ROS's along x."""
     chain = robot.chain
     if robot.base_from_flange(np.zeros((1, len(chain))))[0, 0, 3] <= 0.0:
         return robot
@@ -237,7 +230,7 @@ def _in_controllers_base(robot: Robot) -> Robot:
 
 
 def without_functions(robot: Robot) -> Robot:
-    """The arm without gear ratios, eccentricity and harmonics; the offsets stay."""
+    """The arm with offsets as its only joint functions."""
     functions = np.array(IDENTITY_FUNCTION) - robot.chain.functions
     functions[:, 0] = 0.0
     harmonics = robot.chain.harmonics
@@ -247,28 +240,20 @@ def without_functions(robot: Robot) -> Robot:
 def fit_links(
     robot: Robot, q: FloatArray, base_from_flange: FloatArray, weights: FloatArray
 ) -> Robot:
-    """Fits links and offsets of an arm to where a real one stands; its functions stay.
+    """Fits placements and joint offsets of an arm to (m, 4, 4) flange poses, weighted by (m,).
 
-    Links are moved behind their joints, so that the base stays; see `Robot.placement_jacobian`.
-
-    Args:
-        robot: The arm, with the functions that a reader is to know.
-        q: (m, n) postures [rad].
-        base_from_flange: (m, 4, 4) where the real one stands there.
-        weights: (m,) how much each counts.
-
-    Returns:
-        The arm that is off the least, in the mean of squares.
+    Least squares over (m, n) joint angles; the base and the other joint function coefficients stay.
+    See `Robot.placement_jacobian`.
     """
     count, units = robot.joint_count, np.repeat([1.0, _LEVER_M], 3)
     row_weights = np.sqrt(weights)[:, None] * np.repeat([_LEVER_M, 1.0], 3)
     for _ in range(_STEPS):
-        away = log(invert(robot.base_from_flange(q)) @ base_from_flange)
+        residual = log(invert(robot.base_from_flange(q)) @ base_from_flange)
         links = robot.placement_jacobian(q)[:, :, 6:] * np.tile(units, count)
         offsets = robot.function_jacobian(q).reshape(len(q), 6, count, -1)[..., 0]
         columns = row_weights[:, :, None] * np.concatenate([offsets, links], axis=2)
         step = np.linalg.lstsq(
-            columns.reshape(-1, 7 * count), (row_weights * away).ravel(), rcond=_DETERMINED
+            columns.reshape(-1, 7 * count), (row_weights * residual).ravel(), rcond=_DETERMINED
         )[0]
         functions, placements = np.zeros((count, 4)), np.zeros((count + 1, 6))
         functions[:, 0] = step[:count]
@@ -278,23 +263,20 @@ def fit_links(
 
 
 def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) -> str:
-    """Writes the URDF of a robot with the geometry that a calibration found.
+    """Writes the URDF of a robot with a calibrated geometry.
 
     Only the origins of the joints between base and tip change, and that of the fixed joint before
-    the tip; where there is none, a link NAME_corrected with a fixed joint is added for it. Joint
-    offsets go into the origins. Gear ratio and eccentricity have no place in a URDF; a comment
-    says which are missing.
+    the tip; where there is none, a link NAME_corrected with a fixed joint is added. Joint offsets
+    go into the origins. A URDF cannot hold gear ratio and eccentricity; a comment lists those that
+    are missing.
 
     Args:
         nominal: The robot as the URDF describes it.
         corrected: Its corrected model.
         notes: Lines for comments at the head of the robot.
 
-    Returns:
-        The text.
-
     Raises:
-        DataError: The nominal robot is not of a URDF, or the two have other joints.
+        DataError: The nominal robot is not of a URDF, or the joints differ.
     """
     text = nominal.document.get("urdf")
     if not isinstance(text, str) or nominal.joint_names != corrected.joint_names:
@@ -305,26 +287,26 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
         )
     data = text.encode("utf-8")
     root, joints = joints_of(data)
-    was, now = nominal.chain, corrected.chain.with_offsets_placed()
-    steps = invert(was.placements) @ now.placements
+    old, new = nominal.chain, corrected.chain.with_offsets_placed()
+    steps = invert(old.placements) @ new.placements
     edits, comments = [], comment_lines(corrected, notes)
     for name, before, after, step in zip(
-        (*was.joint_names, None), was.placements, now.placements, steps, strict=True
+        (*old.joint_names, None), old.placements, new.placements, steps, strict=True
     ):
         if np.array_equal(before, after):
             continue
         joint = _of_tip(joints, nominal) if name is None else joints[name]
         if joint is None:
-            edits.append((root.close, root.close, _more(nominal.tip, joints, step)))
+            edits.append((root.close, root.close, _corrected_tip_link(nominal.tip, joints, step)))
         else:
-            edits.append(_edit(joint, _placement(joint) @ step))
+            edits.append(_origin_edit(joint, _placement(joint) @ step))
     if comments:
         edits.append((root.inside, root.inside, ("\n" + "\n".join(comments)).encode("utf-8")))
     return edited(data, edits)
 
 
 def corrected_tip(nominal: Robot, corrected: Robot) -> str:
-    """Names the frame in `corrected_urdf` whose pose `corrected.base_from_flange` gives."""
+    """Name of the frame in `corrected_urdf` that corresponds to the corrected flange."""
     if np.array_equal(nominal.chain.placements[-1], corrected.chain.placements[-1]):
         return nominal.tip
     _, joints = joints_of(str(nominal.document["urdf"]).encode("utf-8"))
@@ -332,7 +314,7 @@ def corrected_tip(nominal: Robot, corrected: Robot) -> str:
 
 
 def joints_of(data: bytes) -> tuple[Element, dict[str, Element]]:
-    """The root of a URDF, and its joints by name; those of transmissions are deeper down."""
+    """The root of a URDF, and its joints by name, without those nested in transmissions."""
     root = parse_xml(data, "the URDF")
     return root, {
         child.attributes["name"]: child for child in root.children if child.tag == "joint"
@@ -340,23 +322,25 @@ def joints_of(data: bytes) -> tuple[Element, dict[str, Element]]:
 
 
 def end_of(joint: Element, end: str) -> str:
-    """The link at the `parent` or the `child` end of a joint; empty where it is not said."""
-    found = joint.child(end)
-    return "" if found is None else found.attributes.get("link", "")
+    """The `parent` or `child` link of a joint; empty where absent."""
+    link = joint.child(end)
+    return "" if link is None else link.attributes.get("link", "")
 
 
 def edited(data: bytes, edits: Iterable[tuple[int, int, bytes]]) -> str:
-    """A text with other pieces in it, each from where to where."""
+    """Text with pieces replaced: (begin, end, new piece), in bytes."""
     for begin, end, piece in sorted(edits, reverse=True):
         data = data[:begin] + piece + data[end:]
     return data.decode("utf-8")
 
 
 def _placement(joint: Element) -> FloatArray:
-    """(4, 4) a joint's origin [m]."""
+    """A joint's origin (4, 4) [m]."""
     origin = joint.child("origin")
-    said = {} if origin is None else origin.attributes
-    xyz, rpy = (np.array(said.get(key, "0 0 0").split(), dtype=float) for key in ("xyz", "rpy"))
+    attributes = {} if origin is None else origin.attributes
+    xyz, rpy = (
+        np.array(attributes.get(key, "0 0 0").split(), dtype=float) for key in ("xyz", "rpy")
+    )
     return compose(ROTATION_FORMS["euler-xyz-rad"].read(rpy[None])[0], xyz)
 
 
@@ -369,8 +353,8 @@ def _of_tip(joints: Mapping[str, Element], robot: Robot) -> Element | None:
     return next(named, None)
 
 
-def _edit(joint: Element, placement: FloatArray) -> tuple[int, int, bytes]:
-    """From where to where to put what, to give a joint another origin."""
+def _origin_edit(joint: Element, placement: FloatArray) -> tuple[int, int, bytes]:
+    """The edit that gives a joint another origin."""
     xyz, rpy = numbers_text(placement)
     text = f'<origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"'.encode()
     origin = joint.child("origin")
@@ -379,8 +363,8 @@ def _edit(joint: Element, placement: FloatArray) -> tuple[int, int, bytes]:
     return origin.begin, origin.inside, text + (b"/>" if origin.is_empty else b">")
 
 
-def _more(tip: str, joints: Mapping[str, Element], step: FloatArray) -> bytes:
-    """A link for the corrected tip behind a tip that no fixed joint places."""
+def _corrected_tip_link(tip: str, joints: Mapping[str, Element], step: FloatArray) -> bytes:
+    """A link with a fixed joint for the corrected tip, where no fixed joint places the tip."""
     xyz, rpy = numbers_text(step)
     parent = end_of(joints[tip], "child") if tip in joints else tip
     link = quoteattr(f"{tip}_corrected")
@@ -395,14 +379,9 @@ def _more(tip: str, joints: Mapping[str, Element], step: FloatArray) -> bytes:
 
 
 def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
-    """Builds an arm whose links weigh otherwise.
+    """Builds an arm with other inertias of its links, in the joints' frames.
 
-    Args:
-        robot: The arm. A table or a chain stays one; a URDF becomes a chain.
-        inertias: Of its links, in the joints' frames.
-
-    Returns:
-        The arm, whose document states the masses, their centres and the inertias.
+    A table or a chain stays one; a URDF becomes a chain.
     """
     if "convention" in robot.document:
         document = dict(robot.document)
@@ -410,34 +389,31 @@ def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
     else:
         document = robot.weighted(chain_document(robot.name, robot.tip, robot.chain))
         joint_from_row = np.broadcast_to(np.eye(4), (robot.joint_count, 4, 4))
-    rows = zip(document["joint"], _seen_from(inertias, joint_from_row).rows(), strict=True)
+    rows = zip(document["joint"], _in_row_frames(inertias, joint_from_row).rows(), strict=True)
     joints: list[dict[str, Any]] = [{**row, **own} for row, own in rows]
     return Robot.from_document(document | {"joint": joints})
 
 
-def _seen_from(inertias: Inertias, joint_from_row: FloatArray) -> Inertias:
-    """The inertias in other frames of the same links."""
+def _in_row_frames(inertias: Inertias, joint_from_row: FloatArray) -> Inertias:
+    """The inertias in the frames in which rows end."""
     row_from_joint = invert(joint_from_row)
-    rotation, place = row_from_joint[:, :3, :3], row_from_joint[:, :3, 3]
+    rotation, position = row_from_joint[:, :3, :3], row_from_joint[:, :3, 3]
     masses = inertias.masses
-    centres = (rotation @ masses.centres_m[:, :, None])[:, :, 0] + place
+    centres = (rotation @ masses.centres_m[:, :, None])[:, :, 0] + position
     about = rotation @ inertias.about_centres @ np.swapaxes(rotation, 1, 2)
     return Inertias.of_bodies(masses.kg, centres, about)
 
 
 def weighed_urdf(robot: Robot, inertias: Inertias, notes: Sequence[str] = ()) -> str:
-    """Writes the URDF of a robot with the inertias that were identified.
+    """Writes the URDF of a robot with identified inertias.
 
-    What moves with a joint of the arm is one body: the link behind the joint gets all of its
-    inertia, and other links that move with it none.
+    All that moves with a joint of the arm is one body: the link after the joint gets its inertia,
+    and other links that move with it none.
 
     Args:
-        robot: The robot as a URDF describes it.
-        inertias: Of what moves with its joints.
+        robot: The robot as the URDF describes it.
+        inertias: Of the bodies that move with its joints.
         notes: Lines for comments at the head of the robot.
-
-    Returns:
-        The text.
 
     Raises:
         DataError: The robot is not of a URDF.
@@ -467,22 +443,22 @@ def weighed_urdf(robot: Robot, inertias: Inertias, notes: Sequence[str] = ()) ->
 
 
 def _moving_with(link: str, joints: Mapping[str, Element], arm: Sequence[str]) -> list[str]:
-    """A link and all that hang on it without one of the arm's joints between."""
-    found = [link]
-    for name in found:
-        found += [
+    """A link and all links attached to it other than by the arm's joints."""
+    links = [link]
+    for name in links:
+        links += [
             end_of(element, "child")
             for joint, element in joints.items()
             if end_of(element, "parent") == name and joint not in arm
         ]
-    return found
+    return links
 
 
 def _inertial_edit(data: bytes, link: Element, inertial: str) -> tuple[int, int, bytes]:
-    """From where to where to put what, to give a link another inertia or none."""
-    before = link.child("inertial")
-    if before is not None:
-        return before.begin, before.end, inertial.strip().encode("utf-8")
+    """The edit that gives a link another inertia or none."""
+    old = link.child("inertial")
+    if old is not None:
+        return old.begin, old.end, inertial.strip().encode("utf-8")
     if not inertial:
         return link.inside, link.inside, b""
     if not link.is_empty:

@@ -1,7 +1,7 @@
-"""Files of others, read as data: no pickles, no constructors, no entities, and bounded sizes.
+"""Safe readers of foreign files: no pickles, constructors or entities, and bounded sizes.
 
-Every reader raises DataError that names the file, the line where there is one, what was seen and
-what is needed.
+Every reader raises DataErrors that name the file, the line if any, the value found and the value
+needed.
 """
 
 from visioncal.core.documents.arrays import read_npy, read_npz

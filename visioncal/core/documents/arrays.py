@@ -1,4 +1,4 @@
-"""NumPy's .npy and .npz: the header is checked before anything is allocated; no pickles."""
+"""NumPy's .npy and .npz, without pickles; headers are checked before memory is allocated."""
 
 import io
 import math
@@ -30,11 +30,7 @@ _HEADER = re.compile(
 
 
 def read_npy(path: Path) -> Array:
-    """Reads an array of numbers or text.
-
-    Raises:
-        DataError: It is missing, no .npy, holds Python objects, or is too large.
-    """
+    """Reads an array of numbers or text; DataError if missing, invalid or too large."""
     return _parse_npy(read_bytes(path), str(path))
 
 
@@ -70,13 +66,13 @@ def _unpacked(archive: zipfile.ZipFile, where: str) -> dict[str, bytes]:
         name = member.filename.removesuffix(".npy")
         if name in arrays:
             raise DataError(f"{where}: the array {name!r} is there twice.", culprits=[where])
-        # numpy.savez and savez_compressed write nothing else.
+        # As written by numpy.savez and savez_compressed.
         if member.compress_type not in _PACKINGS or member.flag_bits & _ENCRYPTED:
             raise DataError(
                 f"{where}: {name[:60]} is encrypted or packed in another way than numpy's.",
                 culprits=[where],
             )
-        # The stated size may lie; what is unpacked counts.
+        # The stated size may be wrong; the unpacked size counts.
         with archive.open(member) as file:
             arrays[name] = file.read(room + 1)
         room -= len(arrays[name])
@@ -109,7 +105,7 @@ def _parse_npy(data: bytes, where: str) -> Array:
     sizes = [part.strip() for part in header["shape"].split(",") if part.strip()]
     plain = len(sizes) <= _MOST_AXES and all(len(size) <= 12 and size.isdecimal() for size in sizes)
     shape = tuple(int(size) for size in sizes) if plain else ()
-    # An axis of none hides the others from the count of bytes.
+    # An axis of size 0 must not hide the others.
     if not plain or math.prod(max(index, 1) for index in shape) > MOST_BYTES:
         raise DataError(
             f"{where} has the shape ({header['shape'][:60]}); up to {_MOST_AXES} axes and "

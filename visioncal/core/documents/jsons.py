@@ -1,7 +1,4 @@
-"""JSON, with doubled keys, depth and size checked.
-
-Of what visioncal wrote, as it may come back from others, every error names its field.
-"""
+"""JSON with checks of repeated keys, depth and size, and with named fields for visioncal's own."""
 
 import json
 import re
@@ -21,25 +18,25 @@ from visioncal.core.documents.values import (
 from visioncal.core.errors import DataError
 from visioncal.core.files import decode_text
 
-# Longer whole numbers are measurements at best; Python's own reading of them takes quadratic time.
+# Longer integers are read as floats: Python parses them in quadratic time.
 _MAX_DIGITS = 18
-# What fields hold, by their names: quantities carry their unit.
+# Names of fields that hold numbers: quantities carry their unit.
 _UNITS = r"mm|m|deg|rad|mrad|px|s|c|nm|kg|a|n|k|m_s2|rad_s2|kg_m2|sigma"
 _NUMBERS = re.compile(
     rf".+_({_UNITS})|.+_per_.+|mm|deg|px|sigma|matrix|quaternion_xyzw|covariance|edge_covariance"
     "|view|corners|resolution|distortion|spectrum|inflation|likelihood_ratio|condition|unknowns"
     "|median|most|p95|value|nominal|change|misfit|correlation|placement|o[1-5]|bow_[xy]+|aspect|shear"
 )
-# Tables whose fields users name.
+# Tables with keys chosen by users.
 _NAMED = ("frames", "robots", "tree")
-# Files of other kinds, and how much of one is shown.
+# Suffixes of files of other kinds, and number of characters of them in a message.
 _OTHER_KINDS, _SHOWN = (".csv", ".toml", ".txt", ".png", ".urdf", ".xml", ".html", ".rrd"), 40
-# Squares and products of larger numbers leave what floats hold.
+# Squares and products of larger numbers may overflow.
 _LARGEST = 1e60
 
 
 def read_json(path: Path) -> object:
-    """Reads a JSON file; NaN and Infinity, which Python writes, become such numbers.
+    """Reads a JSON file; NaN and Infinity, as Python writes them, are accepted.
 
     Raises:
         DataError: It is missing, no JSON, holds a key twice, or is too large or too deep.
@@ -48,12 +45,8 @@ def read_json(path: Path) -> object:
 
 
 def parse_json(text: str, where: str) -> object:
-    """Parses JSON; `where` names its origin in errors.
-
-    Raises:
-        DataError: As `read_json`.
-    """
-    # Every value but the last of its list is followed by a comma, every list begins with a bracket.
+    """Parses JSON as `read_json` does; `where` names its origin in errors."""
+    # An upper bound of the number of values: every value follows a comma or a bracket.
     if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
         raise too_many(where)
     try:
@@ -84,14 +77,14 @@ def _unique(pairs: Sequence[tuple[str, Any]], where: str) -> dict[str, Any]:
 
 
 class StoredTable(dict[str, Any]):
-    """A table of a document that names itself where a field is missing."""
+    """A table of a document whose missing fields raise errors with their paths."""
 
     def __init__(self, content: dict[str, Any], path: str) -> None:
         super().__init__(content)
         self.path = path
 
     def __missing__(self, key: str) -> object:
-        """Refuses the document, in which a field is missing."""
+        """Raises the error for a missing field."""
         raise DataError(f"{self.path}{key} is missing.", culprits=[f"{self.path}{key}"])
 
 
@@ -99,11 +92,11 @@ def parse_stored(text: bytes | str, label: str) -> StoredTable:
     """Parses a document that visioncal wrote.
 
     Returns:
-        Its content; a field that is asked for and missing raises DataError.
+        Its content, which raises DataError on access to a missing field.
 
     Raises:
-        DataError: It is no JSON, no table, too large or too deep, or a field whose name says what
-            it holds, as `rms_mm` does, holds something else; the message has its path.
+        DataError: It is no JSON, no table, too large or too deep, or a field does not hold the
+            number that its name, such as `rms_mm`, announces; the message has its path.
     """
     text = decode_text(text, label) if isinstance(text, bytes) else text
     begins = text.lstrip()[:_SHOWN].partition("\n")[0]
@@ -115,10 +108,10 @@ def parse_stored(text: bytes | str, label: str) -> StoredTable:
             next_step="Name its file, as calibration.json, or its folder. This one is of another "
             "kind; nothing need be changed in it.",
         )
-    found = _checked(parse_json(text, label), f"{label}: ", "")
-    if not isinstance(found, StoredTable):
-        raise DataError(f"{label} is {shown(found)}; a table is needed.", culprits=[label])
-    return found
+    table = _checked(parse_json(text, label), f"{label}: ", "")
+    if not isinstance(table, StoredTable):
+        raise DataError(f"{label} is {shown(table)}; a table is needed.", culprits=[label])
+    return table
 
 
 def _checked(value: Any, path: str, key: str) -> Any:  # noqa: ANN401 - what JSON may hold
@@ -129,19 +122,19 @@ def _checked(value: Any, path: str, key: str) -> Any:  # noqa: ANN401 - what JSO
     if isinstance(value, dict):
         return StoredTable(
             {
-                name: _checked(number, f"{path}{name}.", "" if key in _NAMED else name)
-                for name, number in value.items()
+                name: _checked(item, f"{path}{name}.", "" if key in _NAMED else name)
+                for name, item in value.items()
             },
             path,
         )
     if isinstance(value, list):
         stem = path.rstrip(".")
-        return [_checked(number, f"{stem}[{at}].", key) for at, number in enumerate(value)]
+        return [_checked(item, f"{stem}[{index}].", key) for index, item in enumerate(value)]
     return value
 
 
 def _needed(value: object, key: str) -> str:
-    """What a field must hold by its name and does not; empty where it does."""
+    """The needed content of a field, by its name, that it lacks; empty where it is right."""
     if _NUMBERS.fullmatch(key) and isinstance(value, str | bool):
         return "a number"
     if isinstance(value, float) and not abs(value) <= _LARGEST:

@@ -15,7 +15,7 @@ _MATRICES = ("opencv-matrix", "opencv-nd-matrix")
 
 
 def read_opencv(path: Path) -> Mapping[str, Any]:
-    """Reads what OpenCV's FileStorage wrote, matrices as arrays.
+    """Reads a file of OpenCV's FileStorage, matrices as arrays.
 
     Args:
         path: A `.yaml`, `.yml`, `.json` or `.xml`.
@@ -24,7 +24,7 @@ def read_opencv(path: Path) -> Mapping[str, Any]:
         The values by their names: numbers, text, lists, mappings and (rows, cols) arrays.
 
     Raises:
-        DataError: It is none of these, or a matrix in it is not whole.
+        DataError: It has another format, or a matrix in it is incomplete.
     """
     suffix = path.suffix.lower()
     value: object
@@ -78,7 +78,7 @@ def _by_tag(element: Element, where: str) -> dict[str, Element]:
 
 
 def _numbers(text: str, where: str) -> list[float]:
-    """Reads numbers between blanks; OpenCV writes `.Nan` and `-.Inf`."""
+    """Reads numbers separated by blanks; OpenCV writes `.Nan` and `-.Inf`."""
     words = text.replace(".N", "N").replace(".I", "I").split()
     if not all(is_number(word) for word in words):
         raise DataError(f"{where}: {text[:60]!r}; numbers are needed.", culprits=[where])

@@ -1,8 +1,8 @@
-"""A pose in one line, as a robot's pendant shows it or its program has it.
+"""Parsing of a pose in one line, as robot pendants show it and robot programs contain it.
 
-By its marks: URScript's `p[..]`, Doosan's `posx(..)`, RAPID's `[[..],[..]]` and robtargets, and
-values with names before them: X, Y, Z and A, B, C (KUKA), W, P, R (FANUC), q1 to q4 (ABB), Rx, Ry,
-Rz (several makers), qx to qw. Bare numbers show nothing but their count.
+Recognised are URScript's `p[..]`, Doosan's `posx(..)`, RAPID's `[[..],[..]]` and robtargets, and
+named values: X, Y, Z and A, B, C (KUKA), W, P, R (FANUC), q1 to q4 (ABB), Rx, Ry, Rz (several
+manufacturers), qx to qw. Bare numbers are classified by their count alone.
 """
 
 import re
@@ -21,7 +21,7 @@ _NAMED = re.compile(
     rf"(?<![\w.])([Qq][1-4]|[A-Za-z]+)(?:_m)?\s*[:=]?\s*\"?({_NUMBER})\s*({_UNIT})?(?![\w.])"
 )
 _BETWEEN = re.compile(r"[\s\[\]{}(),;]+")
-# What stands around the numbers of a pose, and in which form it is then.
+# Notations around the numbers of a pose, with their forms.
 _MARKED = (
     ("ur", re.compile(r"(?<!\w)p\s*\[([^\[\]]*)\]")),
     ("doosan", re.compile(r"(?<!\w)posx\s*\(([^()]*)\)")),
@@ -34,12 +34,12 @@ _NAMED_ROTATIONS: Mapping[tuple[str, ...], tuple[str, ...]] = {
     ("qx", "qy", "qz", "qw"): ("ros",),
     ("rx", "ry", "rz"): ("ur", "yaskawa", "staubli"),
 }
-# By their count alone: seven are the columns of views.csv.
+# Forms by the count of bare numbers; seven are the columns of views.csv.
 _BARE_FORMS: Mapping[int, tuple[str, ...]] = {
     6: ("ur", "kuka", "fanuc", "yaskawa", "staubli", "doosan"),
     7: ("ros",),
 }
-# No arm reaches so far [m]; no rotation in radians has so large an angle.
+# Greatest position of an arm [m], and greatest angle in radians.
 _FAR_M, _TURNED_RAD = 10.0, 2.0 * np.pi + 0.01
 
 
@@ -49,8 +49,8 @@ class PendantPose:
 
     Attributes:
         pose: (4, 4) [m].
-        form: The form that it was taken to be in.
-        reading: The units and the rotation that it was taken to be in.
+        form: The assumed form.
+        reading: The assumed units and rotation.
     """
 
     pose: FloatArray
@@ -59,13 +59,13 @@ class PendantPose:
 
     @property
     def words(self) -> str:
-        """How it was understood."""
+        """Description of the interpretation."""
         return f"{self.form.words} ({self.reading.words})"
 
 
 @dataclass(frozen=True)
 class _PendantNumbers:
-    """Numbers as they stand, the forms that they may be in, and the units that they say."""
+    """The numbers of a line, their possible forms, and units stated in the line."""
 
     numbers: tuple[float, ...]
     forms: tuple[str, ...]
@@ -74,28 +74,27 @@ class _PendantNumbers:
 
 
 def is_marked_pose(line: str) -> bool:
-    """Tells whether a line has the marks or the names of a pose, and not only numbers."""
+    """Whether a line has the notation or the names of a pose, and not only numbers."""
     plain = _plain(line)
     return _marked(plain) is not None or _named(plain) is not None
 
 
 def possible_forms(line: str) -> tuple[str, ...]:
-    """Names the forms of `POSE_FORMS` that a line may be in by its looks; none for no pose."""
+    """Possible forms of a line, as names of `POSE_FORMS`; none for no pose."""
     written = _written(line)
     return () if written is None else written.forms
 
 
 def read_pose(line: str, where: str, form: str | None = None) -> PendantPose:
-    """Reads a pose out of a line.
+    """Reads a pose from a line.
 
     Args:
         line: The line.
-        where: What it is, for messages.
-        form: A name among `POSE_FORMS` where the user says it; what the line itself says must
-            agree.
+        where: Its origin, for messages.
+        form: A name among `POSE_FORMS` if the user states it; the line must agree.
 
     Raises:
-        DataError: It is no pose, may be in several forms, or cannot be what it says.
+        DataError: It is no pose, may be in several forms, or has implausible values.
     """
     written = _written(line)
     if written is None:
@@ -126,23 +125,23 @@ def _written(line: str) -> _PendantNumbers | None:
 
 def _marked(line: str) -> _PendantNumbers | None:
     for form, pattern in _MARKED:
-        found = pattern.findall(line)
-        # Of two poses in a line it is not known which is meant.
-        if len(found) == 1:
-            words = re.split(r"[\s,\[\]]+", found[0].strip())
+        matches = pattern.findall(line)
+        # Two poses in a line are ambiguous.
+        if len(matches) == 1:
+            words = re.split(r"[\s,\[\]]+", matches[0].strip())
             if all(re.fullmatch(_NUMBER, word) for word in words):
                 return _PendantNumbers(tuple(map(float, words)), (form,))
     return None
 
 
 def _named(line: str) -> _PendantNumbers | None:
-    found = [(match[1].lower(), match[2], match[3]) for match in _NAMED.finditer(line)]
-    values = {name: float(number) for name, number, _ in found}
-    units = {name: unit for name, _, unit in found if unit}
+    entries = [(match[1].lower(), match[2], match[3]) for match in _NAMED.finditer(line)]
+    values = {name: float(number) for name, number, _ in entries}
+    units = {name: unit for name, _, unit in entries if unit}
     for names, forms in _NAMED_ROTATIONS.items():
         needed = {"x", "y", "z", *names}
         if needed <= values.keys():
-            if sum(name in needed for name, _, _ in found) > len(needed):
+            if sum(name in needed for name, _, _ in entries) > len(needed):
                 return None  # two poses in a line
             numbers = tuple(values[name] for name in ("x", "y", "z", *names))
             lengths = {units[name] for name in "xyz" if name in units}
@@ -150,7 +149,7 @@ def _named(line: str) -> _PendantNumbers | None:
             # One unit for each, and of the right kind.
             if len(lengths) > 1 or len(angles) > 1 or lengths - {"m", "mm"} or angles & {"m", "mm"}:
                 return None
-            # Of those who write Rx, Ry, Rz only Universal Robots does so in radians.
+            # Of the manufacturers with Rx, Ry, Rz only Universal Robots uses radians.
             likely = ("ur",) if angles == {"rad"} and "ur" in forms else forms
             return _PendantNumbers(
                 numbers, likely, next(iter(lengths), None), next(iter(angles), None)
@@ -165,29 +164,29 @@ def _bare(line: str) -> _PendantNumbers | None:
     return _PendantNumbers(tuple(map(float, words)), _BARE_FORMS[len(words)])
 
 
-def _form(written: _PendantNumbers, wished: str | None, where: str) -> str:
-    if wished is None and len(written.forms) == 1:
+def _form(written: _PendantNumbers, stated: str | None, where: str) -> str:
+    if stated is None and len(written.forms) == 1:
         return written.forms[0]
     makers = ", ".join(written.forms)
-    if wished is None:
+    if stated is None:
         raise DataError(
             f"{where}: these numbers may be a pose of {makers}.",
             culprits=[where],
             next_step="Say which of them it is.",
         )
-    # Bare numbers may be whatever the user says that they are.
+    # Bare numbers may be of any form that the user states.
     is_bare = written.forms in _BARE_FORMS.values()
-    if wished not in POSE_FORMS or not (is_bare or wished in written.forms):
+    if stated not in POSE_FORMS or not (is_bare or stated in written.forms):
         raise DataError(
-            f"{where}: it is written as a pose of {makers}, not of {wished!r}.",
+            f"{where}: it is written as a pose of {makers}, not of {stated!r}.",
             culprits=[where],
             next_step=f"The forms are {', '.join(POSE_FORMS)}.",
         )
-    return wished
+    return stated
 
 
 def _reading(form: PoseForm, written: _PendantNumbers) -> Reading:
-    """The form's units, but for those that the line itself says."""
+    """The form's reading, with units that the line itself states."""
     length = written.length if written.length in UNITS_M else form.unit
     rotation = form.rotation
     if written.angle == "deg" and rotation == "rotation-vector":
@@ -198,19 +197,19 @@ def _reading(form: PoseForm, written: _PendantNumbers) -> Reading:
 
 
 def _check_size(numbers: FloatArray, reading: Reading, where: str) -> None:
-    """Refuses what is in another unit than it is taken to be."""
-    away_m = UNITS_M[reading.unit] * float(np.abs(numbers[:3]).max())
-    if away_m > _FAR_M:
+    """Refuses values that are implausible in their assumed unit."""
+    distance_m = UNITS_M[reading.unit] * float(np.abs(numbers[:3]).max())
+    if distance_m > _FAR_M:
         raise DataError(
-            f"{where}: read in {reading.unit}, it is {away_m:.4g} m from the base.",
+            f"{where}: read in {reading.unit}, it is {distance_m:.4g} m from the base.",
             culprits=[where],
             next_step="Write the unit behind the numbers, as X 400 mm, or name another form.",
         )
     is_radian = reading.rotation == "rotation-vector" or reading.rotation.endswith("-rad")
-    turned = float(np.abs(numbers[3:]).max())
-    if is_radian and turned > _TURNED_RAD:
+    angle = float(np.abs(numbers[3:]).max())
+    if is_radian and angle > _TURNED_RAD:
         raise DataError(
-            f"{where}: an angle of {turned:.4g} is too large for radians.",
+            f"{where}: an angle of {angle:.4g} is too large for radians.",
             culprits=[where],
             next_step="Write the unit behind the numbers, as RX 12.5 deg, or name another form.",
         )

@@ -1,4 +1,4 @@
-"""Tables as text: CSV, TSV or blanks between, with or without a header, with comments."""
+"""Text tables: CSV, TSV or blank-separated, with or without header and comments."""
 
 import csv
 import io
@@ -13,14 +13,14 @@ from visioncal.core.errors import DataError
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.I)
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
-# What else str.splitlines splits at may stand inside a cell.
+# Other separators of str.splitlines may be inside a cell.
 _LINE_END = re.compile(r"\r\n|\r|\n")
-# Excel writes the separator itself into the first line, for itself.
+# Excel's declaration of the separator in the first line.
 _SEPARATOR = re.compile(r"sep=([;\t,])", re.I)
-# All that an empty row has.
+# Characters of an empty row.
 _EMPTY = "; ,\t\r"
 _COMMENTS = ("#", "%", "//")
-# A row as programs print a list, with its name before it: `pose: [1.0, 2.0]`, `array([1, 2]),`.
+# A row printed as a list, possibly with a name: `pose: [1.0, 2.0]`, `array([1, 2]),`.
 _LISTED = re.compile(
     r"(?:[^\W\d][\w .-]*+[:=]\s*+)?(?:[^\W\d][\w.]*+\s*+)?"
     r"(?:\[([^][(){}]*+)\]|\(([^][(){}]*+)\)|\(\[([^][(){}]*+)\]\)|\{([^][(){}]*+)\})\s*+[,;]?"
@@ -33,9 +33,9 @@ class TextTable:
 
     Attributes:
         path: Its file.
-        columns: The names of the columns: as the header has them, or `1`, `2`, ... without one.
+        columns: Names of the columns by the header, or `1`, `2`, ... without one.
         has_header: Whether the names come from the file.
-        rows: The rows' cells, without surrounding blanks.
+        rows: Cells of the rows, without surrounding blanks.
         lines: The line of each row in the file.
     """
 
@@ -46,45 +46,46 @@ class TextTable:
     lines: tuple[int, ...]
 
     def place(self, row: int) -> str:
-        """Words where a row stands: `poses.csv, line 3`."""
+        """Location of a row for messages: `poses.csv, line 3`."""
         return f"{self.path.name}, line {self.lines[row]}"
 
 
 def is_number(cell: str) -> bool:
-    """Tells whether a cell is a number; NaN and inf count."""
+    """Whether a cell is a number, NaN and inf included."""
     return _NUMBER.fullmatch(cell) is not None
 
 
 def read_table(path: Path) -> TextTable:
     """Reads a table; the separator is a semicolon, a tab, a comma or blanks, in this order.
 
-    A comment that has as many words as the table has columns, right before the first row, is the
-    header where there is no other, whatever stands before a colon in it; a first line such as
-    `sep=;` names the separator. Between semicolons or tabs a decimal comma is read as a point. Rows
-    may be lists in brackets, with a name before them. Empty rows, and empty columns behind all
-    others, are left aside.
+    Without a header row, a comment right before the first row is the header if it has one word per
+    column after any colon; a first line such as `sep=;` declares the separator. With semicolons or
+    tabs, decimal commas are read as points. Rows may be lists in brackets, with a name before them.
+    Empty rows and empty trailing columns are ignored.
 
     Raises:
         DataError: It is missing, no text, too large, empty, its rows differ in length, or two
-            columns have one name.
+            columns have the same name.
     """
     text, where = read_plain_text(path), str(path)
     if text.count("\n") + text.count("\r") > MAX_VALUES:
         raise too_many(where)
-    every = _LINE_END.split(text)
-    said = _SEPARATOR.fullmatch(every[0])
-    if said:
-        every[0] = ""
+    all_lines = _LINE_END.split(text)
+    declared = _SEPARATOR.fullmatch(all_lines[0])
+    if declared:
+        all_lines[0] = ""
     lines = _without_brackets(
         [
             (at, line)
-            for at, line in enumerate(every, start=1)
+            for at, line in enumerate(all_lines, start=1)
             if line.strip(_EMPTY) and not line.strip().startswith(_COMMENTS)
         ]
     )
     if not lines:
         raise DataError(f"{where} has no rows.", culprits=[where])
-    separator = said[1] if said else next((name for name in ";\t," if name in lines[0][1]), " ")
+    separator = (
+        declared[1] if declared else next((name for name in ";\t," if name in lines[0][1]), " ")
+    )
     if sum(line.count(separator) + 1 for _, line in lines) > MAX_VALUES:
         raise too_many(where)
     numbers = [at for at, _ in lines]
@@ -94,7 +95,7 @@ def read_table(path: Path) -> TextTable:
     if columns is not None:
         rows, numbers = rows[1:], numbers[1:]
     else:
-        columns = _header_in_comments(every[: numbers[0] - 1], separator, len(rows[0]))
+        columns = _header_in_comments(all_lines[: numbers[0] - 1], separator, len(rows[0]))
     if not rows:
         raise DataError(f"{where} has a header and no rows.", culprits=[where])
     width = len(columns or rows[0])
@@ -110,7 +111,7 @@ def read_table(path: Path) -> TextTable:
 
 
 def _without_brackets(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
-    """Takes what stands in the brackets of lines that are all lists of one kind."""
+    """The content of the brackets, if all lines are lists in brackets; else the lines."""
     listed = [_LISTED.fullmatch(line.strip()) for _, line in lines]
     inside = [next(filter(None, match.groups()), "") for match in listed if match]
     return list(zip((at for at, _ in lines), inside, strict=True)) if all(listed) else lines
@@ -128,9 +129,9 @@ def _cells(line: str, separator: str, where: str) -> tuple[str, ...]:
 
 
 def without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Rows without the first one's columns that are empty in all, behind those that are not.
+    """Rows without trailing columns of the first row that are empty in all rows.
 
-    Spreadsheets write them where cells were filled once. A single row's cells beyond are kept.
+    Spreadsheets write them for cells that were cleared. Cells beyond the first row's are kept.
     """
     filled = max(
         (at for row in rows for at, name in enumerate(row, start=1) if name.strip()), default=0
@@ -139,14 +140,14 @@ def without_margin(rows: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
 
 
 def with_points(cells: Sequence[str]) -> tuple[str, ...]:
-    """Cells that commas do not separate, with decimal commas as points."""
+    """Cells with decimal commas replaced by points."""
     return tuple(
         cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells
     )
 
 
 def separator_of(header: str) -> str:
-    """The separator of a table whose columns have names without blanks: a comma where it has any.
+    """The separator of a header: a comma where it has any, else a semicolon or tab.
 
     Spreadsheets in languages with a decimal comma write semicolons.
     """
@@ -159,8 +160,8 @@ def _header_in_comments(
     comment = next((name.strip() for name in reversed(before) if name.strip()), "")
     if not comment.startswith(_COMMENTS):
         return None
-    said = comment.lstrip("#%/ ").rpartition(":")[2]
-    words = said.replace(separator, " ").replace(",", " ").split()
+    names = comment.lstrip("#%/ ").rpartition(":")[2]
+    words = names.replace(separator, " ").replace(",", " ").split()
     fits = len(words) == width and not any(is_number(word) for word in words)
     return tuple(words) if fits else None
 

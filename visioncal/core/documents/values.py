@@ -1,7 +1,4 @@
-"""Values of parsed documents: bounded, and turned into numbers with a word on what is wrong.
-
-Among them OpenCV's matrices, from the mapping that its three text formats have in common.
-"""
+"""Checked conversion of parsed values to numbers, OpenCV's matrices included, within bounds."""
 
 import math
 import re
@@ -25,13 +22,12 @@ _MOST_AXES = 8
 
 
 def read_plain_text(path: Path) -> str:
-    """Reads a bounded text file, in UTF-8 or as spreadsheets in the west write their tables.
+    """Reads a bounded text file in UTF-8, UTF-16 with its mark, or otherwise Windows-1252.
 
-    What is no UTF-8 is taken for Windows-1252, of which numbers are the same, and what has the mark
-    of UTF-16 for that.
+    Numbers read the same in Windows-1252 and similar encodings of spreadsheets.
 
     Raises:
-        DataError: As `read_bytes`, or the bytes hold NUL, as binary files do.
+        DataError: As `read_bytes`, or it has NUL bytes, as binary files do.
     """
     data = read_bytes(path)
     if data.startswith(UTF16_MARKS):
@@ -50,7 +46,7 @@ def read_plain_text(path: Path) -> str:
 
 
 def too_many(where: str) -> DataError:
-    """Builds the error for a document with more values than are read."""
+    """Builds the error for a document with too many values."""
     return DataError(
         f"{where}: more than {MAX_VALUES:,} values; documents of poses up to that size are read.",
         culprits=[where],
@@ -59,7 +55,7 @@ def too_many(where: str) -> DataError:
 
 
 def too_deep(where: str) -> DataError:
-    """Builds the error for a document that is nested deeper than any pose is."""
+    """Builds the error for a document that is nested too deep."""
     return DataError(
         f"{where}: nested deeper than {MAX_DEPTH} levels, as no file of poses is.",
         culprits=[where],
@@ -67,11 +63,7 @@ def too_deep(where: str) -> DataError:
 
 
 def check_bounds(value: object, where: str) -> None:
-    """Checks depth and size of a document without recursion.
-
-    Raises:
-        DataError: It is nested too deep or has too many values.
-    """
+    """Checks depth and size of a document without recursion; raises DataError."""
     pending: list[tuple[object, int]] = [(value, 1)]
     count = 0
     while pending:
@@ -88,7 +80,7 @@ def check_bounds(value: object, where: str) -> None:
 
 
 def shown(value: object) -> str:
-    """Words a value for a message, cut short."""
+    """A value as text for a message, shortened."""
     if isinstance(value, Mapping):
         return f"a mapping of {', '.join(map(str, list(value)[:8]))}"[:_SHOWN]
     if isinstance(value, list):
@@ -98,11 +90,7 @@ def shown(value: object) -> str:
 
 
 def as_numbers(value: object, where: str) -> FloatArray:
-    """Reads a number or regular nested lists of numbers; null counts as NaN.
-
-    Raises:
-        DataError: There is text, a mapping, or lists of several lengths among them.
-    """
+    """Reads a number or regular nested lists of numbers, null as NaN; raises DataError."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         return np.asarray(value, dtype=float)
     if isinstance(value, int | float | list) and not isinstance(value, bool):
@@ -114,11 +102,7 @@ def as_numbers(value: object, where: str) -> FloatArray:
 
 
 def number(value: object, where: str) -> float:
-    """Reads one finite number.
-
-    Raises:
-        DataError: It is something else.
-    """
+    """Reads one finite number; raises DataError."""
     numbers = as_numbers(value, where)
     if numbers.size != 1 or not np.isfinite(numbers).all():
         raise DataError(
@@ -128,11 +112,7 @@ def number(value: object, where: str) -> float:
 
 
 def mapping(value: object, where: str) -> Mapping[str, Any]:
-    """Checks that a value is a mapping.
-
-    Raises:
-        DataError: It is something else.
-    """
+    """Checks that a value is a mapping; raises DataError."""
     if not isinstance(value, Mapping):
         raise DataError(
             f"{where} is {shown(value)}; keys with values are needed.", culprits=[where]
@@ -145,14 +125,14 @@ def matrix_from(value: object, where: str) -> FloatArray:
 
     Args:
         value: The mapping; `data` is a list of numbers.
-        where: Where it stands, for messages.
+        where: Its location, for messages.
 
     Returns:
         (rows, cols) numbers, (rows, cols, channels) where dt names several channels, or an array
         of the stated sizes.
 
     Raises:
-        DataError: A field is missing, or the data are not as many as the size asks for.
+        DataError: A field is missing, or the number of data does not match the size.
     """
     content = mapping(value, where)
     data = as_numbers(content.get("data"), f"{where}: data").reshape(-1)
@@ -168,12 +148,12 @@ def matrix_from(value: object, where: str) -> FloatArray:
         )
     if kind[1] and int(kind[1][:3]) > 1:
         sides.append(float(kind[1][:3]))
-    whole = len(sides) <= _MOST_AXES and all(
+    valid = len(sides) <= _MOST_AXES and all(
         0 <= side <= MAX_VALUES and side % 1 == 0 for side in sides
     )
-    shape = [int(side) for side in sides] if whole else []
-    # A side of none hides the others from the count.
-    if not whole or math.prod(max(index, 1) for index in shape) > MAX_VALUES:
+    shape = [int(side) for side in sides] if valid else []
+    # A side of 0 must not hide the others.
+    if not valid or math.prod(max(index, 1) for index in shape) > MAX_VALUES:
         words = " x ".join(f"{side:g}" for side in sides[:_MOST_AXES])
         raise DataError(f"{where}: a matrix of {words} is none that is read.", culprits=[where])
     if math.prod(shape) != len(data):

@@ -1,4 +1,4 @@
-"""XML without document types, so without entities."""
+"""XML without document types and entities, with byte offsets of its elements."""
 
 import re
 from dataclasses import dataclass, field
@@ -14,18 +14,18 @@ _TAG = re.compile(rb"""<[^\s/>]+(\s+[^\s=]+\s*=\s*("[^"]*"|'[^']*'))*\s*/?>""")
 
 @dataclass
 class Element:
-    """An element; its places count bytes of the text.
+    """An element; its positions are byte offsets.
 
     Attributes:
         tag: Its name.
-        line: Where it begins.
+        line: Line of its begin.
         attributes: Its attributes.
         text: The text directly inside it, without surrounding blanks.
-        children: The elements in it.
-        begin: Where its first tag begins.
-        inside: What follows that.
-        close: Where its last tag begins; `begin` where one tag is all of it.
-        end: What follows that.
+        children: Its child elements.
+        begin: Begin of its start tag.
+        inside: End of its start tag.
+        close: Begin of its end tag; `begin` for an empty-element tag.
+        end: End of its end tag.
     """
 
     tag: str
@@ -40,31 +40,21 @@ class Element:
 
     @property
     def is_empty(self) -> bool:
-        """Whether one tag is all of it: `<a/>`."""
+        """Whether it is an empty-element tag: `<a/>`."""
         return self.close == self.begin
 
     def child(self, tag: str) -> "Element | None":
-        """Finds the first child of a name; None where there is none."""
+        """The first child with a tag; None without one."""
         return next((child for child in self.children if child.tag == tag), None)
 
 
 def read_xml(path: Path) -> Element:
-    """Reads an XML file.
-
-    Returns:
-        Its root.
-
-    Raises:
-        DataError: It is missing, no XML, declares a document type, or is too large or too deep.
-    """
+    """Reads an XML file to its root; the errors are those of `parse_xml` and `read_bytes`."""
     return parse_xml(read_bytes(path), str(path))
 
 
 def parse_xml(data: bytes, where: str) -> Element:
-    """Parses XML; `where` names its origin in errors.
-
-    Returns:
-        Its root.
+    """Parses XML to its root; `where` names its origin in errors.
 
     Raises:
         DataError: It is no XML, declares a document type, or is too large or too deep.
@@ -82,12 +72,12 @@ def parse_xml(data: bytes, where: str) -> Element:
             raise too_many(where)
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        counted(5)  # values' worth of memory
+        counted(5)  # memory in units of values
         if len(stack) > MAX_DEPTH:
             raise too_deep(f"{where}, line {parser.CurrentLineNumber}")
         begin = parser.CurrentByteIndex
         element = Element(tag, parser.CurrentLineNumber, attributes, begin=begin)
-        element.inside = _after_tag(data, begin)
+        element.inside = _start_tag_end(data, begin)
         stack[-1].children.append(element)
         stack.append(element)
         texts.append([])
@@ -95,10 +85,10 @@ def parse_xml(data: bytes, where: str) -> Element:
     def end(_: str) -> None:
         element = stack.pop()
         element.text = "".join(texts.pop()).strip()
-        element.close, element.end = _last_tag(data, element, parser.CurrentByteIndex)
+        element.close, element.end = _end_tag(data, element, parser.CurrentByteIndex)
 
     def text(part: str) -> None:
-        # Parts are a few kilobytes each: their words are counted before all are split.
+        # Parts are a few kilobytes each, so that words are counted before memory grows.
         counted(len(part.split()))
         texts[-1].append(part)
 
@@ -126,14 +116,14 @@ def parse_xml(data: bytes, where: str) -> Element:
     return root.children[0]
 
 
-def _after_tag(data: bytes, begin: int) -> int:
-    """What follows the first tag of an element."""
+def _start_tag_end(data: bytes, begin: int) -> int:
+    """End of an element's start tag."""
     tag = _TAG.match(data, begin)
     return tag.end() if tag else begin
 
 
-def _last_tag(data: bytes, element: Element, at: int) -> tuple[int, int]:
-    """Where the last tag of an element that is over at some place begins, and what follows it."""
+def _end_tag(data: bytes, element: Element, at: int) -> tuple[int, int]:
+    """Begin and end of an element's end tag, which the parser reports at an offset."""
     if data[element.inside - 2 : element.inside] == b"/>":
         return element.begin, element.inside
     return at, data.find(b">", at) + 1

@@ -1,4 +1,4 @@
-"""YAML as data, built from the parser's events: tags construct nothing, aliases are refused."""
+"""Safe YAML, built from parser events: no constructors; aliases are refused."""
 
 import math
 import re
@@ -25,7 +25,7 @@ _PLAIN_TAGS = {
 _MATRIX_TAGS = {f"{_STANDARD}opencv-matrix", f"{_STANDARD}opencv-nd-matrix"}
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
-# YAML 1.1 asks for a point in every float; what others write is not always so strict.
+# YAML 1.1 requires a point in floats; other programs are not always so strict.
 _FLOAT = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _WORDS = {
     "": None,
@@ -58,12 +58,8 @@ def read_yaml(path: Path) -> object:
 
 
 def parse_yaml(text: str, where: str) -> object:
-    """Parses YAML; `where` names its origin in errors.
-
-    Raises:
-        DataError: As `read_yaml`.
-    """
-    # OpenCV writes `%YAML:1.0`, which is no directive of YAML; an empty comment keeps the lines.
+    """Parses YAML as `read_yaml` does; `where` names its origin in errors."""
+    # OpenCV's `%YAML:1.0` is no valid directive; an empty comment keeps line numbers.
     plain = re.sub(r"\A%YAML[^\n]*", "#", text)
     builder = _Builder(where)
     try:
@@ -85,7 +81,7 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 @dataclass
 class _Level:
-    """A list or mapping that is being filled; `key` waits for its value."""
+    """A list or mapping under construction; `key` awaits its value."""
 
     content: dict[str, Any] | list[Any]
     line: int
@@ -103,7 +99,7 @@ class _Builder:
     levels: list[_Level] = field(default_factory=list)
 
     def take(self, event: yaml.Event) -> None:
-        """Takes one event in."""
+        """Processes an event."""
         if isinstance(event, yaml.AliasEvent):
             raise self._refusal(
                 event, f"the alias *{event.anchor}", "values written out are needed"
@@ -172,7 +168,7 @@ def _line(event: yaml.Event) -> int:
 
 
 def _scalar(event: yaml.ScalarEvent) -> object:
-    """Reads a scalar: quoted ones are text, plain ones a number or word where they look it."""
+    """Converts a scalar: quoted ones are text, plain ones a number or constant if they match."""
     text = event.value
     if not event.implicit[0]:
         return text

@@ -1,4 +1,4 @@
-"""How an arm drifts as it warms up: what heats it, how it moves with that, and when it is warm."""
+"""Thermal drift of an arm: heating of its links, their growth, and online compensation."""
 
 from visioncal.robot.thermal.compensator import Advice, OnlineCompensator
 from visioncal.robot.thermal.heating import Heating, Inputs, Kind

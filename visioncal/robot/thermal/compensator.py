@@ -1,4 +1,4 @@
-"""The arm as it is now: fed with temperatures or currents, asked for its model."""
+"""Online compensation of thermal drift from measured temperatures or currents."""
 
 from dataclasses import dataclass
 
@@ -10,24 +10,24 @@ from visioncal.robot import Robot
 from visioncal.robot.thermal.model import ThermalModel
 
 _MINUTES = 60.0
-# How far ahead advice looks [s], and how finely.
+# Horizon and step of the predicted drift rate [s].
 _AHEAD_S, _EVERY_S = 10 * 3600.0, 30.0
-# Rates of measured temperatures are taken over so long [s]: sensors are noisy.
+# Time span over which rates of noisy measured temperatures are taken [s].
 _SPAN_S = 600.0
-# An arm whose rise has not slowed down visibly is expected to settle so slowly [s]; one whose rise
-# has all but ended keeps this share of its rate from one span to the next.
+# Greatest time constant of the warm-up [s], for rates that do not decrease visibly, and least
+# factor of the rate from one span to the next.
 _SLOWEST_S, _LEAST_SHARE = 3600.0, 1e-3
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Whether the arm is warm enough.
+    """Current drift rate of the flange, and time until it is below a limit.
 
     Attributes:
-        rate_um_min: How fast the flange drifts now [um/min].
-        limit_um_min: How fast it may [um/min].
-        wait_s: How long until then if work goes on as it does; zero where it is warm, None where it
-            does not come to that within ten hours or too few samples were given as yet.
+        rate_um_min: Drift rate of the flange now [um/min]; None after too few samples.
+        limit_um_min: Its limit [um/min].
+        wait_s: Time until it is below the limit if work continues [s]; zero where it is already,
+            None where it takes more than ten hours or after too few samples.
     """
 
     rate_um_min: float | None
@@ -50,13 +50,13 @@ class Advice:
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """The links at a sample.
+    """Temperatures of the links at a sample.
 
     Attributes:
-        rest: (n,) where they would come to rest [deg C].
-        driven: (n,) what of that is by motor currents [K].
-        links: (n,) what they have [deg C].
-        jacobian: (n, s) how that moves with the heating's parameters; see `Heating.jacobian`.
+        rest: (n,) steady state [deg C].
+        driven: (n,) its part by motor currents [K].
+        links: (n,) current temperatures [deg C].
+        jacobian: (n, s) their derivatives over the heating's parameters; see `Heating.jacobian`.
     """
 
     rest: FloatArray
@@ -66,14 +66,14 @@ class _Sample:
 
 
 class OnlineCompensator:
-    """Follows an arm's temperatures.
+    """Tracks the link temperatures of an arm, and gives its current model.
 
-    Feed it what was measured, as often as it is; ask it for the arm as it is now. It begins with
-    links in balance: as warm as their joints at the first sample or, fed with currents, as the air.
+    Feed it every measured sample. The links start in equilibrium: at the temperatures of their
+    joints at the first sample or, fed with currents, of the air.
     """
 
     def __init__(self, model: ThermalModel) -> None:
-        """Begins without a sample."""
+        """Prepares a compensator without samples."""
         self._model = model
         self._stamps_s: list[float] = []
         self._links: list[FloatArray] = []
@@ -87,16 +87,16 @@ class OnlineCompensator:
         currents_a: FloatArray | None = None,
         ambient_c: float | None = None,
     ) -> None:
-        """Takes up a sample.
+        """Adds a sample.
 
         Args:
-            stamp_s: When; later than the sample before [s].
-            temperatures_c: (n,) of the joints, where the model was fitted to these.
-            currents_a: (n,) of the motors, where it was fitted to these [A].
-            ambient_c: The air, with currents; that of the reference where it is not given.
+            stamp_s: Time, later than the sample before [s].
+            temperatures_c: (n,) of the joints, for a model of temperatures [deg C].
+            currents_a: (n,) of the motors, for a model of currents [A].
+            ambient_c: Of the air, with currents; that of the reference by default [deg C].
 
         Raises:
-            DataError: The time does not ascend, the wrong kind was given, or numbers are missing.
+            DataError: Times do not ascend, the wrong signal was given, or numbers are missing.
         """
         heating, count = self._model.heating, self._model.joint_count
         given = temperatures_c if heating.kind == "temperatures" else currents_a
@@ -116,10 +116,13 @@ class OnlineCompensator:
         self._last = self._after(signal, air, stamp_s)
         self._stamps_s.append(stamp_s)
         self._links.append(self._last.links)
-        self._forget()
+        # Samples that are too old for the rates.
+        while len(self._stamps_s) > 2 and self._stamps_s[1] < stamp_s - 2.1 * _SPAN_S:
+            self._stamps_s.pop(0)
+            self._links.pop(0)
 
     def _after(self, signal: FloatArray, air: float, stamp_s: float) -> _Sample:
-        """The links at a new sample of what heats them (n,) and of the air [deg C]."""
+        """Link temperatures after a sample of the signal (n,) and of the air [deg C]."""
         heating, last = self._model.heating, self._last
         ambient = np.array([air])
         rest = heating.rest(signal[None], ambient)[0]
@@ -128,10 +131,10 @@ class OnlineCompensator:
             still = np.zeros((len(rest), heating.size // len(rest)))
             return _Sample(rest, driven, heating.cold(signal[None], ambient), still)
         seconds = stamp_s - self._stamps_s[-1]
-        mean = 0.5 * (rest + last.rest)
-        by = 0.5 * (driven + last.driven)
-        links = heating.step(last.links, mean, seconds)
-        jacobian = heating.step_jacobian(last.jacobian, last.links, mean, by, seconds)
+        mean_rest = 0.5 * (rest + last.rest)
+        mean_driven = 0.5 * (driven + last.driven)
+        links = heating.step(last.links, mean_rest, seconds)
+        jacobian = heating.step_jacobian(last.jacobian, last.links, mean_rest, mean_driven, seconds)
         return _Sample(rest, driven, links, jacobian)
 
     @property
@@ -139,7 +142,7 @@ class OnlineCompensator:
         """(n,) temperatures of the links now [deg C].
 
         Raises:
-            DataError: Nothing was fed yet.
+            DataError: There is no sample yet.
         """
         return self._now.links
 
@@ -151,39 +154,39 @@ class OnlineCompensator:
 
     @property
     def robot(self) -> Robot:
-        """The arm as it is now."""
+        """Current model of the arm."""
         return self._model.robot_at(self.links_c)
 
     def base_from_flange(self, q: FloatArray) -> FloatArray:
-        """Where the flange stands now (m, 4, 4), at (m, n) joint angles [rad]."""
+        """Current flange poses (m, 4, 4) at (m, n) joint angles [rad]."""
         return self._model.base_from_flange(q, self.links_c)
 
     def sigma_m(self, q: FloatArray) -> FloatArray:
-        """(m,) how surely its drift is known at (m, n) joint angles [m]; see `ThermalModel`.
+        """(m,) predicted sigma of the drift at (m, n) joint angles [m]; see `ThermalModel`.
 
         Raises:
-            DataError: Nothing was fed yet.
+            DataError: There is no sample yet.
         """
         now = self._now
         jacobian = np.broadcast_to(now.jacobian, (len(q), *now.jacobian.shape))
         return self._model.sigma_m(q, now.links, jacobian)
 
     def advice(self, q: FloatArray, limit_um_min: float) -> Advice:
-        """Says whether the arm is warm enough to work, and else how long to wait.
+        """Tells whether the arm is warm enough for work, and otherwise how long to wait.
 
         Args:
             q: (n,) the posture at work [rad].
-            limit_um_min: How fast the flange may drift [um/min].
+            limit_um_min: Acceptable drift rate of the flange [um/min].
 
         Raises:
-            DataError: The limit is not above zero.
+            DataError: The limit is not positive.
         """
         if not limit_um_min > 0.0:
             raise DataError(f"thermal: a limit of {limit_um_min:g} um/min is not above zero.")
-        found = self._settling()
-        if found is None:
+        settling = self._settling()
+        if settling is None:
             return Advice(None, limit_um_min, None)
-        speeds, tau_s = found
+        speeds, tau_s = settling
         jacobian = 1e6 * _MINUTES * self._model.jacobian(q[None])[0, 3:]
         ahead = np.arange(0.0, _AHEAD_S, _EVERY_S)
         speeds = speeds * np.exp(-ahead[:, None] / tau_s)
@@ -198,7 +201,7 @@ class OnlineCompensator:
         return Advice(float(rates[0]), limit_um_min, wait)
 
     def _settling(self) -> tuple[FloatArray, FloatArray] | None:
-        """How fast links warm up (n,) [K/s], and how that fades (n,) [s]; None for too little."""
+        """Warm-up rates (n,) [K/s] and time constants (n,) [s]; None after too few samples."""
         heating = self._model.heating
         if heating.kind == "currents":
             if self._last is None:
@@ -209,15 +212,9 @@ class OnlineCompensator:
             return None
         then = stamps[-1] - _SPAN_S * np.arange(3)
         links = [np.interp(then, stamps, column) for column in np.array(self._links).T]
-        late, early = -np.diff(np.stack(links, axis=1), axis=0) / _SPAN_S
-        # One share for all joints: those of single ones would follow the work from piece to piece.
-        slowed = float(late @ early) / max(float(early @ early), 1e-12)
-        slowed = min(max(slowed, _LEAST_SHARE), float(np.exp(-_SPAN_S / _SLOWEST_S)))
-        tau_s = np.full_like(late, -_SPAN_S / np.log(slowed))
-        return late, np.maximum(tau_s, heating.tau_s)
-
-    def _forget(self) -> None:
-        """Drops samples older than rates need."""
-        while len(self._stamps_s) > 2 and self._stamps_s[1] < self._stamps_s[-1] - 2.1 * _SPAN_S:
-            self._stamps_s.pop(0)
-            self._links.pop(0)
+        latest, earlier = -np.diff(np.stack(links, axis=1), axis=0) / _SPAN_S
+        # One factor for all joints: those of single joints would follow each work cycle.
+        decay = float(latest @ earlier) / max(float(earlier @ earlier), 1e-12)
+        decay = min(max(decay, _LEAST_SHARE), float(np.exp(-_SPAN_S / _SLOWEST_S)))
+        tau_s = np.full_like(latest, -_SPAN_S / np.log(decay))
+        return latest, np.maximum(tau_s, heating.tau_s)
