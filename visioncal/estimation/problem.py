@@ -227,8 +227,9 @@ class Problem:
         )
 
     def with_effects(self, effects: Sequence[Effect]) -> "Problem":
-        """Returns the problem with other effects."""
-        return replace(self, effects=tuple(effect for effect in effects if len(effect)))
+        """Returns the problem with other effects; with those that it has, itself."""
+        kept = tuple(effect for effect in effects if len(effect))
+        return self if kept == self.effects else replace(self, effects=kept)
 
     @cached_property
     def unknown(self) -> Mapping[str, int]:

@@ -37,7 +37,10 @@ from visioncal.estimation.variance import (
     estimate_sigmas,
 )
 
-_ROUNDS, _SETTLED = 20, 1e-10
+# After shorter steps of frames [rad and m], first order is off by less than any noise.
+_LINEAR = 1e-3
+# Shares of the cost by which it still falls at rest, and while the noise is sought.
+_ROUNDS, _SETTLED, _NEARLY = 20, 1e-10, 1e-7
 # A healthy fit comes to rest within a few steps. One that creeps, as along the flat valley of an
 # arm's errors that stand for another cause, gets other levels of noise after so many.
 _STEPS = 30
@@ -114,16 +117,23 @@ def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> S
         state: Where to start.
         noise: Its levels to start from; those from above where None.
     """
-    settled = False
-    if noise is None:
-        noise = estimate_noise(problem, state, starting_noise(problem), from_above=True)
+    is_near = noise is not None
+    # REML takes residuals as a step to their least would leave them: levels are near before it.
+    noise = estimate_noise(
+        problem, state, noise or starting_noise(problem), from_above=noise is None
+    )
     for turn in range(_ROUNDS):
-        state, settled = solve_problem(problem, state, noise, is_near=turn > 0, most=_STEPS)
-        before, noise = noise, estimate_noise(problem, state, noise)
+        start, before = state, noise
+        state, _ = solve_problem(
+            problem, start, noise, is_near=is_near or turn > 0, most=_STEPS, settled=_NEARLY
+        )
+        if state is start:
+            break
+        noise = estimate_noise(problem, state, noise)
         if _alike(before.robots, noise.robots) and _alike(before.sensors, noise.sensors):
             break
-    if not settled:
-        state, settled = solve_problem(problem, state, noise, is_near=True)
+    # Weights are those at the start of a solve: once more, from the answer.
+    state, settled = solve_problem(problem, state, noise, is_near=True)
     return Solution(state, noise, settled)
 
 
@@ -138,6 +148,7 @@ def solve_problem(
     *,
     is_near: bool = False,
     most: int = ITERATIONS,
+    settled: float = _SETTLED,
 ) -> tuple[State, bool]:
     """Minimises the residuals whitened by a known noise.
 
@@ -147,6 +158,7 @@ def solve_problem(
         noise: The noise.
         is_near: Whether that is the answer under another noise.
         most: So many steps.
+        settled: See `levenberg_marquardt`.
 
     Returns:
         The unknowns, and whether they converged.
@@ -173,7 +185,25 @@ def solve_problem(
         )
 
     damping = NEAR_DAMPING if is_near else START_DAMPING
-    return levenberg_marquardt(state, linearise, _SETTLED, damping, most)
+    return levenberg_marquardt(state, linearise, settled, damping, most)
+
+
+def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
+    """Solves for the unknowns without some observations, by one step from the fit of all.
+
+    Args:
+        problem: The n observations.
+        fit: Their fit, at rest.
+        kept: (n,) those that stay.
+    """
+    linear, moving = problem.linear(fit.state), problem.moving
+    whitening = _Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
+    information, gradient, _ = whitening.equations(problem, fit.state, linear)
+    step = np.zeros(len(moving))
+    step[moving] = damped_step(information[np.ix_(moving, moving)], gradient[moving], NEAR_DAMPING)
+    if np.abs(step[: 6 * len(problem.unknown)]).max() > _LINEAR:
+        return solve_problem(problem.subset(kept), fit.state, fit.noise, is_near=True)[0]
+    return fit.state.moved(step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -687,18 +717,21 @@ def posterior(
         reduced: What `reduce` gives of these.
 
     Returns:
-        (n,) squared residuals in units of their own noise, and (n,) the redundancy of each: how
-        many of its directions were left over to judge by, of which those squares are an estimate.
+        (n,) squared residuals in units of their own noise, after the step to their least, and (n,)
+        the redundancy of each: how many of its directions were left over to judge by, of which
+        those squares are an estimate.
     """
     own = problem.covariance(noise)
     weights, linear = np.linalg.inv(own), problem.linear(state)
     errors = problem.error_covariance(noise)
-    known = covariance_among(_whole(reduced, errors)[0], problem.moving)
+    information, gradient, _ = _whole(reduced, errors)
+    known = covariance_among(information, problem.moving)
+    step = -known @ gradient
     of, _ = problem.units
     residuals, gone = linear.residuals.copy(), np.zeros_like(weights)
     # The flanges' errors as their prior and their observations have them together.
     gain = errors @ np.linalg.inv(reduced.covariance + errors)
-    flange = (gain @ reduced.errors[:, :, None])[:, :, 0]
+    flange = (gain @ (reduced.errors + reduced.jacobian @ step)[:, :, None])[:, :, 0]
     # All unknowns move the errors, and few an observation: what both make is by unit.
     taken = gain @ reduced.jacobian
     common = (taken.reshape(-1, taken.shape[2]) @ known).reshape(taken.shape)
@@ -707,6 +740,7 @@ def posterior(
         jacobian, columns = block.jacobian, block.columns
         spread = jacobian.reshape(-1, len(columns)) @ known[np.ix_(columns, columns)]
         gone[block.rows] = spread.reshape(jacobian.shape) @ np.swapaxes(jacobian, 1, 2)
+        residuals[block.rows] += jacobian @ step[columns]
         inside = of[block.rows] >= 0
         rows = block.rows[inside]
         by_errors, units = linear.by_errors[rows], of[rows]
