@@ -75,8 +75,8 @@ def levenberg_marquardt(
             if fell <= little:
                 return now.state, True
         else:
-            # What is left is curvature that Gauss and Newton leave out, rounding, or an error of the
-            # derivatives.
+            # What is left is rounding, curvature that Gauss and Newton leave out, or an error of
+            # the derivatives.
             if promised <= _LITTLE:
                 leads = then.fall is not None and then.fall(damping) < _LEADS * promised
                 return then.state if leads else now.state, True

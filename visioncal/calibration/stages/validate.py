@@ -38,16 +38,17 @@ class HeldOut:
 
 def validate(
     problem: Problem,
-    refit: Callable[[Problem], State],
-    pixels: Callable[[IntArray, State], FloatArray],
+    refit: Callable[[Mask], State],
+    pixels: Callable[[IntArray, FloatArray, State], FloatArray],
     of: str = "",
 ) -> HeldOut:
     """Leaves stops out, one by one or in ten groups, and predicts what was observed there.
 
     Args:
         problem: The n observations in the fit.
-        refit: Fits a part of them.
-        pixels: Reprojection errors (m,) [px] of some observations (m,) at a state.
+        refit: Fits those of an (n,) mask.
+        pixels: Reprojection errors (m,) [px] of some observations (m,), which are predicted at
+            (m, 4, 4), at a state.
         of: What is fitted, as a part of the method's words.
 
     Returns:
@@ -67,9 +68,11 @@ def validate(
             held = ~kept & ~(needs & ~known).any(axis=1)
             if not held.any():
                 continue
-            state = refit(problem.subset(kept))
-            away_m[held], away_rad[held] = apart(problem.subset(held), state)
-            rms_px[held] = pixels(np.flatnonzero(held), state)
+            state = refit(kept)
+            predicted = problem.predicted(state)
+            off_m, off_rad = _apart(problem, state, predicted)
+            away_m[held], away_rad[held] = off_m[held], off_rad[held]
+            rms_px[held] = pixels(np.flatnonzero(held), predicted[held], state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(problem) else "stops"
     return HeldOut(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
@@ -88,7 +91,11 @@ def _needs(problem: Problem) -> Mask:
 
 def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """How far (n,) [m] and (n,) [rad] observations are from what is predicted."""
-    away_m, turned = distances(problem.measured(state), problem.predicted(state))
+    return _apart(problem, state, problem.predicted(state))
+
+
+def _apart(problem: Problem, state: State, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    away_m, turned = distances(problem.measured(state), predicted)
     seen = problem.observations
     # The rotation of what is only a point is a matter of choice.
     chosen = np.isin(seen.observed, list(problem.points))
