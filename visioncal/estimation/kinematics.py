@@ -115,9 +115,9 @@ class ArmTrials:
         if key not in self._fits:
             problem, fewer = self.erring(errors), self._fits.get(key[:-1])
             state, noise = (self.state, self.noise) if fewer is None else (fewer.state, fewer.noise)
-            added = problem.start_values[len(state.values) :]
-            start = State(state.edges, np.concatenate([state.values, added]))
-            self._fits[key] = fit_problem(problem, start, noise)
+            if len(added := problem.start_values[len(state.values) :]):
+                state = State(state.edges, np.concatenate([state.values, added]))
+            self._fits[key] = fit_problem(problem, state, noise)
         return self._fits[key]
 
     def found(
@@ -154,7 +154,7 @@ class ArmTrials:
             fit,
             gain,
             problem.linear(fit.state).residuals[mine],
-            left_out_residuals(problem, fit.state, fit.noise)[mine],
+            left_out_residuals(problem, fit.state, fit.noise, mine)[mine],
             np.array(rotation, dtype=bool)[mine],
         )
 

@@ -679,6 +679,18 @@ class RobotLikelihood:
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
     """The likelihood of the robots' levels, those of the sensors being known."""
+    # A fit, its tests and the arms of all robots ask for the same one.
+    for there, before, found in problem.last_likelihood:
+        is_same = there is state and np.array_equal(before.sensors, noise.sensors)
+        if is_same and isinstance(found, RobotLikelihood):
+            alike = np.array_equal(before.robots, noise.robots)
+            return found if alike else replace(found, before=noise.robots)
+    found = _robot_likelihood(problem, state, noise)
+    problem.last_likelihood[:] = [(state, noise, found)]
+    return found
+
+
+def _robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
     of, members = problem.units
     stops = np.zeros(len(members), dtype=np.int64)
     stops[of[of >= 0]] = problem.observations.stops[of >= 0]
@@ -770,7 +782,8 @@ def mahalanobis_sq(
         (n,) squared Mahalanobis distances, and (n,) in how many directions they were measured.
     """
     linear = problem.linear(solution.state)
-    known = fitted_covariance(problem.subset(used), solution.state, solution.noise)
+    information = normal_equations(problem, solution.state, solution.noise, among=used)[0]
+    known = covariance_among(information, problem.moving)
     noise = problem.total_covariance(linear, solution.noise)
     left = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.covariance(known)
     squares, directions = squared_lengths(linear.residuals, left, noise)
@@ -778,29 +791,40 @@ def mahalanobis_sq(
     return squares, np.asarray(directions - unmeasured, dtype=float)
 
 
-def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArray:
+def left_out_residuals(
+    problem: Problem, state: State, noise: Noise, among: Mask | None = None
+) -> FloatArray:
     """Residuals (n, 6) of each observation from a fit without it, to first order.
 
     With it go all that share its flange's error. By the identity of Cook and Weisberg (1982,
     section 2.2), with the noise as it is.
+
+    Args:
+        problem: The observations.
+        state: The answer.
+        noise: Its levels.
+        among: (n,) those that are asked for; all where None.
     """
     linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
-    total = problem.total_covariance(linear, noise)
-    left = total - linear.covariance(fitted)
-    found = (total @ covariance_from(left) @ linear.residuals[:, :, None])[:, :, 0]
-    errors, own, jacobian = (
-        problem.error_covariance(noise),
-        problem.covariance(noise),
-        linear.jacobian,
-    )
+    asked = np.ones(len(problem), dtype=bool) if among is None else among
+    found, residuals = np.full((len(problem), 6), np.nan), linear.residuals
+    errors, own = problem.error_covariance(noise), problem.covariance(noise)
+    alone = asked.copy()
     for unit, rows in problem.shared_units:
-        by_errors, own_jacobian = (
-            array[rows].reshape(6 * len(rows), -1) for array in (linear.by_errors, jacobian)
+        alone[rows] = False
+        if not asked[rows].any():
+            continue
+        by_errors, jacobian = (
+            array.reshape(6 * len(rows), -1)
+            for array in (linear.by_errors[rows], linear.jacobian_of(rows))
         )
-        among = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
-        without = covariance_from(among - own_jacobian @ fitted @ own_jacobian.T)
-        found[rows] = (among @ without @ linear.residuals[rows].ravel()).reshape(-1, 6)
-    return np.asarray(found)
+        total = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
+        without = covariance_from(total - jacobian @ fitted @ jacobian.T)
+        found[rows] = (total @ without @ residuals[rows].ravel()).reshape(-1, 6)
+    singles = problem.total_covariance(linear, noise)[alone]
+    left = singles - linear.covariance(fitted)[alone]
+    found[alone] = (singles @ covariance_from(left) @ residuals[alone, :, None])[:, :, 0]
+    return found
 
 
 def whitened(
@@ -873,12 +897,13 @@ class RepeatErrors:
         jacobian[rows[:, None, None], np.arange(6)[:, None], places[:, None]] = linear.by_errors[
             rows, :, :6
         ]
-        weighted = np.linalg.solve(problem.covariance(noise)[rows], jacobian[rows])
+        own = jacobian[rows]
+        weighted = np.linalg.solve(problem.covariance(noise)[rows], own)
         prior = problem.error_covariance(noise)[len(members) - count :, :6, :6]
         among = block_diag(*np.linalg.inv(prior)) if count else np.zeros((0, 0))
-        inverse = np.linalg.inv(among + np.einsum("nip,niq->pq", weighted, jacobian[rows]))
-        values = -inverse @ np.einsum("nip,ni->p", weighted, linear.residuals[rows])
-        follow = -inverse @ np.einsum("nip,niq->pq", weighted, linear.jacobian[rows])
+        inverse = np.linalg.inv(among + gram(weighted, own))
+        values = -inverse @ gram(weighted, linear.residuals[rows])
+        follow = -inverse @ gram(weighted, linear.jacobian_of(rows))
         beside = known @ follow.T
         whole = np.block([[known, beside], [beside.T, inverse + follow @ beside]])
         return cls(jacobian, values, whole)

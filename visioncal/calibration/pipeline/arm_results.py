@@ -208,8 +208,10 @@ def one_by_one(
     values = {effect: problem.values_of(effect.name, fit.state) for effect in problem.effects}
     for name, arm in arms.items():
         stated = arm.without_errors(problem)
-        start = [values.get(effect, effect.values) for effect in stated.effects]
-        state = State(fit.state.edges, np.concatenate([np.zeros(0), *start]))
+        state = fit.state
+        if stated.effects != tuple(values):
+            start = [values.get(effect, effect.values) for effect in stated.effects]
+            state = State(fit.state.edges, np.concatenate([np.zeros(0), *start]))
         found[name] = change(arm, stated, state)
         problem = found[name].put_into(problem)
     return found

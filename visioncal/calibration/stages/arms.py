@@ -246,8 +246,7 @@ class RobotArm:
         """A problem with this arm in the place of what it has of it."""
         mine = {f"{name} of {self.robot}" for name in ("arm", "temperature")}
         rest = [effect for effect in problem.effects if effect.name not in mine]
-        moved = replace(problem, poses={**problem.poses, self.robot: self.poses})
-        return moved.with_effects([*rest, *self.effects()])
+        return problem.with_poses(self.robot, self.poses).with_effects([*rest, *self.effects()])
 
     def without_errors(self, problem: Problem) -> Problem:
         """A problem with this arm as reported, but for its drift."""
