@@ -117,12 +117,13 @@ def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> S
         state: Where to start.
         noise: Its levels to start from; those from above where None.
     """
-    is_near = noise is not None
+    is_near, given = noise is not None, noise or starting_noise(problem)
     # REML takes residuals as a step to their least would leave them: levels are near before it.
-    noise = estimate_noise(
-        problem, state, noise or starting_noise(problem), from_above=noise is None
-    )
-    for turn in range(_ROUNDS):
+    noise = estimate_noise(problem, state, given, from_above=not is_near)
+    is_known = is_near and _alike(given, noise)
+    if is_known:
+        noise = given
+    for turn in range(0 if is_known else _ROUNDS):
         start, before = state, noise
         state, _ = solve_problem(
             problem, start, noise, is_near=is_near or turn > 0, most=_STEPS, settled=_NEARLY
@@ -130,15 +131,16 @@ def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> S
         if state is start:
             break
         noise = estimate_noise(problem, state, noise)
-        if _alike(before.robots, noise.robots) and _alike(before.sensors, noise.sensors):
+        if _alike(before, noise):
             break
     # Weights are those at the start of a solve: once more, from the answer.
     state, settled = solve_problem(problem, state, noise, is_near=True)
     return Solution(state, noise, settled)
 
 
-def _alike(before: FloatArray, after: FloatArray) -> bool:
-    return bool(np.allclose(before, after, rtol=_LEVELS_SETTLED, atol=_FLOOR))
+def _alike(before: Noise, after: Noise) -> bool:
+    pairs = (before.robots, after.robots), (before.sensors, after.sensors)
+    return all(np.allclose(*pair, rtol=_LEVELS_SETTLED, atol=_FLOOR) for pair in pairs)
 
 
 def solve_problem(

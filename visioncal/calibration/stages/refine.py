@@ -215,9 +215,7 @@ def _doubted(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     ]
     if not held:
         return fitted
-    scores = Scores.of(
-        side, fitted, np.concatenate([scales, *(looks.lens_of(name)[:4] for name in held)])
-    )
+    scores = Scores.of(side, fitted)
     doubts = {}
     for name in held:
         problem, lens = looks.problems[name], looks.lens_of(name)
@@ -458,7 +456,7 @@ def _contested(side: Side, answer: ConvergedFit) -> list[str]:
         return []
     bent = np.union1d(moving, looks.shape)
     lenses = {name: looks.lens_of(name) for name in held}
-    scores = Scores.of(side, answer, np.concatenate([bent, *lenses.values()]))
+    scores = Scores.of(side, answer)
     least = scores.gain(bent)
     return [
         name
@@ -499,7 +497,7 @@ def _shapes(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
         for name, problem in looks.problems.items()
         if problem.scene.mode != "hold"
     }
-    scores = Scores.of(side, fitted, np.concatenate([bent, *stated.values()]))
+    scores = Scores.of(side, fitted)
     gain_bent = scores.gain(bent)
     gains = {
         name: scores.gain(np.union1d(bent, lens)) - gain_bent - chance_limit(len(lens))
