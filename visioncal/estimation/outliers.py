@@ -203,7 +203,7 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     """Settles what agrees one by one, and what moved by less than single observations show."""
     problem, moves = agreed.problem, list(agreed.moves)
     if not movable:
-        return inliers(problem, agreed.fit.state, agreed.used)
+        return inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _settled(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
         slight = slight_move(problem.subset(used), fit, movable)
@@ -216,13 +216,16 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     return _without_needless(_agreed(problem, used, fit, moves))
 
 
-def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
+def inliers(
+    problem: Problem, state: State, used: Mask | None = None, noise: Noise | None = None
+) -> Agreed:
     """Finds the observations that agree, where nothing moved.
 
     Args:
         problem: All observations.
         state: The start.
         used: (n,) those that are thought to agree; None for a search without any idea.
+        noise: Their noise; None where it is not known.
 
     Returns:
         Those that agree. Where fewer than half do, or those only to within more than any result
@@ -234,7 +237,7 @@ def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
         mask, fit = (
             _core(problem, state, every)
             if used is None
-            else (used, fit_problem(problem.subset(used), state))
+            else (used, fit_problem(problem.subset(used), state, noise))
         )
         mask, fit = _settled(problem, mask, fit)
         is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))

@@ -119,9 +119,11 @@ def _fitted(begun: Start, looked: Observed, arms: Mapping[str, RobotArm], asked:
     found = replace(found, arms=with_drifts(found.arms, found.part, found.agreed.fit, asked))
     if any(arm.drift is not None for arm in found.arms.values()):
         found = _agreeing_looks(found, looked, sizes)
+    # Of one camera and one robot without priors, the looks have left nothing to settle.
+    rested = None if cell.mount is None or cell.priors else found.agreed
     found = replace(found, agreed=levelled(cell, poses, found.agreed))
     # Poses that are misread say nothing of the arm, nor which views are outliers.
-    found = found if looked.is_misread else _alternating(found, looked)
+    found = found if looked.is_misread else _alternating(found, looked, rested)
     if asked != "hand-eye" and not looked.is_misread:
         found = _with_functions(found)
     found = replace(found, agreed=with_repeats(found.agreed))
@@ -162,8 +164,14 @@ def _without_misreported(agreed: Agreed, arms: Mapping[str, RobotArm], before: M
     return replace(agreed, used=used).refitted()
 
 
-def _alternating(found: Solved, looked: Observed) -> Solved:
-    """Calibrates the arms by what agrees, and sees what agrees with these, until both stay."""
+def _alternating(found: Solved, looked: Observed, rested: Agreed | None) -> Solved:
+    """Calibrates the arms by what agrees, and sees what agrees with these, until both stay.
+
+    Args:
+        found: The fit.
+        looked: What was observed.
+        rested: What agrees, where that was settled before; else None.
+    """
     for turn in range(_ROUNDS + 1):
         if found.asked != "hand-eye":
             arms = _levels(found)
@@ -171,7 +179,8 @@ def _alternating(found: Solved, looked: Observed) -> Solved:
             late = clock_effects(found.cell, looked.clocks, erring)
             found = _at_rest(replace(found, arms=arms, late=late))
         before = found.agreed
-        if turn == _ROUNDS:  # The arms are calibrated by what agreed last.
+        # The arms are calibrated by what agreed last.
+        if turn == _ROUNDS or before is rested:
             break
         agreed = _without_misreported(settled(found.cell, before), found.arms, before.used)
         found = _at_rest(replace(found, agreed=agreed))
