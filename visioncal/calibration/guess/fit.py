@@ -100,15 +100,18 @@ def robust_fit(robot: FloatArray, camera: FloatArray, starts: int = 0) -> Fit:
     """
     lever = max(float(np.median(np.linalg.norm(camera[:, :3, 3], axis=1))), 1e-12)
     rng, count = np.random.default_rng(0), len(robot)
-    sets = [np.arange(count)]
-    if count > _SUBSET:
-        sets += [rng.choice(count, _SUBSET, replace=False) for _ in range(starts)]
+    every = [_fit(robot, camera, lever, np.arange(count))]
+    if count > _SUBSET and starts:
+        sets = np.array([rng.choice(count, _SUBSET, replace=False) for _ in range(starts)])
+        found = SOLVERS["park"](robot[sets], camera[sets])
+        edges = zip(found.x, found.z, strict=True)
+        every += [distances(robot, camera, lever, item) for item in edges]
     return trimmed_start(
-        (_fit(robot, camera, lever, rows) for rows in sets),
+        every,
         lambda fit: fit.away**2,
         lambda mask, _: _fit(robot, camera, lever, np.flatnonzero(mask)),
         kept_count(count),
-        len(sets),
+        len(every),
     )[1]
 
 

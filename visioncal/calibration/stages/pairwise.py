@@ -70,8 +70,8 @@ class Candidates:
         return replace(self, poses=before[:, None] @ self.poses @ after[:, None])
 
     def distances(self, predicted: FloatArray) -> FloatArray:
-        """Distances (m, k) [m] from (m or 1, 4, 4) predictions, rotations on a lever."""
-        between = invert(predicted)[:, None] @ self.poses
+        """Distances (..., m, k) [m] from (..., m or 1, 4, 4) predictions, rotations on a lever."""
+        between = invert(predicted)[..., None, :, :] @ self.poses
         away = np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
         return np.asarray(np.where(self.valid, away, np.inf))
 
@@ -110,6 +110,15 @@ def parted(
     return Parted(found.x, found.z, candidates.distances(invert(robot @ found.x) @ found.z))
 
 
+def _parted_by(
+    robot: FloatArray, candidates: Candidates, rows: IntArray, picks: IntArray
+) -> list[Parted]:
+    """What `parted` gives of (s, t) views and picks, for s sets at once."""
+    found = SOLVERS["park"](robot[rows], candidates.poses[rows, picks])
+    away = candidates.distances(invert(robot @ found.x[:, None]) @ found.z[:, None])
+    return [Parted(*item) for item in zip(found.x, found.z, away, strict=True)]
+
+
 def trimmed(
     robot: FloatArray, candidates: Candidates, solver: Solver = SOLVERS["park"]
 ) -> tuple[Mask, Parted]:
@@ -128,8 +137,14 @@ def trimmed(
         rows = np.flatnonzero(mask)
         return parted(robot, candidates, rows, at.picks[rows], solver)
 
+    every, *sets = _starts(candidates)
+    starts = [parted(robot, candidates, *every, solver)]
+    if sets and solver is SOLVERS["park"]:
+        starts += _parted_by(robot, candidates, *map(np.array, zip(*sets, strict=True)))
+    else:
+        starts += [parted(robot, candidates, *item, solver) for item in sets]
     return trimmed_start(
-        (parted(robot, candidates, *start, solver) for start in _starts(candidates)),
+        starts,
         lambda item: np.asarray(item.away.min(axis=1)),
         solve,
         max(len(robot) // 2 + 1, FEWEST),
