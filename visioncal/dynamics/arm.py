@@ -50,8 +50,10 @@ class ArmDynamics:
         humps = identified.stribeck
         hump_nm, hump_speeds = np.zeros(robot.joint_count), np.ones(robot.joint_count)
         hump_nm[humps.joints], hump_speeds[humps.joints] = humps.hump_nm, humps.speed_rad_s
-        linear = [by_joint(symbol) for symbol in ("Fc", "Fv", "offset", "Ia")]
-        friction = Friction(*linear, hump_nm, hump_speeds, identified.base.model.terms.slow_rad_s)
+        friction = Friction(
+            *(by_joint("Fc"), by_joint("Fv"), by_joint("offset"), by_joint("Ia")),
+            *(hump_nm, hump_speeds, identified.base.model.terms.slow_rad_s),
+        )
         return cls(robot, Inertias(parameters[:links].reshape(-1, 10)), friction)
 
     def torques(self, q: FloatArray, dq: FloatArray, ddq: FloatArray) -> FloatArray:

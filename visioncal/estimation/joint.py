@@ -7,7 +7,7 @@ the answer, until it stays, is Gauss-Newton's method on the whole problem.
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -80,6 +80,8 @@ class ConvergedFit:
     seen: LinearisedCorners
     problem: Problem
     fit: Solution
+    # Those that were last asked for; see `Scores.of`.
+    _scores: list[tuple[Side, "Scores"]] = field(default_factory=list, init=False, repr=False)
 
     @property
     def columns(self) -> slice:
@@ -248,15 +250,12 @@ def measured_scale(side: Side, fitted: ConvergedFit, board: int = 0) -> Measured
     looks = fitted.seen.looks
     (place,) = looks.scale_of(board)
     stated, known = looks.stated_scale_sigma(board), float(looks.prior_sigma[place] ** -2.0)
-    problem, there = _at(side, fitted, fitted.seen.freed(np.union1d(fitted.moving, place)))
-    information, gradient = normal_equations(problem, there, fitted.fit.noise)
-    covariance = covariance_among(information, problem.moving)
-    at = fitted.columns.start + int(np.searchsorted(fitted.seen.free, place))
+    step, covariance = Scores.of(side, fitted).asked_for(np.array([place]), fitted.moving)
     # What was stated is taken away again: without it the rest may leave the size open.
-    measured = 1.0 / float(covariance[at, at]) - known
+    measured = 1.0 / float(covariance[0, 0]) - known
     if measured <= _UNMEASURED * known:
         return MeasuredScale(board, 0.0, np.inf, stated)
-    with_stated = float(fitted.looks.values[place]) - float(covariance[at] @ gradient)
+    with_stated = float(fitted.looks.values[place] + step[0])
     return MeasuredScale(
         board,
         with_stated * (1.0 + known / measured),
@@ -365,7 +364,7 @@ class Scores:
     """What the data ask of values that a fit holds (Rao's score test).
 
     Attributes:
-        information: (p, p) with all the values free that may be asked for.
+        information: (p, p) with all values free.
         gradient: (p,) of half the squared error, at the fit.
         moving: (p,) which columns a fit moves.
         columns: Those of lenses and boards.
@@ -379,14 +378,24 @@ class Scores:
     places: IntArray
 
     @classmethod
-    def of(cls, side: Side, fitted: ConvergedFit, asked: IntArray) -> "Scores":
-        """The scores of some values, at a fit."""
-        seen = fitted.seen.freed(np.union1d(fitted.moving, asked))
-        problem, there = _at(side, fitted, seen)
-        scores = normal_equations(problem, there, fitted.fit.noise)
+    def of(cls, side: Side, fitted: ConvergedFit) -> "Scores":
+        """The scores of all values, at a fit."""
+        for asked, found in fitted._scores:
+            if asked is side:
+                return found
+        seen = fitted.seen.freed(np.arange(len(fitted.seen.looks.values)))
+        values = fitted.fit.state.values[len(fitted.seen.free) :]
+        values = np.concatenate([fitted.looks.values, values])
+        problem, there = side.problem(seen), State(fitted.fit.state.edges, values)
         first = fitted.columns.start
-        columns = slice(first, first + len(seen.free))
-        return cls(*scores, problem.moving, columns, seen.free)
+        found = cls(
+            *normal_equations(problem, there, fitted.fit.noise),
+            problem.moving,
+            slice(first, first + len(seen.free)),
+            seen.free,
+        )
+        fitted._scores[:] = [(side, found)]
+        return found
 
     def gain(self, moving: IntArray) -> float:
         """How much the squared error falls when these values are free (Rao's score test)."""
@@ -406,10 +415,3 @@ class Scores:
         covariance = covariance_among(self.information, among)
         at = self.columns.start + np.searchsorted(self.places, places)
         return -covariance[at] @ self.gradient, covariance[np.ix_(at, at)]
-
-
-def _at(side: Side, fitted: ConvergedFit, seen: LinearisedCorners) -> tuple[Problem, State]:
-    """The problem with other values free, and a fit's state in it."""
-    values = fitted.fit.state.values[len(fitted.seen.free) :]
-    values = np.concatenate([fitted.looks.values[seen.free], values])
-    return side.problem(seen), State(fitted.fit.state.edges, values)

@@ -112,9 +112,9 @@ class ArmTrials:
         if key not in self._fits:
             problem, base = self.erring(errors), self._fits.get(key[:-1])
             state, noise = (self.state, self.noise) if base is None else (base.state, base.noise)
-            added = problem.start_values[len(state.values) :]
-            start = State(state.edges, np.concatenate([state.values, added]))
-            self._fits[key] = fit_problem(problem, start, noise)
+            if len(added := problem.start_values[len(state.values) :]):
+                state = State(state.edges, np.concatenate([state.values, added]))
+            self._fits[key] = fit_problem(problem, state, noise)
         return self._fits[key]
 
     def found(
@@ -151,7 +151,7 @@ class ArmTrials:
             fit,
             gain,
             problem.linear(fit.state).residuals[rows],
-            left_out_residuals(problem, fit.state, fit.noise)[rows],
+            left_out_residuals(problem, fit.state, fit.noise, rows)[rows],
             np.array(rotation, dtype=bool)[rows],
         )
 

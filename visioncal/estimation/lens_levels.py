@@ -139,8 +139,8 @@ class _Likelihood:
         modes[len(self.known) :] = self.modes[:, None] == levels
         return (self.kinds[:, :, None] == levels).astype(float), modes
 
-    def __call__(self, logs: FloatArray) -> Likely:
-        """The negative logarithm, its slope, and its second derivative."""
+    def __call__(self, logs: FloatArray, *, is_sloped: bool = True) -> Likely:
+        """The negative logarithm, its slope and its second derivative, or zeros for these two."""
         # Where that is not positive, the average information takes its place (Gilmour, Thompson and
         # Cullis 1995): it never is negative.
         t, variances, is_random = len(self.known), np.exp(2.0 * logs), self.kinds >= 0
@@ -172,6 +172,11 @@ class _Likelihood:
         squared = weight * self.cost + gradient @ best - float(np.sum(pulls * pulled))
         determinants = 2.0 * float(np.log(np.diag(factor[0])).sum() - np.log(scale).sum())
         determinants += 2.0 * float(np.log(root[:, diagonal, diagonal]).sum() + self.counts @ logs)
+        value = 0.5 * float(self.rows * 2.0 * logs[_NOISE] + determinants + squared)
+        slope, curvature = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
+        ratios = ratio_prior(range(self.flanges), _FLANGES)
+        if not is_sloped:
+            return ratios.beside(Likely(value, slope, curvature), logs)
         # Where a level's values are, and how well they are known: in units of the level.
         levels = np.flatnonzero(self.counts)
         singles, modes = self._members
@@ -210,11 +215,8 @@ class _Likelihood:
         second = 4.0 * moved - expected + 2.0 * np.diag(slope[places])
         if np.linalg.eigvalsh(second)[0] <= 0.0:
             second = 2.0 * moved
-        curvature = np.zeros((len(logs),) * 2)
         curvature[np.ix_(places, places)] = second
-        value = 0.5 * (self.rows * 2.0 * logs[_NOISE] + determinants + squared)
-        ratios = ratio_prior(range(self.flanges), _FLANGES)
-        return ratios.beside(Likely(float(value), slope, curvature), logs)
+        return ratios.beside(Likely(value, slope, curvature), logs)
 
     def _expected(
         self,
@@ -287,7 +289,7 @@ class _Likelihood:
         if logs[level] <= least:
             return 0.0
         without[level] = least
-        most = 2.0 * (self(without).value - value)
+        most = 2.0 * (self(without, is_sloped=False).value - value)
         # What the others can take over is asked only where it matters.
         if most < SIGNIFICANT:
             return most

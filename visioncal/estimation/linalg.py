@@ -1,5 +1,6 @@
 """Linear algebra of least squares: solving, covariance, and the spectrum of the information."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -122,7 +123,7 @@ def gram(left: _Floats, right: _Floats) -> FloatArray:
 
     One product of tall matrices, which is many times faster than `einsum` over the blocks.
     """
-    rows = left.reshape(-1, left.shape[-1])
+    rows = left.reshape(math.prod(left.shape[:-1]), left.shape[-1])
     return np.asarray(rows.T @ right.reshape(len(rows), *right.shape[2:]))
 
 

@@ -192,7 +192,7 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     """Refines the inliers one by one, and finds moves too small for single observations."""
     problem, moves = agreed.problem, list(agreed.moves)
     if not movable:
-        return inliers(problem, agreed.fit.state, agreed.used)
+        return inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
         slight = slight_move(problem.subset(used), fit, movable)
@@ -205,8 +205,10 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     return _without_needless(_inlier_fit(problem, used, fit, moves))
 
 
-def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
-    """Finds the inliers where nothing moved; `used` are (n,) presumed ones, if any.
+def inliers(
+    problem: Problem, state: State, used: Mask | None = None, noise: Noise | None = None
+) -> Agreed:
+    """Finds the inliers where nothing moved; `used` are (n,) presumed ones, if any, of some noise.
 
     Where fewer than half are inliers, or their noise exceeds any accepted result's, the outliers
     cannot be identified: all stay except gross outliers.
@@ -216,7 +218,7 @@ def inliers(problem: Problem, state: State, used: Mask | None = None) -> Agreed:
         mask, fit = (
             _trimmed_core(problem, state, all_rows)
             if used is None
-            else (used, fit_problem(problem.subset(used), state))
+            else (used, fit_problem(problem.subset(used), state, noise))
         )
         mask, fit = _refined(problem, mask, fit)
         is_noise = bool(np.all(fit.noise.robots < _MOST_NOISE))

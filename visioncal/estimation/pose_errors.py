@@ -193,18 +193,18 @@ def left_out_clusters(
     white = levels[problem.robots.index(robot)] if errors.white is None else errors.white
     levels[problem.robots.index(robot)] = white
     noise_beside = replace(noise, robots=levels)
+    linear = widened.linear(widened_state)
+    covariances = widened.total_covariance(linear, noise_beside)
     for cluster in range(_CLUSTERS):
-        held = np.zeros(len(problem), dtype=bool)
-        held[rows[clusters == cluster]] = True
-        rest, left_out = widened.subset(~held), widened.subset(held)
-        information, gradient = normal_equations(rest, widened_state, noise)
+        held = rows[clusters == cluster]
+        kept = ~np.isin(np.arange(len(problem)), held)
+        information, gradient = normal_equations(widened, widened_state, noise, among=kept)
         fitted = covariance_among(information[:size, :size], problem.moving)
-        linear = left_out.linear(widened_state)
-        jacobian, by_arm = np.split(linear.jacobian, [size], axis=2)
-        residuals = linear.residuals - jacobian @ (fitted @ gradient[:size])
+        jacobian, by_arm = np.split(linear.jacobian_of(held), [size], axis=2)
+        residuals = linear.residuals[held] - jacobian @ (fitted @ gradient[:size])
         by_arm = errors.sigma * (by_arm - jacobian @ (fitted @ information[:size, size:]))
-        fitted = fitted + less_noise(problem.subset(~held), state, noise, robot, white)
-        predicted = left_out.total_covariance(linear, noise_beside)
+        fitted = fitted + less_noise(problem.subset(kept), state, noise, robot, white)
+        predicted = covariances[held]
         predicted += by_arm @ np.swapaxes(by_arm, 1, 2)
         predicted += jacobian @ fitted @ np.swapaxes(jacobian, 1, 2)
         squares[0] += np.sum(residuals**2, axis=0).reshape(2, 3)

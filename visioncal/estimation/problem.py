@@ -142,6 +142,10 @@ class Problem:
     is_combined: bool = False
     # The last of `linear`, ideal or not: a fit, its noise and its tests ask for the same one.
     _last: dict[bool, tuple[State, Linear]] = field(default_factory=dict, init=False, repr=False)
+    # What `solve.robot_likelihood` last made of one.
+    last_likelihood: list[tuple[State, Noise, object]] = field(
+        default_factory=list, init=False, repr=False
+    )
     _last_moved: list[tuple[State, tuple[FloatArray, FloatArray, tuple[JacobianBlock, ...]]]] = (
         field(default_factory=list, init=False, repr=False)
     )
@@ -226,9 +230,16 @@ class Problem:
             effects=tuple(effects),
         )
 
+    def with_poses(self, robot: str, poses: FloatArray) -> "Problem":
+        """Returns the problem with other poses of a robot; with those that it has, itself."""
+        if np.array_equal(self.poses[robot], poses, equal_nan=True):
+            return self
+        return replace(self, poses={**self.poses, robot: poses})
+
     def with_effects(self, effects: Sequence[Effect]) -> "Problem":
-        """Returns the problem with other effects."""
-        return replace(self, effects=tuple(effect for effect in effects if len(effect)))
+        """Returns the problem with other effects; with those that it has, itself."""
+        kept = tuple(effect for effect in effects if len(effect))
+        return self if kept == self.effects else replace(self, effects=kept)
 
     @cached_property
     def unknown(self) -> Mapping[str, int]:

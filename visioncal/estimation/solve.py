@@ -37,7 +37,10 @@ from visioncal.estimation.variance import (
     estimate_sigmas,
 )
 
-_ROUNDS, _SETTLED = 20, 1e-10
+# After shorter steps of frames [rad and m], first order is off by less than any noise.
+_LINEAR = 1e-3
+# Shares of the cost by which it still falls at rest, and while the noise is sought.
+_ROUNDS, _SETTLED, _NEARLY = 20, 1e-10, 1e-7
 # A healthy fit comes to rest within a few steps. One that creeps, as along the flat valley of an
 # arm's errors that stand for another cause, gets other levels of noise after so many.
 _STEPS = 30
@@ -114,21 +117,30 @@ def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> S
         state: Where to start.
         noise: Its levels to start from; those from above where None.
     """
-    settled = False
-    if noise is None:
-        noise = estimate_noise(problem, state, starting_noise(problem), from_above=True)
-    for turn in range(_ROUNDS):
-        state, settled = solve_problem(problem, state, noise, is_near=turn > 0, most=_STEPS)
-        before, noise = noise, estimate_noise(problem, state, noise)
-        if _alike(before.robots, noise.robots) and _alike(before.sensors, noise.sensors):
+    is_near, given = noise is not None, noise or starting_noise(problem)
+    # REML takes residuals as a step to their least would leave them: levels are near before it.
+    noise = estimate_noise(problem, state, given, from_above=not is_near)
+    is_known = is_near and _alike(given, noise)
+    if is_known:
+        noise = given
+    for turn in range(0 if is_known else _ROUNDS):
+        start, before = state, noise
+        state, _ = solve_problem(
+            problem, start, noise, is_near=is_near or turn > 0, most=_STEPS, settled=_NEARLY
+        )
+        if state is start:
             break
-    if not settled:
-        state, settled = solve_problem(problem, state, noise, is_near=True)
+        noise = estimate_noise(problem, state, noise)
+        if _alike(before, noise):
+            break
+    # Weights are those at the start of a solve: once more, from the answer.
+    state, settled = solve_problem(problem, state, noise, is_near=True)
     return Solution(state, noise, settled)
 
 
-def _alike(before: FloatArray, after: FloatArray) -> bool:
-    return bool(np.allclose(before, after, rtol=_LEVELS_SETTLED, atol=_FLOOR))
+def _alike(before: Noise, after: Noise) -> bool:
+    pairs = (before.robots, after.robots), (before.sensors, after.sensors)
+    return all(np.allclose(*pair, rtol=_LEVELS_SETTLED, atol=_FLOOR) for pair in pairs)
 
 
 def solve_problem(
@@ -138,6 +150,7 @@ def solve_problem(
     *,
     is_near: bool = False,
     most: int = ITERATIONS,
+    settled: float = _SETTLED,
 ) -> tuple[State, bool]:
     """Minimises the residuals whitened by a known noise.
 
@@ -147,6 +160,7 @@ def solve_problem(
         noise: The noise.
         is_near: Whether that is the answer under another noise.
         most: So many steps.
+        settled: See `levenberg_marquardt`.
 
     Returns:
         The unknowns, and whether they converged.
@@ -173,7 +187,25 @@ def solve_problem(
         )
 
     damping = NEAR_DAMPING if is_near else START_DAMPING
-    return levenberg_marquardt(state, linearise, _SETTLED, damping, most)
+    return levenberg_marquardt(state, linearise, settled, damping, most)
+
+
+def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
+    """Solves for the unknowns without some observations, by one step from the fit of all.
+
+    Args:
+        problem: The n observations.
+        fit: Their fit, at rest.
+        kept: (n,) those that stay.
+    """
+    linear, moving = problem.linear(fit.state), problem.moving
+    whitening = _Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
+    information, gradient, _ = whitening.equations(problem, fit.state, linear)
+    step = np.zeros(len(moving))
+    step[moving] = damped_step(information[np.ix_(moving, moving)], gradient[moving], NEAR_DAMPING)
+    if np.abs(step[: 6 * len(problem.unknown)]).max() > _LINEAR:
+        return solve_problem(problem.subset(kept), fit.state, fit.noise, is_near=True)[0]
+    return fit.state.moved(step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -649,6 +681,18 @@ class RobotLikelihood:
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
     """The likelihood of the robots' levels, those of the sensors being known."""
+    # A fit, its tests and the arms of all robots ask for the same one.
+    for there, before, found in problem.last_likelihood:
+        is_same = there is state and np.array_equal(before.sensors, noise.sensors)
+        if is_same and isinstance(found, RobotLikelihood):
+            alike = np.array_equal(before.robots, noise.robots)
+            return found if alike else replace(found, before=noise.robots)
+    found = _robot_likelihood(problem, state, noise)
+    problem.last_likelihood[:] = [(state, noise, found)]
+    return found
+
+
+def _robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
     of, members = problem.units
     stops = np.zeros(len(members), dtype=np.int64)
     stops[of[of >= 0]] = problem.observations.stops[of >= 0]
@@ -687,18 +731,21 @@ def posterior(
         reduced: What `reduce` gives of these.
 
     Returns:
-        (n,) squared residuals in units of their own noise, and (n,) the redundancy of each: how
-        many of its directions were left over to judge by, of which those squares are an estimate.
+        (n,) squared residuals in units of their own noise, after the step to their least, and (n,)
+        the redundancy of each: how many of its directions were left over to judge by, of which
+        those squares are an estimate.
     """
     own = problem.covariance(noise)
     weights, linear = np.linalg.inv(own), problem.linear(state)
     errors = problem.error_covariance(noise)
-    known = covariance_among(_whole(reduced, errors)[0], problem.moving)
+    information, gradient, _ = _whole(reduced, errors)
+    known = covariance_among(information, problem.moving)
+    step = -known @ gradient
     of, _ = problem.units
     residuals, gone = linear.residuals.copy(), np.zeros_like(weights)
     # The flanges' errors as their prior and their observations have them together.
     gain = errors @ np.linalg.inv(reduced.covariance + errors)
-    flange = (gain @ reduced.errors[:, :, None])[:, :, 0]
+    flange = (gain @ (reduced.errors + reduced.jacobian @ step)[:, :, None])[:, :, 0]
     # All unknowns move the errors, and few an observation: what both make is by unit.
     taken = gain @ reduced.jacobian
     common = (taken.reshape(-1, taken.shape[2]) @ known).reshape(taken.shape)
@@ -707,6 +754,7 @@ def posterior(
         jacobian, columns = block.jacobian, block.columns
         spread = jacobian.reshape(-1, len(columns)) @ known[np.ix_(columns, columns)]
         gone[block.rows] = spread.reshape(jacobian.shape) @ np.swapaxes(jacobian, 1, 2)
+        residuals[block.rows] += jacobian @ step[columns]
         inside = of[block.rows] >= 0
         rows = block.rows[inside]
         by_errors, units = linear.by_errors[rows], of[rows]
@@ -736,7 +784,8 @@ def mahalanobis_sq(
         (n,) squared Mahalanobis distances, and (n,) in how many directions they were measured.
     """
     linear = problem.linear(solution.state)
-    known = fitted_covariance(problem.subset(used), solution.state, solution.noise)
+    information = normal_equations(problem, solution.state, solution.noise, among=used)[0]
+    known = covariance_among(information, problem.moving)
     noise = problem.total_covariance(linear, solution.noise)
     left = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.covariance(known)
     squares, directions = squared_lengths(linear.residuals, left, noise)
@@ -744,29 +793,40 @@ def mahalanobis_sq(
     return squares, np.asarray(directions - unmeasured, dtype=float)
 
 
-def left_out_residuals(problem: Problem, state: State, noise: Noise) -> FloatArray:
+def left_out_residuals(
+    problem: Problem, state: State, noise: Noise, among: Mask | None = None
+) -> FloatArray:
     """Residuals (n, 6) of each observation from a fit without it, to first order.
 
     With it go all that share its flange's error. By the identity of Cook and Weisberg (1982,
     section 2.2), with the noise as it is.
+
+    Args:
+        problem: The observations.
+        state: The answer.
+        noise: Its levels.
+        among: (n,) those that are asked for; all where None.
     """
     linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
-    total = problem.total_covariance(linear, noise)
-    left = total - linear.covariance(fitted)
-    found = (total @ covariance_from(left) @ linear.residuals[:, :, None])[:, :, 0]
-    errors, own, jacobian = (
-        problem.error_covariance(noise),
-        problem.covariance(noise),
-        linear.jacobian,
-    )
+    asked = np.ones(len(problem), dtype=bool) if among is None else among
+    found, residuals = np.full((len(problem), 6), np.nan), linear.residuals
+    errors, own = problem.error_covariance(noise), problem.covariance(noise)
+    alone = asked.copy()
     for unit, rows in problem.shared_units:
-        by_errors, own_jacobian = (
-            array[rows].reshape(6 * len(rows), -1) for array in (linear.by_errors, jacobian)
+        alone[rows] = False
+        if not asked[rows].any():
+            continue
+        by_errors, jacobian = (
+            array.reshape(6 * len(rows), -1)
+            for array in (linear.by_errors[rows], linear.jacobian_of(rows))
         )
-        among = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
-        without = covariance_from(among - own_jacobian @ fitted @ own_jacobian.T)
-        found[rows] = (among @ without @ linear.residuals[rows].ravel()).reshape(-1, 6)
-    return np.asarray(found)
+        total = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
+        without = covariance_from(total - jacobian @ fitted @ jacobian.T)
+        found[rows] = (total @ without @ residuals[rows].ravel()).reshape(-1, 6)
+    singles = problem.total_covariance(linear, noise)[alone]
+    left = singles - linear.covariance(fitted)[alone]
+    found[alone] = (singles @ covariance_from(left) @ residuals[alone, :, None])[:, :, 0]
+    return found
 
 
 def whitened(
@@ -839,12 +899,13 @@ class RepeatErrors:
         jacobian[rows[:, None, None], np.arange(6)[:, None], places[:, None]] = linear.by_errors[
             rows, :, :6
         ]
-        weighted = np.linalg.solve(problem.covariance(noise)[rows], jacobian[rows])
+        own = jacobian[rows]
+        weighted = np.linalg.solve(problem.covariance(noise)[rows], own)
         prior = problem.error_covariance(noise)[len(members) - count :, :6, :6]
         among = block_diag(*np.linalg.inv(prior)) if count else np.zeros((0, 0))
-        inverse = np.linalg.inv(among + np.einsum("nip,niq->pq", weighted, jacobian[rows]))
-        values = -inverse @ np.einsum("nip,ni->p", weighted, linear.residuals[rows])
-        follow = -inverse @ np.einsum("nip,niq->pq", weighted, linear.jacobian[rows])
+        inverse = np.linalg.inv(among + gram(weighted, own))
+        values = -inverse @ gram(weighted, linear.residuals[rows])
+        follow = -inverse @ gram(weighted, linear.jacobian_of(rows))
         beside = known @ follow.T
         whole = np.block([[known, beside], [beside.T, inverse + follow @ beside]])
         return cls(jacobian, values, whole)

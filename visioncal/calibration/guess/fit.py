@@ -100,15 +100,18 @@ def robust_fit(robot: FloatArray, camera: FloatArray, starts: int = 0) -> Fit:
     """
     lever = max(float(np.median(np.linalg.norm(camera[:, :3, 3], axis=1))), 1e-12)
     rng, count = np.random.default_rng(0), len(robot)
-    subsets = [np.arange(count)]
-    if count > _SUBSET:
-        subsets += [rng.choice(count, _SUBSET, replace=False) for _ in range(starts)]
+    fits = [_fit(robot, camera, lever, np.arange(count))]
+    if count > _SUBSET and starts:
+        subsets = np.array([rng.choice(count, _SUBSET, replace=False) for _ in range(starts)])
+        solutions = SOLVERS["park"](robot[subsets], camera[subsets])
+        edges = zip(solutions.x, solutions.z, strict=True)
+        fits += [distances(robot, camera, lever, item) for item in edges]
     return trimmed_start(
-        (_fit(robot, camera, lever, rows) for rows in subsets),
+        fits,
         lambda fit: fit.residuals**2,
         lambda mask, _: _fit(robot, camera, lever, np.flatnonzero(mask)),
         kept_count(count),
-        len(subsets),
+        len(fits),
     )[1]
 
 

@@ -194,9 +194,10 @@ def change_each(
     changed = dict(arms)
     values = {effect: problem.values_of(effect.name, fit.state) for effect in problem.effects}
     for name, arm in arms.items():
-        nominal = arm.without_errors(problem)
-        start = [values.get(effect, effect.values) for effect in nominal.effects]
-        state = State(fit.state.edges, np.concatenate([np.zeros(0), *start]))
+        nominal, state = arm.without_errors(problem), fit.state
+        if nominal.effects != tuple(values):
+            start = [values.get(effect, effect.values) for effect in nominal.effects]
+            state = State(fit.state.edges, np.concatenate([np.zeros(0), *start]))
         changed[name] = change(arm, nominal, state)
         problem = changed[name].put_into(problem)
     return changed

@@ -10,14 +10,13 @@ from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.handeye import closed_form_state
 from visioncal.calibration.stages.validate import HeldOut, validate
 from visioncal.core.transforms import apply_each
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import shape_basis, shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.estimation.parts import State
-from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import solve_problem
+from visioncal.estimation.solve import solve_without
 from visioncal.session import frame_name
 from visioncal.vision.targets import corner_positions
 
@@ -25,17 +24,20 @@ from visioncal.vision.targets import corner_positions
 def left_out(solved: Solved) -> HeldOut:
     """Residuals of the inliers, each by a fit without its stop."""
     fit, used, mount = solved.agreed.fit, np.flatnonzero(solved.agreed.used), solved.cell.mount
+    part = solved.part
 
-    def refit(part: Problem) -> State:
+    def refit(kept: Mask) -> State:
         if solved.solver == "joint" or mount is None:
-            return solve_problem(part, fit.state, fit.noise, is_near=True)[0]
-        return closed_form_state(part, solved.solver, fit.state, mount)
+            return solve_without(part, fit, kept)
+        return closed_form_state(part.subset(kept), solved.solver, fit.state, mount)
 
-    def pixels(rows: IntArray, state: State) -> FloatArray:
-        return solved.chain_px(used[rows], state)
+    def pixels(rows: IntArray, predicted: FloatArray, state: State) -> FloatArray:
+        mine = used[rows].tolist()
+        seen = [solved.cell.rows[at] for at in mine], [solved.poses[at] for at in mine]
+        return solved.pixels(*seen, predicted, state)
 
     of = {None: "", "instrument": ", of the whole fit"}.get(mount, ", of the hand-eye fit")
-    return validate(solved.part, refit, pixels, of)
+    return validate(part, refit, pixels, of)
 
 
 def _covariances_of_edges(

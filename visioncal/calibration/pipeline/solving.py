@@ -120,9 +120,11 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
     solved = replace(solved, arms=with_drifts(solved.arms, solved.part, solved.agreed.fit, level))
     if any(arm.drift is not None for arm in solved.arms.values()):
         solved = _fit_with_inliers(solved, observed, sizes)
+    # Of one camera and one robot without priors, the inliers are final with lenses and boards.
+    final = None if cell.mount is None or cell.priors else solved.agreed
     solved = replace(solved, agreed=with_camera_levels(cell, poses, solved.agreed))
     # Misread poses determine neither the arm nor which views are outliers.
-    solved = solved if observed.is_misread else _calibrate_arms(solved, observed)
+    solved = solved if observed.is_misread else _calibrate_arms(solved, observed, final)
     if level != "hand-eye" and not observed.is_misread:
         solved = _with_functions(solved)
     solved = replace(solved, agreed=with_repeats(solved.agreed))
@@ -163,8 +165,14 @@ def _without_misreported(inliers: Agreed, arms: Mapping[str, RobotArm], before: 
     return replace(inliers, used=used).refitted()
 
 
-def _calibrate_arms(solved: Solved, observed: Observed) -> Solved:
-    """Alternates between calibrating the arms and updating the inliers until neither changes."""
+def _calibrate_arms(solved: Solved, observed: Observed, final: Agreed | None) -> Solved:
+    """Alternates between calibrating the arms and updating the inliers until neither changes.
+
+    Args:
+        solved: The fit.
+        observed: The observations.
+        final: Inliers that need no update, if any.
+    """
     for iteration in range(_ROUNDS + 1):
         if solved.asked != "hand-eye":
             arms = _choose_levels(solved)
@@ -172,7 +180,8 @@ def _calibrate_arms(solved: Solved, observed: Observed) -> Solved:
             clock_errors = clock_effects(solved.cell, observed.clocks, erring)
             solved = _converge_arms(replace(solved, arms=arms, late=clock_errors))
         before = solved.agreed
-        if iteration == _ROUNDS:  # The arms are calibrated with the last inliers.
+        # The arms are calibrated with the last inliers.
+        if iteration == _ROUNDS or before is final:
             break
         inliers = _without_misreported(
             updated_inliers(solved.cell, before), solved.arms, before.used

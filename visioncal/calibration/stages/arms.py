@@ -246,8 +246,7 @@ class RobotArm:
         """A problem with this arm's poses and effects in place of its former ones."""
         mine = {f"{name} of {self.robot}" for name in ("arm", "temperature")}
         rest = [effect for effect in problem.effects if effect.name not in mine]
-        moved = replace(problem, poses={**problem.poses, self.robot: self.poses})
-        return moved.with_effects([*rest, *self.effects()])
+        return problem.with_poses(self.robot, self.poses).with_effects([*rest, *self.effects()])
 
     def without_errors(self, problem: Problem) -> Problem:
         """A problem with this arm as reported, apart from its drift."""

@@ -68,8 +68,8 @@ class Candidates:
         return replace(self, poses=before[:, None] @ self.poses @ after[:, None])
 
     def distances(self, predicted: FloatArray) -> FloatArray:
-        """Distances (m, k) [m] from (m or 1, 4, 4) predictions, rotations on a lever."""
-        between = invert(predicted)[:, None] @ self.poses
+        """Distances (..., m, k) [m] from (..., m or 1, 4, 4) predictions, rotations on a lever."""
+        between = invert(predicted)[..., None, :, :] @ self.poses
         distances = np.linalg.norm(between[..., :3, 3], axis=-1) + LEVER_M * rotation_angle(between)
         return np.asarray(np.where(self.valid, distances, np.inf))
 
@@ -103,6 +103,15 @@ def solve_edges(
     return HandEyeEdges(edges.x, edges.z, candidates.distances(invert(robot @ edges.x) @ edges.z))
 
 
+def _solve_edges_of_sets(
+    robot: FloatArray, candidates: Candidates, rows: IntArray, picks: IntArray
+) -> list[HandEyeEdges]:
+    """The result of `solve_edges` for each of s sets of (s, t) views and picks, in one batch."""
+    edges = SOLVERS["park"](robot[rows], candidates.poses[rows, picks])
+    residuals = candidates.distances(invert(robot @ edges.x[:, None]) @ edges.z[:, None])
+    return [HandEyeEdges(*item) for item in zip(edges.x, edges.z, residuals, strict=True)]
+
+
 def trimmed_edges(
     robot: FloatArray, candidates: Candidates, solver: Solver = SOLVERS["park"]
 ) -> tuple[Mask, HandEyeEdges]:
@@ -118,8 +127,14 @@ def trimmed_edges(
         rows = np.flatnonzero(mask)
         return solve_edges(robot, candidates, rows, edges.picks[rows], solver)
 
+    every, *sets = _starts(candidates)
+    starts = [solve_edges(robot, candidates, *every, solver)]
+    if sets and solver is SOLVERS["park"]:
+        starts += _solve_edges_of_sets(robot, candidates, *map(np.array, zip(*sets, strict=True)))
+    else:
+        starts += [solve_edges(robot, candidates, *item, solver) for item in sets]
     return trimmed_start(
-        (solve_edges(robot, candidates, *start, solver) for start in _starts(candidates)),
+        starts,
         lambda item: np.asarray(item.residuals.min(axis=1)),
         solve,
         max(len(robot) // 2 + 1, FEWEST),

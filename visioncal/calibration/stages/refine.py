@@ -209,9 +209,7 @@ def _with_lens_priors(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     ]
     if not held:
         return fitted
-    scores = Scores.of(
-        side, fitted, np.concatenate([scales, *(looks.lens_of(name)[:4] for name in held)])
-    )
+    scores = Scores.of(side, fitted)
     doubts = {}
     for name in held:
         problem, lens = looks.problems[name], looks.lens_of(name)
@@ -449,7 +447,7 @@ def _contested_cameras(side: Side, fitted: ConvergedFit) -> list[str]:
         return []
     bent = np.union1d(moving, looks.shape)
     lenses = {name: looks.lens_of(name) for name in held}
-    scores = Scores.of(side, fitted, np.concatenate([bent, *lenses.values()]))
+    scores = Scores.of(side, fitted)
     least = scores.gain(bent)
     return [
         name
@@ -487,7 +485,7 @@ def _shape_sets(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
         for name, problem in looks.problems.items()
         if problem.scene.mode != "hold"
     }
-    scores = Scores.of(side, fitted, np.concatenate([bent, *stated.values()]))
+    scores = Scores.of(side, fitted)
     gain_bent = scores.gain(bent)
     gains = {
         name: scores.gain(np.union1d(bent, lens)) - gain_bent - chance_limit(len(lens))

@@ -39,16 +39,17 @@ class HeldOut:
 
 def validate(
     problem: Problem,
-    refit: Callable[[Problem], State],
-    pixels: Callable[[IntArray, State], FloatArray],
+    refit: Callable[[Mask], State],
+    pixels: Callable[[IntArray, FloatArray, State], FloatArray],
     of: str = "",
 ) -> HeldOut:
     """Holds stops out, one by one or in ten groups, and predicts their observations.
 
     Args:
         problem: The n observations in the fit.
-        refit: Fits a part of them.
-        pixels: Reprojection errors (m,) [px] of some observations (m,) at a state.
+        refit: Fits those of an (n,) mask.
+        pixels: Reprojection errors (m,) [px] of some observations (m,), which are predicted at
+            (m, 4, 4), at a state.
         of: What is fitted, as a part of the method's words.
 
     Returns:
@@ -68,9 +69,11 @@ def validate(
             held = ~kept & ~(needed & ~determined).any(axis=1)
             if not held.any():
                 continue
-            state = refit(problem.subset(kept))
-            away_m[held], away_rad[held] = apart(problem.subset(held), state)
-            rms_px[held] = pixels(np.flatnonzero(held), state)
+            state = refit(kept)
+            predicted = problem.predicted(state)
+            off_m, off_rad = _apart(problem, state, predicted)
+            away_m[held], away_rad[held] = off_m[held], off_rad[held]
+            rms_px[held] = pixels(np.flatnonzero(held), predicted[held], state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(problem) else "stops"
     return HeldOut(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
@@ -87,7 +90,11 @@ def _needed_frames(problem: Problem) -> Mask:
 
 def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """Residuals (n,) [m] and (n,) [rad] of observations."""
-    away_m, away_rad = distances(problem.measured(state), problem.predicted(state))
+    return _apart(problem, state, problem.predicted(state))
+
+
+def _apart(problem: Problem, state: State, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    away_m, away_rad = distances(problem.measured(state), predicted)
     observations = problem.observations
     # The rotation of a mere point is arbitrary.
     is_point = np.isin(observations.observed, list(problem.points))

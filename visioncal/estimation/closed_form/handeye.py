@@ -27,8 +27,8 @@ class HandEye:
     """Both unknown transforms.
 
     Attributes:
-        x: (4, 4) X: `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
-        z: (4, 4) Z: `base_from_target` or `flange_from_target` [m].
+        x: (..., 4, 4) X: `flange_from_cam` (eye-in-hand) or `base_from_cam` (eye-to-hand) [m].
+        z: (..., 4, 4) Z: `base_from_target` or `flange_from_target` [m].
     """
 
     x: FloatArray
@@ -42,8 +42,8 @@ def solver(solve: Solver) -> Solver:
     """Decorates a closed form with checks of its input.
 
     Args:
-        solve: The closed form, of (m, 4, 4) robot poses `R_i` and `cam_from_target` of the same
-            views [m]; it returns X and Z.
+        solve: The closed form, of (..., m, 4, 4) robot poses `R_i` and `cam_from_target` of the
+            same views [m]; it returns X and Z.
 
     Returns:
         The checked solver. It raises a DataError where shapes do not match or a pose has an entry
@@ -59,19 +59,21 @@ def solver(solve: Solver) -> Solver:
 
 def _checked(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatArray]:
     robot, camera = np.asarray(robot, dtype=float), np.asarray(camera, dtype=float)
-    if robot.shape != camera.shape or robot.shape[1:] != (4, 4):
+    if robot.shape != camera.shape or robot.ndim < 3 or robot.shape[-2:] != (4, 4):
         raise DataError(
             f"hand-eye: robot poses of shape {robot.shape} and camera poses of shape "
             f"{camera.shape} cannot be paired; both must be (views, 4, 4)."
         )
-    if len(robot) < FEWEST_VIEWS:
+    if robot.shape[-3] < FEWEST_VIEWS:
         raise DegenerateError(
-            f"hand-eye: {len(robot)} views were given; a relative motion needs at least "
+            f"hand-eye: {robot.shape[-3]} views were given; a relative motion needs at least "
             f"{FEWEST_VIEWS}, and a full solution 3 with two different rotation axes.",
             next_step="Add views that are tilted about different axes.",
         )
     if not (np.isfinite(robot).all() and np.isfinite(camera).all()):
-        finite = np.isfinite(robot).all(axis=(1, 2)) & np.isfinite(camera).all(axis=(1, 2))
+        finite = (
+            np.isfinite(robot + camera).all(axis=(-2, -1)).reshape(-1, robot.shape[-3]).all(axis=0)
+        )
         rows = ", ".join(str(row) for row in np.flatnonzero(~finite))
         raise DataError(
             f"hand-eye: the poses in rows {rows} (counted from 0) are not finite numbers.",

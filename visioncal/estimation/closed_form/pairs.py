@@ -34,9 +34,9 @@ class Pairs:
     """Relative rotations as quaternions (w, x, y, z), both orders of n / 2 pairs of views.
 
     Attributes:
-        robot: (4, n) of A = inv(R_j) R_i.
-        camera: (4, n) of B = C_j inv(C_i), one motion after the other.
-        weight: (n,) from -1 to 1; negative where the sign of one of the two must be flipped.
+        robot: (..., 4, n) of A = inv(R_j) R_i.
+        camera: (..., 4, n) of B = C_j inv(C_i), one motion after the other.
+        weight: (..., n) from -1 to 1; negative where the sign of one of the two must be flipped.
     """
 
     robot: FloatArray
@@ -45,25 +45,28 @@ class Pairs:
 
 
 def rotation_pairs(robot: FloatArray, camera: FloatArray) -> Pairs:
-    """Forms the relative rotations of the pairs of (m, 4, 4) views."""
-    r = quaternions.from_rotations(robot[:, :3, :3])
-    c = quaternions.from_rotations(camera[:, :3, :3])
+    """Forms the relative rotations of the pairs of (..., m, 4, 4) views."""
+    r = quaternions.from_rotations(robot[..., :3, :3])
+    c = quaternions.from_rotations(camera[..., :3, :3])
     return pair_up(r, c)
 
 
 def pair_up(robot: FloatArray, camera: FloatArray) -> Pairs:
-    """Forms the relative rotations of the pairs of (m, 4) quaternions."""
+    """Forms the relative rotations of the pairs of (..., m, 4) quaternions."""
     a = pair_products(robot * quaternions.CONJUGATE, robot)
     b = pair_products(camera, camera * quaternions.CONJUGATE)
-    agreement = a[0] * b[0] / _FULL_WEIGHT
+    agreement = a[..., 0, :] * b[..., 0, :] / _FULL_WEIGHT
     return Pairs(a, b, np.minimum(np.maximum(agreement, -1.0), 1.0))
 
 
 def pair_products(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Products `left[j] * right[i]` of (m, 4) quaternions for all pairs of views, as (4, n)."""
-    if len(left) <= _GROUP:
+    """Products `left[j] * right[i]` of (..., m, 4) quaternions of all pairs, as (..., 4, n)."""
+    if left.shape[-2] <= _GROUP:
         return quaternions.all_products(left, right)
-    order = np.random.default_rng(0).permutation(len(left))
-    groups = np.array_split(order, -(-len(left) // _GROUP))
-    parts = [quaternions.all_products(left[group], right[group]) for group in groups]
-    return np.concatenate(parts, axis=1)
+    views = left.shape[-2]
+    order = np.random.default_rng(0).permutation(views)
+    parts = [
+        quaternions.all_products(left[..., group, :], right[..., group, :])
+        for group in np.array_split(order, -(-views // _GROUP))
+    ]
+    return np.concatenate(parts, axis=-1)

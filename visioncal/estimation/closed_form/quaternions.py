@@ -40,7 +40,7 @@ _IDENTITY = np.eye(4).reshape(16)
 
 
 def from_rotations(rotations: FloatArray) -> FloatArray:
-    """Quaternions of (m, 3, 3) rotations, as (m, 4), accurate at any angle; signs are free.
+    """Quaternions (..., 4) of (..., 3, 3) rotations, accurate at any angle; signs are free.
 
     Every row of q q^T is a multiple of q; the row with the largest diagonal is well scaled.
     """
@@ -48,7 +48,7 @@ def from_rotations(rotations: FloatArray) -> FloatArray:
     row = outer[:, ::5].argmax(axis=1)
     quaternions = outer.reshape(-1, 4, 4)[np.arange(len(row)), row]
     norms = np.sqrt((quaternions * quaternions).sum(axis=1))
-    return np.asarray(quaternions / norms[:, None])
+    return np.asarray(quaternions / norms[:, None]).reshape(*rotations.shape[:-2], 4)
 
 
 def to_rotation(quaternion: FloatArray) -> FloatArray:
@@ -64,6 +64,7 @@ def to_rotation(quaternion: FloatArray) -> FloatArray:
 
 
 def all_products(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Every `left[j] * right[i]` of (m, 4) quaternions, as (4, m * m) with i running fastest."""
-    m = len(left)
-    return np.asarray(((left @ PRODUCT).reshape(4 * m, 4) @ right.T).reshape(4, m * m))
+    """Every `left[j] * right[i]` of (..., m, 4) quaternions, as (..., 4, m * m), i fastest."""
+    *sets, m, _ = left.shape
+    turned = (left[..., None, :, :] @ PRODUCT).reshape(*sets, 4 * m, 4)
+    return np.asarray((turned @ np.swapaxes(right, -1, -2)).reshape(*sets, 4, m * m))

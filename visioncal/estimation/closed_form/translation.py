@@ -25,23 +25,24 @@ def smallest_solution(normal: FloatArray, right: FloatArray, noise: float) -> Fl
     """Minimum-norm solution of `normal @ x = right`, truncated at the noise.
 
     Args:
-        normal: (n, n) symmetric and positive semidefinite.
-        right: (n,) or (n, k) right-hand sides.
+        normal: (..., n, n) symmetric and positive semidefinite.
+        right: (n,) or (..., n, k) right-hand sides.
         noise: Eigenvalues up to this one are discarded.
 
     Returns:
         x of the shape of `right`, without components along discarded eigenvectors.
     """
     values, vectors = np.linalg.eigh(normal)
-    seen = vectors[:, values > noise]
-    return np.asarray((seen / values[values > noise]) @ (seen.T @ right))
+    inverse = np.where(values > noise, 1.0 / np.where(values > noise, values, 1.0), 0.0)
+    return np.asarray((vectors * inverse[..., None, :]) @ (np.swapaxes(vectors, -1, -2) @ right))
 
 
 def mean_camera(camera: FloatArray) -> FloatArray:
-    """The (3,) mean of the camera centres in the target frame [m], of (m, 4, 4) poses."""
-    m = len(camera)
-    rotation, translation = camera[:, :3, :3], camera[:, :3, 3]
-    return np.asarray(translation.reshape(3 * m) @ rotation.reshape(3 * m, 3) / -m)
+    """The (..., 3) mean camera centre in the target frame [m], of (..., m, 4, 4) poses."""
+    *sets, m, _, _ = camera.shape
+    rotation = camera[..., :3, :3].reshape(*sets, 3 * m, 3)
+    translation = camera[..., :3, 3].reshape(*sets, 1, 3 * m)
+    return np.asarray((translation @ rotation)[..., 0, :] / -m)
 
 
 def complete(
@@ -53,43 +54,44 @@ def complete(
     """Solves for both translations and Z's rotation, by least squares over all pairs of views.
 
     Args:
-        robot: (m, 4, 4) robot poses `R_i` [m].
-        camera: (m, 4, 4) `cam_from_target` [m].
-        rotation_x: (3, 3) rotation of X.
-        rotation_z: (3, 3) rotation of Z; if None, the chordal mean of `R_i X C_i`.
+        robot: (..., m, 4, 4) robot poses `R_i` [m].
+        camera: (..., m, 4, 4) `cam_from_target` [m].
+        rotation_x: (..., 3, 3) rotation of X.
+        rotation_z: (..., 3, 3) rotation of Z; if None, the chordal mean of `R_i X C_i`.
 
     Returns:
         X and Z. Components of X's translation that the motion does not determine are zero.
     """
-    m = len(robot)
-    turns = robot[:, :3, :3]
+    *sets, m, _, _ = robot.shape
+    turns, rotation_x = robot[..., :3, :3], rotation_x[..., None, :, :]
     towards = mean_camera(camera)
     # Column 0 is the target's origin; column 1 the step from it to the camera.
-    columns = np.empty((m, 3, 2))
-    columns[:, :, 0] = camera[:, :3, 3]
-    columns[:, :, 1] = camera[:, :3, :3] @ towards
+    columns = np.empty((*sets, m, 3, 2))
+    columns[..., 0] = camera[..., :3, 3]
+    columns[..., 1] = (camera[..., :3, :3] @ towards[..., None, :, None])[..., 0]
     positions = turns @ (rotation_x @ columns)
-    positions[:, :, 0] += robot[:, :3, 3]
+    positions[..., 0] += robot[..., :3, 3]
 
-    mean_turn, mean_position = turns.sum(axis=0) / m, positions.sum(axis=0) / m
-    deviations = (turns - mean_turn).reshape(3 * m, 3)
-    scatter = (positions - mean_position).reshape(3 * m, 2)
-    cut = m * _SMALLEST_TURN_RAD**2
-    shifts = -smallest_solution(deviations.T @ deviations, deviations.T @ scatter, cut)
-    step = _steadiest_step(scatter + deviations @ shifts)
+    mean_turn, mean_position = turns.mean(axis=-3), positions.mean(axis=-3)
+    deviations = (turns - mean_turn[..., None, :, :]).reshape(*sets, 3 * m, 3)
+    scatter = (positions - mean_position[..., None, :, :]).reshape(*sets, 3 * m, 2)
+    cut, transposed = m * _SMALLEST_TURN_RAD**2, np.swapaxes(deviations, -1, -2)
+    shifts = -smallest_solution(transposed @ deviations, transposed @ scatter, cut)
+    step = _steadiest_step(scatter + deviations @ shifts)[..., None]
 
-    translation_x = shifts[:, 0] + step * shifts[:, 1]
+    translation_x = shifts[..., 0] + step * shifts[..., 1]
     if rotation_z is None:
-        rotation_z = nearest_rotation((turns @ rotation_x @ camera[:, :3, :3]).sum(axis=0))
-    position = mean_position[:, 0] + step * mean_position[:, 1] + mean_turn @ translation_x
-    translation_z = position - rotation_z @ (step * towards)
-    return HandEye(compose(rotation_x, translation_x), compose(rotation_z, translation_z))
+        rotation_z = nearest_rotation((turns @ rotation_x @ camera[..., :3, :3]).sum(axis=-3))
+    position = mean_position[..., 0] + step * mean_position[..., 1]
+    position = position + (mean_turn @ translation_x[..., None])[..., 0]
+    translation_z = position - (rotation_z @ (step * towards)[..., None])[..., 0]
+    x = compose(rotation_x[..., 0, :, :], translation_x)
+    return HandEye(x, compose(rotation_z, translation_z))
 
 
-def _steadiest_step(scatter: FloatArray) -> float:
-    """The step from 0 to 1 that makes column 0 + step * column 1 of (n, 2) residuals shortest."""
-    square = float(scatter[:, 1] @ scatter[:, 1])
-    if square == 0.0:
-        return 0.5
-    step = -float(scatter[:, 0] @ scatter[:, 1]) / square
-    return min(max(step, 0.0), 1.0)
+def _steadiest_step(scatter: FloatArray) -> FloatArray:
+    """The step from 0 to 1 that makes column 0 + step * column 1 of (..., n, 2) residuals least."""
+    square = np.sum(scatter[..., 1] ** 2, axis=-1)
+    pulled = -np.sum(scatter[..., 0] * scatter[..., 1], axis=-1)
+    best = np.divide(pulled, square, out=np.full_like(square, 0.5), where=square > 0.0)
+    return np.asarray(np.clip(best, 0.0, 1.0))
