@@ -110,7 +110,7 @@ def test_dynamics_are_identified_on_one_thread(monkeypatch):
         within.extend(settings()[1])
         raise DataError("Enough is seen.")
 
-    monkeypatch.setattr(dynamics, "of_one_arm", look)
+    monkeypatch.setattr(dynamics, "select_arm", look)
     with threadpool_limits(2, user_api="blas"):
         before = settings()
         with pytest.raises(DataError, match="Enough"):

@@ -27,8 +27,8 @@ from visioncal.live.capture.record import record
 from visioncal.live.capture.take import TakenView
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.planning.plan import PlanRequest, make_plan
+from visioncal.live.planning.plan_file import PlanFile, Stop
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.planning.read_back import PlanFile, Stop
 from visioncal.live.rehearsal.camera import RehearsalCamera
 from visioncal.live.rehearsal.controller import spawn
 from visioncal.live.rehearsal.machine import ControllerOptions

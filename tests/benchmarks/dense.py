@@ -22,7 +22,7 @@ from support.rendered import Shot, photograph
 from support.smeared import smeared
 
 from visioncal.calibration.stages.dense import Dense, fit_densely
-from visioncal.calibration.stages.detect import image_of, look_for
+from visioncal.calibration.stages.detect import find_corners, image_of
 from visioncal.core.types import Corners, FloatArray, Target
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.session import MemoryImages
@@ -145,7 +145,7 @@ def corners_by_kind(session) -> dict[str, dict[int, Corners]]:
     )
     plain, fine = {}, {}
     for view, image in images.items():
-        seen, found = detected(image, target), look_for(image, target, view)[0]
+        seen, found = detected(image, target), find_corners(image, target, view)[0]
         if seen is not None and isinstance(found, Corners):
             plain[view], fine[view] = Corners(view, seen.ids, seen.px, found.blur_px), found
     dense = fit_densely(session, session.views, fine, Dense("cpu"))[0]

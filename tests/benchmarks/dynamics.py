@@ -23,11 +23,11 @@ from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import Conditioned, LowPass, Piece, condition
 from visioncal.dynamics.excitation import ExcitationRequest, excite
 from visioncal.dynamics.identify import SLOW_RAD_S, Identification, Options, identify
-from visioncal.dynamics.limits import Share, allowed_motion
+from visioncal.dynamics.limits import MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import JointMotion, Measured
 from visioncal.dynamics.reading import RecordedSamples
-from visioncal.dynamics.validate import friction_of_known, predict, validate
+from visioncal.dynamics.validate import fit_friction_to_known, predict, validate
 from visioncal.robot import load_robot, small_urdf
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
 from visioncal.simulation.exercise import Exercise, multi_sine, slow_sweep
@@ -62,7 +62,7 @@ class World:
 
 def excitation(name: str) -> Exercise:
     """The motion that `visioncal dynamics plan` writes for an arm."""
-    allowed = allowed_motion(load_robot(name), Share())
+    allowed = motion_limits(load_robot(name), MotionMargins())
     motion = excite(allowed, SEARCH).series.sampled(RATE_HZ)
     return Exercise(motion.times_s, motion.q, motion.dq, motion.ddq)
 
@@ -114,7 +114,7 @@ def fresh_errors(found: Identification, built, rng) -> tuple[FloatArray, FloatAr
     begin = int(np.searchsorted(fresh.times_s, motion.times_s[0] - 1e-6))
     true = drive_torques(built, fresh.q, fresh.dq, fresh.ddq)
     noise = 0.03 * np.sqrt(np.mean(true**2, axis=0))
-    prediction = predict(found.identified, stream, friction_of_known(found))
+    prediction = predict(found.identified, stream, fit_friction_to_known(found))
     result = validate(found.identified, prediction)
     known = result.known_rms_nm / result.rms_nm
 
@@ -170,7 +170,9 @@ def panda_text() -> str:
     whole = RecordedSamples("panda", np.loadtxt(PANDA / "time.txt"), q, dq, torques)
     train, test = (condition(whole.part(*pair), 8.0) for pair in ((0.0, 0.7), (0.7, 1.0)))
     found = identify(load_robot("panda"), [train])
-    result = validate(found.identified, predict(found.identified, test, friction_of_known(found)))
+    result = validate(
+        found.identified, predict(found.identified, test, fit_friction_to_known(found))
+    )
     rows = {
         "a plain script": np.array(PANDA_LIMITS),
         "base parameters": 100.0 * result.shares,

@@ -11,7 +11,7 @@ from results import few, first, wished, write_section
 
 from visioncal.dynamics.base import BaseModel, condition_of
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
-from visioncal.dynamics.limits import Allowed, Share, allowed_motion
+from visioncal.dynamics.limits import MotionLimits, MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.robot import load_robot
 
@@ -24,9 +24,9 @@ NO_FRICTION = FrictionTerms(coulomb=False, viscous=False, offset=False)
 def figures(job: tuple[str, int]) -> tuple[float, ...]:
     """What one search finds: conditions, shares of the limits, distance [mm], starts, seconds."""
     name, seed = job
-    allowed = allowed_motion(load_robot(name), Share())
+    allowed = motion_limits(load_robot(name), MotionMargins())
     found = excite(allowed, replace(SEARCH, seed=seed))
-    condition, kept = found.condition, found.kept
+    condition, kept = found.condition, found.extremes
     return (
         condition.weighted,
         condition.scaled,
@@ -48,7 +48,7 @@ def links_alone(found: Excitation) -> float:
     return condition_of(base, found.series.sampled(100.0), np.ones(len(found.weights))).scaled
 
 
-def broken(allowed: Allowed, found: Excitation) -> int:
+def broken(allowed: MotionLimits, found: Excitation) -> int:
     """Samples at 1 kHz whose positions, or differences of them, are beyond the data sheet."""
     q, robot = found.series.sampled(1000.0).q, allowed.robot
     beyond = [

@@ -18,7 +18,7 @@ from results import first, wished, write_section
 
 import visioncal
 from visioncal.core.types import Camera
-from visioncal.results.lens import refitted
+from visioncal.results.lens import fit_coefficients
 from visioncal.vision.camera import normalise
 
 SEEDS = 6
@@ -59,7 +59,7 @@ def tried(world: str, given: bool, seed: int, folder: Path) -> list[float]:
         away = (found[:, :2] / found[:, 2:] - rays) * elsewhere.MATRIX[[0, 1], [0, 1]]
         return float(np.sqrt(np.mean(away**2)))
 
-    plain = refitted(lens)
+    plain = fit_coefficients(lens)
     return [
         off_px(lens.camera, px),
         off_px(plain.camera, px),

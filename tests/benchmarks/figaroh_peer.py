@@ -28,8 +28,8 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.kinematics import LEVELS, ArmTrials, fit_level
-from visioncal.estimation.parts import ROBOT, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.robot import load_robot
@@ -164,7 +164,7 @@ def fitted(world: World, noise: Noise | None) -> tuple[FloatArray, ArmModel]:
         if level is None:
             raise RuntimeError("the arm's errors do not show")
         errors, noise, edges = dict(level.errors), level.fit.noise, level.fit.state.edges
-    model = model.erring(errors)
+    model = model.with_errors(errors)
     while True:
         arm = replace(errors["links"], basis=model.basis(q)).effect(ROBOT, values=model.values)
         still = np.zeros_like(model.values)
@@ -198,7 +198,7 @@ def from_corners(world: World) -> Found:
     seconds = process_time() - begun
     if known.robot_arm.model is None:
         raise RuntimeError("the arm stayed nominal")
-    edges, robot = known.solved.state.edges, known.robot_arm.model.robot
+    edges, robot = known.assessment.state.edges, known.robot_arm.model.robot
     return lambda q: world.at(edges, robot.base_from_flange(q)), seconds
 
 

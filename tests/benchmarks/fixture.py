@@ -95,7 +95,7 @@ def trial(seed: int, count: int, known: bool) -> Trial:
         parts_of(away(unweighted(pairs), frame) ** 2),
         mahalanobis_sq,
         bool(mahalanobis_sq < limit),
-        int(np.sum(~found.agreement.agrees)),
+        int(np.sum(~found.agreement.mask)),
     )
 
 
@@ -114,7 +114,7 @@ def feature_trial(seed: int, kinds: Sequence[str]) -> Trial:
         np.full(2, np.nan),
         mahalanobis_sq,
         bool(mahalanobis_sq < f_limit(found.agreement.fit.freedom)),
-        int(np.sum(~found.agreement.agrees)),
+        int(np.sum(~found.agreement.mask)),
     )
 
 
@@ -144,7 +144,7 @@ def outcome(pairs: PointPairs) -> tuple[tuple[int, ...], str]:
         found = fit_points(pairs)
     except DataError as error:
         return (), error.message
-    return tuple(np.flatnonzero(~found.agreement.agrees)), ""
+    return tuple(np.flatnonzero(~found.agreement.mask)), ""
 
 
 def slipped(count: int, slip_m: float) -> str:

@@ -135,7 +135,7 @@ def against_the_bound(task: tuple[World, int]) -> list[float] | None:
         *squared(error),
         float(np.trace(bound[:3, :3])),
         float(np.trace(bound[3:6, 3:6])),
-        mahalanobis_sq(error, known.solved.covariance[:12, :12]),
+        mahalanobis_sq(error, known.assessment.covariance[:12, :12]),
         float(len(known.used) < row.options.views),
         *np.square(opencv_errors(cell)).ravel(),
     ]
@@ -183,7 +183,7 @@ def with_wrong_views(task: tuple[World, int, int]) -> list[float] | None:
         float(np.trace(bound[3:6, 3:6])),
         float(out == set(cell.wrong_views)),
         float(bool(set(cell.wrong_views) - out)),
-        mahalanobis_sq(error, known.solved.covariance[:12, :12]),
+        mahalanobis_sq(error, known.assessment.covariance[:12, :12]),
     ]
 
 
@@ -218,7 +218,7 @@ def with_a_wrong_arm(task: tuple[CellOptions, bool, int]) -> list[float] | None:
         known = calibrated(cell, joints=joints)
     except VisioncalError:
         return None
-    error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+    error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
     flagged = any("the arm" in reason.lower() for reason in known.verdict.reasons)
     return [*squared(error), mahalanobis_sq(error, covariance), float(flagged)]
 
@@ -329,7 +329,7 @@ def real_folds(path: Path, repeats: int) -> tuple[float, float]:
     from visioncal.calibration.pipeline.solving import solve
     from visioncal.calibration.pipeline.steps import STAGES
     from visioncal.calibration.stages.cell import read_cell
-    from visioncal.estimation.parts import State
+    from visioncal.estimation.problem_parts import State
 
     session = Session.load(path)
     seen = RunState(session)
@@ -338,13 +338,13 @@ def real_folds(path: Path, repeats: int) -> tuple[float, float]:
             seen = stage.run(seen)
     cell, away = read_cell(seen), []
     whole = solve(cell, seen, "hand-eye")
-    views = np.array([row.view for row in whole.cell.rows])[whole.agreed.used]
-    problem = whole.part.with_effects([])
+    views = np.array([row.view for row in whole.cell.rows])[whole.inlier_fit.used]
+    problem = whole.inlier_problem.with_effects([])
     rng = np.random.default_rng(0)
     for _ in range(repeats):
         for fold in np.array_split(rng.permutation(len(views)), 5):
             part = cell.without(dict.fromkeys(views[fold].tolist(), "left out"))
-            edges = solve(part, seen, "hand-eye").agreed.fit.state.edges
+            edges = solve(part, seen, "hand-eye").inlier_fit.fit.state.edges
             left = problem.subset(np.isin(np.arange(len(views)), fold))
             state = State(edges, np.zeros(0))
             away.append(log(left.change_of(left.observations.observed[0], state)))

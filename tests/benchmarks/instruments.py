@@ -17,24 +17,32 @@ from support.tracked import errors_of, information, known_of, mounting_bound, re
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.parts import State
 from visioncal.estimation.positions import fit_mounting
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import fit_problem
 from visioncal.estimation.workspace import postures
 from visioncal.session import Session
 from visioncal.simulation.arms import forward
-from visioncal.simulation.tracked import THREE, Shop, Tracked, session_of, tracked
+from visioncal.simulation.instrument_session import (
+    THREE,
+    InstrumentOptions,
+    InstrumentRecord,
+    session_of,
+    tracked,
+)
 
 WORLDS = 20
 DATA = Path(__file__).parents[3] / "shared" / "data"
 KINDS = {
-    "a probe": Tracked(poses=True),
-    "one point": Tracked(),
-    "three points": Tracked(points=THREE),
+    "a probe": InstrumentOptions(poses=True),
+    "one point": InstrumentOptions(),
+    "three points": InstrumentOptions(points=THREE),
 }
 WRONG = {"dh_sigma_m": 5e-4, "dh_sigma_rad": 1e-3, "offset_sigma_rad": 1e-3}
 # Example A: errors of lengths and angles in this ratio, as large as its arm's.
-EXAMPLE = Tracked(robot="generic-6r-1800", stops=30, robot_sigma_m=0.0, robot_sigma_rad=0.0)
+EXAMPLE = InstrumentOptions(
+    robot="generic-6r-1800", stops=30, robot_sigma_m=0.0, robot_sigma_rad=0.0
+)
 BEFORE_MM = 1.6
 
 
@@ -50,18 +58,18 @@ def prose(text: str) -> str:
 
 def places(known: RunState, q: FloatArray) -> FloatArray:
     """(k, 3) where a calibration has the first point, in the instrument's frame."""
-    x, z = known.solved.state.edges
+    x, z = known.assessment.state.edges
     robot = known.robot if known.robot_arm.model is None else known.robot_arm.model.robot
     return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]
 
 
-def true_places(shop: Shop, q: FloatArray) -> FloatArray:
+def true_places(shop: InstrumentRecord, q: FloatArray) -> FloatArray:
     """(k, 3) where it is."""
     flange = forward(shop.true_arm, q)
     return (invert(shop.base_from_instrument) @ flange @ shop.flange_from_probe)[:, :3, 3]
 
 
-def workspace_bound(shop: Shop, q: FloatArray) -> float:
+def workspace_bound(shop: InstrumentRecord, q: FloatArray) -> float:
     """Least root mean square error of the first point's place at some postures [m]."""
     whole = information(shop, arm_columns=True)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-30))
@@ -77,7 +85,7 @@ def workspace_bound(shop: Shop, q: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum((jacobian @ root) ** 2, axis=(1, 2)))))
 
 
-def frames_row(options: Tracked, worlds: int) -> str:
+def frames_row(options: InstrumentOptions, worlds: int) -> str:
     """The arm is right: both frames against their bound."""
     kept = np.arange(12) if options.poses else np.r_[:6, 9:12]
     by_bound, by_sigma = [], []
@@ -86,14 +94,14 @@ def frames_row(options: Tracked, worlds: int) -> str:
         known = solved_of(session_of(shop))
         error, covariance = (
             errors_of(shop, known)[kept],
-            known.solved.covariance[np.ix_(kept, kept)],
+            known.assessment.covariance[np.ix_(kept, kept)],
         )
         by_bound.append(error @ np.linalg.solve(mounting_bound(shop), error) / len(kept))
         by_sigma.append(error @ np.linalg.solve(covariance, error) / len(kept))
     return f"{np.sqrt(np.mean(by_bound)):.2f} | {np.mean(by_sigma):.2f}"
 
 
-def arm_row(options: Tracked, worlds: int) -> str:
+def arm_row(options: InstrumentOptions, worlds: int) -> str:
     """The arm is wrong: its point all over the workspace."""
     found, levels = [], []
     for seed in range(worlds):
@@ -175,7 +183,7 @@ def example_a(worlds: int) -> str:
     return "\n".join((prose(text), "", prose(parameters), "", *head, *table, "", prose(explained)))
 
 
-def example(size: float, seed: int) -> Tracked:
+def example(size: float, seed: int) -> InstrumentOptions:
     """Example A with errors of this size, in half millimetres and milliradians."""
     errors = {name: size * sigma for name, sigma in WRONG.items()}
     return replace(EXAMPLE, **errors, seed=seed)
@@ -184,13 +192,13 @@ def example(size: float, seed: int) -> Tracked:
 def before_mm(size: float, seed: int) -> float:
     """How far the nominal arm is off at its stops, frames fitted [mm]."""
     known = solved_of(session_of(tracked(example(size, seed))), level="hand-eye")
-    nominal = known.solved.problem.with_effects([])
-    fit = fit_problem(nominal, State(known.solved.state.edges, np.zeros(0)))
+    nominal = known.assessment.problem.with_effects([])
+    fit = fit_problem(nominal, State(known.assessment.state.edges, np.zeros(0)))
     place = nominal.change_of(nominal.observations.observed[0], fit.state)[:, :3, 3]
     return 1e3 * rms(np.linalg.norm(place, axis=1))
 
 
-def parameter_conditions(shop: Shop) -> tuple[float, float, float, float]:
+def parameter_conditions(shop: InstrumentRecord) -> tuple[float, float, float, float]:
     """Conditions of Phi^T Phi over the 23 told combinations: own errors, SI, mm and rad, scaled."""
     jacobian = parameter_jacobian(shop)
     lengths = np.repeat([1.0, 1.0, 0.0, 0.0, 0.0], [6, 6, 6, 6, 4]) > 0.0
@@ -209,7 +217,7 @@ def parameter_conditions(shop: Shop) -> tuple[float, float, float, float]:
     return tuple(found)
 
 
-def parameter_jacobian(shop: Shop) -> FloatArray:
+def parameter_jacobian(shop: InstrumentRecord) -> FloatArray:
     """(3 s, 28) derivatives of the reflector's place by a, d, alpha, offset and four betas."""
     arm, step = shop.arm, 1e-6
 
@@ -248,7 +256,9 @@ def irb120() -> str:
     ):
         q, places_m = thirdparty.irb120_set(DATA, joints, read)
         rest, everything = tool_errors_mm(
-            known.robot_arm.model.robot.base_from_flange(q), known.solved.state.edges[0], places_m
+            known.robot_arm.model.robot.base_from_flange(q),
+            known.assessment.state.edges[0],
+            places_m,
         )
         before = tool_errors_mm(known.robot.base_from_flange(q), nominal, places_m)[1]
         lines.append(
@@ -267,7 +277,7 @@ def nominal_fit(known: RunState) -> FloatArray:
     """(4, 4) the instrument's frame as the nominal arm has it."""
     readings = known.readings
     flange = {view: known.base_from_flange[view] for view in known.used}
-    stops = np.unique(known.solved.problem.observations.stops, return_inverse=True)[1]
+    stops = np.unique(known.assessment.problem.observations.stops, return_inverse=True)[1]
     seen = readings.places(known.used, flange, stops)
     return fit_mounting(seen, None, len(readings.names)).base_from_instrument
 

@@ -41,7 +41,13 @@ from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.session import Session
 from visioncal.simulation.arms import forward
-from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
+from visioncal.simulation.instrument_session import (
+    InstrumentOptions,
+    InstrumentRecord,
+    random_postures,
+    session_of,
+    tracked,
+)
 
 WORLDS = 10
 SESSIONS = Path(__file__).parents[3] / "shared" / "data" / "sessions"
@@ -100,7 +106,7 @@ def slopes(flange: FloatArray, x: FloatArray, z: FloatArray) -> FloatArray:
 
 def predicted_covariance(known: RunState, q: FloatArray, z: FloatArray) -> FloatArray:
     """(6 m, 6 m) of the probe at (m, n) joints by what is open about the arm, and its noise."""
-    answer, arm = known.solved, known.robot_arm
+    answer, arm = known.assessment, known.robot_arm
     fit = Solution(answer.state, answer.noise)
     data, model = arm.data(answer.problem, fit, answer.covariance, {}), arm.model
     carried = adjoint(invert(z))
@@ -165,14 +171,14 @@ class Carried:
 
 def carried_over(known: RunState, other: Recording) -> Carried:
     """How an arm predicts another recording, its frames fitted on a few of the stops."""
-    arm, edges = known.robot_arm, known.solved.state.edges
+    arm, edges = known.robot_arm, known.assessment.state.edges
     stated = arm.matched.arm.base_from_flange(other.q)
     calibrated = stated if arm.model is None else arm.model.base_from_flange(other.q)
     squares, predicted, session = {"stated": [], "calibrated": []}, [], 0.0
     among = None
     if arm.model is not None:
         among = predicted_covariance(known, other.q, edges[1])
-        session = (1e-3 * arm_found(known).carries.session_mm) ** 2
+        session = (1e-3 * arm_found(known).carries_over.session_mm) ** 2
     for draw in range(few(DRAWS, 1)):
         rows = np.random.default_rng(draw).choice(len(other.q), ANCHORS, replace=False)
         rest = np.setdiff1d(np.arange(len(other.q)), rows)
@@ -283,9 +289,9 @@ class World:
     function_rad: float
     length_rad: float
 
-    def drawn(self, seed: int) -> tuple[Shop, FloatArray, FloatArray]:
+    def drawn(self, seed: int) -> tuple[InstrumentRecord, FloatArray, FloatArray]:
         """What was read, and (m, 6) postures in the range and all over."""
-        options = Tracked(
+        options = InstrumentOptions(
             stops=self.stops,
             poses=True,
             dh_sigma_m=5e-4,
@@ -296,7 +302,7 @@ class World:
             seed=seed,
         )
         rng = np.random.default_rng([seed, 5])
-        anywhere = above(tracked(options, np.zeros((1, 6))).arm, self.stops + 400, rng)
+        anywhere = random_postures(tracked(options, np.zeros((1, 6))).arm, self.stops + 400, rng)
         middle = np.array([0.3, -1.2, 1.4, -0.4, 1.2, 0.1])
         boxed = middle + rng.uniform(-1, 1, (self.stops + 100, 6)) * self.range_rad
         near = boxed if self.range_rad < 2.5 else anywhere
@@ -312,14 +318,14 @@ class World:
         before = without_functions(session)
 
         def away(known: RunState, q: FloatArray) -> FloatArray:
-            x, z = known.solved.state.edges[:2]
+            x, z = known.assessment.state.edges[:2]
             arm = known.robot_arm
             flange = (arm.model or arm.matched.arm).base_from_flange(q)
             true = forward(shop.true_arm, q) @ shop.flange_from_probe
             error = invert(invert(x) @ flange @ z) @ invert(shop.base_from_instrument) @ true
             return np.sum(error[:, :3, 3] ** 2, axis=1)
 
-        ratios, answer = [], ours.solved
+        ratios, answer = [], ours.assessment
         data = ours.robot_arm.data(
             answer.problem, Solution(answer.state, answer.noise), answer.covariance, {}
         )
@@ -342,7 +348,7 @@ class World:
         shop, *regions = self.drawn(seed)
         known = known_of(session_of(shop))
         result, arm = result_of(known), known.robot_arm
-        edges = known.solved.state.edges
+        edges = known.assessment.state.edges
         stated = arm.kinematics.nominal.fit.state.edges
         written = document(result, "robot-dh")
         beside = document(result, "robot-dh", Selection(with_corrections=True))
@@ -407,7 +413,7 @@ class World:
         """Errors [mm], and squared over predicted by posture, and by the maps of the result."""
         shop, *regions = self.drawn(seed)
         known = known_of(session_of(shop))
-        answer, arm = known.solved, known.robot_arm
+        answer, arm = known.assessment, known.robot_arm
         x, z = answer.state.edges[:2]
         data = arm.data(answer.problem, Solution(answer.state, answer.noise), answer.covariance, {})
         rows = []

@@ -19,8 +19,8 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.poses import fit_poses
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import solve_problem
 from visioncal.simulation import BOARDS, CellOptions, SimulatedCell, fine_camera, simulate
 from visioncal.vision.targets import corner_positions

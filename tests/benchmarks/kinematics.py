@@ -22,7 +22,7 @@ from support.wrong_arms import WRONG_LINKS, error_m
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages import kinematics as levels
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import solve_problem
 from visioncal.estimation.workspace import postures
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
@@ -62,7 +62,7 @@ def measured(options: CellOptions) -> tuple[float, ...]:
     if model is None:
         return 1e3 * before, 1e3 * before, 1e3 * bound, np.nan, seconds, 0.0
     after = error_m(cell, known, model.robot)
-    predicted = 1e3 * float(np.sqrt(np.mean(arm_found(known).numbers.sigmas_m ** 2)))
+    predicted = 1e3 * float(np.sqrt(np.mean(arm_found(known).identifiability.sigmas_m ** 2)))
     taken = known.robot_arm.kinematics.level == "geometry"
     return 1e3 * before, 1e3 * after, 1e3 * bound, predicted, seconds, float(taken)
 
@@ -97,18 +97,22 @@ def without_blocks(cell: SimulatedCell, **changes: object) -> RunState:
 def corners_alone(known: RunState) -> RunState:
     """The same unknowns with the robot's stops taken for exact: a fit of reprojection alone."""
     exact = Noise.of_robot(1e-6, 1e-6)
-    arm, problem, state = known.robot_arm, known.solved.problem, known.solved.state
+    arm, problem, state = known.robot_arm, known.assessment.problem, known.assessment.state
     for _ in range(6):
         state = solve_problem(problem, State(state.edges, problem.start_values), exact)[0]
-        arm = arm.moved(problem, state)[0]
-        problem = arm.put_into(problem)
-    agreed = known.fitted.agreed
+        arm = arm.relinearised(problem, state)[0]
+        problem = arm.applied_to(problem)
+    agreed = known.cell_fit.inlier_fit
     fitted = replace(
-        known.fitted,
+        known.cell_fit,
         arms={arm.robot: arm},
-        agreed=replace(agreed, fit=replace(agreed.fit, state=state)),
+        inlier_fit=replace(agreed, fit=replace(agreed.fit, state=state)),
     )
-    return replace(known, fit=fitted, answer=replace(known.answer, solved=fitted))
+    return replace(
+        known,
+        cell_fit_or_none=fitted,
+        assessment_or_none=replace(known.assessment_or_none, solved=fitted),
+    )
 
 
 def ideal_row(words: str, options: CellOptions, found: np.ndarray) -> str:

@@ -28,8 +28,8 @@ from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import exp, invert, rotation_angle
 from visioncal.core.types import FloatArray, Need
 from visioncal.estimation.tolerance_probability import radius_within
-from visioncal.frames.camera_chain import Eye
-from visioncal.frames.target_in_image import see
+from visioncal.frames.camera_chain import CalibratedCamera
+from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.simulation import BOARDS, CellOptions, SimulatedCell, simulate
@@ -76,7 +76,7 @@ def of_one_cell(seed: int) -> Outcome | None:
         return None
     (picks,) = known.findings.picks
     need = some_need(picks, rng)
-    eye = None if seen == POSES else Eye.of(result_of(known))
+    eye = None if seen == POSES else CalibratedCamera.of(result_of(known))
     landed = [lands(cell, known, eye, need, rng) for _ in range(PICKS)]
     kind = (cell.options.mount, seen)
     return Outcome(kind, need.deg is not None, picks.probability(need), float(np.mean(landed)))
@@ -85,8 +85,8 @@ def of_one_cell(seed: int) -> Outcome | None:
 def some_need(picks: Picks, rng: np.random.Generator) -> Need:
     """A need that some share of picks meets, of place alone or of place and rotation."""
     quantile, both = float(rng.uniform(0.02, 0.98)), bool(rng.integers(2))
-    mm = 1e3 * radius_within(picks.spreads, quantile, picks.freedom)
-    turned = float(np.sqrt(np.trace(picks.spreads[:, :3, :3], axis1=1, axis2=2).mean()))
+    mm = 1e3 * radius_within(picks.covariances, quantile, picks.freedom)
+    turned = float(np.sqrt(np.trace(picks.covariances[:, :3, :3], axis1=1, axis2=2).mean()))
     return Need(mm, float(np.rad2deg(turned * rng.uniform(0.7, 1.8))) if both else None)
 
 
@@ -113,11 +113,15 @@ def numbers(matrix: FloatArray) -> list[str]:
 
 
 def lands(
-    cell: SimulatedCell, known: RunState, eye: Eye | None, need: Need, rng: np.random.Generator
+    cell: SimulatedCell,
+    known: RunState,
+    eye: CalibratedCamera | None,
+    need: Need,
+    rng: np.random.Generator,
 ) -> bool:
     """Looks at a thing and goes there; whether that is near enough."""
     at, middle = int(rng.integers(len(cell.cam_from_target))), np.array([0.0, 0.0, 0.0, 1.0])
-    true, found = next(iter(cell.transforms.values())), known.solved.state.edges[0]
+    true, found = next(iter(cell.transforms.values())), known.assessment.state.edges[0]
     sigmas = np.repeat([cell.options.robot_sigma_rad, cell.options.robot_sigma_m], 3)
     if cell.options.mount == "eye-in-hand":
         reported = cell.robot.base_from_flange[at]
@@ -136,12 +140,12 @@ def lands(
 
 
 def seen_by(
-    cell: SimulatedCell, eye: Eye, in_camera: FloatArray, rng: np.random.Generator
+    cell: SimulatedCell, eye: CalibratedCamera, in_camera: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
     """(4, 4) where the calibrated camera has a thing that stands somewhere, by exact corners."""
     exact = replace(cell, options=replace(cell.options, pixel_sigma_px=0.0))
     corners = seen_corners(exact, in_camera, BOARD, rng)
-    return see(eye, corners, BOARD, "thing", 0.1).cam_from_target[0]
+    return target_pose_candidates(eye, corners, BOARD, "thing", 0.1).cam_from_target[0]
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -32,8 +32,8 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.core.errors import VisioncalError
 from visioncal.core.transforms import exp, invert, rotation_angle
 from visioncal.core.types import Corners, FloatArray, Need
-from visioncal.frames.camera_chain import Eye
-from visioncal.frames.target_in_image import see
+from visioncal.frames.camera_chain import CalibratedCamera
+from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.session import Session
 
 SEEDS = 6
@@ -66,18 +66,18 @@ def of_one_cell(at: tuple[str, str, bool, int], folder: Path) -> Trial | None:
         return None
     (picks,) = known.findings.picks
     need, result = some_need(picks, rng), result_of(known)
-    landed = float(np.mean(lands(case, known, Eye.of(result), need, rng)))
+    landed = float(np.mean(lands(case, known, CalibratedCamera.of(result), need, rng)))
     kind = (mount, "lens given" if given else "lens estimated")
     outcome = Outcome(kind, need.deg is not None, picks.probability(need), landed)
     return Trial(world, outcome, result.verdict.status)
 
 
 def lands(
-    case: Case, known: RunState, eye: Eye, need: Need, rng: np.random.Generator
+    case: Case, known: RunState, eye: CalibratedCamera, need: Need, rng: np.random.Generator
 ) -> FloatArray:
     """(p,) whether picks at times spread over the session come near enough."""
     at, noise = rng.integers(len(case.boards), size=PICKS), noise_of(case, rng)
-    in_camera, found = case.boards[at], known.solved.state.edges[0]
+    in_camera, found = case.boards[at], known.assessment.state.edges[0]
     shown = np.array([in_image(case, eye, known, value, rng) for value in in_camera])
     if case.mount == "eye-in-hand":
         robot = case.flanges(in_camera)
@@ -107,14 +107,20 @@ def noise_of(case: Case, rng: np.random.Generator) -> FloatArray:
 
 
 def in_image(
-    case: Case, eye: Eye, known: RunState, in_camera: FloatArray, rng: np.random.Generator
+    case: Case,
+    eye: CalibratedCamera,
+    known: RunState,
+    in_camera: FloatArray,
+    rng: np.random.Generator,
 ) -> FloatArray:
     """(4, 4) where the calibrated camera has a thing that stands somewhere, by exact corners."""
     far = in_camera[2:3, 3] / case.mean_m
     focal = float(case.world.focus(far, rng)[0]) if case.world.focus else 1.0
     px = seen(THING @ in_camera[:3, :3].T + in_camera[:3, 3], case.shift, focal)
     corners = Corners(0, np.arange(len(px)), px, 0.0)
-    return see(eye, corners, known.session.target, "thing", 0.1).cam_from_target[0]
+    return target_pose_candidates(eye, corners, known.session.target, "thing", 0.1).cam_from_target[
+        0
+    ]
 
 
 def main(seeds: int) -> None:

@@ -22,11 +22,11 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.live.planning.candidates import candidates
-from visioncal.live.planning.design import CRITERIA, chosen
+from visioncal.live.planning.design import CRITERIA, choose_stops
 from visioncal.live.planning.information import WORLDS as SAMPLE
-from visioncal.live.planning.information import World, worlds_of
+from visioncal.live.planning.information import World, predict_worlds
 from visioncal.live.planning.purposes import PURPOSES
-from visioncal.live.planning.recorded import Begun, begin
+from visioncal.live.planning.recorded import SessionStart, start_from_session
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 
 WORLDS = 20
@@ -50,10 +50,10 @@ def duel(name: str, options: CellOptions) -> tuple[FloatArray, FloatArray]:
     error = arm_error if name == "kinematics" else edge_error
     cell = plan_cell(options, GUESS_RAD, GUESS_M)
     q = candidates(cell, CANDIDATES, seed=options.seed).q
-    worlds = worlds_of((cell, *cell.guesses(SAMPLE - 1, options.seed)), purpose, q)
-    planned = chosen(worlds, count).rows
+    worlds = predict_worlds((cell, *cell.guesses(SAMPLE - 1, options.seed)), purpose, q)
+    planned = choose_stops(worlds, count).rows
     random = np.random.default_rng(options.seed).choice(len(q), count, replace=False)
-    truth = worlds_of([true_cell(options)], purpose, q)[0]
+    truth = predict_worlds([true_cell(options)], purpose, q)[0]
     errors, expected = [], []
     for rows in (planned, random):
         real = [simulate(replace(options, draw=index), q[rows]) for index in range(DRAWS)]
@@ -64,7 +64,7 @@ def duel(name: str, options: CellOptions) -> tuple[FloatArray, FloatArray]:
 
 def expected_mm(truth: World, rows: FloatArray) -> float:
     """The sigma of the place that counts, in the true cell [mm]."""
-    return 1e3 * float(np.sqrt(np.trace(truth.place @ truth.covariance(rows))))
+    return 1e3 * float(np.sqrt(np.trace(truth.position @ truth.covariance(rows))))
 
 
 def arm_error(cell: SimulatedCell, known: RunState) -> FloatArray:
@@ -100,12 +100,13 @@ def criteria(options: CellOptions, name: str) -> str:
     count = STOPS[name]
     cell = plan_cell(options, GUESS_RAD, GUESS_M)
     q = candidates(cell, CANDIDATES).q
-    worlds = worlds_of((cell, *cell.guesses(SAMPLE - 1, 0)), PURPOSES[name], q)
-    truth = worlds_of([true_cell(options)], PURPOSES[name], q)[0]
+    worlds = predict_worlds((cell, *cell.guesses(SAMPLE - 1, 0)), PURPOSES[name], q)
+    truth = predict_worlds([true_cell(options)], PURPOSES[name], q)[0]
     rng = np.random.default_rng(0)
     draws = [expected_mm(truth, rng.choice(len(q), count, replace=False)) for _ in range(100)]
     cells = [
-        f"{expected_mm(truth, chosen(worlds, count, criterion=word).rows):.3g}" for word in CRITERIA
+        f"{expected_mm(truth, choose_stops(worlds, count, criterion=word).rows):.3g}"
+        for word in CRITERIA
     ]
     return f"| {name} | {count} | {' | '.join(cells)} | {np.median(draws):.3g} | {min(draws):.3g} |"
 
@@ -116,9 +117,9 @@ def speed(options: CellOptions) -> str:
     begun = time.process_time()
     q = candidates(cell, CANDIDATES).q
     found = time.process_time()
-    worlds = worlds_of((cell, *cell.guesses(SAMPLE - 1, 0)), PURPOSES["kinematics"], q)
+    worlds = predict_worlds((cell, *cell.guesses(SAMPLE - 1, 0)), PURPOSES["kinematics"], q)
     told = time.process_time()
-    chosen(worlds, 60)
+    choose_stops(worlds, 60)
     done = time.process_time()
     steps = 3
     peer(worlds[0], steps)
@@ -169,8 +170,8 @@ def bad_guess(mount: str, robot: str, seed: int) -> float:
         q = candidates(guess, CANDIDATES // 5, seed=seed).q
     except DataError:
         return np.nan
-    worlds = worlds_of((guess, *guess.guesses(SAMPLE - 1, seed)), PURPOSES["hand-eye"], q)
-    return float(whole(true, q[chosen(worlds, 20).rows], 0.0).mean())
+    worlds = predict_worlds((guess, *guess.guesses(SAMPLE - 1, seed)), PURPOSES["hand-eye"], q)
+    return float(whole(true, q[choose_stops(worlds, 20).rows], 0.0).mean())
 
 
 def bad_guess_row(robot: str, found: dict[str, list[float]]) -> str:
@@ -189,7 +190,7 @@ def peer(world: World, count: int) -> list[int]:
     gains = np.swapaxes(world.factors, 1, 2) @ world.factors
     for _ in range(count):
         spreads = np.linalg.inv(information + gains)
-        values = np.einsum("ij,kji->k", world.counted, spreads)
+        values = np.einsum("ij,kji->k", world.objective, spreads)
         values[rows] = np.inf
         rows.append(int(np.argmin(values)))
         information = information + gains[rows[-1]]
@@ -200,14 +201,14 @@ def one_axis(mount: str, seed: int) -> tuple[float, ...]:
     """Sigmas of x: predicted and obtained, at the noise of each; error over the obtained one."""
     options = replace(HAND_EYE, mount=mount, motion="one_axis", views=8, seed=seed)
     cell = simulate(options)
-    begun = begin(so_far_of(cell))
+    begun = start_from_session(so_far_of(cell))
     q = candidates(begun.cell, 400, seed=seed).q
     added = next_best(begun, PURPOSES["hand-eye"], q, 5, seed=seed)
     whole = simulate(
         replace(options, motion="free"), np.concatenate([cell.robot.joints, q[added.design.rows]])
     )
     known = calibrated(whole, level="hand-eye")
-    obtained = sigmas(known.solved.covariance)
+    obtained = sigmas(known.assessment.covariance)
     predicted = added.design.predicted
     equal = at_noise(begun, q[added.design.rows], known)
     error = edge_error(whole, known)
@@ -222,15 +223,15 @@ def sigmas(covariance: FloatArray) -> tuple[float, float]:
     )
 
 
-def at_noise(begun: Begun, added: FloatArray, known: RunState) -> tuple[float, float]:
+def at_noise(begun: SessionStart, added: FloatArray, known: RunState) -> tuple[float, float]:
     """The prediction at the noise that the whole session shows."""
-    noise = known.solved.noise
+    noise = known.assessment.noise
     scale = (known.pixel_px / begun.cell.pixel_px) ** 2
     problem = begun.recorded.problem
     seen = replace(problem.observations, covariance=scale * problem.observations.covariance)
     cell = replace(begun.cell, noise=noise, pixel_px=known.pixel_px)
     recorded = replace(begun.recorded, problem=replace(problem, observations=seen), noise=noise)
-    world = worlds_of([cell], PURPOSES["hand-eye"], added, recorded=recorded)[0]
+    world = predict_worlds([cell], PURPOSES["hand-eye"], added, recorded=recorded)[0]
     return sigmas(world.covariance(range(len(added))))
 
 

@@ -72,7 +72,7 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
     moved = sweep(replace(world.cell, seed=seed), how)
     known = calibrated_sweep(moved)
     (found,) = next(iter(known.clocks.values())).clock.delays
-    error, covariance = x_error(moved, known), known.solved.covariance[:6, :6]
+    error, covariance = x_error(moved, known), known.assessment.covariance[:6, :6]
     ignoring = np.full(6, np.nan)
     if seed < IGNORED:
         look, clock_sweep.find_delays = clock_sweep.find_delays, lambda *_: (None, ())
@@ -91,7 +91,7 @@ def of_one_sweep(task: tuple[World, int]) -> Outcome:
 
 def x_error(moved: SimulatedCell, known: RunState) -> FloatArray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
-    return log(invert(next(iter(moved.transforms.values()))) @ known.solved.state.edges[0])
+    return log(invert(next(iter(moved.transforms.values()))) @ known.assessment.state.edges[0])
 
 
 def row(world: World, found: list[Outcome]) -> str:

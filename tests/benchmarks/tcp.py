@@ -14,8 +14,8 @@ from results import few, write_section
 from support.touched import TURN, Job, Made, bound, error_of, slipped, touched, turned
 
 from visioncal.core.transforms import compose
-from visioncal.estimation.parts import Noise
 from visioncal.estimation.pivot import fit_pivot
+from visioncal.estimation.problem_parts import Noise
 
 SEEDS, SLIP_SEEDS, WORKERS = *few((1000, 300), (3, 3)), 2
 ROBOT = Noise.of_robot(5e-5, 3e-5)
@@ -68,7 +68,7 @@ def fitted(task: tuple[Job, int]) -> Outcome:
         float(np.trace(least[3:, 3:])),
         float(linear[3:] @ linear[3:]),
         float(error[free] @ np.linalg.solve(covariance, error[free])),
-        int(np.sum(~fit.agreement.agrees)),
+        int(np.sum(~fit.agreement.mask)),
     )
 
 
@@ -88,7 +88,7 @@ def named(task: tuple[Job, str, int]) -> tuple[bool, int]:
     touches = made.touches if spoil is None else spoil(made, way / np.linalg.norm(way))
     wrong = np.zeros(len(touches), dtype=bool)
     wrong[3] = spoil is not None
-    agrees = fit_pivot(touches, job.noise).agreement.agrees
+    agrees = fit_pivot(touches, job.noise).agreement.mask
     return bool(np.all(~agrees[wrong])), int(np.sum(~agrees & ~wrong))
 
 

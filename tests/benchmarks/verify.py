@@ -19,7 +19,7 @@ from support.later import ANYHOW, Change, Lot, knock, known_again, lot
 
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
-from visioncal.calibration.verification.prediction import seen_by
+from visioncal.calibration.verification.prediction import predict_detected
 from visioncal.core.types import Mount
 from visioncal.simulation import CellOptions
 
@@ -88,7 +88,9 @@ def _tallied(place: Lot, name: str, checks: int) -> tuple[np.ndarray, float]:
         begun = time.process_time()
         named = [
             suspect.name
-            for suspect in check(seen_by(known, prior_calibration), prior_calibration).named
+            for suspect in check(
+                predict_detected(known, prior_calibration), prior_calibration
+            ).named
         ] or ["none"]
         seconds += time.process_time() - begun
         tally += [named[0] == case.right, named == [case.right], named != ["none"]]

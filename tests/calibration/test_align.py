@@ -20,6 +20,7 @@ from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import CellOptions, simulate
+from visioncal.simulation.elasticity import Payload
 from visioncal.simulation.layout import (
     BoardAt,
     CameraAt,
@@ -31,7 +32,6 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.records import cell_session
-from visioncal.simulation.sag import Payload
 
 STOPS = 20
 # Looks the same after half a turn: both counts are even.

@@ -21,14 +21,14 @@ from visioncal.core.types import MOUNTS
 from visioncal.estimation.identifiability import Indices
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.parameters import free_parameters, parameter_moves
-from visioncal.estimation.parts import Effect
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.solve import fisher_information
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 from visioncal.estimation.workspace import postures
 from visioncal.results import to_document
 from visioncal.robot import Robot, convert_table, load_robot, robot_names, table_of
-from visioncal.robot.jacobians import number_jacobian, table_moves
+from visioncal.robot.jacobians import number_jacobian, table_jacobian
 from visioncal.robot.tables import table_document, table_from_document
 from visioncal.simulation import simulate
 
@@ -81,7 +81,7 @@ def test_a_table_moves_as_its_derivatives_say(name, convention):
     # Common normals of nearly parallel axes run away with the inverse square of the angle.
     step = 1e-7 if convention == "hayati" else 1e-9
     for by, turn, way in zip(
-        table_moves(arm, table, twists, functions), twists, functions, strict=True
+        table_jacobian(arm, table, twists, functions), twists, functions, strict=True
     ):
         ends = [
             rows_of(table_of(arm.corrected(value * turn, value * way), convention, like=like))
@@ -152,7 +152,7 @@ def test_a_second_board_adds_six_values(mount):
     robot = load_robot("ur5e")
     arm = arm_data(robot, postures(robot)[:40], mount)
     seen = np.where(np.arange(40)[:, None, None] % 2 == 1, np.eye(6), 0.0)
-    place = Effect.free("board", Knowledge(np.zeros((6, 6)), np.zeros(6)), seen)
+    place = Effect.free("board", PriorInformation(np.zeros((6, 6)), np.zeros(6)), seen)
     problem = arm.problem.with_effects([place, *arm.problem.effects])
     state = replace(arm.state, values=problem.start_values)
     covariance = covariance_from(fisher_information(problem, state, arm.noise))
@@ -350,7 +350,7 @@ def calibrated_cell():
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, convention):
     cell, known = calibrated_cell
-    assert arm_found(known).numbers.convention == "hayati"
+    assert arm_found(known).identifiability.convention == "hayati"
     asked = replace(known, convention=convention)
     (examine_again,) = (stage for stage in STAGES if stage.name == "examine")
     known = examine_again.run(asked)
@@ -390,11 +390,13 @@ def test_a_missing_direction_is_in_the_verdict():
     """Looking straight at a board leaves the fifth joint of a UR almost where it is."""
     options = replace(WRONG_LINKS, seed=9, tilt_rad=(0.0, 0.03), roll_rad=0.4, views=40)
     known = calibrated(simulate(options))
-    assert arm_found(known).numbers.counts.determined < 30
-    assert arm_found(known).numbers.advice in known.verdict.reasons
-    assert "joint 5 (wrist_2_joint) moved by 3.9 deg only" in arm_found(known).numbers.advice
+    assert arm_found(known).identifiability.counts.determined < 30
+    assert arm_found(known).identifiability.advice in known.verdict.reasons
+    assert (
+        "joint 5 (wrist_2_joint) moved by 3.9 deg only" in arm_found(known).identifiability.advice
+    )
     rich = calibrated(simulate(replace(WRONG_LINKS, seed=9, views=40)))
-    assert arm_found(rich).numbers.counts.determined == 30
+    assert arm_found(rich).identifiability.counts.determined == 30
     assert not any("identifiable values" in reason for reason in rich.verdict.reasons)
 
 

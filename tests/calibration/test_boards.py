@@ -18,7 +18,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.appearance import BOARD_NAMES
 from visioncal.estimation.workspace import postures
-from visioncal.frames.session_observations import session_looks
+from visioncal.frames.session_observations import detect_session_target
 from visioncal.interchange.outputs import write_outputs
 from visioncal.results import Calibration, to_document
 from visioncal.session import Session
@@ -111,12 +111,12 @@ def test_each_board_adds_six_values_that_are_determined():
     """Everett and Hsu (1988): 4 a revolute joint, 6 for the frames, and 6 a further board."""
     cell = simulate(replace(TWO, **WRONG_LINKS, views=24, seed=1))
     known = calibrated(cell)
-    counts = arm_found(known).numbers.counts
+    counts = arm_found(known).identifiability.counts
     assert known.robot_arm.kinematics.level == "geometry"
     assert (counts.columns, counts.identifiable, counts.determined) == (54, 36, 36)
     # The first board alone determines thirty.
     one = calibrated(without(cell, set(np.flatnonzero(board_numbers(cell) == 1).tolist())))
-    counts = arm_found(one).numbers.counts
+    counts = arm_found(one).identifiability.counts
     assert (counts.columns, counts.identifiable) == (48, 30)
 
 
@@ -125,9 +125,9 @@ def error_m(cell, known):
     robot = known.robot_arm.model.robot
     q = postures(robot)
     x, z, *_ = cell.transforms.values()
-    board = known.solved.state.edges[1]
+    board = known.assessment.state.edges[1]
     true = invert(x) @ forward(cell.robot.true_arm, q) @ z
-    ours = invert(known.solved.state.edges[0]) @ robot.base_from_flange(q) @ board
+    ours = invert(known.assessment.state.edges[0]) @ robot.base_from_flange(q) @ board
     return float(np.sqrt(np.mean(np.sum((true - ours)[:, :3, 3] ** 2, axis=1))))
 
 
@@ -186,7 +186,7 @@ def test_one_view_places_a_board():
     # One draw of chi-square with six degrees of freedom, at one in ten thousand.
     assert away @ np.linalg.solve(covariance, away) < chi2.ppf(1.0 - 1e-4, 6)
     # Without that view nothing places the board: it has no part in what is held out.
-    assert np.isnan(known.solved.held_out.away_m).sum() == 1
+    assert np.isnan(known.assessment.held_out.residual_m).sum() == 1
     assert np.isfinite(known.findings.held_out.mm)
 
 
@@ -288,7 +288,7 @@ def test_every_output_shows_all_boards(tmp_path):
         assert f"/targets/{name}/sheet" in logged
         assert any(placement.startswith(f"/targets/{name}/") for placement in placements)
     with pytest.raises(DataError, match=r"several targets \(first, second\)"):
-        session_looks(session, written.calibration, "base")
+        detect_session_target(session, written.calibration, "base")
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens estimated"])
@@ -296,10 +296,10 @@ def test_what_is_written_of_the_fit_is_read_back(given):
     """Further boards are written relative to the first."""
     known = calibrated(simulate(replace(TWO, seed=2, state_intrinsics=given, **WRONG_LINKS)))
     assert known.robot_arm.model is not None
-    prior_calibration, solved = CalibrationPrior.of(result_of(known)), known.solved
+    prior_calibration, solved = CalibrationPrior.of(result_of(known)), known.assessment
     np.testing.assert_allclose(prior_calibration.state.edges, solved.state.edges, atol=1e-12)
     # What lenses do beyond their models is not written.
-    own = np.delete(np.arange(len(solved.covariance)), known.fitted.field_columns)
+    own = np.delete(np.arange(len(solved.covariance)), known.cell_fit.field_columns)
     covariance = solved.covariance[np.ix_(own, own)]
     sigmas = np.sqrt(np.diag(covariance))
     # Slopes there and back undo each other up to rounding.

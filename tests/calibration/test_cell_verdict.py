@@ -9,10 +9,10 @@ from support.commands import visioncal
 from support.problems import observed, pose, world
 from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
-from visioncal.calibration.pipeline import align, reading_hints, running
+from visioncal.calibration.pipeline import align, misread_poses, running
 from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DataError, DegenerateError
-from visioncal.interchange.formats.exchanging import exchange_views
+from visioncal.interchange.formats.view_exchange import exchange_views
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation import (
@@ -401,7 +401,7 @@ def test_exchanged_names_are_the_cause_that_is_said_first(session, kind, names, 
 
 def test_exchanges_are_tried_only_where_views_disagree(session, monkeypatch):
     # A cell that is sound has no pair that does not close.
-    monkeypatch.setattr(reading_hints, "exchanged_names", None)
+    monkeypatch.setattr(misread_poses, "exchanged_names", None)
     monkeypatch.setattr(running, "exchanged_names", None)
     assert align(session).verdict.status == "good"
     assert not [

@@ -15,7 +15,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.clock_offset import LARGEST_SIGMA_S, ClockOffset
 from visioncal.calibration.stages.clocks import set_clocks
 from visioncal.calibration.stages.observed import Observed
-from visioncal.calibration.stages.pnp import given_poses
+from visioncal.calibration.stages.pnp import stated_poses
 from visioncal.calibration.verification import verify
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
@@ -45,7 +45,7 @@ SHORT = SweepOptions(stops=5, camera_minus_robot_s=AHEAD_S)
 
 def clocked_of(session):
     """What its stream gives the views of a session of measured poses."""
-    (clocked,) = set_clocks(Observed(session, poses=given_poses(session))).clocks.values()
+    (clocked,) = set_clocks(Observed(session, poses=stated_poses(session))).clocks.values()
     return clocked
 
 
@@ -155,7 +155,7 @@ def test_another_sweep_verifies_the_camera(session):
     again = swept(recording=1)
     held = verify(cell_session(again, "again", seen="poses"), known)
     assert held.passed
-    assert held.seen.stops > 20
+    assert held.predicted.stops > 20
     knocked = cell_session(swept(recording=1, camera_moved_m=2e-3), "knocked", seen="poses")
     assert verify(knocked, known).named[0].name == "camera"
 
@@ -486,11 +486,11 @@ def test_what_is_open_about_the_clocks_counts(session):
 def test_frames_that_are_in_the_fit_tell_the_offset_once():
     clock = ClockOffset(0.02, 1e-4, "motion", None, 100, 0.9, dict.fromkeys(range(75), np.ones(6)))
     # A quarter of the frames tells half as well.
-    assert clock.known_s() == pytest.approx(2e-4)
-    assert replace(clock, frames=75).known_s() == LARGEST_SIGMA_S
+    assert clock.prior_sigma_s() == pytest.approx(2e-4)
+    assert replace(clock, frames=75).prior_sigma_s() == LARGEST_SIGMA_S
     # The arm as stated was told by, and its errors are sought.
-    assert clock.known_s(erring=True) == LARGEST_SIGMA_S
-    assert replace(clock, method="stated", frames=0).known_s(erring=True) == 1e-4
+    assert clock.prior_sigma_s(erring=True) == LARGEST_SIGMA_S
+    assert replace(clock, method="stated", frames=0).prior_sigma_s(erring=True) == 1e-4
 
 
 def test_views_with_poses_of_their_own_ask_no_stream(moved, session):

@@ -20,7 +20,7 @@ from visioncal.calibration.pipeline.checkup import to_document
 from visioncal.calibration.stages.image_size import other_images, scaled_matrix, turned_lens
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
-from visioncal.interchange.formats import load_in_doubt
+from visioncal.interchange.formats import load_for_rereading
 from visioncal.session import Session
 from visioncal.simulation import BOARDS
 from visioncal.vision.camera import project
@@ -274,7 +274,7 @@ def test_squares_in_the_place_of_inner_corners_are_named_at_once(
 
 def test_rotations_of_another_form_are_loaded_in_doubt(tmp_path):
     name = "Euler angles in degrees in quaternion columns"
-    doubtful = load_in_doubt(broken_session(tmp_path / "session", BROKEN[name]))
+    doubtful = load_for_rereading(broken_session(tmp_path / "session", BROKEN[name]))
     assert doubtful.robot is not None
     assert doubtful.robot.reading.rotation == "euler-xyz-deg"
     assert np.abs(doubtful.robot.rotations).max() > 90.0

@@ -19,10 +19,10 @@ from support.mistakes import MISTAKES, OTHER, guessed, is_named, measured, numbe
 import visioncal
 from visioncal.calibration.guess import guess_reading
 from visioncal.calibration.pipeline.guess_inputs import (
+    camera_poses_of,
     chain_poses,
-    guess_seen,
+    guess_from_camera_poses,
     guess_session,
-    seen_poses,
 )
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import DataError, DegenerateError
@@ -436,7 +436,7 @@ def test_a_session_of_images_is_read_by_its_joints_as_well(rendered):
     session = Session.load(rendered)
     chain = chain_poses(session)
     assert np.isfinite(chain).all()
-    seen = seen_poses(session)
+    seen = camera_poses_of(session)
     assert np.isfinite(seen.poses()).all()
     told = numbers(np.diag([-1.0, -1.0, 1.0, 1.0]) @ chain, unit="mm").read_as(Reading())
     guess = guess_session(session, told)
@@ -460,7 +460,7 @@ def test_a_board_that_looks_the_same_turned_does_not_hide_sound_poses():
     ]
     known = measured(showing(cell, seen))
     assert len(known.poses[0].cam_from_target) > 1
-    guess = guess_seen(known, numbers(cell.robot.base_from_flange))
+    guess = guess_from_camera_poses(known, numbers(cell.robot.base_from_flange))
     assert guess.best is guess.declared
     assert guess.declared.closes
 

@@ -17,9 +17,9 @@ from visioncal.core.transforms import adjoint, compose, exp, invert, log
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.linalg import covariance_from, damped_step, spectrum
-from visioncal.estimation.parts import ROBOT, Effect, Noise, State
+from visioncal.estimation.problem_parts import ROBOT, Effect, Noise, State
 from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 from visioncal.simulation import CellOptions, measured_poses, simulate
 
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -61,7 +61,7 @@ def test_jacobian_agrees_with_central_differences(mount):
     x, z = some_edges()
     rng = np.random.default_rng(0)
     by_camera, flange_jacobian = rng.normal(size=(2, 5, 6, 3))
-    known = Knowledge(np.eye(3), np.zeros(3))
+    known = PriorInformation(np.eye(3), np.zeros(3))
     effect = Effect.free("any", known, by_camera, {ROBOT: flange_jacobian})
     problem = made_up(some_motion(5), x, z, Noise.of_robot(0.05, 0.02), mount=mount)
     problem, state = problem.with_effects([effect]), State(np.array([x, z]), np.zeros(3))
@@ -174,9 +174,9 @@ def test_the_whole_chain_states_its_errors_honestly(mount, given, coarse):
             )
         )
         known = calibrated(cell)
-        error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+        error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
         surprises.append(error @ np.linalg.solve(covariance, error) / 12)
-        noises.append(known.solved.noise.robots[0])
+        noises.append(known.assessment.noise.robots[0])
         assert known.pixel_px == pytest.approx(0.1, rel=0.1)
     # The mean of 8 chi-square of 12 has the standard deviation 0.144: four of it. The estimated
     # noise raises the expectation by some percent (F against chi-square).
@@ -193,7 +193,7 @@ def test_a_stop_counts_once_however_often_it_is_looked_at():
     coarse = CellOptions(
         seed=4, views=12, pixel_sigma_px=0.1, robot_sigma_m=2e-4, robot_sigma_rad=4e-4
     )
-    problem = calibrated(simulate(coarse)).solved.problem.with_effects([])
+    problem = calibrated(simulate(coarse)).assessment.problem.with_effects([])
     once = solved(problem)
     again = np.repeat(np.arange(12), 3)
     looks = problem.observations.take(again)

@@ -15,16 +15,20 @@ import visioncal
 from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert
-from visioncal.estimation.positions import Mounting, Places, fit_mounting
+from visioncal.estimation.positions import Mounting, PositionReadings, fit_mounting
 from visioncal.estimation.workspace import postures
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE
 from visioncal.session.instruments import instrument_names, known_instrument, stated_instrument
 from visioncal.simulation.arms import forward
-from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
+from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
 
-PROBE, POINT, POINTS = Tracked(poses=True), Tracked(), Tracked(points=THREE)
+PROBE, POINT, POINTS = (
+    InstrumentOptions(poses=True),
+    InstrumentOptions(),
+    InstrumentOptions(points=THREE),
+)
 KINDS = pytest.mark.parametrize("options", [PROBE, POINT, POINTS], ids=["probe", "point", "three"])
 PROBE_FIRST = pytest.mark.parametrize(
     "options",
@@ -73,7 +77,7 @@ def test_errors_follow_their_covariance_and_reach_their_bound(options):
         known = solved_of(session_of(shop))
         error, covariance = (
             errors_of(shop, known)[kept],
-            known.solved.covariance[np.ix_(kept, kept)],
+            known.assessment.covariance[np.ix_(kept, kept)],
         )
         by_sigma.append(error @ np.linalg.solve(covariance, error) / len(kept))
         by_bound.append(error @ np.linalg.solve(mounting_bound(shop), error) / len(kept))
@@ -89,7 +93,7 @@ def test_an_arm_off_by_millimetres_is_calibrated_all_over_its_workspace(options)
     assert known.robot_arm.kinematics.level == "geometry"
     assert known.verdict.status == "good"
     q = postures(known.robot)
-    (x, z), size = known.solved.state.edges[:2], len(known.robot_arm.model.values)
+    (x, z), size = known.assessment.state.edges[:2], len(known.robot_arm.model.values)
 
     def place(robot):
         return (invert(x) @ robot.base_from_flange(q) @ z)[:, :3, 3]
@@ -116,7 +120,7 @@ def test_so_many_values_are_told_of_a_six_axis_arm(options, rank):
     Three points have six values more than one, of their places.
     """
     shop = tracked(replace(options, **WRONG))
-    seen = arm_found(known_of(session_of(shop))).numbers.counts
+    seen = arm_found(known_of(session_of(shop))).identifiability.counts
     assert (seen.identifiable, seen.determined) == (rank, rank)
     whole = information(shop, arm_columns=True)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-30))
@@ -339,7 +343,7 @@ def test_a_mounting_is_found_from_a_rough_start():
     in_base = (flange[:, :3, :3] @ on_flange)[:, :, 0] + flange[:, :3, 3]
     x = invert(mounting.base_from_instrument)
     read = in_base @ x[:3, :3].T + x[:3, 3]
-    places = Places(flange, read, points, np.arange(8) // 2, np.full(8, 1e-4))
+    places = PositionReadings(flange, read, points, np.arange(8) // 2, np.full(8, 1e-4))
     off = Mounting(
         mounting.base_from_instrument @ exp(np.full((1, 6), 0.05))[0], 0.8 * mounting.on_flange
     )

@@ -16,7 +16,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.kinematics import FUNCTIONS
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
-from visioncal.calibration.verification.prediction import seen_by
+from visioncal.calibration.verification.prediction import predict_detected
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
 from visioncal.estimation.solve import Solution
@@ -26,10 +26,16 @@ from visioncal.results.arm import ArmResult, CarriedRegion, CarriesOver
 from visioncal.robot import Robot
 from visioncal.robot.inverse import Inverse
 from visioncal.simulation.arms import forward
-from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
+from visioncal.simulation.instrument_session import (
+    InstrumentOptions,
+    InstrumentRecord,
+    random_postures,
+    session_of,
+    tracked,
+)
 
 # Long functions, which few harmonics carry, are quickly found.
-OPTIONS = Tracked(
+OPTIONS = InstrumentOptions(
     stops=40,
     poses=True,
     dh_sigma_m=5e-4,
@@ -41,21 +47,21 @@ OPTIONS = Tracked(
 
 
 @pytest.fixture(scope="module")
-def shop() -> Shop:
+def shop() -> InstrumentRecord:
     return tracked(OPTIONS)
 
 
 @pytest.fixture(scope="module")
-def known(shop: Shop) -> RunState:
+def known(shop: InstrumentRecord) -> RunState:
     return known_of(session_of(shop))
 
 
-Q = above(tracked(OPTIONS).arm, 200, np.random.default_rng(1))
+Q = random_postures(tracked(OPTIONS).arm, 200, np.random.default_rng(1))
 
 
-def away_m(shop: Shop, known: RunState) -> FloatArray:
+def away_m(shop: InstrumentRecord, known: RunState) -> FloatArray:
     """(m, 3) how far the probe is predicted off at postures all over the workspace."""
-    x, z = known.solved.state.edges[:2]
+    x, z = known.assessment.state.edges[:2]
     model = known.robot_arm.model
     found = invert(x) @ model.base_from_flange(Q) @ z
     true = invert(shop.base_from_instrument) @ forward(shop.true_arm, Q) @ shop.flange_from_probe
@@ -64,7 +70,7 @@ def away_m(shop: Shop, known: RunState) -> FloatArray:
 
 def sigmas_m(known: RunState) -> FloatArray:
     """(m,) what is predicted of that."""
-    answer = known.solved
+    answer = known.assessment
     fit = Solution(answer.state, answer.noise)
     return known.robot_arm.data(answer.problem, fit, answer.covariance, {}).place_sigmas_m(Q)
 
@@ -123,7 +129,7 @@ def test_places_alone_tell_of_them():
 
 
 def test_where_it_carries_over_is_what_is_predicted_there(known):
-    found = arm_found(known).carries
+    found = arm_found(known).carries_over
     assert found.measured_mm == known.robot_arm.kinematics.result.chosen.held_out_mm
     # The wave's own noise and another session's share come on top of what is not known of the arm.
     squares = [found.session_mm**2, 1e6 * np.mean(sigmas_m(known) ** 2)]
@@ -141,7 +147,7 @@ def test_stops_near_one_another_tell_less_elsewhere_and_the_arm_as_stated_is_wor
     near = q + 0.15 * np.random.default_rng(5).standard_normal((24, 6))
     shop = tracked(options, near)
     known = known_of(session_of(shop), level="kinematics")
-    found = arm_found(known).carries
+    found = arm_found(known).carries_over
     assert found.sigma_mm > 3.0 * found.measured_mm
     # One arm of errors that few values tell of: its error is within a factor of what is predicted.
     ours = 1e3 * float(np.sqrt(np.mean(np.sum(away_m(shop, known) ** 2, axis=1))))
@@ -230,20 +236,20 @@ def test_a_check_of_an_unchanged_cell_passes_and_a_bump_is_seen(tmp_path):
     place.calibration.save(tmp_path / "calibration.json")
     prior = CalibrationPrior.of(Calibration.load(tmp_path / "calibration.json"))
     rng = np.random.default_rng(0)
-    found = [check(seen_by(known_again(place.cell, rng), prior), prior) for _ in range(4)]
+    found = [check(predict_detected(known_again(place.cell, rng), prior), prior) for _ in range(4)]
     assert all(item.passed and not item.named for item in found)
     # Chi-square of thirty directions; views that were left out err by more than the stops of a cell
     # that is well known, so that it comes out small.
     assert 4.0 < np.mean([item.misfit for item in found]) < 45.0
     bump = Change(camera=np.array([0.0, 0.0, 0.0, 0.0, 4e-3, 0.0]))
-    bumped = check(seen_by(known_again(place.cell, rng, bump), prior), prior)
+    bumped = check(predict_detected(known_again(place.cell, rng, bump), prior), prior)
     assert not bumped.passed
     assert [suspect.name for suspect in bumped.named] == ["camera"]
 
 
 def test_corrected_targets_reach_where_functions_would_have_led_them_astray(shop, known):
     result, q = result_of(known), 0.9 * Q[:40]
-    x, z = known.solved.state.edges[:2]
+    x, z = known.assessment.state.edges[:2]
     stated = known.robot_arm.kinematics.nominal.fit.state.edges
     wanted = known.robot.base_from_flange(q)
     sent = correct(result, wanted, q)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages import detect, kept_corners
-from visioncal.calibration.stages.kept_corners import KeptCorners
+from visioncal.calibration.stages import corner_cache, detect
+from visioncal.calibration.stages.corner_cache import CornerCache
 from visioncal.results import to_document
 from visioncal.session import Session
 
@@ -32,13 +32,13 @@ def cell(rendered, tmp_path):
 @pytest.fixture
 def searched(monkeypatch):
     """The views that were searched."""
-    views, look_for = [], detect.look_for
+    views, look_for = [], detect.find_corners
 
     def counted(image, target, view, *rest, **named):
         views.append(view)
         return look_for(image, target, view, *rest, **named)
 
-    monkeypatch.setattr(detect, "look_for", counted)
+    monkeypatch.setattr(detect, "find_corners", counted)
     return views
 
 
@@ -84,11 +84,11 @@ def test_what_is_kept_belongs_to_image_board_and_version(cell, searched, monkeyp
     (target,) = session.boards.values()
     larger, kept = (
         replace(target, square_m=2 * target.square_m),
-        KeptCorners.beside(session, grows=False),
+        CornerCache.beside(session, grows=False),
     )
     keys = {kept.key(name, board, "") for name in (b"1", b"2") for board in (target, larger)}
     assert len(keys) == 4
-    monkeypatch.setattr(kept_corners, "_MADE_BY", {"visioncal": "0.0.1", "opencv": "1"})
+    monkeypatch.setattr(corner_cache, "_MADE_BY", {"visioncal": "0.0.1", "opencv": "1"})
     facts(cell, keep=False)
     assert len(searched) == 6
 

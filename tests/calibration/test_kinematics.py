@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import MOUNTS
 from visioncal.estimation.armpair import ArmPair
-from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.workspace import postures
 from visioncal.frames.tcp import touched_tool
 from visioncal.frames.touches import TouchRows
@@ -64,7 +64,7 @@ def test_an_arm_that_errs_before_a_lens_that_is_not_as_stated():
     cell = simulate(options)
     known = calibrated(cell)
     assert known.robot_arm.errors.is_estimated
-    squares = error_of(cell, known)[:6] ** 2 / np.diag(known.solved.covariance)[:6]
+    squares = error_of(cell, known)[:6] ** 2 / np.diag(known.assessment.covariance)[:6]
     # Of six values, each within four sigmas in all but one of two thousand cases.
     assert squares.max() < 16.0
 
@@ -72,7 +72,7 @@ def test_an_arm_that_errs_before_a_lens_that_is_not_as_stated():
 def test_an_arm_that_is_no_longer_worth_calibrating_is_as_stated_again():
     """Views that agree later have a say in the level: what an earlier one estimated goes."""
     known = calibrated(simulate(replace(GOOD, offset_sigma_rad=1e-3, views=20, seed=1)))
-    agreed, arm = known.fit.agreed, known.robot_arm
+    agreed, arm = known.cell_fit_or_none.inlier_fit, known.robot_arm
     assert arm.model is not None
     few = np.flatnonzero(agreed.used)[:4]
     stated = arm.without_errors(agreed.problem.subset(np.isin(np.arange(len(agreed.used)), few)))
@@ -81,7 +81,7 @@ def test_an_arm_that_is_no_longer_worth_calibrating_is_as_stated_again():
     assert (again.kinematics.level, again.model) == ("nominal", None)
     assert again.errors is None or not again.errors.is_estimated
     np.testing.assert_array_equal(again.poses, arm.reported)
-    assert again.moved(again.put_into(stated), start) == (again, 0.0)
+    assert again.relinearised(again.applied_to(stated), start) == (again, 0.0)
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_links_that_are_off_by_little_count_in_the_covariance():
         known = calibrated(cell)
         assert known.robot_arm.kinematics.level == "geometry"
         error = error_of(cell, known)
-        squares += error @ np.linalg.solve(known.solved.covariance[:12, :12], error)
+        squares += error @ np.linalg.solve(known.assessment.covariance[:12, :12], error)
     # Chi-square of 36 degrees of freedom but for one in a thousand; under offsets it is 118.
     assert squares < 68.0
 
@@ -148,9 +148,9 @@ def test_an_arm_with_long_links_is_not_taken_for_a_small_board():
     known = calibrated(cell)
     # As if nothing but errors of one size could be, this arm makes the board 0.16 % smaller, at
     # three sigma; what was measured to a millionth is kept.
-    assert 9 in known.fitted.seen.free
-    assert known.fitted.seen.held.all()
-    sigma = float(np.sqrt(np.mean(arm_found(known).numbers.sigmas_m ** 2)))
+    assert 9 in known.cell_fit.linearised_corners.free
+    assert known.cell_fit.linearised_corners.held.all()
+    sigma = float(np.sqrt(np.mean(arm_found(known).identifiability.sigmas_m ** 2)))
     assert error_m(cell, known, known.robot_arm.model.robot) < 2.0 * sigma
 
 
@@ -171,11 +171,11 @@ def test_without_joints_no_level_can_be_asked_for():
 @pytest.mark.parametrize("mount", [MOUNTS[0], slow(MOUNTS[1])])
 def test_predictions_move_as_their_derivatives_say(mount):
     known = calibrated(simulate(replace(WRONG_LINKS, mount=mount, seed=4)))
-    arm, edges = known.robot_arm.at(np.arange(3)), known.solved.state.edges
+    arm, edges = known.robot_arm.at(np.arange(3)), known.assessment.state.edges
     model, q = arm.model, arm.joints_rad
     size, step = 12 + len(model.values), 1e-6
     middle = target_in_camera(mount, *edges, model.robot.base_from_flange(q))
-    problem = known.solved.problem.with_effects([])
+    problem = known.assessment.problem.with_effects([])
     pair = ArmPair.of(problem, State(edges, np.zeros(0)), ROBOT)
     jacobian = pair.jacobian(model.base_from_flange(q), model.basis(q))[1]
     for at in range(size):
@@ -203,7 +203,7 @@ def test_the_workspace_sigma_is_the_bound_and_holds_the_error(mount):
     # The bound takes the lens for exact; here nothing speaks against that.
     cell = simulate(replace(WRONG_LINKS, seed=7, mount=mount, target=sure))
     known = calibrated(cell)
-    sigma = float(np.sqrt(np.mean(arm_found(known).numbers.sigmas_m ** 2)))
+    sigma = float(np.sqrt(np.mean(arm_found(known).identifiability.sigmas_m ** 2)))
     bound = workspace_bound_m(cell, postures(known.robot)[::20])
     # The bound knows the size of each error; the fit estimates one size and the noise's levels from
     # 30 views, which tell them to a tenth. Twenty postures stand for all to about as much.

@@ -13,9 +13,9 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cell import read_cell
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import compose, exp, invert, log
-from visioncal.live.planning.information import worlds_of
+from visioncal.live.planning.information import predict_worlds
 from visioncal.live.planning.purposes import PURPOSES
-from visioncal.live.planning.recorded import SoFar, begin
+from visioncal.live.planning.recorded import PartialCalibration, start_from_session
 from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session, View
@@ -140,7 +140,7 @@ def test_what_was_measured_of_the_target_helps_as_well(mount):
     place = cell.transforms[name][:3, 3]
     prior = dict(zip(("x_m", "y_m", "z_m"), place.tolist(), strict=True)) | {"sigma_m": SIGMA_M}
     known = run(cell, {name: prior})
-    sigmas = np.sqrt(np.diag(known.solved.covariance)[:12])
+    sigmas = np.sqrt(np.diag(known.assessment.covariance)[:12])
     # Four sigma, for twelve numbers.
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     assert sum("was used" in note for note in known.notes) == 3
@@ -151,7 +151,7 @@ def test_a_rotation_may_be_known_alone():
     name = "base_from_target"
     turn = Rotation.from_matrix(cell.transforms[name][:3, :3]).as_quat().tolist()
     known = run(cell, {name: {"quaternion_xyzw": turn, "sigma_rad": 1e-6}})
-    sigmas = np.sqrt(np.diag(known.solved.covariance)[:12])
+    sigmas = np.sqrt(np.diag(known.assessment.covariance)[:12])
     # Four sigma, for twelve numbers.
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     # The board is turned no farther than that is known; the views alone know it to 2e-5.
@@ -167,7 +167,7 @@ def test_a_board_of_several_may_be_known_whole():
     prior = dict(zip(("x_m", "y_m", "z_m"), edge[:3, 3].tolist(), strict=True))
     prior |= {"sigma_m": SIGMA_M, "quaternion_xyzw": turn, "sigma_rad": 1e-5}
     known = run(cell, {name: prior})
-    sigmas = np.sqrt(np.diag(known.solved.covariance)[:18])
+    sigmas = np.sqrt(np.diag(known.assessment.covariance)[:18])
     # Four sigma, for eighteen numbers.
     assert np.all(np.abs(error_of(cell, known)) < 4.0 * sigmas)
     # The board is turned no farther than that is known.
@@ -191,8 +191,8 @@ def test_a_measurement_that_good_data_contradict_is_told_and_left_out():
     ranked = run(few, {"flange_from_cam": {"z_m": z_m, "sigma_m": 1e-3}}).verdict.ranked
     assert [finding.kind for finding in ranked[:2]] == ["prior", "few_stops"]
     # The same views once more, from where they were with it.
-    sigmas = np.sqrt(np.diag(free.solved.covariance))
-    off = log(invert(free.solved.state.edges) @ wrong.solved.state.edges).ravel()
+    sigmas = np.sqrt(np.diag(free.assessment.covariance))
+    off = log(invert(free.assessment.state.edges) @ wrong.assessment.state.edges).ravel()
     # Sizes of noise and of the lens's field were sought beside it: these are known to a tenth.
     assert np.max(np.abs(off) / sigmas[: len(off)]) < 0.2
     assert wrong.used == free.used
@@ -264,8 +264,8 @@ def test_a_plan_counts_what_was_measured():
     cell = simulate(CellOptions(robot="ur5e", motion="one_axis", views=8, seed=4))
     place = cell.transforms["flange_from_cam"][:3, 3].tolist()
     prior = dict(zip(("x_m", "y_m", "z_m"), place, strict=True)) | {"sigma_m": SIGMA_M}
-    begun = begin(SoFar(run(cell, {"flange_from_cam": prior})))
-    (world,) = worlds_of(
+    begun = start_from_session(PartialCalibration(run(cell, {"flange_from_cam": prior})))
+    (world,) = predict_worlds(
         [begun.cell], PURPOSES["hand-eye"], cell.robot.joints[:1], recorded=begun.recorded
     )
     covariance = world.covariance(np.arange(0))

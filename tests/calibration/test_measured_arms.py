@@ -19,7 +19,7 @@ def test_an_irb_120_by_a_measuring_arm(real_data):
         ("TestJointAngles2", "TestPosition2", 0.26),
     ):
         q, places = thirdparty.irb120_set(real_data, joints, read)
-        flange, x = known.robot_arm.model.base_from_flange(q), known.solved.state.edges[0]
+        flange, x = known.robot_arm.model.base_from_flange(q), known.assessment.state.edges[0]
         in_base = places @ x[:3, :3].T + x[:3, 3]
         on_flange = np.einsum("mji,mj->mi", flange[:, :3, :3], in_base - flange[:, :3, 3])
         # The sets have another tool: its point is what the first five configurations say.

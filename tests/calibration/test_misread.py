@@ -17,13 +17,19 @@ from support.slips import (
     with_tool,
 )
 
-from visioncal.calibration.guess.misread import guess_joints
+from visioncal.calibration.guess.joint_guess import guess_joints
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.reported_poses import reported_poses
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp, invert
-from visioncal.robot import load_robot, other_convention, placed_at, table_document, with_zeros
+from visioncal.robot import (
+    load_robot,
+    other_convention,
+    table_document,
+    with_base,
+    with_joint_offsets,
+)
 from visioncal.robot.conversion import table_of
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
@@ -96,7 +102,7 @@ def test_with_poses_the_hand_eye_goes_on_without_misread_joints():
     assert any("pi / 180" in reason for reason in known.verdict.reasons)
     alone = finished(replace(told, robot=None))
     # What is done with the poses is what would be done if there were no joints.
-    assert np.array_equal(known.solved.state.edges[0], alone.solved.state.edges[0])
+    assert np.array_equal(known.assessment.state.edges[0], alone.assessment.state.edges[0])
 
 
 def test_an_arm_asked_for_is_refused_where_its_joints_are_misread():
@@ -119,7 +125,7 @@ def test_rows_without_poses_are_not_taken_by_misread_joints():
 def test_degrees_are_known_by_their_fit_and_not_by_their_size():
     # A table whose zeros are where the arm works: all angles are within a few degrees.
     middle = IN_HAND.robot.joints.mean(axis=0)
-    robot = with_zeros(load_robot("ur5e"), middle)
+    robot = with_joint_offsets(load_robot("ur5e"), middle)
     near = 0.1 * (IN_HAND.robot.joints - middle)
     poses = robot.base_from_flange(near)
     assert np.abs(np.rad2deg(near)).max() < 13.0
@@ -230,14 +236,14 @@ def test_arms_move_with_their_base_and_their_zeros(as_chain):
         robot = robot.corrected()
     base = exp(TURN)
     q = IN_HAND.robot.joints
-    assert placed_at(robot, base).base_from_flange(q) == pytest.approx(
+    assert with_base(robot, base).base_from_flange(q) == pytest.approx(
         base @ robot.base_from_flange(q), abs=1e-12
     )
     zeros = 0.1 * TURN
-    assert with_zeros(robot, zeros).base_from_flange(q) == pytest.approx(
+    assert with_joint_offsets(robot, zeros).base_from_flange(q) == pytest.approx(
         robot.base_from_flange(q + zeros), abs=1e-12
     )
-    assert ("convention" in with_zeros(robot, zeros).document) != as_chain
+    assert ("convention" in with_joint_offsets(robot, zeros).document) != as_chain
 
 
 def test_the_other_convention_of_a_table_is_the_arm_that_was_meant():

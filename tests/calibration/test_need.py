@@ -67,10 +67,10 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
     known = without_arm_errors(calibrated(cell, joints=False))
     (picks,) = findings_of(known).picks
     rng, count = np.random.default_rng(0), 20_000
-    result = known.solved
+    result = known.assessment
     covariance = np.linalg.cholesky(result.covariance[:6, :6])
     views = rng.integers(len(known.used), size=count)
-    problem = known.solved.problem
+    problem = known.assessment.problem
     flange = known.robot_arm.poses[problem.observations.stops][views]
     middle = np.array([0.135, 0.09, 0.0, 1.0])
     seen = (problem.measured(result.state)[views] @ middle)[:, :, None]
@@ -95,11 +95,11 @@ def test_picks_err_as_the_chain_does(mount: str) -> None:
 
 def without_arm_errors(known: RunState) -> RunState:
     """The same with an arm of which nothing but noise is known."""
-    answer, solved = known.solved, known.fitted
+    answer, solved = known.assessment, known.cell_fit
     arms = {name: replace(arm, errors=None) for name, arm in solved.arms.items()}
-    covariance = answer.covariance - answer.beside["arm"]
+    covariance = answer.covariance - answer.covariance_by_source["arm"]
     changed = replace(answer, covariance=covariance)
-    return replace(known, answer=changed, fit=replace(solved, arms=arms))
+    return replace(known, assessment_or_none=changed, cell_fit_or_none=replace(solved, arms=arms))
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
@@ -123,7 +123,7 @@ def test_a_focus_that_changes_from_image_to_image_does_so_at_a_pick(mount: str) 
 def test_what_an_arm_does_again_moves_no_pick(mount: str) -> None:
     """Its base and its flange are off by 2 mm and 4 mrad: the frames have taken it up."""
     known = without_arm_errors(calibrated(simulate(CellOptions(mount=mount)), joints=False))
-    answer, solved = known.solved, known.fitted
+    answer, solved = known.assessment, known.cell_fit
     ((robot, arm),) = solved.arms.items()
     poses = answer.problem.poses[robot]
     fixed = pose_basis(poses)[:, :, :12]
@@ -131,31 +131,33 @@ def test_what_an_arm_does_again_moves_no_pick(mount: str) -> None:
     off = errors.sigma * misfit_jacobian(answer.problem, answer.state, answer.noise, robot, errors)
     erring = replace(
         known,
-        answer=replace(answer, covariance=answer.covariance + off @ off.T),
-        fit=replace(solved, arms={robot: replace(arm, errors=errors)}),
+        assessment_or_none=replace(answer, covariance=answer.covariance + off @ off.T),
+        cell_fit_or_none=replace(solved, arms={robot: replace(arm, errors=errors)}),
     )
     (before,), (after,) = (findings_of(run_state).picks for run_state in (known, erring))
     # Both are the same to rounding, of spreads that would be a hundred times as large.
-    np.testing.assert_allclose(after.spreads, before.spreads, atol=1e-3 * before.spreads.max())
+    np.testing.assert_allclose(
+        after.covariances, before.covariances, atol=1e-3 * before.covariances.max()
+    )
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_errors_that_last_are_others_at_a_pick(mount: str) -> None:
     """Against drawn ones: those of the session move the fit, and a pick has its own."""
     known = without_arm_errors(calibrated(simulate(CellOptions(mount=mount)), joints=False))
-    answer, solved = known.solved, known.fitted
+    answer, solved = known.assessment, known.cell_fit
     ((robot, arm),) = solved.arms.items()
     poses, order = answer.problem.poses[robot], np.arange(len(answer.problem.poses[robot]))
     # An Ornstein-Uhlenbeck process of a memory of five stops, of 0.4 mrad and 0.2 mm.
     memory = np.linalg.cholesky(np.exp(-np.abs(order[:, None] - order) / 5.0))
     sizes = np.repeat([4e-4, 2e-4], 3)
     basis = (memory[:, None, :, None] * np.diag(sizes)[None, :, None]).reshape(len(poses), 6, -1)
-    errors = ArmErrors(basis, 1.0, gain=0.0, of_links=False, lasting=basis.shape[2])
+    errors = ArmErrors(basis, 1.0, gain=0.0, of_links=False, time_correlated_count=basis.shape[2])
     off = misfit_jacobian(answer.problem, answer.state, answer.noise, robot, errors)
     erring = replace(
         known,
-        answer=replace(answer, covariance=answer.covariance + off @ off.T),
-        fit=replace(solved, arms={robot: replace(arm, errors=errors)}),
+        assessment_or_none=replace(answer, covariance=answer.covariance + off @ off.T),
+        cell_fit_or_none=replace(solved, arms={robot: replace(arm, errors=errors)}),
     )
     (before,), (after,) = (findings_of(run_state).picks for run_state in (known, erring))
     rng, count = np.random.default_rng(0), 20_000
@@ -190,10 +192,10 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: st
     size = 1.0015
     cell = simulate(CellOptions(mount=mount, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, board_scale=size))
     known = calibrated(cell)
-    assert all(arm.is_modelled for arm in known.fitted.arms.values())
+    assert all(arm.is_modelled for arm in known.cell_fit.arms.values())
     (picks,) = known.findings.picks
     middle, scaled = np.array([0.135, 0.09, 0.0, 1.0]), np.diag([size, size, size, 1.0])
-    went = known.solved.problem.predicted(known.solved.state) @ middle
+    went = known.assessment.problem.predicted(known.assessment.state) @ middle
     seen = cell.cam_from_target[np.array(known.used)] @ scaled @ middle
     away_mm = 1e3 * np.sqrt(np.mean(np.sum((went - seen)[:, :3] ** 2, axis=1)))
     # 1.5 sigma of that size make nearly all of it, and what is held counts by its pull as well.
@@ -208,15 +210,17 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: st
 def test_only_views_that_are_known_well_show_what_is_not_predicted(views: slice, is_found: bool):
     """A view of a small board from the front: off by 2 deg, which is 2.5 times its sigma."""
     known = calibrated(simulate(CellOptions(views=12)), joints=False)
-    answer = known.solved
+    answer = known.assessment
     seen = answer.problem.observations
     among = seen.covariance.copy()
     among[0, :3, :3] = np.deg2rad(0.8) ** 2 / 3.0 * np.eye(3)
-    away_rad = answer.held_out.away_rad.copy()
+    away_rad = answer.held_out.residual_rad.copy()
     away_rad[views] = np.deg2rad(2.0)
     blurred = replace(answer.problem, observations=replace(seen, covariance=among))
-    held = replace(answer.held_out, away_rad=away_rad)
-    findings = findings_of(replace(known, answer=replace(answer, problem=blurred, held_out=held)))
+    held = replace(answer.held_out, residual_rad=away_rad)
+    findings = findings_of(
+        replace(known, assessment_or_none=replace(answer, problem=blurred, held_out=held))
+    )
     (picks,) = findings.picks
     kinds = [finding.kind for finding in judge(findings).findings]
     assert (("left out" in picks.parts), ("unexplained" in kinds)) == (is_found, is_found)
@@ -264,9 +268,9 @@ def test_both_have_to_hold() -> None:
         ({"held_out": Rms(30.0, 5.0), "rms": Rms(29.0, 4.8)}, 0.0),
         ({"worst": directions(4e-3, 0, 0, 0)}, 0.0),
         ({"stops": 8}, 0.0),
-        ({"away_mm": 1.0}, 10.0),
-        ({"away_deg": 0.1}, 10.0),
-        ({"held_out": Rms(3.0, 0.1), "away_mm": 1.0}, 10.0),
+        ({"noise_mm": 1.0}, 10.0),
+        ({"noise_deg": 0.1}, 10.0),
+        ({"held_out": Rms(3.0, 0.1), "noise_mm": 1.0}, 10.0),
         ({"warnings": remarks(["It is upside down."])}, np.inf),
         ({"pixel_px": 4.0}, np.inf),
     ],

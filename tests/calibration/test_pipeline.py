@@ -36,7 +36,7 @@ def with_camera(cell, off_px=(0, 0, 0, 0), **table):
 
 def mahalanobis_sq(cell, known):
     """Squared error of both edges over the covariance, divided by their twelve numbers."""
-    error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+    error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
     return error @ np.linalg.solve(covariance, error) / 12
 
 
@@ -46,9 +46,12 @@ def test_intrinsics_are_refined_where_they_are_asked_to_be():
     for seed in range(4):
         cell = simulate(replace(FINE, seed=seed))
         known = calibrated(cell, session=with_camera(cell, off, intrinsics="refine"))
-        assert np.isin(known.fitted.looks.lens_of("cam")[:4], known.fitted.seen.moving).all()
-        refined = known.fitted.looks.camera("cam")
-        sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
+        assert np.isin(
+            known.cell_fit.camera_parameters.lens_of("cam")[:4],
+            known.cell_fit.linearised_corners.moving,
+        ).all()
+        refined = known.cell_fit.camera_parameters.camera("cam")
+        sigma = np.sqrt(np.diag(known.assessment.covariance)[12:16])
         # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
         assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.5 * sigma)
         surprises.append(mahalanobis_sq(cell, known))
@@ -65,7 +68,7 @@ def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
         off = 0.5 * rng.standard_normal(4)
         told = with_camera(cell, off, matrix_sigma_px=0.5, intrinsics=mode)
         known = calibrated(cell, session=told)
-        assert known.work.budget_mm["intrinsics"] > 0.0
+        assert known.accuracy_at_work.budget_mm["intrinsics"] > 0.0
         surprises.append(mahalanobis_sq(cell, known))
     # Mean of 8 chi-square of 12 over 12: sigma 0.14; four sigma, and held values err a bit more.
     assert 0.4 < np.mean(surprises) < 1.8
@@ -78,7 +81,7 @@ def test_a_fisheye_camera_goes_the_whole_way(given):
         options = CellOptions(camera=fisheye_camera(), state_intrinsics=given, seed=seed)
         known = calibrated(cell := simulate(options))
         assert known.used == tuple(range(20))
-        assert len(known.fitted.looks.lens_of("cam")) == 8
+        assert len(known.cell_fit.camera_parameters.lens_of("cam")) == 8
         surprises.append(mahalanobis_sq(cell, known))
     # Mean of 4 chi-square of 12 over 12: sigma 0.2.
     assert np.mean(surprises) == pytest.approx(1.0, abs=0.8)
@@ -86,7 +89,7 @@ def test_a_fisheye_camera_goes_the_whole_way(given):
 
 def test_a_closed_form_is_diagnosed_too():
     cell = simulate(replace(FINE, seed=2))
-    joint, park = (calibrated(cell, solver=name).work for name in ("joint", "park"))
+    joint, park = (calibrated(cell, solver=name).accuracy_at_work for name in ("joint", "park"))
     assert {"pixels", "robot", "total"} < set(park.budget_mm)
     # The closed form leaves larger residuals, so its budget is wider, but of the same order; what
     # is held pulls at a fit that is at rest only.
@@ -133,8 +136,8 @@ def test_a_lens_stated_for_images_twice_as_large_is_refined(mount):
     told = CellOptions(robot="ur3e", mount=mount, views=24, camera=camera, pixel_sigma_px=0.03)
     cell = simulate(replace(told, robot_sigma_m=1e-4))
     known = calibrated(cell, session=with_camera(cell, matrix))
-    refined = known.fitted.looks.camera("cam")
-    sigma = np.sqrt(np.diag(known.solved.covariance)[12:16])
+    refined = known.cell_fit.camera_parameters.camera("cam")
+    sigma = np.sqrt(np.diag(known.assessment.covariance)[12:16])
     # Chi-square of four under 23.5 in all but one case of ten thousand, were they independent.
     assert np.all(np.abs(refined.matrix - matrix) < 4.5 * sigma)
 

@@ -7,7 +7,7 @@ import pytest
 
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.pnp import estimate_poses
-from visioncal.calibration.stages.pose_ambiguity import chosen
+from visioncal.calibration.stages.pose_ambiguity import with_candidate
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Corners
 from visioncal.estimation.chain import chain
@@ -145,8 +145,8 @@ def test_corners_of_a_turned_board_behind_another_stay_among_its_own():
     behind = estimate_poses(shifted, [before, target], cell.options.camera).views
     for one, other in zip(alone, behind, strict=True):
         pick = one.turns.index(1)
-        ids = chosen(one, pick, target).corners.ids
-        np.testing.assert_array_equal(chosen(other, pick, target).corners.ids, ids + 20)
+        ids = with_candidate(one, pick, target).corners.ids
+        np.testing.assert_array_equal(with_candidate(other, pick, target).corners.ids, ids + 20)
 
 
 def test_a_turn_of_all_views_alike_is_only_a_change_of_the_targets_frame():

@@ -34,7 +34,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Target
-from visioncal.interchange.formats import load_in_doubt
+from visioncal.interchange.formats import load_for_rereading
 from visioncal.present.recording import board, write_recording
 from visioncal.present.report import write_report
 from visioncal.results import Calibration, to_document
@@ -119,7 +119,7 @@ def test_points_that_are_not_where_the_table_has_them_are_named(tmp_path):
     free = CalibrationPrior.of(again).free
     moved = (free.basis @ free.appearance.board)[4]
     assert moved == pytest.approx(result.rig.shape[4])
-    assert predict_stops(fresh, CalibrationPrior.of(again)).known.pixel_px == pytest.approx(
+    assert predict_stops(fresh, CalibrationPrior.of(again)).observed.pixel_px == pytest.approx(
         NOISE_PX, rel=0.15
     )
 
@@ -659,7 +659,7 @@ def test_a_board_in_another_unit_is_read_as_the_chain_has_it(unit, metres, drawn
     (drawn / "b.toml").write_text(
         "".join(f"{key} = {json.dumps(value)}\n" for key, value in wrong.items())
     )
-    read = load_in_doubt(drawn).session
+    read = load_for_rereading(drawn).session
     # The unit's own rounding.
     assert read.target.square_m == pytest.approx(board.square_m, rel=1e-12)
     assert read.target.marker_m == pytest.approx(board.marker_m, rel=1e-12)

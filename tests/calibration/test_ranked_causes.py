@@ -14,7 +14,7 @@ from support.sound_findings import SOUND, changed, directions, left_out
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.stages.cause_ranking import MEASURE_BOARD, NO_JOINTS, with_misread
 from visioncal.calibration.stages.findings import PointAccuracy
-from visioncal.calibration.stages.fit_messages import scale_found
+from visioncal.calibration.stages.fit_messages import scale_finding
 from visioncal.calibration.stages.judge import judge
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.codec import read, write
@@ -47,7 +47,7 @@ POSTURE = Finding("arm_errors", "Residuals follow the arm's posture.", mahalanob
 FIELD = Finding("lens_field", "The lens departs.", mahalanobis_sq=300.0, up_to_mm=0.08)
 DRIFT = Finding("moved_slowly", "Residuals drift with time.")
 MEASURED = MeasuredScale(0, 4.7e-3, 6e-4, 8e-4)
-SIZE = scale_found(
+SIZE = scale_finding(
     "board", load_target("charuco_9x6_30mm"), MEASURED, replace(MEASURED, scale=4e-3, sigma=9e-4)
 )
 
@@ -87,7 +87,7 @@ def test_exchanged_rows_come_first_with_what_is_left_without_them() -> None:
 )
 def test_explanations_of_one_misfit_share_it(warnings, chances) -> None:
     """By the bound of Sellke, Bayarri and Berger on what a chance says, none of them among them."""
-    verdict = judge(changed(SOUND, warnings=warnings, away_mm=1.0))
+    verdict = judge(changed(SOUND, warnings=warnings, noise_mm=1.0))
     odds = {text: -1.0 / (np.e * p * np.log(p)) for text, p in zip(warnings, chances, strict=True)}
     found = {cause.words: cause.probability for cause in verdict.causes}
     for text in warnings:
@@ -104,7 +104,7 @@ def test_a_size_is_said_as_the_result_has_it() -> None:
 
 def test_what_moves_picks_little_is_no_cause_of_a_large_misfit() -> None:
     """However sure it is that it is there."""
-    found = changed(SOUND, warnings=(FIELD, SIZE), away_mm=1.0)
+    found = changed(SOUND, warnings=(FIELD, SIZE), noise_mm=1.0)
     verdict = judge(found)
     assert ids(verdict)[0] == "board_size"
     share = (FIELD.up_to_mm / found.held_out.mm) ** 2
@@ -134,7 +134,7 @@ def test_what_moves_with_the_time_passes_for_a_focus_and_not_the_other_way() -> 
 
 def test_a_held_lens_that_is_wrong_is_no_arm_that_errs() -> None:
     held = Finding("lens", "The given intrinsics do not fit.", mahalanobis_sq=2000.0)
-    verdict = judge(changed(SOUND, warnings=(POSTURE, held), away_mm=2.0))
+    verdict = judge(changed(SOUND, warnings=(POSTURE, held), noise_mm=2.0))
     assert ids(verdict)[0] == "lens"
     # It is the first reason, too, before how large the errors are.
     assert verdict.reasons[0] == held.words
@@ -149,13 +149,13 @@ def test_a_held_lens_that_is_wrong_is_no_arm_that_errs() -> None:
     ],
 )
 def test_another_size_is_said_by_what_the_targets_file_calls_it(name, said, written) -> None:
-    found = scale_found("board", load_target(name), MEASURED, MEASURED)
+    found = scale_finding("board", load_target(name), MEASURED, MEASURED)
     assert said in found.words
     assert written in found.do.words
 
 
 def test_what_nothing_explains_is_the_cause_itself() -> None:
-    (only,) = judge(changed(SOUND, away_mm=1.0)).causes
+    (only,) = judge(changed(SOUND, noise_mm=1.0)).causes
     assert (only.kind, only.probability) == ("unexplained", 1.0)
     assert "a board of another size than stated (measure it" in only.do.words
 
@@ -168,7 +168,7 @@ def test_views_that_are_left_out_are_a_cause(views, cause: str) -> None:
 
 
 def test_what_happened_comes_before_what_nothing_explains() -> None:
-    found = judge(changed(left_out(range(12, 20)), away_mm=1.0))
+    found = judge(changed(left_out(range(12, 20)), noise_mm=1.0))
     assert ids(found)[:2] == ["something_moved", "unexplained"]
     assert found.reasons[0].startswith("Views 12, 13")
 

@@ -22,7 +22,7 @@ from visioncal.interchange.formats import (
     ImportOptions,
     assemble,
     guess_foreign,
-    load_in_doubt,
+    load_for_rereading,
     read_foreign,
     reread,
     reread_session,
@@ -123,7 +123,7 @@ def test_a_board_in_millimetres_is_read_so_and_said(cell):
     (cell / "board.toml").write_text(f'{board}dictionary = "DICT_5X5_100"\n', encoding="utf-8")
     declared = (cell / "session.toml").read_text(encoding="utf-8")
     (cell / "session.toml").write_text(f'target = "board.toml"\n{declared}', encoding="utf-8")
-    session = load_in_doubt(cell).session
+    session = load_for_rereading(cell).session
     assert session.target is not None
     # A factor of a thousand, and its rounding.
     assert session.target.square_m == pytest.approx(0.030, rel=1e-15)

@@ -42,7 +42,7 @@ def swept(seed: int, how: SweepOptions = HURRIED, **options) -> SimulatedCell:
 
 def x_error(moved: SimulatedCell, known: RunState) -> np.ndarray:
     """(6,) right perturbation of the camera's edge, true to estimated."""
-    return log(invert(next(iter(moved.transforms.values()))) @ known.solved.state.edges[0])
+    return log(invert(next(iter(moved.transforms.values()))) @ known.assessment.state.edges[0])
 
 
 def distance(error: np.ndarray, covariance: np.ndarray) -> float:
@@ -114,7 +114,7 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
     # Four sigma, of which none is so large that this were easy: a hundredth of the readout.
     assert abs(found.time_s - READOUT_S) < 4.0 * found.sigma_s
     assert found.sigma_s < 0.01 * READOUT_S
-    error, covariance = x_error(moved, known), known.solved.covariance[:6, :6]
+    error, covariance = x_error(moved, known), known.assessment.covariance[:6, :6]
     # Six degrees of freedom: one in ten thousand is beyond.
     assert distance(error, covariance) < 27.9
     assert known.pixel_px == pytest.approx(0.1, rel=0.05)
@@ -124,7 +124,7 @@ def test_the_readout_is_found_and_the_camera_is_where_it_is(seed, mount):
 @pytest.mark.slow
 def test_a_readout_that_is_ignored_moves_the_camera(monkeypatch):
     moved = swept(1)
-    covariance = calibrated_sweep(moved).solved.covariance[:6, :6]
+    covariance = calibrated_sweep(moved).assessment.covariance[:6, :6]
     monkeypatch.setattr(clock_sweep, "find_delays", lambda *_: (None, ()))
     away = x_error(moved, calibrated_sweep(moved))[3:]
     # Five sigma of what is possible.

@@ -9,7 +9,7 @@ from support.boards import any_page, printed
 from support.marks import slow
 
 from visioncal.calibration.pipeline import run
-from visioncal.calibration.stages.detect import look_for
+from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners
@@ -89,7 +89,7 @@ def test_one_tag_will_do_for_a_view(seen):
         point_numbers=TAGS.point_numbers[:4],
         point_tags=TAGS.point_tags[:4],
     )
-    found, _ = look_for(seen[1], four, 0)
+    found, _ = find_corners(seen[1], four, 0)
     assert isinstance(found, Corners), found
     assert found.ids.tolist() == [0, 1, 2, 3]
 

@@ -28,7 +28,7 @@ from visioncal.robot import load_robot
 from visioncal.robot.thermal import Heating, Inputs, OnlineCompensator, ThermalModel
 from visioncal.session.streams import Stream
 from visioncal.simulation import Heat, Round, WarmUpOptions, cell_session, simulate_warm_up
-from visioncal.simulation.tracked import THREE, Tracked, session_of, tracked
+from visioncal.simulation.instrument_session import THREE, InstrumentOptions, session_of, tracked
 
 ROBOT = load_robot("ur5e")
 GROWTH, DRIFT = np.full(6, 2e-5), np.array([3.0, -2.0, 4.0, -1.0, 2.0, 0.0]) * 1e-6
@@ -111,7 +111,7 @@ def test_a_check_says_that_it_takes_the_arm_for_cold(learnt):
     cold, warm = found.session.views[:24:4], found.session.views[-6:]
     passed = verify(replace(found.session, views=cold), found.calibration)
     assert passed.passed
-    assert "as warm as it was at the start (about 21 deg C)" in passed.seen.warnings[-1]
+    assert "as warm as it was at the start (about 21 deg C)" in passed.predicted.warnings[-1]
     # Half a millimetre is no noise, and the reason for it may be what the warning says.
     failed = verify(replace(found.session, views=warm), found.calibration)
     assert not failed.passed
@@ -422,7 +422,7 @@ def test_a_posture_that_is_come_back_to_is_another_stop(learnt):
 def test_an_instrument_that_reads_points_sees_the_drift(learnt, points):
     """A place alone does not part a flange's rotation from its own: nothing fails at that."""
     truth = learnt["temperatures"].truth
-    shop = tracked(Tracked(points=points), truth.robot.joints)
+    shop = tracked(InstrumentOptions(points=points), truth.robot.joints)
     moved = truth.robot.true_base_from_flange @ invert(truth.robot.base_from_flange)
     base = shop.base_from_instrument
     read = [(stop, at, invert(base) @ moved[stop] @ base @ array) for stop, at, array in shop.rows]

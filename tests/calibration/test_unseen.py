@@ -63,7 +63,7 @@ def test_views_left_out_add_up_to_the_levels_figures(known):
 def test_views_held_back_are_predicted_by_both_arms(known):
     rows = result_of(known).arm.holdout
     assert tuple(row.view for row in rows) == HELD
-    shown = {view.view: view for view in known.solved.views}
+    shown = {view.view: view for view in known.assessment.views}
     for row in rows:
         # Against the target's estimated place here, against the views' mean there: some 0.01 mm.
         assert row.mm == pytest.approx(shown[row.view].residual_mm, abs=0.03)

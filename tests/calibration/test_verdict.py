@@ -20,9 +20,9 @@ LOST = [Rejection(at, "blurred: very") for at in range(30, 40)]
 
 def test_noise_that_chance_makes_of_a_good_arms_is_no_doubt():
     """Coarse poses leave it open: doubt is about what it is at the least."""
-    loud = {"away_mm": 0.1, "away_deg": 0.025}
-    assert judge(changed(SOUND, **loud, surely=(0.05, 0.012))).status == "good"
-    assert judge(changed(SOUND, **loud, surely=(0.05, 0.021))).status == "check"
+    loud = {"noise_mm": 0.1, "noise_deg": 0.025}
+    assert judge(changed(SOUND, **loud, lower_bounds=(0.05, 0.012))).status == "good"
+    assert judge(changed(SOUND, **loud, lower_bounds=(0.05, 0.021))).status == "check"
 
 
 def test_sound_findings_are_good_and_say_how_good():
@@ -44,12 +44,12 @@ def test_sound_findings_are_good_and_say_how_good():
         ({"held_out": Rms(0.5, 0.011)}, "bad", "fit 5.0 times worse"),
         ({"held_out": Rms(0.11, 0.02)}, "check", "fit 2.0 times worse"),
         (
-            {"views": views(residual_mm=0.9), "away_mm": None},
+            {"views": views(residual_mm=0.9), "noise_mm": None},
             "check",
             "View 7 stands out: it places the target 0.9",
         ),
         (
-            {"away_mm": None, "views": views(residual_deg=0.2)},
+            {"noise_mm": None, "views": views(residual_deg=0.2)},
             "check",
             "0.2 deg from the others, 20 times",
         ),
@@ -71,8 +71,8 @@ def test_sound_findings_are_good_and_say_how_good():
             "check",
             "the direction 2 (2 mm)",
         ),
-        ({"away_mm": 1.0}, "check", "take a flange that is off by 1 mm and 0.0057 deg"),
-        ({"away_deg": 0.029}, "check", "0.029 deg from stop to stop"),
+        ({"noise_mm": 1.0}, "check", "take a flange that is off by 1 mm and 0.0057 deg"),
+        ({"noise_deg": 0.029}, "check", "0.029 deg from stop to stop"),
         ({"stops": 8}, "check", "Only 8 stops are used"),
         ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
         ({"lost": LOST}, "check", "10 of 30 views are not used; the first: view 30, blurred"),
@@ -100,7 +100,7 @@ def test_each_doubt_has_its_sentence(changes, status, words):
         {"views": views(residual_mm=0.5)},
         {"lost": LOST[:3]},
         {"pixel_px": None},
-        {"away_mm": None},
+        {"noise_mm": None},
         # Exact data: held-out and in-sample scatter are both rounding.
         {"rms": Rms(1e-10, 1e-11), "held_out": Rms(9e-10, 9e-11)},
     ],

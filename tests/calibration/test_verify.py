@@ -25,7 +25,11 @@ from visioncal.calibration.verification import (
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.calibration.verification.check import check
 from visioncal.calibration.verification.messages import _signed_axis
-from visioncal.calibration.verification.prediction import known_before, predict_stops, seen_by
+from visioncal.calibration.verification.prediction import (
+    checked_state,
+    predict_detected,
+    predict_stops,
+)
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import compose, exp, invert, log
@@ -43,7 +47,7 @@ MOUNTS = ("eye-in-hand", "eye-to-hand")
 def checked(place, rng, change=None, stops=5, **options):
     prior_calibration = CalibrationPrior.of(place.calibration)
     return check(
-        seen_by(known_again(place.cell, rng, change, stops), prior_calibration),
+        predict_detected(known_again(place.cell, rng, change, stops), prior_calibration),
         prior_calibration,
         **options,
     )
@@ -74,16 +78,16 @@ def test_an_unchanged_cell_passes_as_often_as_it_should(place):
 
 
 def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
-    plain = seen_by(
+    plain = predict_detected(
         known_again(place.cell, np.random.default_rng(0)), CalibrationPrior.of(place.calibration)
     )
     result = with_field(place.calibration)
     lens, known = result.camera, known_again(place.cell, np.random.default_rng(0))
     ((frame, look),) = known.cameras.items()
-    poses = {view: pose.cam_from_target[0] for view, pose in plain.known.poses.items()}
+    poses = {view: pose.cam_from_target[0] for view, pose in plain.observed.poses.items()}
     displaced = {}
     for view, view_corners in look.corners.items():
-        points = numbered_positions(tuple(plain.known.session.boards.values()))[view_corners.ids]
+        points = numbered_positions(tuple(plain.observed.session.boards.values()))[view_corners.ids]
         far_m = float(np.mean(points @ poses[view][2, :3] + poses[view][2, 3]))
         px = view_corners.px + lens.displacements(view_corners.px, far_m) @ lens.field.coefficients
         displaced[view] = replace(view_corners, px=px)
@@ -92,7 +96,7 @@ def test_a_lens_that_departs_from_its_model_is_seen_with_its_field(place):
 
     def off_mm(calibration):
         prior_calibration = CalibrationPrior.of(calibration)
-        away = seen_by(known, prior_calibration).away(prior_calibration)
+        away = predict_detected(known, prior_calibration).away(prior_calibration)
         return 1e3 * np.abs(away - expected)[:, :3, 3].max()
 
     # A field of 0.3 px changes by some thousandths of that over itself.
@@ -191,7 +195,8 @@ def test_two_changes_more_noise_and_a_wrong_view_are_told(place):
     wrong = cell.robot.joints.copy()
     wrong[2] = wrong[2] + 0.02
     found = check(
-        seen_by(known_of(reporting(cell, joints=wrong)), prior_calibration), prior_calibration
+        predict_detected(known_of(reporting(cell, joints=wrong)), prior_calibration),
+        prior_calibration,
     )
     assert names(found) == ["view 2"]
     assert "View 2 alone contradicts" in verdict_of(found).reasons[0]
@@ -201,12 +206,14 @@ def test_the_page_shows_what_is_left_with_the_change_undone(place):
     found = checked(
         place, np.random.default_rng(9), Change(camera=knock(np.random.default_rng(9), 2.0, 0.2))
     )
-    before, after = (np.linalg.norm(value[:, 3:], axis=1) for value in (found.away, found.left))
+    before, after = (
+        np.linalg.norm(value[:, 3:], axis=1) for value in (found.residuals, found.remaining)
+    )
     # Two millimetres and 0.2 deg at half a metre become the noise of stops, some tenths of that.
     assert np.sqrt(np.mean(after**2)) < 0.3 * np.sqrt(np.mean(before**2))
     policy = outcomes(
         load_policy(),
-        facts_of(found.seen.known.session, place.calibration, failed=True, collision=True),
+        facts_of(found.predicted.observed.session, place.calibration, failed=True, collision=True),
     )
     page = Page(render_check(found, policy, verdict_of(found)))
     assert "does not hold any more" in page.words
@@ -214,7 +221,7 @@ def test_the_page_shows_what_is_left_with_the_change_undone(place):
     assert [significant(1e3 * value) in page.words for value in (*before, *after)] == [True] * 10
     assert "now a collision" in page.words
     passed = checked(place, np.random.default_rng(0))
-    assert (passed.left == passed.away).all()
+    assert (passed.remaining == passed.residuals).all()
     assert "undone" not in Page(render_check(passed, (), verdict_of(passed))).words
     more = checked(place, np.random.default_rng(6), Change(noise_factor=8.0))
     assert "undone" not in Page(render_check(more, (), verdict_of(more))).words
@@ -239,7 +246,7 @@ def test_an_arm_off_by_its_posture_raises_no_alarm_near_the_calibration():
     rng = np.random.default_rng(8)
     for _ in range(4):
         known = known_of(again(cell, rng), joints=False)
-        assert check(seen_by(known, prior_calibration), prior_calibration).passed
+        assert check(predict_detected(known, prior_calibration), prior_calibration).passed
 
 
 @pytest.mark.parametrize("weighed", [True, slow(False)])
@@ -253,12 +260,13 @@ def test_a_bent_arm_under_its_loads_is_no_change(weighed):
     assert lot.arm.level == "elastic"
     rng, prior_calibration = np.random.default_rng(4), CalibrationPrior.of(lot)
     found = check(
-        seen_by(known_of(again(cell, rng), robot=robot), prior_calibration), prior_calibration
+        predict_detected(known_of(again(cell, rng), robot=robot), prior_calibration),
+        prior_calibration,
     )
     assert found.passed, found.misfit
     bumped = again(cell, rng, Change(camera=knock(rng, 2.0, 0.0)))
     assert not check(
-        seen_by(known_of(bumped, robot=robot), prior_calibration), prior_calibration
+        predict_detected(known_of(bumped, robot=robot), prior_calibration), prior_calibration
     ).passed
 
 
@@ -270,9 +278,9 @@ def test_one_of_two_boards_that_moved_is_named():
     known = known_of(cell)
     shown = board_numbers(cell)
     pushed = np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0])
-    assert check(seen_by(known, prior_calibration), prior_calibration).passed
+    assert check(predict_detected(known, prior_calibration), prior_calibration).passed
     assert shown.max() == 1
-    moved = seen_by(known, prior_calibration)
+    moved = predict_detected(known, prior_calibration)
     # Some stops show both.
     assert len(moved.problem) > moved.stops == 40
     mine = np.array([shown[views[0]] for views in moved.views]) == 1
@@ -303,7 +311,7 @@ def test_a_calibration_holds_by_its_own_session_of_which_it_left_views_out(tmp_p
     assert [view.view for view in calibration.views if not view.used] == [4, 9]
     found = verify(session, calibration)
     assert found.passed
-    assert found.seen.stops == 22
+    assert found.predicted.stops == 22
     assert [value["view"] for value in to_document(found, ())["not_used"]] == [4, 9]
     # Of another session nothing is known beforehand.
     assert not verify(
@@ -324,7 +332,7 @@ def test_boards_are_those_of_the_same_name_or_print_however_many_a_session_has(t
         one = replace(two, document=alone, target=board, targets={}, views=shown)
         found = check(predict_stops(one, prior_calibration), prior_calibration)
         assert found.passed
-        assert found.seen.stops == len(shown)
+        assert found.predicted.stops == len(shown)
         with pytest.raises(DataError, match="which of the targets"):
             predict_stops(replace(one, target=None), prior_calibration)
         with pytest.raises(DataError, match="columns = 11"):
@@ -350,13 +358,17 @@ def test_other_cells_are_refused_by_what_differs():
         (replace(session, robot_document=load_robot("ur10e").document), "another robot"),
     ):
         with pytest.raises(DataError, match=words):
-            known_before(wrong, prior_calibration)
+            checked_state(wrong, prior_calibration)
     known = known_again(place.cell, np.random.default_rng(9))
     with pytest.raises(DataError, match="no joint angles"):
-        seen_by(known.with_robot("", replace(known.reported, matched=None)), prior_calibration)
+        predict_detected(
+            known.with_robot("", replace(known.reported, matched=None)), prior_calibration
+        )
     look = known.cameras["cam"]
     with pytest.raises(DataError, match="640 x 480"):
-        seen_by(known.with_camera("cam", replace(look, resolution=(640, 480))), prior_calibration)
+        predict_detected(
+            known.with_camera("cam", replace(look, resolution=(640, 480))), prior_calibration
+        )
     with pytest.raises(DataError, match="an older version"):
         CalibrationPrior.of(replace(place.calibration, joint_fit=None))
     spoilt = replace(place.calibration.joint_fit, covariance=np.eye(1))

@@ -29,7 +29,7 @@ def test_weight_is_among_the_functions(bare):
     # An upright axis bears nothing.
     assert functions.parts[0].shape[1] == 0
     torques = load_robot("ur10e").load_torques(q)
-    values = functions.bends(bare, q).reshape(-1, functions.size)
+    values = functions.values(bare, q).reshape(-1, functions.size)
     shares, *_ = np.linalg.lstsq(values, torques.ravel(), rcond=None)
     assert values @ shares == pytest.approx(torques.ravel(), abs=1e-6)
     again = np.einsum("mjk,jk->mj", bare.weight_jacobian(q), functions.moments(shares))

@@ -17,7 +17,7 @@ from visioncal.calibration.pipeline import Run
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.output_generations import write_generation
-from visioncal.interchange.merge_results import rewrite
+from visioncal.interchange.merge_results import rewrite_result
 from visioncal.interchange.outputs import write_outputs
 from visioncal.present import recording, report
 from visioncal.results import Calibration
@@ -141,7 +141,7 @@ def test_a_result_outlives_a_drawing_that_fails(tmp_path, monkeypatch, module, n
         path.name for path in done.files
     )
     assert {item.name for item in before.files} - {item.name for item in done.files} == {file}
-    (missing,) = done.undrawn
+    (missing,) = done.failed_drawings
     assert missing.file == tmp_path / file
     assert "ValueError at test_generations.py" in missing.cause
     assert "18 mm of 25 mm" in missing.cause
@@ -166,7 +166,7 @@ def test_frames_join_a_result_whose_report_cannot_be_drawn(tmp_path, monkeypatch
     write_outputs(tmp_path, sample.session, Run(sample.calibration, sample.evidence))
     monkeypatch.setattr(report, "write_report", breaking)
     joined = with_frames(sample).calibration
-    assert len(rewrite(tmp_path, joined).undrawn) == 1
+    assert len(rewrite_result(tmp_path, joined).failed_drawings) == 1
     assert Calibration.load(tmp_path).frames.keys() == joined.frames.keys()
 
 

@@ -14,11 +14,11 @@ from visioncal.dynamics.conditioning import condition
 from visioncal.dynamics.identified import Identified, TorqueValidation
 from visioncal.dynamics.identify import SLOW_RAD_S, Options, block_of, identify
 from visioncal.dynamics.judge import judge
-from visioncal.dynamics.limits import Share, allowed_motion
+from visioncal.dynamics.limits import MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
-from visioncal.dynamics.validate import friction_of_known, predict, validate
+from visioncal.dynamics.validate import fit_friction_to_known, predict, validate
 from visioncal.robot import load_robot
 from visioncal.session import Stream
 from visioncal.simulation.dynamics import drive_torques, nominal_dynamics, real_dynamics
@@ -133,7 +133,7 @@ def test_planned_sweeps_tell_friction():
     """Joints move one at a time, and those at rest are held by what nothing foretells."""
     rng = np.random.default_rng(3)
     built = real_dynamics("ur5e", rng, stribeck=True)
-    plan = plan_sweeps(allowed_motion(load_robot("ur5e"), Share()), SweepRequest(speeds=4))
+    plan = plan_sweeps(motion_limits(load_robot("ur5e"), MotionMargins()), SweepRequest(speeds=4))
     swept = plan.sampled(500.0)
     sweeps = record(built, Exercise(swept.times_s, swept.q, swept.dq, swept.ddq), rng)
     resting = {f"tau{index}_nm": np.abs(swept.dq[:, index - 1]) < 1e-9 for index in range(1, 7)}
@@ -217,7 +217,7 @@ def test_motion_about_one_line_is_named():
 def test_results_survive_the_disk(tmp_path, worlds):
     built, found, fresh, rng = worlds[0]
     stream = recorded(built, fresh, rng)
-    prediction = predict(found.identified, stream, friction_of_known(found))
+    prediction = predict(found.identified, stream, fit_friction_to_known(found))
     result = replace(found.identified, validation=validate(found.identified, prediction))
     result.save(tmp_path / "dynamics.json")
     again = Identified.load(tmp_path)
@@ -243,7 +243,9 @@ def test_what_is_predicted_far_worse_than_fitted_is_doubted_where_it_matters(
 
 def test_what_the_maker_publishes_predicts_worse(worlds):
     built, found, fresh, rng = worlds[1]
-    prediction = predict(found.identified, recorded(built, fresh, rng), friction_of_known(found))
+    prediction = predict(
+        found.identified, recorded(built, fresh, rng), fit_friction_to_known(found)
+    )
     result = validate(found.identified, prediction)
     assert (result.rms_nm < result.known_rms_nm).all()
     assert (result.shares < 0.03).all()
@@ -265,7 +267,9 @@ def test_a_real_panda_is_predicted(panda):
     train, test = condition(panda.part(0.0, 0.7), 8.0), condition(panda.part(0.7, 1.0), 8.0)
     found = identify(load_robot("panda"), [train])
     assert found.identified.base.rank == 64
-    result = validate(found.identified, predict(found.identified, test, friction_of_known(found)))
+    result = validate(
+        found.identified, predict(found.identified, test, fit_friction_to_known(found))
+    )
     limits = np.array([5.0, 1.5, 2.4, 4.9, 6.2, 3.4, 17.9])
     assert (100.0 * result.shares <= limits).all()
     assert found.identified.inertias.consistent

@@ -35,10 +35,10 @@ from visioncal.robot import (
     robot_names,
     small_urdf,
     torque_regressor,
-    weighed_urdf,
+    urdf_with_inertias,
     with_inertias,
 )
-from visioncal.robot.torques import weighed_model
+from visioncal.robot.torques import model_with_inertias
 
 # Sums of some hundred products of numbers about 1 to 100 [N m].
 ROUNDING = 1e-10
@@ -65,7 +65,7 @@ def test_torques_are_those_of_newton_and_euler(name):
     import pinocchio as pin
 
     robot = load_robot(name)
-    model = weighed_model(robot, robot.inertias)
+    model = model_with_inertias(robot, robot.inertias)
     data = model.createData()
     wanted = [pin.rnea(model, data, *row) for row in zip(*states(robot), strict=True)]
     found = joint_torques(robot, robot.inertias, *states(robot))
@@ -319,7 +319,7 @@ def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
     heavy = Robot.from_document(given)
     assert heavy.masses.kg[2] == pytest.approx(robot.masses.kg[2] + 2.0)
     found = Inertias(1.2 * heavy.inertias.values)
-    written = weighed_urdf(heavy, found, ["identified -- yesterday"])
+    written = urdf_with_inertias(heavy, found, ["identified -- yesterday"])
     again = Robot.from_document(given | {"urdf": written})
     assert again.inertias.values == pytest.approx(found.values, abs=1e-12)
     assert again.base_from_flange(states(robot)[0]) == pytest.approx(
@@ -328,7 +328,7 @@ def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
     assert "<visual/>" in written
     assert "<!-- identified - - yesterday -->" in written
     with pytest.raises(DataError, match="a robot of a URDF is needed"):
-        weighed_urdf(load_robot("ur5e"), found)
+        urdf_with_inertias(load_robot("ur5e"), found)
 
 
 def test_a_link_of_one_tag_gets_its_inertia_inside():
@@ -336,6 +336,8 @@ def test_a_link_of_one_tag_gets_its_inertia_inside():
     whole = str(robot.document["urdf"])
     text = re.sub(r'<link name="link_2">.*?</link>', '<link name="link_2"/>', whole, flags=re.S)
     assert text != whole
-    written = weighed_urdf(Robot.from_document(robot.document | {"urdf": text}), robot.inertias)
+    written = urdf_with_inertias(
+        Robot.from_document(robot.document | {"urdf": text}), robot.inertias
+    )
     again = Robot.from_document(robot.document | {"urdf": written})
     assert again.inertias.values == pytest.approx(robot.inertias.values, abs=1e-12)

@@ -182,12 +182,17 @@ def test_what_the_drives_gains_are_known_to_counts_in_the_mass(run, world):
 def test_torques_that_do_not_count_are_not_unexplained(run, world):
     (stream,) = loaded_streams(run.identified, world.full)
     (piece,) = stream.pieces
-    resting = (np.arange(len(piece.bad)) < len(piece.bad) // 5)[:, None]
+    resting = (np.arange(len(piece.invalid)) < len(piece.invalid) // 5)[:, None]
     held = replace(piece.measured, torques_nm=piece.measured.torques_nm + 5.0 * resting)
     moving, standing = (
         estimate_payload(
             run.identified,
-            [replace(stream, pieces=(replace(piece, measured=value, bad=piece.bad | resting),))],
+            [
+                replace(
+                    stream,
+                    pieces=(replace(piece, measured=value, invalid=piece.invalid | resting),),
+                )
+            ],
         )
         for value in (piece.measured, held)
     )

@@ -16,7 +16,7 @@ from visioncal.dynamics import excitation
 from visioncal.dynamics.base import BaseModel, smooth_condition
 from visioncal.dynamics.excitation import ExcitationRequest, Objective, excite
 from visioncal.dynamics.fourier import Harmonics, Series
-from visioncal.dynamics.limits import Missing, Share, allowed_motion, kept_limits
+from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_extremes, motion_limits
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import JointMotion
 from visioncal.robot import Robot, joint_torques, load_robot
@@ -86,7 +86,7 @@ def test_the_objective_knows_its_jacobian(far):
     centre = compose(np.eye(3), np.array([0.4, 0.0, 0.4]))
     post = Body("post", 0, "box", np.array([0.1, 0.1, 0.8]), centre)
     arm = small_arm(lower_deg=-100.0, upper_deg=100.0, torque_nm=40.0)
-    allowed = allowed_motion(arm, Share(), bodies=[post])
+    allowed = motion_limits(arm, MotionMargins(), bodies=[post])
     base = BaseModel.reduce(DynamicModel(arm, FrictionTerms()))
     objective = Objective(allowed, base, np.array([1.0, 2.0, 3.0]), Harmonics(12.0, 4))
     series = some_series(seed=4)
@@ -115,7 +115,7 @@ def ur5e() -> Robot:
 
 @pytest.fixture(scope="module")
 def found(ur5e):
-    return excite(allowed_motion(ur5e, Share()), QUICK)
+    return excite(motion_limits(ur5e, MotionMargins()), QUICK)
 
 
 def test_a_found_motion_keeps_the_data_sheet_by_plain_differences(ur5e, found):
@@ -134,8 +134,8 @@ def test_a_found_motion_keeps_the_data_sheet_by_plain_differences(ur5e, found):
     # The least distance of tubes, by golden sections; coal's may differ by its own 1e-6.
     apart = clearances(ur_arm("ur5e"), q[::5], 0.0, [])
     assert apart.min() > 0.03 - 1e-5
-    assert found.kept.clearance_m == pytest.approx(apart.min(), abs=1e-3)
-    assert found.kept.breaches == ()
+    assert found.extremes.clearance_m == pytest.approx(apart.min(), abs=1e-3)
+    assert found.extremes.breaches == ()
 
 
 def test_torques_have_room_for_wrong_inertias(ur5e, found):
@@ -146,7 +146,7 @@ def test_torques_have_room_for_wrong_inertias(ur5e, found):
     torques = np.array([pin.rnea(model, data, *state).copy() for state in states])
     assert (1.2 * np.abs(torques).max(axis=0) <= ur5e.torque_nm).all()
     # At a twentieth of the samples the peaks are lower by their curvature.
-    assert np.abs(torques).max(axis=0) == pytest.approx(found.kept.torque, rel=0.01)
+    assert np.abs(torques).max(axis=0) == pytest.approx(found.extremes.torque, rel=0.01)
 
 
 def pinocchio_with_bodies(robot: Robot) -> pin.Model:
@@ -173,7 +173,7 @@ def test_a_short_search_already_beats_random_motions(found):
 
 
 def test_the_same_seed_gives_the_same_motion_and_another_seed_another():
-    allowed = allowed_motion(small_arm(), Share())
+    allowed = motion_limits(small_arm(), MotionMargins())
     quick = replace(QUICK, steps=3, harmonics=3)
     first, again, other = (
         excite(allowed, replace(quick, seed=seed)).series.free for seed in (1, 1, 2)
@@ -183,7 +183,7 @@ def test_the_same_seed_gives_the_same_motion_and_another_seed_another():
 
 
 def test_a_slow_computer_finds_the_same_motion_unless_a_limit_of_time_is_wished(monkeypatch):
-    allowed = allowed_motion(small_arm(), Share())
+    allowed = motion_limits(small_arm(), MotionMargins())
     wished = replace(QUICK, steps=3, harmonics=3, starts=2)
     first = excite(allowed, wished)
     hours = itertools.count(step=3600.0)
@@ -224,9 +224,9 @@ def breaking(kind: str) -> JointMotion:
     ],
 )
 def test_each_broken_limit_is_named(kind, words):
-    allowed = allowed_motion(small_arm(torque_nm=24.0), Share())
-    assert kept_limits(allowed, breaking("none")).breaches == ()
-    breaches = kept_limits(allowed, breaking(kind)).breaches
+    allowed = motion_limits(small_arm(torque_nm=24.0), MotionMargins())
+    assert motion_extremes(allowed, breaking("none")).breaches == ()
+    breaches = motion_extremes(allowed, breaking(kind)).breaches
     assert len(breaches) == 1
     assert breaches[0].startswith(words)
 
@@ -235,8 +235,8 @@ def test_a_payload_counts_in_the_torques():
     arm, motion = small_arm(), breaking("none")
     motion.q[:, 1] = 0.0
     body = np.array([2.0, *(2.0 * np.array([0.0, 0.0, 0.1])), 0.02, 0.0, 0.02, 0.0, 0.0, 0.0])
-    bare = allowed_motion(arm, Share()).torques(motion)
-    loaded = allowed_motion(arm, Share(), payload=body).torques(motion)
+    bare = motion_limits(arm, MotionMargins()).torques(motion)
+    loaded = motion_limits(arm, MotionMargins(), payload=body).torques(motion)
     # Two kilograms at the end of 0.65 m, stretched out level.
     more = np.abs(loaded - bare)[0, 1]
     assert more == pytest.approx(2.0 * 9.80665 * 0.65, rel=1e-9)
@@ -246,15 +246,17 @@ def test_a_payload_counts_in_the_torques():
 
 
 def test_without_inertias_the_torques_are_not_checked_and_that_is_said():
-    allowed = allowed_motion(small_arm(mass_kg=None, com_m=None, inertia_kg_m2=None), Share())
+    allowed = motion_limits(
+        small_arm(mass_kg=None, com_m=None, inertia_kg_m2=None), MotionMargins()
+    )
     assert "no inertias" in allowed.unchecked[0]
     quick = replace(QUICK, steps=2, harmonics=3)
     found = excite(allowed, quick)
-    assert found.kept.torque is None
-    assert "torque" not in found.kept.shares
-    unknown = allowed_motion(small_arm(torque_nm=None), Share())
+    assert found.extremes.torque is None
+    assert "torque" not in found.extremes.shares
+    unknown = motion_limits(small_arm(torque_nm=None), MotionMargins())
     assert "joint_1, joint_2, joint_3" in unknown.unchecked[0]
-    assert allowed_motion(small_arm(), Share()).unchecked == ()
+    assert motion_limits(small_arm(), MotionMargins()).unchecked == ()
 
 
 # A joint that turns without end, and in whose URDF nobody can write an acceleration.
@@ -277,9 +279,9 @@ ENDLESS = """<robot name="endless"><link name="base"/><link name="tool0"/>
 )
 def test_missing_limits_are_named_and_can_be_given(robot, joints, option):
     with pytest.raises(DataError, match=joints) as told:
-        allowed_motion(robot, Share())
+        motion_limits(robot, MotionMargins())
     assert option in told.value.next_step
-    given = allowed_motion(robot, Share(), missing=Missing(2.0, 1.0, 3.0))
+    given = motion_limits(robot, MotionMargins(), missing=DefaultLimits(2.0, 1.0, 3.0))
     expected = {
         "--range-deg": (given.upper, 2.0 - 0.05),
         "--speed-deg": (given.speed, 0.9 * 1.0),
@@ -291,13 +293,13 @@ def test_missing_limits_are_named_and_can_be_given(robot, joints, option):
 
 def test_limits_that_leave_nothing_are_named():
     with pytest.raises(DataError, match=r"joint_1 10\.0 deg are left"):
-        allowed_motion(small_arm(lower_deg=-5.0, upper_deg=5.0), Share(margin_rad=0.2))
-    flooded = allowed_motion(small_arm(), Share(floor_m=2.0))
+        motion_limits(small_arm(lower_deg=-5.0, upper_deg=5.0), MotionMargins(margin_rad=0.2))
+    flooded = motion_limits(small_arm(), MotionMargins(floor_m=2.0))
     with pytest.raises(DegenerateError, match="none of 2000 postures") as told:
         excite(flooded, QUICK)
     assert "floor" in told.value.culprits
     # Level within 20 degrees, its second joint holds more than 8 N m; upright it would hold none.
-    weak = allowed_motion(small_arm(torque_nm=8.0, lower_deg=-20.0, upper_deg=20.0), Share())
+    weak = motion_limits(small_arm(torque_nm=8.0, lower_deg=-20.0, upper_deg=20.0), MotionMargins())
     with pytest.raises(DegenerateError, match="torque of joint_2"):
         excite(weak, replace(QUICK, harmonics=3))
 
@@ -317,4 +319,4 @@ def test_wishes_that_make_no_sense_are_refused(wrong, words):
     with pytest.raises(DataError, match=words):
         ExcitationRequest(**wrong)
     with pytest.raises(DataError, match=r"speed is 1\.5"):
-        Share(speed=1.5)
+        MotionMargins(speed=1.5)

@@ -9,7 +9,7 @@ from support.moved_arms import changed, robot_with_bodies
 from visioncal.core.errors import DataError
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.conditioning import condition
-from visioncal.dynamics.convention_hypotheses import check_mistakes
+from visioncal.dynamics.convention_hypotheses import check_recording
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.reading import read_recorded
 from visioncal.simulation.dynamics import nominal_dynamics, real_dynamics
@@ -23,7 +23,7 @@ def check(stream, name="ur5e", *, with_inertias=True):
     robot = robot_with_bodies(nominal_dynamics(name))
     robot = robot if with_inertias else replace(robot, inertias=None)
     base = BaseModel.reduce(DynamicModel(robot, FrictionTerms()))
-    check_mistakes(base, [condition(read_recorded(stream, "streams/robot.csv", 6))])
+    check_recording(base, [condition(read_recorded(stream, "streams/robot.csv", 6))])
 
 
 def swapped(one, other, *groups):

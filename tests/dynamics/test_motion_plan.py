@@ -20,9 +20,9 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
 from visioncal.dynamics.excitation import excite
 from visioncal.dynamics.fourier import Harmonics, Series
-from visioncal.dynamics.limits import Share, allowed_motion
+from visioncal.dynamics.limits import MotionMargins, motion_limits
+from visioncal.dynamics.plan_files import excitation_program, sweeps_program
 from visioncal.dynamics.sweeps import Stroke, SweepRequest, Sweeps, plan_sweeps
-from visioncal.dynamics.written import excitation_program, sweeps_program
 from visioncal.present.recording import paths
 from visioncal.robot import load_robot
 from visioncal.robot.bodies import Body
@@ -46,7 +46,7 @@ def sweeps() -> Sweeps:
         "post", 0, "box", np.array([0.1, 0.1, 0.8]), compose(np.eye(3), np.array([0.5, 0.2, 0.4]))
     )
     return plan_sweeps(
-        allowed_motion(load_robot("ur5e"), Share(), bodies=[post]), SweepRequest(speeds=4)
+        motion_limits(load_robot("ur5e"), MotionMargins(), bodies=[post]), SweepRequest(speeds=4)
     )
 
 
@@ -78,7 +78,7 @@ def test_sweeps_move_one_joint_at_a_time_within_all_limits(sweeps):
     pose = compose(np.eye(3), np.array([0.5, 0.2, 0.4]))
     apart = clearances(ur_arm("ur5e"), motion.q[::10], 0.0, [(pose, np.array([0.1, 0.1, 0.8]))])
     assert apart.min() > 0.03 - 1e-5
-    assert sweeps.kept.breaches == ()
+    assert sweeps.extremes.breaches == ()
     assert sweeps.left_out == ()
 
 
@@ -101,11 +101,11 @@ def test_joints_without_room_are_left_out_and_named():
     document = small_document()
     document["joint"][1] |= {"lower_deg": 80.0, "upper_deg": 96.0}
     arm = type(small_arm()).from_document(document)
-    found = plan_sweeps(allowed_motion(arm, Share()), SweepRequest(speeds=2))
+    found = plan_sweeps(motion_limits(arm, MotionMargins()), SweepRequest(speeds=2))
     assert found.left_out == ("joint_2",)
     assert {stroke.joint for stroke in found.strokes} == {0, 2}
     with pytest.raises(DegenerateError, match="no posture was found"):
-        plan_sweeps(allowed_motion(arm, Share(floor_m=2.0)), SweepRequest())
+        plan_sweeps(motion_limits(arm, MotionMargins(floor_m=2.0)), SweepRequest())
     with pytest.raises(DataError, match="1 speeds"):
         SweepRequest(speeds=1)
 

@@ -105,15 +105,15 @@ def test_the_corners_alone_do_not_tell_the_size():
 def test_a_flat_board_of_the_stated_size_stays_so(given):
     for seed in range(4):
         known = calibrated(simulate(replace(FINE, state_intrinsics=given, seed=seed)))
-        looks = known.fitted.looks
-        assert len(known.fitted.seen.moving) == (0 if given else 9)
+        looks = known.cell_fit.camera_parameters
+        assert len(known.cell_fit.linearised_corners.moving) == (0 if given else 9)
         assert np.all(looks.values[looks.boards] == 0.0)
 
 
 def mahalanobis_sq(cell, known, size=12) -> float:
     """Squared error of the edges in units of the stated covariance: chi-square if that is true."""
     error = error_of(cell, known)[:size]
-    return float(error @ np.linalg.solve(known.solved.covariance[:size, :size], error))
+    return float(error @ np.linalg.solve(known.assessment.covariance[:size, :size], error))
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_a_bent_board_is_noticed_and_costs_nothing(given):
             options = replace(FINE, state_intrinsics=given, seed=seed, board_bow_m=bow_m)
             known = calibrated(simulate(options))
             assert any("not flat" in warning.reason for warning in known.warnings) == (bow_m > 0.0)
-            sigmas_sq.append(np.diag(known.solved.covariance)[:6])
+            sigmas_sq.append(np.diag(known.assessment.covariance)[:6])
             if bow_m > 0.0:
                 errors_sq.append(mahalanobis_sq(simulate(options), known, size=6))
     flat, bent = (np.sqrt(np.mean(sigmas_sq, axis=0)) for sigmas_sq in stated.values())
@@ -231,7 +231,9 @@ def with_lens(cell, off, **table):
 
 def lens_is_free(known):
     """Whether the fit moves the intrinsics."""
-    return np.isin(known.fitted.looks.lens_of("cam"), known.fitted.seen.moving).any()
+    return np.isin(
+        known.cell_fit.camera_parameters.lens_of("cam"), known.cell_fit.linearised_corners.moving
+    ).any()
 
 
 def test_intrinsics_that_are_held_against_the_images_are_named_and_counted():
@@ -290,9 +292,9 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
     told = replace(cell, stated={"": wrong})
     known = calibrated(told)
     assert any("given intrinsics do not fit" in warning.reason for warning in known.warnings)
-    refined = known.fitted.looks.camera("cam")
-    lens = known.fitted.columns_of(known.fitted.looks.lens_of("cam"))
-    sigma = np.sqrt(np.diag(known.solved.covariance))[lens[:4]]
+    refined = known.cell_fit.camera_parameters.camera("cam")
+    lens = known.cell_fit.columns_of(known.cell_fit.camera_parameters.lens_of("cam"))
+    sigma = np.sqrt(np.diag(known.assessment.covariance))[lens[:4]]
     assert np.all(np.abs(refined.matrix - cell.options.camera.matrix) < 4.0 * sigma)
     table = {"intrinsics": "hold"}
     document = known_of(told).session.document
@@ -300,7 +302,7 @@ def test_given_intrinsics_that_do_not_fit_are_refined_or_held_as_asked():
         known_of(told).session, document=document | {"camera": document["camera"] | table}
     )
     held = calibrated(told, session=session)
-    assert held.fitted.looks.camera("cam").matrix == pytest.approx(wrong.matrix)
+    assert held.cell_fit.camera_parameters.camera("cam").matrix == pytest.approx(wrong.matrix)
 
 
 def test_too_few_corners_leave_the_lens_alone():

@@ -72,12 +72,12 @@ def test_a_wrong_arm_is_noticed_and_counts_in_the_covariance(mount, joints):
         # looks the same in all views is not in it.
         sigma = known.robot_arm.errors.sigma
         if not joints:
-            (found,) = known.solved.arms.values()
+            (found,) = known.assessment.arms.values()
             sigma = np.deg2rad(known.robot_arm.result(found, ()).arm_errors.sigma_deg)
         assert 1e-4 < sigma < 3e-3
         told = known.notes if joints else [warning.words for warning in known.warnings]
         assert any(("was calibrated" if joints else "arm's posture") in name for name in told)
-        error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+        error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
         surprises.append(error @ np.linalg.solve(covariance, error) / 12)
     # Without it, this is about a hundred.
     assert np.mean(surprises) < 2.0

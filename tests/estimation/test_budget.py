@@ -7,9 +7,9 @@ import pytest
 from support.problems import ROBOT_SIGMAS, moved, observed, true_state, world
 
 from visioncal.estimation.budget import Sources, covariance_by_source
-from visioncal.estimation.parts import Effect, FramePrior, Noise, State
+from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, State
 from visioncal.estimation.solve import Solution, covariance_of, normal_equations
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))
 SOURCES = Sources(
@@ -30,7 +30,7 @@ def with_drift(problem):
     """The problem with two values that are known together, and all that counts besides."""
     by_sensor = np.zeros((len(problem), 6, 2))
     by_sensor[:, 3, 0] = by_sensor[:, 5, 1] = 1e-3
-    known = Knowledge(np.array([[4.0, 1.0], [1.0, 2.0]]), np.zeros(2))
+    known = PriorInformation(np.array([[4.0, 1.0], [1.0, 2.0]]), np.zeros(2))
     effect = Effect("drift", np.zeros(2), known, np.zeros(2, dtype=bool), by_sensor)
     prior = FramePrior("flange_b", "target_b", (0, 2), (-0.02, 0.06), 1e-4)
     return replace(problem.with_effects([effect]), priors=(prior,), with_repeats=True)

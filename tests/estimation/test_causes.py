@@ -7,8 +7,14 @@ import pytest
 
 from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.estimation.chain import chain
-from visioncal.estimation.model_evidence import Belief, Cause, _at, explain, undone
-from visioncal.estimation.parts import ROBOT, Noise, State
+from visioncal.estimation.model_evidence import (
+    CalibrationPosterior,
+    ChangeHypothesis,
+    _linearised,
+    evidence_of,
+    undone,
+)
+from visioncal.estimation.problem_parts import ROBOT, Noise, State
 
 NOISE = Noise.of_robot(1e-4, 1e-4)
 MOUNTS = ("eye-in-hand", "eye-to-hand")
@@ -31,16 +37,18 @@ def seen_as(problem, measured):
 def moved_board(data):
     still = np.zeros((len(data), 6, 6))
     by_sensor = -np.tile(np.eye(6), (len(data), 1, 1))
-    return Cause("board", by_sensor, still, np.full(6, 2.0), np.zeros(6))
+    return ChangeHypothesis("board", by_sensor, still, np.full(6, 2.0), np.zeros(6))
 
 
 def slipped(data, rng):
     still = np.zeros((len(data), 6, 1))
-    return Cause("joint", still, rng.normal(size=(len(data), 6, 1)), np.ones(1), np.zeros(1))
+    return ChangeHypothesis(
+        "joint", still, rng.normal(size=(len(data), 6, 1)), np.ones(1), np.zeros(1)
+    )
 
 
 def belief_of(state, freedom=np.inf, sigma=1e-5):
-    return Belief(state, sigma**2 * np.eye(12), NOISE, freedom)
+    return CalibrationPosterior(state, sigma**2 * np.eye(12), NOISE, freedom)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -52,13 +60,13 @@ def test_stops_move_with_a_change_as_its_derivatives_say(mount, size):
         count = len(cause.units)
         at = size * np.ones(count) / np.sqrt(6.0)
         belief, step = belief_of(state), 1e-6
-        found = _at(data, belief, cause, at, 1.0)
+        found = _linearised(data, belief, cause, at, 1.0)
         for unknown in range(count):
             ends = []
             for sign in (1.0, -1.0):
                 beside = at.copy()
                 beside[unknown] += sign * step
-                stops = _at(data, belief, cause, beside, 1.0)
+                stops = _linearised(data, belief, cause, beside, 1.0)
                 ends.append(stops.residuals + stops.jacobian @ beside)
             slope = (ends[0] - ends[1]) / (2 * step)
             # The series of the right Jacobian is cut where it is exact to 1e-9 up to 0.5 rad, and
@@ -76,7 +84,7 @@ def test_a_board_that_was_turned_over_is_told_exactly(mount):
     turned = seen_as(data, data.observations.measured @ exp(change))
     start = log(turned.change_of("target", state)).mean(axis=0)
     cause = replace(moved_board(data), start=start)
-    found = explain(turned, belief_of(state), cause)
+    found = evidence_of(turned, belief_of(state), cause)
     assert exp(found.values) == pytest.approx(exp(change), abs=1e-6)
     # Exact stops leave nothing but rounding.
     assert found.misfit == pytest.approx(0.0, abs=1e-3)
@@ -95,8 +103,8 @@ def test_misfit_and_evidence_follow_their_distributions():
     for _ in range(60):
         noise = exp(sigma * rng.standard_normal((5, 6)))
         noisy = replace(data, poses={ROBOT: data.poses[ROBOT] @ noise})
-        nothing = explain(noisy, belief_of(state, freedom=60.0))
-        board = explain(noisy, belief_of(state, freedom=60.0), moved_board(data))
+        nothing = evidence_of(noisy, belief_of(state, freedom=60.0))
+        board = evidence_of(noisy, belief_of(state, freedom=60.0), moved_board(data))
         misfits.append(nothing.misfit)
         ratios.append(np.exp(board.likelihood - nothing.likelihood))
     # Chi-square of thirty directions: its mean over 60 draws is known to 1.
@@ -110,6 +118,6 @@ def test_a_known_scale_and_one_of_many_degrees_of_freedom_agree():
     data, state = stops_of("eye-in-hand", np.random.default_rng(6))
     off = seen_as(data, data.observations.measured @ exp(np.full(6, 2e-4)))
     sure, nearly = (
-        explain(off, belief_of(state, freedom=value)).likelihood for value in (np.inf, 1e9)
+        evidence_of(off, belief_of(state, freedom=value)).likelihood for value in (np.inf, 1e9)
     )
     assert nearly == pytest.approx(sure, rel=1e-6)

@@ -34,7 +34,7 @@ def test_exact_touches_give_the_exact_frame(each):
     # Rounding of coordinates near a metre, over a lever of 0.1 m.
     assert np.abs(found.base_from_fixture - frame).max() < 1e-13
     assert np.abs(found.agreement.fit.groups.residuals).max() < 1e-13
-    assert found.agreement.agrees.all()
+    assert found.agreement.mask.all()
 
 
 def test_derivatives_are_those_of_the_residuals():
@@ -111,7 +111,7 @@ def test_a_wrong_touch_is_named(wrong):
         points = touches.points.copy()
         points[wrong] += 3e-3 * found.base_from_fixture[:3, 2]
         again = fit_features(replace(touches, points=points))
-        assert np.flatnonzero(~again.agreement.agrees).tolist() == [wrong]
+        assert np.flatnonzero(~again.agreement.mask).tolist() == [wrong]
 
 
 def test_the_wrong_one_of_two_is_not_guessed():
@@ -119,7 +119,7 @@ def test_the_wrong_one_of_two_is_not_guessed():
     points = touches.points.copy()
     points[1] += 3e-3 * np.array([0.6, 0.0, 0.8])
     found = fit_features(replace(touches, points=points), expected_noise_m=NOISE_M)
-    assert found.agreement.agrees.all()
+    assert found.agreement.mask.all()
     assert not found.agreement.explained
 
 
@@ -141,7 +141,7 @@ def test_a_touch_that_tells_no_direction_does_no_harm():
     points = touches.points.copy()
     points[3] = points[0] + NOISE_M * np.array([-1.0, 0.5, 0.5])
     found = fit_features(replace(touches, points=points))
-    assert found.agreement.agrees.all()
+    assert found.agreement.mask.all()
     # A few times 0.1 mm over 0.2 m.
     assert np.abs(away(frame, found.base_from_fixture)).max() < 3e-3
     points[3] = points[0]

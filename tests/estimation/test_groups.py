@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from visioncal.estimation.group_outliers import agreeing_groups
+from visioncal.estimation.group_outliers import find_inlier_groups
 from visioncal.estimation.groups import Groups, fit_groups
 from visioncal.estimation.robust import small_sets
 
@@ -116,8 +116,8 @@ def test_without_freedom_the_expected_level_stands():
     assert fit.freedom == 0
     assert fit.sigma == 3e-4
     assert fit.sigma_95 == (0.0, np.inf)
-    blind = agreeing_groups(problem, 3e-4)
-    assert blind.agrees.all()
+    blind = find_inlier_groups(problem, 3e-4)
+    assert blind.mask.all()
     # Nothing predicts either group from the other.
     assert np.isinf(blind.limit).all()
 
@@ -129,15 +129,15 @@ def test_just_the_wrong_groups_are_left_out(count, wrong):
         # Thirty times the noise: the least distance that five groups can tell for certain.
         for at in range(wrong):
             problem = shifted(problem, at, 3e-3 * np.array([1.0, -1.0, 1.0]))
-        found = agreeing_groups(problem)
-        assert np.flatnonzero(~found.agrees).tolist() == list(range(wrong))
+        found = find_inlier_groups(problem)
+        assert np.flatnonzero(~found.mask).tolist() == list(range(wrong))
         assert not found.doubtful.any()
         assert (found.mahalanobis_sq[:wrong] > found.limit[:wrong]).all()
 
 
 def test_a_mahalanobis_sq_is_the_distance_from_what_the_others_predict():
     problem = lines(3)
-    found = agreeing_groups(problem)
+    found = find_inlier_groups(problem)
     others = np.arange(10) != 4
     jacobian, values = problem.jacobian[others].reshape(-1, 6), problem.values[others].ravel()
     predicted = np.linalg.lstsq(jacobian, values, rcond=None)[0]
@@ -157,8 +157,8 @@ def test_a_group_that_alone_determines_a_direction_is_not_accused():
     noise = SIGMA * np.random.default_rng(6).standard_normal((10, 3))
     alone = shifted(alone, slice(None), noise)
     # An error along the direction that only the first group sees is a change of the unknown.
-    found = agreeing_groups(shifted(alone, 0, jacobian[0] @ np.array([0, 0, 0, 0, 0, 0.05])))
-    assert found.agrees.all()
+    found = find_inlier_groups(shifted(alone, 0, jacobian[0] @ np.array([0, 0, 0, 0, 0, 0.05])))
+    assert found.mask.all()
     assert found.fit.state[5] == pytest.approx(TRUTH[5] + 0.05, abs=20 * SIGMA)
 
 
@@ -171,19 +171,19 @@ def test_where_nothing_tells_which_is_wrong_both_stay_and_are_doubtful():
     # Two groups see three unknowns that no other does, and disagree about them.
     values = jacobian @ TRUTH + SIGMA * np.random.default_rng(8).standard_normal((10, 3))
     values[0] += 0.01
-    found = agreeing_groups(Lines(jacobian, values, problem.observed, problem.known))
-    assert found.agrees.all()
+    found = find_inlier_groups(Lines(jacobian, values, problem.observed, problem.known))
+    assert found.mask.all()
     assert np.flatnonzero(found.doubtful).tolist() == [0, 1]
     assert not found.explained
 
 
 def test_noise_beyond_the_expected_is_told():
-    assert agreeing_groups(lines(2), SIGMA).explained
-    assert not agreeing_groups(lines(2), SIGMA / 3).explained
+    assert find_inlier_groups(lines(2), SIGMA).explained
+    assert not find_inlier_groups(lines(2), SIGMA / 3).explained
 
 
 def test_sound_sets_keep_all_their_groups():
-    lost = [seed for seed in range(60) if not agreeing_groups(lines(seed, 8)).agrees.all()]
+    lost = [seed for seed in range(60) if not find_inlier_groups(lines(seed, 8)).mask.all()]
     # One in a thousand loses one by design: more than two of 60 have a probability of 3e-5.
     assert len(lost) <= 2
 

@@ -12,10 +12,10 @@ from visioncal.core.transforms import exp
 from visioncal.estimation import lens_levels
 from visioncal.estimation.appearance import Appearance, compress
 from visioncal.estimation.corners import reproject
-from visioncal.estimation.joint import again
+from visioncal.estimation.joint import refit_jointly
 from visioncal.estimation.lens_field import LensLevels, displacements, distances, field_modes
 from visioncal.estimation.poses import fit_poses
-from visioncal.estimation.variance import Likely, most_likely
+from visioncal.estimation.variance import LikelihoodValue, most_likely
 from visioncal.simulation import CellOptions, fine_camera, simulate
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1, views=8, seed=1)
@@ -25,7 +25,7 @@ LEVELS = LensLevels(field=1.5, length=0.35, breathing=0.05, jitter=0.01)
 @pytest.fixture(scope="module")
 def corners():
     """The corners of one camera as the fit has them, with their poses."""
-    looks = calibrated(simulate(FINE), joints=False).fitted.looks
+    looks = calibrated(simulate(FINE), joints=False).cell_fit.camera_parameters
     (problem,) = looks.problems.values()
     return replace(problem.with_levels(LEVELS), levels=LEVELS), looks
 
@@ -116,7 +116,7 @@ def test_a_level_that_rises_far_is_not_given_up_for_what_its_first_step_gains():
         share = v / (1.0 + v)
         value = 50.0 * np.log(1.0 + v) + 50.0 * 100.0 / (1.0 + v)
         slope = 100.0 * share * (1.0 - 100.0 / (1.0 + v))
-        return Likely(float(value[0]), slope, 200.0 * np.diag(share**2))
+        return LikelihoodValue(float(value[0]), slope, 200.0 * np.diag(share**2))
 
     best = np.array([0.5 * np.log(99.0)])
     low, high = np.array([-9.0]), np.array([9.0])
@@ -149,10 +149,10 @@ def test_the_slope_of_the_likelihood_is_that_of_its_differences(monkeypatch, sti
         ahead, behind = likelihood(logs + step), likelihood(logs - step)
         # The third order of the step, and rounding of values of some thousands.
         difference = (ahead.value - behind.value) / 2e-4
-        assert here.slope[level] == pytest.approx(difference, rel=1e-3, abs=1e-3)
+        assert here.gradient[level] == pytest.approx(difference, rel=1e-3, abs=1e-3)
         # Where it is not convex, the average information takes the place of the second derivative.
         if not still:
-            curved = (ahead.slope - behind.slope) / 2e-4
+            curved = (ahead.gradient - behind.gradient) / 2e-4
             np.testing.assert_allclose(here.curvature[level], curved, rtol=1e-3, atol=2e-2)
 
 
@@ -183,8 +183,10 @@ def test_the_size_of_breathing_does_not_hang_on_where_the_fit_before_had_it(monk
     side, fitted = asked[-1]
     gains = []
     for breathing in (0.0, 0.1, 0.3):  # shares up to 3 %, at 0.1 px of noise
-        levels = dict.fromkeys(fitted.looks.problems, LensLevels(breathing=breathing))
-        before = again(fitted, side, fitted.moving, fitted.looks.with_levels(levels))
+        levels = dict.fromkeys(fitted.camera_parameters.problems, LensLevels(breathing=breathing))
+        before = refit_jointly(
+            fitted, side, fitted.moving, fitted.camera_parameters.with_levels(levels)
+        )
         (found,) = original(side, before).values()
         gains.append(found.gains)
     # Fits end where a step gains a thousandth of a sigma; it was 0.9 for 3 %.
@@ -200,8 +202,10 @@ def test_a_field_is_not_counted_beside_itself(monkeypatch):
     side, fitted = asked[-1]
     sizes = []
     for field in (0.0, 0.5):
-        levels = dict.fromkeys(fitted.looks.problems, LensLevels(field=field))
-        before = again(fitted, side, fitted.moving, fitted.looks.with_levels(levels))
+        levels = dict.fromkeys(fitted.camera_parameters.problems, LensLevels(field=field))
+        before = refit_jointly(
+            fitted, side, fitted.moving, fitted.camera_parameters.with_levels(levels)
+        )
         (found,) = original(side, before).values()
         sizes.append((found.field, found.gains[0]))
     assert sizes[0][0] > 0.0
@@ -210,6 +214,6 @@ def test_a_field_is_not_counted_beside_itself(monkeypatch):
 
 
 def test_a_fit_that_has_run_away_is_no_bug_of_the_likelihood():
-    """`refine.refined` then takes lenses for what their models say."""
+    """`refine.refine_jointly` then takes lenses for what their models say."""
     with pytest.raises(ConvergenceError, match="runs away"):
         lens_levels._factor(np.array([[1.0, 1e9], [1e9, 1.0]]))

@@ -12,15 +12,15 @@ from support.problems import observed, world
 from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.stages import refine
-from visioncal.calibration.stages.diagnose import misfits
-from visioncal.calibration.stages.turned_images import turned_how
+from visioncal.calibration.stages.residual_findings import residual_tests
+from visioncal.calibration.stages.turned_images import find_image_turn
 from visioncal.core.transforms import exp, invert, log
 from visioncal.estimation.arm import ArmErrors, covariance_of_size
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.chain import chain
 from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
 from visioncal.estimation.solve import covariance_of, fit_problem
 from visioncal.estimation.variance import profile_interval
@@ -40,7 +40,7 @@ def with_moving_base(cell, twist):
 
 def answered(cell):
     known = calibrated(cell, joints=False)
-    return known.solved, known
+    return known.assessment, known
 
 
 def told(result):
@@ -103,8 +103,8 @@ def test_a_bump_among_measured_poses_is_found():
     measured = cell.cam_from_target @ exp(1e-4 * np.random.default_rng(0).normal(size=(24, 6)))
     problem = chain("eye-in-hand", exp(lifted) @ cell.robot.base_from_flange, measured)
     assert problem.is_combined
-    found = misfits(problem, inliers_of(problem).fit, {})[ROBOT]
-    assert found.moved is None
+    found = residual_tests(problem, inliers_of(problem).fit, {})[ROBOT]
+    assert found.drift is None
     assert found.step.stop == 12
 
 
@@ -171,9 +171,9 @@ def test_a_turning_base_moves_the_target_by_its_distance(mount):
 def test_a_closed_form_is_not_taken_for_a_misfit(changes):
     for seed in range(4):
         known = calibrated(simulate(replace(FINE, seed=seed, **changes)), solver="park")
-        (found,) = known.solved.misfits.values()
-        assert not found.alike.is_significant
-        assert found.moved is None
+        (found,) = known.assessment.residual_tests.values()
+        assert not found.neighbours.is_significant
+        assert found.drift is None
 
 
 @pytest.mark.slow
@@ -259,19 +259,22 @@ def test_the_budget_adds_up(given):
     whole = covariance_of(result.problem, result.fit)[:12, :12]
     # An identity; what is left is rounding of an inverse with a condition of 1e10.
     np.testing.assert_allclose(sum(parts.values()), whole, rtol=1e-4, atol=1e-6 * whole.max())
-    budget, covariance = known.work.budget_mm, result.covariance[:6, :6]
-    at_work = point_covariance(result.state.edges[0], covariance, known.work.point_cam)
+    budget, covariance = known.accuracy_at_work.budget_mm, result.covariance[:6, :6]
+    at_work = point_covariance(result.state.edges[0], covariance, known.accuracy_at_work.point_cam)
     assert budget["total"] == pytest.approx(1e3 * np.sqrt(np.trace(at_work)), rel=1e-4)
-    lens = known.fitted.seen.looks.lens_of("cam")
-    assert ("intrinsics" in budget) == np.isin(lens, known.fitted.seen.free).any()
+    lens = known.cell_fit.linearised_corners.camera_parameters.lens_of("cam")
+    assert ("intrinsics" in budget) == np.isin(lens, known.cell_fit.linearised_corners.free).any()
 
 
 def test_sources_that_are_known_together_add_up_as_well():
     bent = replace(FINE, state_intrinsics=False, board_bow_m=5e-4, seed=2)
     result, known = answered(simulate(bent))
-    is_lens = known.fitted.seen.free < known.fitted.looks.boards.start
+    is_lens = known.cell_fit.linearised_corners.free < known.cell_fit.camera_parameters.boards.start
     owners = {"intrinsics": np.flatnonzero(is_lens), "board": np.flatnonzero(~is_lens)}
-    fields = known.fitted.field_columns - known.fitted.columns_of(known.fitted.seen.free)[0]
+    fields = (
+        known.cell_fit.field_columns
+        - known.cell_fit.columns_of(known.cell_fit.linearised_corners.free)[0]
+    )
     owners["lens_field"] = fields
     parts = covariance_by_source(*told(result), sources(**owners))
     whole = covariance_of(result.problem, result.fit)[:12, :12]
@@ -399,7 +402,7 @@ def test_one_image_that_was_turned_is_named_and_no_lens_that_refocuses(mount):
     (found,) = known.findings.warnings
     assert (found.views, "turned by 180 deg" in found.words) == ((5,), True)
     assert "mogrify -rotate 180 SESSION/images/005.png" in found.do.command
-    assert "its image is turned by 180 deg" in known.solved.views[5].reason
+    assert "its image is turned by 180 deg" in known.assessment.views[5].reason
     # 3 components: 5.4 is one in a thousand.
     assert mahalanobis_sq_of_place(cell, known) / 3 < 5.4
 
@@ -422,21 +425,21 @@ def test_how_an_image_was_turned_is_by_its_corners(words):
     image[rows, columns] = np.arange(1, len(rows) + 1)
     places = np.stack([columns, rows], axis=1).astype(float)
     seen = np.argwhere(CHANGES[words](image))[:, ::-1] + rng.normal(0.0, 0.1, places.shape)
-    assert turned_how(seen, places, (400, 400), 0.1).words == words
+    assert find_image_turn(seen, places, (400, 400), 0.1).words == words
     # Quarters change the size of other images; where corners agree, or nowhere, nothing is said.
     is_quarter = "90" in words
-    found = turned_how(seen, places, (400, 399), 0.1)
+    found = find_image_turn(seen, places, (400, 399), 0.1)
     assert found is None or not is_quarter
-    assert turned_how(places, places, (400, 400), 0.1) is None
-    assert turned_how(seen + 7.0, places, (400, 400), 0.1) is None
+    assert find_image_turn(places, places, (400, 400), 0.1) is None
+    assert find_image_turn(seen + 7.0, places, (400, 400), 0.1) is None
     # However much the others are off by, corners amid the predicted ones are on none of them.
     upper = places[places[:, 1] < 130.0]
     amid = np.array([0.0, 399.0]) + (upper + 12.0) * np.array([1.0, -1.0])
-    assert turned_how(amid, upper, (400, 400), 10.0) is None
+    assert find_image_turn(amid, upper, (400, 400), 10.0) is None
 
 
 def mahalanobis_sq_of_place(cell, known):
-    away, covariance = error_of(cell, known)[3:6], known.solved.covariance[3:6, 3:6]
+    away, covariance = error_of(cell, known)[3:6], known.assessment.covariance[3:6, 3:6]
     return float(away @ np.linalg.solve(covariance, away))
 
 

@@ -12,7 +12,7 @@ from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp
 from visioncal.estimation.chain import chain
 from visioncal.estimation.outliers import distances
-from visioncal.estimation.parts import ROBOT, State
+from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.solve import Solution, fit_problem, solve_problem
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 
@@ -33,7 +33,7 @@ def test_just_the_wrong_views_are_left_out(world, wrong):
         assert set(range(20)) - set(known.used) == set(cell.wrong_views)
         for view in cell.wrong_views:
             assert "times the noise" in known.reasons[view]
-        error, covariance = error_of(cell, known), known.solved.covariance[:12, :12]
+        error, covariance = error_of(cell, known), known.assessment.covariance[:12, :12]
         # Chi-square of 12 stays under 39 in all but one case of ten thousand.
         assert error @ np.linalg.solve(covariance, error) < 39.0
 
@@ -65,7 +65,7 @@ def test_two_exchanged_rows_are_found():
 @pytest.mark.slow
 def test_where_nothing_agrees_nothing_is_left_out():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=2)))
-    problem = known.solved.problem.with_effects([])
+    problem = known.assessment.problem.with_effects([])
     mixed = replace(problem, poses={ROBOT: np.roll(problem.poses[ROBOT], 1, axis=0)})
     assert inliers_of(mixed).used.all()
 
@@ -86,7 +86,7 @@ def test_a_stop_is_right_or_wrong_as_a_whole():
     cell = simulate(replace(WORLDS["fine, given"], seed=1, wrong_views=1))
     known = calibrated(cell)
     (wrong,) = cell.wrong_views
-    problem = known.fitted.agreed.problem.with_effects([])
+    problem = known.cell_fit.inlier_fit.problem.with_effects([])
     doubled = problem.observations.take(np.repeat(np.arange(20), 2))
     found = inliers_of(replace(problem, observations=doubled))
     assert np.flatnonzero(~found.used).tolist() == [2 * wrong, 2 * wrong + 1]
@@ -108,7 +108,7 @@ def with_measured(problem, measured):
 @pytest.mark.parametrize("measured", [True, False], ids=["covariance unknown", "covariance known"])
 def test_a_wrong_image_does_not_take_a_sound_one_of_its_stop_with_it(times, measured):
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=1)))
-    problem = looked_at_again(known.solved.problem.with_effects([]), times)
+    problem = looked_at_again(known.assessment.problem.with_effects([]), times)
     if measured:
         unknown = np.zeros_like(problem.observations.covariance)
         seen = replace(
@@ -132,8 +132,8 @@ def test_one_pose_of_the_robot_is_refused_before_anything_is_counted():
 
 def test_a_square_is_the_distance_from_what_the_others_predict():
     known = calibrated(simulate(replace(WORLDS["fine, given"], seed=3, views=12)))
-    problem = known.solved.problem.with_effects([])
-    state = State(known.solved.state.edges, np.zeros(0))
+    problem = known.assessment.problem.with_effects([])
+    state = State(known.assessment.state.edges, np.zeros(0))
     everything = np.ones(12, dtype=bool)
     fit = fit_problem(problem, state)
     inside = distances(problem, everything, fit)

@@ -23,8 +23,8 @@ from support.touched import (
 
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose, exp, invert
-from visioncal.estimation.parts import Noise
 from visioncal.estimation.pivot import fit_pivot
+from visioncal.estimation.problem_parts import Noise
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Touches, TouchProblem, TouchUnknowns
 
@@ -34,7 +34,7 @@ WAY = np.array([0.48, -0.6, 0.64])
 
 
 def rejected(fit):
-    return np.flatnonzero(~fit.agreement.agrees).tolist()
+    return np.flatnonzero(~fit.agreement.mask).tolist()
 
 
 def with_poses(touches, rotations):
@@ -53,7 +53,7 @@ def test_exact_touches_give_the_exact_tool(job):
     turn = TURN.as_matrix() if job.axes else np.eye(3)
     assert fit.flange_from_tool[:3, :3] == pytest.approx(turn, abs=1e-10)
     assert fit.oriented == (job.axes > 0)
-    assert fit.agreement.agrees.all()
+    assert fit.agreement.mask.all()
     if not fit.oriented:
         assert not fit.covariance[:3].any()
 
@@ -178,7 +178,7 @@ def test_a_lone_touch_of_an_axis_is_not_accused():
     made = touched(Job(axes=1), 5)
     aside = 5e-3 * made.truly[10].apply(TURN.apply([1, 0, 0]))
     fit = fit_pivot(slipped(made.touches, 10, aside))
-    assert fit.agreement.agrees.all()
+    assert fit.agreement.mask.all()
     assert np.isinf(fit.agreement.limit[10:]).all()
 
 
@@ -194,7 +194,7 @@ def test_of_two_touches_of_a_point_neither_is_accused():
     # Of point B there are one touch of its own and one that was slipped.
     few = touches.subset(np.array([True] * 5 + [True, True] + [False] * 3))
     fit = fit_pivot(slipped(few, 5, 2e-3 * WAY))
-    assert fit.agreement.agrees.all()
+    assert fit.agreement.mask.all()
     assert np.flatnonzero(fit.agreement.doubtful).tolist() == [5, 6]
     assert not fit.agreement.explained
 
@@ -211,7 +211,7 @@ def test_sound_touches_are_kept():
     lost = [
         seed
         for seed in range(40)
-        if not fit_pivot(touched(Job(), seed).touches).agreement.agrees.all()
+        if not fit_pivot(touched(Job(), seed).touches).agreement.mask.all()
     ]
     # One in a thousand loses one by design: more than one of 40 has a probability of 8e-4.
     assert len(lost) <= 1
@@ -322,7 +322,7 @@ def test_five_real_touches():
     # Root mean square of the distances in space; per axis it is 0.126.
     assert 1e3 * fit.rms_m == pytest.approx(0.219, abs=0.001)
     assert 1e3 * fit.agreement.off_m.max() == pytest.approx(0.301, abs=0.001)
-    assert fit.agreement.agrees.all()
+    assert fit.agreement.mask.all()
     # 15 residuals, 6 unknowns: the level is that of 9 degrees of freedom.
     assert fit.sigma_m == pytest.approx(fit.rms_m * np.sqrt(5 / 9), rel=1e-3)
     assert fit.agreement.fit.sigma_95[0] < fit.sigma_m < fit.agreement.fit.sigma_95[1]

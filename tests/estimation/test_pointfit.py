@@ -44,7 +44,7 @@ def test_exact_points_give_the_exact_frame(count):
     assert np.abs(found.base_from_fixture - frame).max() < 1e-13
     assert found.scale.value == pytest.approx(1.0, abs=1e-13)
     assert not found.scale.differs
-    assert found.agreement.agrees.all()
+    assert found.agreement.mask.all()
     assert np.abs(found.agreement.fit.groups.residuals).max() < 1e-13
 
 
@@ -125,7 +125,7 @@ def test_a_wrong_point_is_named(wrong):
         points = pairs.measured.copy()
         points[wrong] += 2e-3 * slip / np.linalg.norm(slip)
         found = fit_points(replace(pairs, measured=points))
-        assert np.flatnonzero(~found.agreement.agrees).tolist() == [wrong]
+        assert np.flatnonzero(~found.agreement.mask).tolist() == [wrong]
         # The distance from where the others place it: the slip, give or take the noise.
         assert np.linalg.norm(found.agreement.fit.groups.residuals[wrong]) == pytest.approx(
             2e-3, abs=6 * NOISE_M
@@ -138,7 +138,7 @@ def test_two_exchanged_points_among_many_are_named_and_left_out():
     points = pairs.measured.copy()
     points[[2, 7]] = points[[7, 2]]
     found = fit_points(replace(pairs, measured=points))
-    assert np.flatnonzero(~found.agreement.agrees).tolist() == [2, 7]
+    assert np.flatnonzero(~found.agreement.mask).tolist() == [2, 7]
     assert found.numbering.words(pairs.drawn_labels) == "P2 and P7 are exchanged"
 
 
@@ -166,7 +166,7 @@ def test_a_point_of_the_drawing_that_was_not_measured_explains_a_wrong_name():
     pairs = replace(pairs_of(drawn[:5], points), spare_labels=("P5",), spare=drawn[5:])
     found = fit_points(pairs)
     assert found.numbering.words(pairs.drawn_labels) == "numbers are shifted by 1: P4 is P5"
-    assert np.flatnonzero(~found.agreement.agrees).tolist() == [4]
+    assert np.flatnonzero(~found.agreement.mask).tolist() == [4]
 
 
 @pytest.mark.parametrize("flip", [[-1, 1, 1], [1, 1, -1], [-1, -1, -1]])
@@ -187,7 +187,7 @@ def test_points_in_a_plane_have_no_hand():
     turned = frame[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
     # A sigma of 0.1 mm on 0.2 m: some 0.5 mrad.
     assert np.abs(mirrored.base_from_fixture[:3, :3] - turned).max() < 2e-3
-    assert mirrored.agreement.agrees.all()
+    assert mirrored.agreement.mask.all()
     assert fit_points(measured_part(9, 6)[1]).hand_known
 
 
@@ -255,7 +255,7 @@ def test_a_scale_is_told_and_not_absorbed():
     # 0.1 % of some 0.2 m, which the frame without a scale leaves as residuals.
     assert 5e-5 < found.agreement.fit.sigma < 3e-4
     # The points that are far out are not to blame.
-    assert found.agreement.agrees.all()
+    assert found.agreement.mask.all()
     assert not fit_points(pairs).scale.differs
 
 
@@ -267,7 +267,7 @@ def test_a_grown_part_accuses_no_point():
     points = placed(frame, 1.002 * nominal) + 1e-5 * rng.normal(size=(10, 3))
     found = fit_points(pairs_of(nominal, points))
     assert found.scale.differs
-    assert found.agreement.agrees.all()
+    assert found.agreement.mask.all()
     assert not found.agreement.explained
 
 

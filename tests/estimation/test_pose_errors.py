@@ -7,8 +7,8 @@ from visioncal.core.transforms import adjoint, exp, invert, log
 from visioncal.estimation import pose_errors
 from visioncal.estimation.arm import SIGNIFICANT, misfit_covariance
 from visioncal.estimation.chain import chain
-from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.pose_errors import find_pose_errors, left_out_clusters
+from visioncal.estimation.problem_parts import ROBOT
 from visioncal.estimation.solve import covariance_of, fit_problem, solve_problem
 
 X, Z = exp(np.array([0.1, -0.2, 0.3, 0.03, -0.05, 0.09])), exp(np.array([0, 0, 0, 0.6, 0.1, 0.0]))
@@ -128,7 +128,9 @@ def test_the_slope_is_that_of_the_likelihood():
             step = 1e-4 * np.eye(len(logs))[at]
             ends = [likelihood._step(common, logs + value).value for value in (step, -step)]
             # The third order of a step of 1e-4, and rounding of a value of some hundreds.
-            assert (ends[0] - ends[1]) / 2e-4 == pytest.approx(here.slope[at], abs=1e-4, rel=1e-4)
+            assert (ends[0] - ends[1]) / 2e-4 == pytest.approx(
+                here.gradient[at], abs=1e-4, rel=1e-4
+            )
 
 
 def test_many_stops_are_put_by_some_columns():
@@ -138,7 +140,7 @@ def test_many_stops_are_put_by_some_columns():
     assert found.basis.shape[2] <= 360
     # Noise and errors together are what single stops show, as far as the edges do not take it up.
     squares = np.sum(found.basis**2, axis=2).mean(axis=0).reshape(2, 3).mean(axis=1)
-    assert np.sqrt(squares + found.white**2) == pytest.approx(found.look, rel=0.5)
+    assert np.sqrt(squares + found.white**2) == pytest.approx(found.fit_sigmas, rel=0.5)
     # Nine tenths of the last value: ten stops and more are as good as one.
     more = misfit_covariance(problem, fit.state, fit.noise, ROBOT, found)
     covariance = covariance_of(problem, fit)
@@ -169,7 +171,7 @@ def test_looks_at_other_postures_err_by_what_is_predicted(errors):
     for seed in range(8):
         problem, fit = fitted(errors, seed)
         found = find_pose_errors(problem, fit.state, fit.noise, ROBOT)
-        there, predicted = found.away**2
+        there, predicted = found.far_posture_errors**2
         ratios.append(there / predicted)
     # Of 8 x 22 looks at three axes each, and errors that look alike in a cluster: known to 0.3.
     assert 0.5 < np.mean(ratios) < 1.6

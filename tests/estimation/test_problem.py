@@ -11,9 +11,9 @@ from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import Move
-from visioncal.estimation.outliers import agree, settle
-from visioncal.estimation.parts import Effect, FramePrior, Noise, State
-from visioncal.estimation.slight_steps import evidence_gain, slight_move
+from visioncal.estimation.outliers import inliers_and_moves, refine_inliers
+from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, State
+from visioncal.estimation.slight_steps import evidence_gain, find_slight_move
 from visioncal.estimation.solve import (
     RepeatErrors,
     Solution,
@@ -25,7 +25,7 @@ from visioncal.estimation.solve import (
     robot_likelihood,
     solve_problem,
 )
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 MOVABLE = ("cam_left", "cam_right", "target_floor", "target_a", "target_b")
 NOISE = Noise(np.array([ROBOT_SIGMAS["a"], ROBOT_SIGMAS["b"]]), np.zeros(0))
@@ -69,7 +69,7 @@ def with_places_alone(problem, rows):
 
 def with_values(problem, rng):
     """The problem with two effects of one and two values: on sensors, and on one robot's flange."""
-    known = [Knowledge(np.eye(name), np.zeros(name)) for name in (1, 2)]
+    known = [PriorInformation(np.eye(name), np.zeros(name)) for name in (1, 2)]
     held = [np.zeros(name, dtype=bool) for name in (1, 2)]
     by_sensor = rng.normal(size=(len(problem), 6, 1)) * 1e-3
     flange_jacobian = {"a": rng.normal(size=(len(problem.poses["a"]), 6, 2)) * 1e-3}
@@ -185,7 +185,7 @@ def test_repeats_share_errors_that_a_step_does_not_pass_for():
     known = np.linalg.inv(errors.covariance) - information
     np.testing.assert_allclose(known[:size], 0.0, atol=1e-6 * np.abs(information).max())
     frames = tuple(problem.unknown)
-    assert all(slight_move(*still_cell(seed), frames) is None for seed in range(6))
+    assert all(find_slight_move(*still_cell(seed), frames) is None for seed in range(6))
 
 
 def test_steps_are_as_likely_as_their_evidence_says():
@@ -264,7 +264,7 @@ def test_the_start_is_near_the_truth():
 
 def test_a_sound_cell_has_nothing_left_out_and_nothing_moved():
     _, problem = problem_of(8)
-    found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
+    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
     assert found.used.all()
     assert not found.moves
 
@@ -280,7 +280,7 @@ def test_a_board_that_slips_and_a_camera_that_is_bumped_are_two_frames_each():
     changed = pushed(cell, "target_b", 9, (0.004, 0, 0, 0.003, 0, 0.004))
     changed |= pushed(cell, "cam_right", 12, (0, -0.006, 0, 0, 0.005, 0))
     problem = observed(cell, rng, changed)
-    found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
+    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
     assert {(move.frame, move.stop) for move in found.moves} == {("target_b", 9), ("cam_right", 12)}
     assert found.used.all()
     plain = [name for name in found.problem.unknown if "@" not in name]
@@ -303,7 +303,7 @@ def test_a_robot_that_is_pushed_is_no_board_and_no_camera_of_it_that_slipped(twi
         carrying = replace(cell, parents=parents, truth=truth, pairs=pairs)
         for one, carried in ((cell, {"target_b"}), (carrying, {"target_b", "cam_right"})):
             problem = observed(one, rng, pushed(one, "base_b", 10, twist))
-            found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
+            found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
             assert not found.moves
             out = [bool(carried & {*pair[:2]}) and pair[2] >= 10 for pair in one.pairs]
             assert (~found.used).tolist() == out
@@ -314,7 +314,7 @@ def test_a_slip_that_hides_in_the_noise_of_single_views_is_found():
     cell = world(rng, 40, 1.0)
     # 0.12 mm: one sigma of a single view along its axis.
     problem = observed(cell, rng, pushed(cell, "target_floor", 20, (0, 0, 0, 1e-4, 6e-5, 0), 40))
-    found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
+    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
     (move,) = found.moves
     assert move.frame == "target_floor"
     assert abs(move.stop - 20) <= 2
@@ -333,7 +333,7 @@ def test_wrong_images_are_left_out_and_nothing_else(some, others):
     wrong = rows[some]
     measured[wrong] = problem.observations.measured[rows[others]]
     problem = replace(problem, observations=replace(problem.observations, measured=measured))
-    found = settle(agree(problem, started(problem), MOVABLE), MOVABLE)
+    found = refine_inliers(inliers_and_moves(problem, started(problem), MOVABLE), MOVABLE)
     assert np.flatnonzero(~found.used).tolist() == wrong
     assert not found.moves
 
@@ -358,7 +358,7 @@ def test_a_held_value_stays_and_counts_with_what_is_known_of_it():
     state = true_state(cell, problem.tree)
     by_sensor = np.zeros((len(problem), 6, 1))
     by_sensor[:, 3, 0] = 1e-3  # every camera measures x too long alike
-    known = Knowledge(np.eye(1), np.zeros(1))
+    known = PriorInformation(np.eye(1), np.zeros(1))
     effect = Effect("drift", np.zeros(1), known, np.ones(1, dtype=bool), by_sensor)
     held = problem.with_effects([effect])
     moved, _ = solve_problem(held, State(state.edges, np.zeros(1)), NOISE)
@@ -439,7 +439,7 @@ def test_observations_of_one_stop_merge_without_loss(count):
     cell, problem = problem_of(4, stops=8)
     rows = np.repeat(np.arange(len(problem)), 2)
     seen = replace(problem.observations.take(rows), sensors=np.full(len(rows), -1))
-    known = Knowledge(np.eye(2), np.zeros(2))
+    known = PriorInformation(np.eye(2), np.zeros(2))
     by_sensor = rng.normal(size=(count, len(rows), 6, 2)) * 1e-3
     effects = [Effect.free(f"effect {at}", known, value) for at, value in enumerate(by_sensor)]
     twice = replace(problem, observations=seen).with_effects(effects)

@@ -10,7 +10,7 @@ from support.cells import calibrated
 from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import joint
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.parts import ROBOT, Effect
+from visioncal.estimation.problem_parts import ROBOT, Effect
 from visioncal.estimation.solve import (
     RATIO_PRIOR,
     equations_and_cost,
@@ -22,8 +22,8 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.variance import (
     Components,
-    Knowledge,
-    Weighed,
+    PriorInformation,
+    WeightedResiduals,
     estimate_sigmas,
     likelihood,
     likely_sigma,
@@ -36,8 +36,8 @@ LENS = pytest.mark.parametrize("given", [True, False], ids=["lens given", "lens 
 
 def answered(given, **changes):
     known = calibrated(simulate(replace(FINE, state_intrinsics=given, **changes)))
-    problem = known.solved.problem
-    return problem, fit_problem(problem, known.solved.state)
+    problem = known.assessment.problem
+    return problem, fit_problem(problem, known.assessment.state)
 
 
 @LENS
@@ -69,7 +69,7 @@ def doubled(problem):
 def test_a_stop_seen_twice_half_as_well_is_one_seen_once(mount):
     problem, fit = answered(False, views=8, seed=2, mount=mount)
     arm = 1e-3 * np.random.default_rng(0).standard_normal((8, 6, 2))
-    known = Knowledge(np.eye(2), np.zeros(2))
+    known = PriorInformation(np.eye(2), np.zeros(2))
     errors = Effect.free("arm", known, flange_jacobian={ROBOT: arm})
     problem = problem.with_effects([*problem.effects, errors])
     state = replace(fit.state, values=problem.start_values)
@@ -138,7 +138,7 @@ def test_the_likelihood_jacobian_as_its_differences_say(given):
         shift = step * np.eye(2)[level]
         slope = (at(logs + shift).value - at(logs - shift).value) / (2 * step)
         # The third order of a step of 1e-4 is left, and rounding of values of some thousands.
-        assert at(logs).slope[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+        assert at(logs).gradient[level] == pytest.approx(slope, rel=1e-4, abs=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["one a stop", "two a stop", "places", "combined"])
@@ -155,7 +155,7 @@ def test_errors_of_an_arm_beside_a_likelihood_are_those_of_a_wider_problem(kind)
         problem = replace(problem, observations=seen, is_combined=True)
     moves = np.random.default_rng(0).standard_normal((8, 6, 3))
     effect = Effect.free(
-        "arm", Knowledge(np.zeros((3, 3)), np.zeros(3)), flange_jacobian={ROBOT: moves}
+        "arm", PriorInformation(np.zeros((3, 3)), np.zeros(3)), flange_jacobian={ROBOT: moves}
     )
     wider = problem.with_effects([*problem.effects, effect])
     there = replace(fit.state, values=np.append(fit.state.values, np.zeros(3)))
@@ -185,9 +185,11 @@ def test_the_likeliest_size_of_effects_is_that_of_the_likelihood_beside_given_le
         information[-count:, -count:] += np.eye(count) / size**2
         given = replace(known, information=information)
         jacobian, parts = wider.jacobian, found.components
-        return Weighed.of(errors, jacobian, parts, given, logs).value + count * np.log(size)
+        return WeightedResiduals.of(errors, jacobian, parts, given, logs).value + count * np.log(
+            size
+        )
 
-    without = Weighed.of(errors, found.jacobian, found.components, found.known, logs)
+    without = WeightedResiduals.of(errors, found.jacobian, found.components, found.known, logs)
     size, gain = without.likely_size(moved, np.ones(20, dtype=bool))
     # Effects that look like the unknowns alone are of any size, and pull at nothing.
     taken = found.jacobian[:, :, :3]
@@ -233,7 +235,7 @@ def test_shared_errors_of_flanges_are_eliminated_exactly():
     noise = block_diag(*problem.covariance(fit.noise))
     noise += by_errors @ block_diag(*problem.error_covariance(fit.noise)) @ by_errors.T
     jacobian, residuals = linear.jacobian.reshape(len(noise), -1), linear.residuals.ravel()
-    known = problem.knowledge(fit.state)
+    known = problem.prior_information(fit.state)
     weighted = np.linalg.solve(noise, jacobian)
     information, gradient, cost = equations_and_cost(problem, fit.state, fit.noise)
     scale = np.sqrt(np.diag(information))
@@ -246,7 +248,7 @@ def test_shared_errors_of_flanges_are_eliminated_exactly():
     away = gradient - known.gradient - weighted.T @ residuals
     np.testing.assert_allclose(away / scale, 0.0, atol=1e-8)
     whole = residuals @ np.linalg.solve(noise, residuals)
-    assert cost == pytest.approx(whole + problem.cost_of_knowledge(fit.state), rel=1e-8)
+    assert cost == pytest.approx(whole + problem.prior_cost(fit.state), rel=1e-8)
 
 
 def test_a_fit_at_its_answer_looks_twice(monkeypatch):
@@ -279,7 +281,7 @@ def test_a_noise_level_of_nothing_is_found_beside_a_large_one():
         np.hstack([common, np.zeros((40, 1))]),
         np.tile([[1.0], [0.0]], (40, 1, 1)),
         Components(np.zeros((40, 2, 2)), parts.swapaxes(0, 1)),
-        Knowledge(np.zeros((1, 1)), np.zeros(1)),
+        PriorInformation(np.zeros((1, 1)), np.zeros(1)),
         np.array([3.0, 3.0]),
         np.ones(2, dtype=bool),
     )

@@ -7,7 +7,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.clock import clock_problem
 from visioncal.estimation.clock_correlation import ImageTimes, turning_matches
-from visioncal.estimation.parts import State
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.trajectory import Samples, Trajectory
 
 RATES = np.array([0.31, 0.47, 0.73, 0.21, 0.37, 0.53])

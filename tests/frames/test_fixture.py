@@ -14,11 +14,11 @@ from support.samples import made_up
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp
-from visioncal.estimation.parts import Noise
+from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture import drawn_fixture, touched_fixture
-from visioncal.frames.fixture_fit import Setting
-from visioncal.frames.measured import Tool, touched_points
+from visioncal.frames.fixture_fit import FitSettings
+from visioncal.frames.measured_points import Tool, touched_points
 from visioncal.frames.touches import TouchRows, check_lengths
 from visioncal.results import Edge, FrameFile, Verdict
 
@@ -346,12 +346,14 @@ def test_errors_that_points_share_are_carried_to_the_answer():
     sigmas = np.array([1e-4, 2e-4, 3e-4, 1e-4, 1e-4, 5e-5])
     jacobian = np.concatenate([sigmas * _turning(point) for point in measured.points])
     shared = replace(measured, common=jacobian @ jacobian.T)
-    found = drawn_fixture(shared, drawing(1e-3 * CAD_MM), Setting()).edge
+    found = drawn_fixture(shared, drawing(1e-3 * CAD_MM), FitSettings()).edge
     moves = []
     for step in np.diag(sigmas):
         moved = [placed(exp(sign * step), measured.points) for sign in (1.0, -1.0)]
         ahead, behind = (
-            drawn_fixture(replace(measured, points=array), drawing(1e-3 * CAD_MM), Setting()).edge
+            drawn_fixture(
+                replace(measured, points=array), drawing(1e-3 * CAD_MM), FitSettings()
+            ).edge
             for array in moved
         )
         moves.append(0.5 * away(behind.matrix, ahead.matrix))

@@ -12,10 +12,10 @@ from support.plates import CENTRES, looking, marked_plate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import Target
-from visioncal.frames.camera_chain import Eye
-from visioncal.frames.fixture_from_markers import seen_markers
-from visioncal.frames.single_view import Sight, places
-from visioncal.frames.target_in_image import see
+from visioncal.frames.camera_chain import CalibratedCamera
+from visioncal.frames.fixture_from_markers import measure_markers
+from visioncal.frames.single_view import Sight, candidate_places
+from visioncal.frames.target_in_image import target_pose_candidates
 from visioncal.frames.target_pose import place_seen
 from visioncal.simulation import BOARDS, CellOptions, simulate
 from visioncal.vision.camera import intrinsics, with_intrinsics
@@ -70,14 +70,18 @@ def sights_of(cell, parent, place, rng, count=6, target=BOARD):
 def test_what_moves_a_sight_agrees_with_central_differences(mount, parent):
     cell = simulate(exact(CellOptions(mount=mount, views=8, seed=1)))
     calibration = calibration_of(cell)
-    eye, rng = Eye.of(calibration), np.random.default_rng(0)
+    eye, rng = CalibratedCamera.of(calibration), np.random.default_rng(0)
     place = place_of(cell, parent, rng)
     (sight,) = sights_of(cell, parent, place, rng, count=1)
 
     def placed(eye, sight=sight, target=BOARD):
-        return places(eye, sight, see(eye, sight.seen, target, "image", 0.1), parent)[0].matrix
+        return candidate_places(
+            eye, sight, target_pose_candidates(eye, sight.seen, target, "image", 0.1), parent
+        )[0].matrix
 
-    here = places(eye, sight, see(eye, sight.seen, BOARD, "image", 0.1), parent)[0]
+    here = candidate_places(
+        eye, sight, target_pose_candidates(eye, sight.seen, BOARD, "image", 0.1), parent
+    )[0]
     np.testing.assert_allclose(here.matrix, place, atol=1e-8)
     size = np.concatenate([np.full(6, 1e-3), np.full(4, 1.0), np.full(5, 1e-3)])
     steps = [1e-2 * value for value in np.diag(size)]
@@ -123,7 +127,7 @@ def test_places_follow_their_stated_covariance(mount, parent, target):
         found = place_seen(
             calibration, sights_of(cell, parent, place, rng, 6, target), target, parent
         )
-        assert found.agrees.all()
+        assert found.inliers.all()
         error = log(invert(place) @ found.matrix)
         surprises.append(error @ np.linalg.solve(found.covariance, error) / 6)
     # Five of six degrees of freedom: sqrt(2 / 30) = 0.26; the target is of the exact size, which
@@ -161,7 +165,7 @@ def test_a_moved_target_and_a_wrong_pose_are_named(cell):
     slipped = sights_of(made, parent, place @ exp(np.array([0, 0, 0.01, 0.002, 0, 0])), rng, 6)
     sights[5] = slipped[5]
     found = place_seen(calibration, sights, BOARD, parent)
-    assert list(np.flatnonzero(~found.agrees)) == [2, 5]
+    assert list(np.flatnonzero(~found.inliers)) == [2, 5]
     assert [warning.split()[1] for warning in found.warnings] == ["2", "5"]
     assert "left out" in found.warnings[0]
     # Two of seven images fewer: the mean stays within what it is known to.
@@ -181,7 +185,7 @@ def test_one_image_is_checked_by_nothing_and_two_do_not_tell_which_is_right(cell
     wrong = sights_of(made, parent, place @ exp(np.array([0, 0, 0.02, 0.004, 0, 0])), rng, 2)
     torn = place_seen(calibration, [sights[0], wrong[1]], BOARD, parent)
     assert "it is not known which are right" in torn.warnings[0]
-    assert torn.agrees.all()
+    assert torn.inliers.all()
     # The contradiction counts in the sigmas.
     assert torn.scatter > 5.0
 
@@ -191,8 +195,10 @@ def test_images_of_one_stop_share_the_robots_error(cell):
     parent = "base" if made.options.mount == IN_HAND else "flange"
     rng = np.random.default_rng(9)
     (sight,) = sights_of(made, parent, place_of(made, parent, rng), rng, count=1)
-    eye = Eye.of(calibration)
-    (place, *_) = places(eye, sight, see(eye, sight.seen, BOARD, "image", 0.1), parent)
+    eye = CalibratedCamera.of(calibration)
+    (place, *_) = candidate_places(
+        eye, sight, target_pose_candidates(eye, sight.seen, BOARD, "image", 0.1), parent
+    )
     robot = place.flange_jacobian @ eye.flange_noise @ place.flange_jacobian.T
     same = [replace(sight, label=f"image {at}") for at in range(4)]
     found = place_seen(calibration, same, BOARD, parent, sigma_px=0.1)
@@ -237,7 +243,7 @@ def test_a_symmetric_board_may_be_turned(cell):
         sights[1], seen=replace(turned, ids=last - turned.ids[::-1], px=turned.px[::-1])
     )
     found = place_seen(calibration, sights, board, parent)
-    assert found.agrees.all()
+    assert found.inliers.all()
     assert any("the same when it is turned" in warning for warning in found.warnings)
     # The first image's numbering is kept.
     assert 1e3 * np.linalg.norm((invert(place) @ found.matrix)[:3, 3]) < 3.0
@@ -263,7 +269,7 @@ def marked():
 
 def test_markers_are_measured_points_with_a_common_part(marked):
     calibration, base_from_plate, sights = marked
-    found = seen_markers(calibration, sights, list(CENTRES), "DICT_5X5_100", 0.04, sigma_px=0.1)
+    found = measure_markers(calibration, sights, list(CENTRES), "DICT_5X5_100", 0.04, sigma_px=0.1)
     assert found.names == ("0", "7", "21", "30")
     assert found.seen_in == (4, 4, 4, 4)
     on_plate = np.array([[x, y, 0.0] for x, y in CENTRES.values()])
@@ -275,13 +281,13 @@ def test_markers_are_measured_points_with_a_common_part(marked):
     assert 1e3 * np.abs(error).max() < 0.5
     # The robot and the camera move all markers alike: neighbours are correlated.
     assert found.common[:3, 3:6].trace() > 0.3 * found.common[:3, :3].trace()
-    fewer = seen_markers(calibration, sights[:1], [7], "DICT_5X5_100", 0.04, sigma_px=0.1)
+    fewer = measure_markers(calibration, sights[:1], [7], "DICT_5X5_100", 0.04, sigma_px=0.1)
     assert np.trace(fewer.independent[0]) > np.trace(found.independent[1])
 
 
 def test_a_marker_that_is_in_no_image_is_named(marked):
     calibration, _, sights = marked
     with pytest.raises(DataError, match="marker 50 of DICT_5X5_100 is in none of the 4 images"):
-        seen_markers(calibration, sights, [0, 50], "DICT_5X5_100", 0.04)
+        measure_markers(calibration, sights, [0, 50], "DICT_5X5_100", 0.04)
     with pytest.raises(DataError, match=r"metres, such as 0\.04"):
-        seen_markers(calibration, sights, [0], "DICT_5X5_100", 40.0)
+        measure_markers(calibration, sights, [0], "DICT_5X5_100", 40.0)

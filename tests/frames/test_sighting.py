@@ -12,8 +12,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.limits import ImageFrameLimits
 from visioncal.core.transforms import invert, log, skew
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_from_markers import marked_fixture
-from visioncal.frames.frame_from_images import rests_on_camera, seen_frame
+from visioncal.frames.fixture_from_markers import fixture_from_marker_images
+from visioncal.frames.frame_from_images import depends_on_camera, seen_frame
 from visioncal.results import Verdict
 from visioncal.robot import load_robot
 from visioncal.session import MemoryImages
@@ -62,7 +62,7 @@ def test_a_board_in_images_is_where_it_stands(mount, kind):
     ]
     assert all(observation.used and not observation.reason for observation in frame.observations)
     assert frame.source == "the part"
-    assert rests_on_camera(frame)
+    assert depends_on_camera(frame)
     assert frame.details["camera_calibrated"] == calibration.created
 
 
@@ -225,14 +225,14 @@ def drawing(places):
 def test_markers_place_a_fixture_by_its_drawing(plate):
     calibration, base_from_plate, sights = plate
     spare = {**CENTRES, 44: (0.0, 0.2)}
-    frame = marked_fixture(plate_session(sights), calibration, drawing(spare))
+    frame = fixture_from_marker_images(plate_session(sights), calibration, drawing(spare))
     error = log(invert(base_from_plate) @ frame.edge.matrix)
     # Six degrees of freedom at 99.9 %: 22.5. The calibration's own error is left out here.
     assert error @ np.linalg.solve(frame.edge.covariance, error) < 22.5
     assert {observation.name for observation in frame.observations} == {"0", "7", "21", "30"}
     assert frame.details["spare_points"] == ["44"]
     assert frame.details["seen_in"] == {"0": 4, "7": 4, "21": 4, "30": 4}
-    assert rests_on_camera(frame)
+    assert depends_on_camera(frame)
     assert "4 points to plate.csv" in frame.method
     # What the markers share does not fall out of a fit to them.
     common = calibration.edges["flange_from_cam"].sigma_mm
@@ -245,13 +245,13 @@ def test_markers_that_do_not_fit_are_named(plate):
     places = list(CENTRES.values())
     swapped = dict(zip(CENTRES, [places[1], places[0], *places[2:]], strict=True))
     with pytest.raises(DataError, match=r"in another order to .*0.*7"):
-        marked_fixture(session, calibration, drawing(swapped))
+        fixture_from_marker_images(session, calibration, drawing(swapped))
     strangers = {0: places[0], 7: places[1], 50: (0.0, 0.0), 51: (0.1, 0.1)}
     with pytest.raises(DataError, match=r"2 drawn markers .*\(0, 7\).* not drawn \(21, 30\)"):
-        marked_fixture(session, calibration, drawing(strangers))
+        fixture_from_marker_images(session, calibration, drawing(strangers))
     named = replace(drawing(CENTRES), names=("0", "7", "21", "hole"))
     with pytest.raises(DataError, match="point 'hole' is no marker's id"):
-        marked_fixture(session, calibration, named)
+        fixture_from_marker_images(session, calibration, named)
     board = {"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.03}
     with pytest.raises(DataError, match="a checkerboard; beside a drawing"):
-        marked_fixture(plate_session(sights, board), calibration, drawing(CENTRES))
+        fixture_from_marker_images(plate_session(sights, board), calibration, drawing(CENTRES))

@@ -13,8 +13,8 @@ from support.pages import Page
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
-from visioncal.frames.touch_test import judged, touch_points
-from visioncal.interchange.merge_results import rewrite
+from visioncal.frames.touch_test import evaluate_gaps, touch_points
+from visioncal.interchange.merge_results import rewrite_result
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.controller import spawn
@@ -55,10 +55,10 @@ def test_the_tip_comes_as_near_as_predicted(proved):
         np.testing.assert_allclose(point.base_from_flange[:3, 3], point.base_m)
         step = invert(point.base_from_flange) @ point.above(0.05)
         np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
-    assert judged(points, away_mm).passed
-    assert not judged(points, [5.0] * 5).passed
+    assert evaluate_gaps(points, away_mm).passed
+    assert not evaluate_gaps(points, [5.0] * 5).passed
     with pytest.raises(DataError, match="5 of 0 mm and more"):
-        judged(points, [0.1])
+        evaluate_gaps(points, [0.1])
 
 
 @pytest.mark.usefixtures("patient")
@@ -144,7 +144,7 @@ def test_what_touches_is_the_only_tool_or_the_flange(proved):
     tool = Frame(edge, True, "stated", "", known.created, 0.0, 0.0, (), known.verdict)
     held = folder / "held"
     shutil.copytree(folder / "out", held)
-    rewrite(held, replace(known, frames={"flange_from_grip": tool}))
+    rewrite_result(held, replace(known, frames={"flange_from_grip": tool}))
 
     def first(*said):
         done = visioncal("touch-test", look, "-c", held, "--json", *said)

@@ -20,7 +20,7 @@ from visioncal.core.choices import CONVENTIONS
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.interchange.exports import Selection, document, export
-from visioncal.interchange.result_files import load_placed
+from visioncal.interchange.result_files import load_result_or_frames
 from visioncal.results.arm import (
     ArmResult,
     ElasticResult,
@@ -326,7 +326,7 @@ def test_the_command_writes_the_arm_and_warns(tmp_path):
     assert "--convention hayati" in done.err
     # Of the session's ranges nothing is known here: what is left is that of the workspace.
     said_mm = float(done.err.replace("\n", " ").partition("least of that: ")[2].split()[0])
-    q, expected = poses(load_placed(tmp_path))
+    q, expected = poses(load_result_or_frames(tmp_path))
     rms, _ = rms_and_most_mm(load_robot(str(out)).base_from_flange(q) - expected)
     assert rms == pytest.approx(said_mm, rel=0.3)
 

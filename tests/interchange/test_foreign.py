@@ -259,7 +259,7 @@ def test_what_the_user_says_of_poses_is_applied_in_every_form(make, tmp_path):
     read = read_foreign(recording.source, replace(recording.requested, **said))
     for whose, requested in said.items():
         before, after = getattr(plain, whose), getattr(read, whose)
-        if before is not None and before.there.any():
+        if before is not None and before.present.any():
             assert after.reading == Reading(before.reading.rotation, "cm", requested.inverse)
             np.testing.assert_array_equal(after.positions, before.positions)
 

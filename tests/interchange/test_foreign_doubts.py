@@ -231,7 +231,7 @@ def test_empty_columns_and_numbers_of_cameras_are_no_poses(table):
     source = table(f"image,camera,robot,x,y,z,qx,qy,qz,qw,{CAMERA}", rows)
     foreign = read_foreign(source, SEEN)
     assert foreign.camera is None
-    assert foreign.robot.there.all()
+    assert foreign.robot.present.all()
 
 
 @pytest.mark.parametrize(("step", "timed"), [(1, False), (0.5, True)])

@@ -19,7 +19,7 @@ from visioncal.interchange.formats import (
     convert,
     read_foreign,
 )
-from visioncal.interchange.formats.finding import images_named, listed
+from visioncal.interchange.formats.file_search import files_in, images_named
 
 WISHES = ImportOptions(mount="eye-in-hand", target=CHARUCO)
 
@@ -103,14 +103,14 @@ def test_links_that_lead_out_are_not_followed(tmp_path, naming):
     picture(inside / "own.png")
     linked(inside / "b.png", inside / "own.png")
     linked(tmp_path / "circle.png", tmp_path / "circle.png")
-    assert [path.name for path in listed(inside)] == ["b.png", "own.png"]
+    assert [path.name for path in files_in(inside)] == ["b.png", "own.png"]
     linked(tmp_path / "out.png", "/etc/hostname")
     for name in ("out.png", "circle.png"):
         with pytest.raises(DataError, match="or leaves the folder"):
             naming(name)
     # The folder that the user names may be a link itself.
     linked(tmp_path / "alias", inside)
-    assert [path.name for path in listed(tmp_path / "alias")] == ["b.png", "own.png"]
+    assert [path.name for path in files_in(tmp_path / "alias")] == ["b.png", "own.png"]
 
 
 def test_poses_are_not_read_through_a_link(tmp_path):
@@ -156,7 +156,7 @@ def test_digits_of_other_scripts_are_letters(tmp_path):
     names = ["10.png", "2.png", "1²2.png", "1٣2.png"]
     for name in names:
         picture(tmp_path / name)
-    assert {path.name for path in listed(tmp_path)} == set(names)
+    assert {path.name for path in files_in(tmp_path)} == set(names)
     assert natural(tmp_path / "2.png") < natural(tmp_path / "10.png")
 
 

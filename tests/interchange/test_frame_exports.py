@@ -15,7 +15,7 @@ from support.samples import made_up
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
 from visioncal.interchange.exports import EXPORT_FORMATS, Load, Selection, document, export
-from visioncal.interchange.result_files import load_calibration, load_placed
+from visioncal.interchange.result_files import load_calibration, load_result_or_frames
 from visioncal.results import Calibration, FrameFile, Verdict
 
 RNG = np.random.default_rng(6)
@@ -440,20 +440,20 @@ def exporting(*arguments):
 def test_a_file_of_frames_is_known_by_its_content(tmp_path):
     file = tmp_path / "any name"
     ALONE.save(file)
-    assert isinstance(load_placed(file), FrameFile)
+    assert isinstance(load_result_or_frames(file), FrameFile)
     with pytest.raises(DataError, match="no calibration"):
         load_calibration(file)
     SAMPLE.save(tmp_path / "calibration.json")
     CELL.save(tmp_path / "frames.json")
     # The calibration of a folder comes before the frames beside it.
-    assert load_placed(tmp_path).frames == {}
+    assert load_result_or_frames(tmp_path).frames == {}
     for name in ("calibration.json", "frames.json"):
-        assert isinstance(load_placed(tmp_path / name), Calibration)
+        assert isinstance(load_result_or_frames(tmp_path / name), Calibration)
 
 
 def test_a_folder_with_frames_alone(tmp_path):
     ALONE.save(tmp_path / "frames.json")
-    assert set(load_placed(tmp_path).frames) == {TOOL, FIXTURE}
+    assert set(load_result_or_frames(tmp_path).frames) == {TOOL, FIXTURE}
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"frames": {}}', '{"frames": 3, "schema": 1}'])
@@ -461,7 +461,7 @@ def test_a_broken_file_is_named(tmp_path, text):
     file = tmp_path / "frames.json"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(DataError, match=re.escape(str(file))):
-        load_placed(file)
+        load_result_or_frames(file)
 
 
 def test_the_command_writes_what_the_library_does(tmp_path):

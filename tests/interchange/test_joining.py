@@ -15,7 +15,7 @@ from visioncal.cli.calibrate import calibrate_command
 from visioncal.cli.options import NeedOptions, WorkOptions
 from visioncal.core.errors import DataError
 from visioncal.frames.frame_from_images import SEEN_BY
-from visioncal.interchange.merge_results import leftover, rewrite
+from visioncal.interchange.merge_results import frames_to_keep, rewrite_result
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_stored
 from visioncal.present.recording import read_calibration, read_evidence, read_session
@@ -48,7 +48,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_all_files_are_as_before_with_the_frames(sample, folder):
     joined = with_frames(sample).calibration
-    files = rewrite(folder, joined).files
+    files = rewrite_result(folder, joined).files
     assert [file.name for file in files] == ["calibration.json", "report.html", "recording.rrd"]
     assert sorted(contents(folder)) == sorted(file.name for file in files)
     expected = to_document(sample.calibration) | {"frames": to_document(joined)["frames"]}
@@ -64,10 +64,10 @@ def test_all_files_are_as_before_with_the_frames(sample, folder):
 
 def test_frames_can_be_taken_out_again(sample, folder):
     # The report names the folder, and this one is a copy.
-    rewrite(folder, sample.calibration)
+    rewrite_result(folder, sample.calibration)
     before = contents(folder)
-    rewrite(folder, with_frames(sample).calibration)
-    rewrite(folder, sample.calibration)
+    rewrite_result(folder, with_frames(sample).calibration)
+    rewrite_result(folder, sample.calibration)
     after = contents(folder)
     # A recording bears an id and the time of its making.
     for name in ("calibration.json", "report.html"):
@@ -80,7 +80,7 @@ def test_the_new_recording_calibrates_to_the_same_numbers(sample, tmp_path):
     first = run(session)
     write_outputs(tmp_path / "out", session, first)
     frames = with_frames(sample).calibration.frames
-    rewrite(tmp_path / "out", replace(first.calibration, frames=frames))
+    rewrite_result(tmp_path / "out", replace(first.calibration, frames=frames))
     again = run(tmp_path / "out" / "recording.rrd").calibration
     assert again.session_sha256 == first.calibration.session_sha256
     for name, edge in first.calibration.edges.items():
@@ -99,14 +99,14 @@ def test_a_write_that_fails_leaves_the_old_files(sample, folder, monkeypatch, pa
     else:
         monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(DataError, match="No space left on device"):
-        rewrite(folder, with_frames(sample).calibration)
+        rewrite_result(folder, with_frames(sample).calibration)
     monkeypatch.undo()
     assert contents(folder) == before
 
 
 def test_a_result_without_its_recording_keeps_the_rest(sample, folder):
     (folder / "recording.rrd").unlink()
-    files = rewrite(folder, with_frames(sample).calibration).files
+    files = rewrite_result(folder, with_frames(sample).calibration).files
     assert [file.name for file in files] == ["calibration.json", "report.html"]
     assert sorted(contents(folder)) == ["calibration.json", "report.html"]
     assert Calibration.load(folder).frames.keys() == with_frames(sample).calibration.frames.keys()
@@ -117,7 +117,7 @@ def test_a_recording_of_another_result_is_left_alone(sample, folder):
     other = replace(sample.calibration, created="2026-11-21T00:00:00+00:00")
     other.save(folder / "calibration.json")
     before = contents(folder)
-    rewrite(folder, replace(other, frames=with_frames(sample).calibration.frames))
+    rewrite_result(folder, replace(other, frames=with_frames(sample).calibration.frames))
     assert contents(folder)["recording.rrd"] == before["recording.rrd"]
     assert "holds another one" in (folder / "report.html").read_text("utf-8")
 
@@ -126,9 +126,9 @@ def test_results_of_another_session_are_refused(sample, folder):
     before = contents(folder)
     other = replace(sample.calibration, session_sha256="0" * 64)
     with pytest.raises(DataError, match="holds the result of another session"):
-        rewrite(folder, other)
+        rewrite_result(folder, other)
     with pytest.raises(DataError, match="does not exist"):
-        rewrite(folder / "absent", sample.calibration)
+        rewrite_result(folder / "absent", sample.calibration)
     assert contents(folder) == before
 
 
@@ -142,7 +142,7 @@ def pairs(tmp_path: Path) -> Path:
 def test_frames_of_a_replaced_result_are_kept_beside_the_new_one(sample, pairs, tmp_path, capsys):
     out = tmp_path / "out"
     calibrate_command([pairs], NeedOptions(), WorkOptions(), out)
-    assert leftover(out) is None
+    assert frames_to_keep(out) is None
     assert not (out / "frames.json").exists()
     # Of what had joined, the fixture was placed by the camera.
     capsys.readouterr()
@@ -179,5 +179,5 @@ def test_frames_that_cannot_be_kept_stop_a_new_result(sample, pairs, tmp_path):
 
 def test_an_unreadable_result_has_nothing_to_lose(tmp_path):
     (tmp_path / "calibration.json").write_text("an earlier result", encoding="utf-8")
-    assert leftover(tmp_path) is None
-    assert leftover(tmp_path / "nowhere") is None
+    assert frames_to_keep(tmp_path) is None
+    assert frames_to_keep(tmp_path / "nowhere") is None

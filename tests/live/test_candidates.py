@@ -13,9 +13,9 @@ from visioncal.core.transforms import compose, exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.live.planning.candidates import candidates
 from visioncal.live.planning.cell import Box, Limits, PlanCell
-from visioncal.live.planning.design import chosen
-from visioncal.live.planning.information import worlds_of
-from visioncal.live.planning.path import ordered
+from visioncal.live.planning.design import choose_stops
+from visioncal.live.planning.information import predict_worlds
+from visioncal.live.planning.path import order_stops
 from visioncal.live.planning.purposes import PURPOSES
 from visioncal.robot import Robot, load_robot
 from visioncal.simulation import CellOptions
@@ -76,7 +76,7 @@ def test_all_stops_and_ways_keep_limits_and_clearances(mount):
     depth = outline @ seen[:, 2, :3].T + seen[:, 2, 3]
     assert depth.min() > 0.3
     assert depth.max() < 0.75
-    route = ordered(cell, None, stops.q)
+    route = order_stops(cell, None, stops.q)
     assert set(route.order) | set(route.unreachable) == set(range(60))
     assert len(route.order) >= 55
     legs = zip(route.order, route.order[1:], route.segments, strict=False)
@@ -102,11 +102,11 @@ def test_a_box_in_the_way_is_gone_around():
         np.array([3.7, -1.3, 1.3, -1.6, -1.57, 0]),
     )
     stops = np.stack([left, right])
-    free = ordered(cell, None, stops)
+    free = order_stops(cell, None, stops)
     assert [len(segment) for segment in free.segments] == [0]
     height = compose(np.eye(3), np.array([0.55, 0.12, 0.25]))
     wall = Box("wall", height, np.array([0.3, 0.04, 0.5]))
-    walled = ordered(replace(cell, boxes=(wall,)), None, stops)
+    walled = order_stops(replace(cell, boxes=(wall,)), None, stops)
     assert len(walled.order) == 2
     assert len(walled.segments[0]) > 0
     assert walled.length_rad > free.length_rad
@@ -132,7 +132,7 @@ def test_a_stop_without_a_safe_way_is_named():
             ]
         )
     ]
-    route = ordered(replace(cell, boxes=tuple(ring)), None, stops)
+    route = order_stops(replace(cell, boxes=tuple(ring)), None, stops)
     assert set(route.order) | set(route.unreachable) == set(range(12))
     assert all("wall" in words for words in route.unreachable.values())
     assert route.unreachable
@@ -142,14 +142,14 @@ def test_a_start_in_contact_is_refused_by_name():
     cell = cell_of(CellOptions(robot="ur5e"))
     down = np.array([0.0, 0.6, 0.2, 0.0, 0.0, 0.0])
     with pytest.raises(DataError, match=r"where the arm starts, .*floor"):
-        ordered(cell, down, candidates(cell, 5).q)
+        order_stops(cell, down, candidates(cell, 5).q)
 
 
 def test_the_way_begins_at_the_start():
     cell = cell_of(CellOptions(robot="ur5e"))
     stops = candidates(cell, 10).q
     start = stops[4] + 1e-3
-    route = ordered(cell, start, stops)
+    route = order_stops(cell, start, stops)
     assert route.order[0] == 4
     assert len(route.segments) == len(route.order)
 
@@ -297,8 +297,8 @@ def test_from_a_bad_guess_nine_of_ten_stops_see_the_whole_board(mount):
         guess = replace(true, x=true.x @ off_x, z=true.z @ off_z, limits=limits, **said)
         stops = candidates(guess, 100, seed=seed)
         seen = whole(true, stops.q, 0.0)
-        worlds = worlds_of([guess], PURPOSES["hand-eye"], stops.q)
-        planned = chosen(worlds, 20).rows
+        worlds = predict_worlds([guess], PURPOSES["hand-eye"], stops.q)
+        planned = choose_stops(worlds, 20).rows
         shares.append((seen.mean(), seen[planned].mean()))
     # The most telling stops are near the edge of what is safe, and must be as sure as the others.
     assert np.mean(shares) > 0.98

@@ -11,15 +11,15 @@ from support.recorded import QUICK, REPEATABILITY_M, errors_m, recorded
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import compose
-from visioncal.live.capture.core import missed
+from visioncal.live.capture.core import missed_stops
 from visioncal.live.capture.drive import JointPace
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
-from visioncal.live.capture.record import CheckedPaths, departure
+from visioncal.live.capture.record import CheckedPaths, motion_summary
 from visioncal.live.capture.still import image_motion_px
 from visioncal.live.planning.cell import Box
-from visioncal.live.planning.read_back import PlanFile
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
 
 
@@ -169,7 +169,7 @@ def test_a_board_that_is_lost_once_is_told_and_three_times_ends(plan, tmp_path):
     # The first move goes to the first stop.
     camera.hidden_at = (2,)
     steps = recorded(tmp_path / "once", plan, arm, camera)
-    lost = dict(missed(steps))
+    lost = dict(missed_stops(steps))
     assert list(lost) == [2]
     assert "uniform" in lost[2]
     assert len(Session.load(tmp_path / "once").views) == len(plan.stops) - 1
@@ -200,7 +200,7 @@ def test_stale_joint_angles_are_no_view(plan, tmp_path):
 
     camera.frame = stale_views
     steps = recorded(tmp_path / "live", plan, arm, camera)
-    lost = dict(missed(steps))
+    lost = dict(missed_stops(steps))
     assert list(lost) == [3]
     assert "joint" in lost[3]
 
@@ -268,7 +268,7 @@ def test_a_plan_for_another_arm_is_not_driven(plan):
     state, offset = moved.state, compose(np.eye(3), np.array([0.3, 0.0, 0.0]))
     moved.state = lambda: replace(said := state(), base_from_flange=offset @ said.base_from_flange)
     with pytest.raises(DataError, match=r"its flange is 300 mm and 0 deg from where the plan's"):
-        departure(LiveCell(moved, camera, arm.clock), plan, (), QUICK)
+        motion_summary(LiveCell(moved, camera, arm.clock), plan, (), QUICK)
 
 
 def test_images_that_move_are_measured_to_a_hundredth_of_a_pixel():

@@ -11,7 +11,7 @@ from support.recorded import recorded
 
 from visioncal.core.errors import DataError, DriverError
 from visioncal.live.capture import journal as journal_module
-from visioncal.live.planning.read_back import PlanFile
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
 
 

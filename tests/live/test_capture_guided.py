@@ -5,7 +5,7 @@ import pytest
 from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 from support.recorded import QUICK, REPEATABILITY_M, errors_m, facts_of
 
-from visioncal.calibration.stages.detect import look_for
+from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.types import Corners
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, CaptureEvent
@@ -14,7 +14,7 @@ from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.take import TakenView
-from visioncal.live.planning.read_back import PlanFile
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
 
 
@@ -37,7 +37,7 @@ def test_the_coach_asks_for_what_is_missing(plan):
     for view, stop in enumerate(plan.stops):
         arm, camera = fake_devices(plan)
         arm.q0 = stop.q
-        found, _ = look_for(camera.frame().image, plan.cell.target, view)
+        found, _ = find_corners(camera.frame().image, plan.cell.target, view)
         coach.add(found)
     assert "right" in coach.advice() or "bottom" in coach.advice()
 

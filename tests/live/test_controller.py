@@ -17,7 +17,7 @@ from visioncal.live.rehearsal.machine import (
     pose_of,
     tool_pose,
 )
-from visioncal.live.rehearsal.motion import Brake, Profile, joint_way
+from visioncal.live.rehearsal.motion import Brake, Profile, joint_path
 from visioncal.live.rehearsal.rtde_wire import HEADER_BYTES, Kind, Recipe, read_header
 from visioncal.live.rehearsal.script import DONE, READY, ControlScript
 from visioncal.live.rehearsal.truth import TruthClient
@@ -50,7 +50,7 @@ def test_a_way_keeps_speed_and_acceleration_and_takes_the_shortest_time(distance
 
 def test_all_joints_arrive_together_and_the_farthest_keeps_the_speed():
     start, goal = np.zeros(6), np.array([0.5, -1.0, 0.0, 0.2, 0.1, 0.3])
-    way = joint_way(start, goal, speed=0.7, acceleration=1.0)
+    way = joint_path(start, goal, speed=0.7, acceleration=1.0)
     q, dq = way.at(0.5 * way.duration_s)
     assert q == pytest.approx(0.5 * goal)
     assert np.abs(dq).max() == pytest.approx(0.7)
@@ -58,7 +58,7 @@ def test_all_joints_arrive_together_and_the_farthest_keeps_the_speed():
 
 
 def test_no_way_at_all_is_over_at_once():
-    way = joint_way(np.ones(6), np.ones(6), speed=1.0, acceleration=1.0)
+    way = joint_path(np.ones(6), np.ones(6), speed=1.0, acceleration=1.0)
     assert way.duration_s == 0.0
     assert way.at(0.0)[0] == pytest.approx(np.ones(6))
 

@@ -187,12 +187,12 @@ class CameraNode(dai.node.ThreadedHostNode):
 
     def requestOutput(self, *asked):  # noqa: N802
         """Tells what was asked for."""
-        self.seen.asked = asked
+        self.seen.level = asked
         return self.out
 
     def run(self):
         """Sends pictures."""
-        (width, height), kind = self.seen.asked[:2]
+        (width, height), kind = self.seen.level[:2]
         shape = (height, width) if kind == dai.ImgFrame.Type.GRAY8 else (height, width, 3)
         while self.isRunning():
             message = dai.ImgFrame()
@@ -261,7 +261,7 @@ def test_a_device_is_held_where_automatic_exposure_and_focus_went(monkeypatch):
     assert frame.image.shape == (1520, 2028, 3)
     assert frame.stamp_s - 0.003 >= asked
     # Never undistorted by the device: the lens is ours to calibrate.
-    assert seen.asked[-1] is False
+    assert seen.level[-1] is False
     camera.close()
     assert device.is_closed
 
@@ -276,7 +276,7 @@ def test_what_is_wished_is_set_from_the_start(monkeypatch):
     held = {"rate_hz": 20.0, "exposure_us": 5000, "gain": 200, "focus": 90}
     assert held.items() <= camera.settings.items()
     assert camera.resolution == (640, 400)
-    assert seen.asked[1] == dai.ImgFrame.Type.GRAY8
+    assert seen.level[1] == dai.ImgFrame.Type.GRAY8
 
 
 def test_it_focuses_where_the_factory_calibrated(monkeypatch):

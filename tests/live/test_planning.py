@@ -11,16 +11,16 @@ from support.planned import next_best, plan_cell, postures_in_view, so_far_of, t
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.estimation.linalg import covariance_from, covariance_root
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fisher_information
 from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Box
-from visioncal.live.planning.design import CRITERIA, chosen, shortfall
-from visioncal.live.planning.information import stop_factors, worlds_of
+from visioncal.live.planning.design import CRITERIA, choose_stops, shortfall
+from visioncal.live.planning.information import predict_worlds, stop_factors
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.purposes import PURPOSES, purpose_of
-from visioncal.live.planning.recorded import RoughEdges, begin
-from visioncal.live.planning.visibility import sight_of
+from visioncal.live.planning.recorded import RoughEdges, start_from_session
+from visioncal.live.planning.visibility import board_views
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, Second, fine_camera, simulate
 from visioncal.vision.targets import corner_positions, extent_m
@@ -32,7 +32,7 @@ CELL = CellOptions(robot="ur5e")
 
 def mm(world, rows):
     """Sigma of the place that the purpose is about, from some candidates [mm]."""
-    return 1e3 * float(np.sqrt(np.trace(world.place @ world.covariance(rows))))
+    return 1e3 * float(np.sqrt(np.trace(world.position @ world.covariance(rows))))
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
     cell = replace(true_cell(options), noise=Noise.of_robot(5e-5, 3e-5), pixel_px=0.05)
     q = simulate(options).robot.joints
     factors = stop_factors(cell, HAND_EYE, q)
-    problem = seen.fitted.part
+    problem = seen.cell_fit.inlier_problem
     # The same corners at the plan's noise; exact ones count as seen to a millionth of a pixel.
     scale = (0.05 / max(seen.pixel_px, 1e-6)) ** 2
     views = replace(problem.observations, covariance=scale * problem.observations.covariance)
@@ -68,7 +68,7 @@ def test_predicted_information_is_that_of_the_recorded_views(mount):
 def test_more_stops_tell_more_of_everything(mount, purpose):
     options = replace(CELL, mount=mount, views=12, cut_views=0.0)
     cell, q = true_cell(options), simulate(options).robot.joints
-    world = worlds_of([cell], purpose, q)[0]
+    world = predict_worlds([cell], purpose, q)[0]
     size = world.factors.shape[2]
     assert size == {"hand-eye": 13, "offsets": 19, "kinematics": 49}[purpose.name]
     stops = world.covariance(range(len(q)))
@@ -86,11 +86,11 @@ def test_a_board_that_is_not_seen_tells_nothing(views):
 
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_each_criterion_beats_chance_in_its_own_measure(views, criterion):
-    worlds = worlds_of([true_cell(CELL)], HAND_EYE, views)
-    best = chosen(worlds, 8, criterion=criterion)
+    worlds = predict_worlds([true_cell(CELL)], HAND_EYE, views)
+    best = choose_stops(worlds, 8, criterion=criterion)
     rng = np.random.default_rng(0)
     random = [
-        chosen(
+        choose_stops(
             [replace(world, factors=world.factors[rows]) for world in worlds],
             8,
             criterion=criterion,
@@ -107,16 +107,16 @@ def test_each_criterion_beats_chance_in_its_own_measure(views, criterion):
 def test_the_choice_is_nearly_the_best_of_all(criterion):
     """All 495 choices of 4 among 12, by inverting each one's information."""
     few = postures_in_view(CELL, 12)
-    world = worlds_of([true_cell(CELL)], HAND_EYE, few)[0]
+    world = predict_worlds([true_cell(CELL)], HAND_EYE, few)[0]
 
     def value(rows):
         covariance = world.covariance(list(rows))
         if criterion == "I":
-            return float(np.trace(world.counted @ covariance))
+            return float(np.trace(world.objective @ covariance))
         return float(np.linalg.slogdet(covariance)[1])
 
     values = sorted(value(combination) for combination in combinations(range(12), 4))
-    found = value(chosen([world], 4, criterion=criterion).rows)
+    found = value(choose_stops([world], 4, criterion=criterion).rows)
     # Exchange ends in a local optimum: among the best one per cent.
     assert found <= values[4] + 1e-9 * abs(values[4])
 
@@ -125,12 +125,12 @@ def test_the_values_are_those_of_a_plain_inversion(views):
     """Rank-six updates, left-out directions and worlds change no figure."""
     cell = plan_cell(CELL, 0.03, 0.01)
     for purpose in (HAND_EYE, KINEMATICS):
-        worlds = worlds_of((cell, *cell.guesses(2, 0)), purpose, views)
-        design = chosen(worlds, 9)
-        plain = [np.trace(world.place @ world.covariance(design.rows)) for world in worlds]
+        worlds = predict_worlds((cell, *cell.guesses(2, 0)), purpose, views)
+        design = choose_stops(worlds, 9)
+        plain = [np.trace(world.position @ world.covariance(design.rows)) for world in worlds]
         assert design.predicted.mm == pytest.approx(1e3 * np.sqrt(np.mean(plain)), rel=1e-6)
         everything = [
-            np.trace(world.place @ world.covariance(range(len(views)))) for world in worlds
+            np.trace(world.position @ world.covariance(range(len(views)))) for world in worlds
         ]
         assert design.best.mm == pytest.approx(1e3 * np.sqrt(np.mean(everything)), rel=1e-6)
         history = [accuracy.mm for accuracy in design.history]
@@ -139,14 +139,14 @@ def test_the_values_are_those_of_a_plain_inversion(views):
 
 
 def test_what_is_known_beforehand_may_be_singular_to_rounding(views):
-    (world,) = worlds_of([true_cell(CELL)], HAND_EYE, views[:20])
+    (world,) = predict_worlds([true_cell(CELL)], HAND_EYE, views[:20])
     size, sharp = len(world.prior), np.zeros(len(world.prior))
     sharp[[11, 12]] = 1e-3, 1.0
     # Two unknowns of which next to nothing but their difference is known, as of a rational lens.
     stiff = replace(world, prior=world.prior + 1e24 * np.outer(sharp, sharp))
     assert np.linalg.eigvalsh(stiff.prior)[0] < 1e-16 * np.linalg.eigvalsh(stiff.prior)[-1]
     for criterion in CRITERIA:
-        assert len(chosen([stiff], 3, criterion=criterion).rows) == 3
+        assert len(choose_stops([stiff], 3, criterion=criterion).rows) == 3
     # What is known beforehand is the identity in the new coordinates: as much of it as rounding
     # leaves, which is some 1e-8 of the largest here.
     root = covariance_root(world.prior)
@@ -159,22 +159,22 @@ def test_no_information_at_all_is_a_large_variance_and_no_nan():
 
 
 def test_it_stops_when_the_wish_is_predicted(views):
-    worlds = worlds_of([true_cell(CELL)], HAND_EYE, views)
+    worlds = predict_worlds([true_cell(CELL)], HAND_EYE, views)
     wish = Wish(mm=0.08)
-    design = chosen(worlds, 40, wish=wish)
+    design = choose_stops(worlds, 40, wish=wish)
     assert design.met
     assert design.predicted.mm <= 0.08
     assert len(design.rows) < 40
-    fewer = chosen(worlds, len(design.rows) - 1, wish=wish)
+    fewer = choose_stops(worlds, len(design.rows) - 1, wish=wish)
     assert not fewer.met
     assert "more than" in shortfall(fewer, wish, len(design.rows) - 1)
     assert shortfall(design, wish, 40) == ""
 
 
 def test_a_wish_that_no_candidates_give_is_refused_with_what_they_give(views):
-    worlds = worlds_of([true_cell(CELL)], HAND_EYE, views)
+    worlds = predict_worlds([true_cell(CELL)], HAND_EYE, views)
     wish = Wish(mm=1e-4, deg=0.1)
-    design = chosen(worlds, 10, wish=wish)
+    design = choose_stops(worlds, 10, wish=wish)
     assert design.met is False
     words = shortfall(design, wish, 10)
     assert "cannot be reached" in words
@@ -183,11 +183,11 @@ def test_a_wish_that_no_candidates_give_is_refused_with_what_they_give(views):
 
 def test_a_board_of_unknown_size_is_named_as_what_is_in_the_way():
     options = CELL
-    worlds = worlds_of([true_cell(options)], KINEMATICS, postures_in_view(options, 60))
+    worlds = predict_worlds([true_cell(options)], KINEMATICS, postures_in_view(options, 60))
     # A size that is open by 0.1 % leaves half a millimetre of an arm's place at a metre.
     wish = Wish(mm=0.4)
-    design = chosen(worlds, 30, wish=wish)
-    assert design.best.mm > 0.4 > design.best_look.mm
+    design = choose_stops(worlds, 30, wish=wish)
+    assert design.best.mm > 0.4 > design.best_known_lens_board.mm
     assert "square_sigma_m" in shortfall(design, wish, 30)
 
 
@@ -198,8 +198,8 @@ def test_thirty_planned_stops_are_expected_better_than_random_ones(mount):
     options = replace(CELL, mount=mount, target=sure)
     q = postures_in_view(options, 250)
     cell = plan_cell(options, 0.03, 0.01)
-    rows = chosen(worlds_of((cell, *cell.guesses(2, 0)), KINEMATICS, q), 30).rows
-    truth = worlds_of([true_cell(options)], KINEMATICS, q)[0]
+    rows = choose_stops(predict_worlds((cell, *cell.guesses(2, 0)), KINEMATICS, q), 30).rows
+    truth = predict_worlds([true_cell(options)], KINEMATICS, q)[0]
     rng = np.random.default_rng(0)
     random = [mm(truth, rng.choice(len(q), 30, replace=False)) for _ in range(20)]
     # Of 1500 candidates they are 1.5 times better; of 250 less.
@@ -211,14 +211,14 @@ def test_a_declared_workspace_counts(views):
     cell = true_cell(CELL)
     placed = exp(np.array([0, 0, 0, 0.4, 0.0, 0.5]))
     near = Box("bin", placed, np.array([0.5, 0.5, 0.5]))
-    whole = worlds_of([cell], KINEMATICS, views)[0]
-    inside = worlds_of([cell], KINEMATICS, views, workspace=near)[0]
+    whole = predict_worlds([cell], KINEMATICS, views)[0]
+    inside = predict_worlds([cell], KINEMATICS, views, workspace=near)[0]
     rows = range(20)
     # Near the board the arm is told better than all over its reach.
     assert mm(inside, rows) < 0.9 * mm(whole, rows)
     far = Box("bin", exp(np.array([0, 0, 0, 9.0, 0, 0])), np.ones(3))
     with pytest.raises(DataError, match="none of"):
-        worlds_of([cell], KINEMATICS, views, workspace=far)
+        predict_worlds([cell], KINEMATICS, views, workspace=far)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -227,7 +227,7 @@ def test_five_planned_stops_make_a_session_about_one_axis_solvable(mount):
     cell = simulate(options)
     found = so_far_of(cell)
     assert "not determined" in found.refusal
-    begun = begin(found)
+    begun = start_from_session(found)
     free = replace(options, motion="free")
     q = postures_in_view(free, 150)
     added = next_best(begun, HAND_EYE, q, 5)
@@ -240,7 +240,7 @@ def test_five_planned_stops_make_a_session_about_one_axis_solvable(mount):
     known = calibrated(
         simulate(free, np.concatenate([cell.robot.joints, q[rows]])), level="hand-eye"
     )
-    covariance = known.solved.covariance
+    covariance = known.assessment.covariance
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
     # The noise of 13 stops is told to a fifth, and that of 8 beforehand to a fourth; what a lens
     # does beyond its model, and doubt about it, count in a result, and are not foreseen.
@@ -253,10 +253,10 @@ def test_open_edges_are_those_nearest_to_what_is_known(mount):
     cell = simulate(options)
     x, z = cell.transforms.values()
     found = so_far_of(cell)
-    begun = begin(found)
+    begun = start_from_session(found)
     # Mounted within decimetres of the flange, along the axis that is open.
     assert np.linalg.norm(begun.cell.x[:3, 3] - x[:3, 3]) < 0.1
-    guessed = begin(found, guess=RoughEdges(x, z, 0.02, 0.005))
+    guessed = start_from_session(found, guess=RoughEdges(x, z, 0.02, 0.005))
     # The guess was the truth: what is left is the noise of the views.
     assert np.linalg.norm(guessed.cell.x[:3, 3] - x[:3, 3]) < 1e-3
     # What is open moves both edges together: drawn cells see the recorded views alike.
@@ -271,22 +271,22 @@ def test_open_edges_are_those_nearest_to_what_is_known(mount):
 def test_stops_are_added_as_far_from_the_board_as_it_has_been_seen():
     options = CellOptions(robot="ur5e", mount="eye-to-hand", views=10, seed=1)
     cell = simulate(options)
-    found = begin(so_far_of(cell)).cell
+    found = start_from_session(so_far_of(cell)).cell
     low, high = extent_m(found.target)
     seen, centre = cell.cam_from_target, np.append(0.5 * (low + high), 0.0)
     away = np.linalg.norm(seen[:, :3, :3] @ centre + seen[:, :3, 3], axis=1)
     # The fit places camera and board to a tenth of a millimetre.
-    assert found.shown_m == pytest.approx((away.min(), away.max()), abs=1e-3)
+    assert found.observed_distances_m == pytest.approx((away.min(), away.max()), abs=1e-3)
     # Farther off than where the board fills the image, as a camera at the cell's edge looks.
-    near, far = sight_of(replace(found, shown_m=None), 0).distance_m
-    wider = sight_of(replace(found, shown_m=(3.0 * near, 3.0 * far)), 0).distance_m
+    near, far = board_views(replace(found, observed_distances_m=None), 0).distance_m
+    wider = board_views(replace(found, observed_distances_m=(3.0 * near, 3.0 * far)), 0).distance_m
     assert wider[0] == near
     assert wider[1] > 3.0 * far
 
 
 def test_a_session_that_is_good_already_needs_no_stop():
     cell = simulate(replace(CELL, views=15, seed=4))
-    begun = begin(so_far_of(cell))
+    begun = start_from_session(so_far_of(cell))
     assert begun.refusal == ""
     q = postures_in_view(replace(CELL, seed=4), 40)
     easy = next_best(begun, HAND_EYE, q, 5, wish=Wish(mm=1.0))
@@ -297,15 +297,17 @@ def test_a_session_that_is_good_already_needs_no_stop():
 
 def test_the_few_stops_that_a_recorded_cell_allows_are_added():
     """As before a fixed camera: of a guessed cell so few say that it is guessed wrong."""
-    begun = begin(so_far_of(simulate(CellOptions(mount="eye-to-hand", seed=4))))
+    begun = start_from_session(so_far_of(simulate(CellOptions(mount="eye-to-hand", seed=4))))
     cell = replace(begun.cell, limits=replace(begun.cell.limits, edge_px=330.0))
     request = PlanRequest(HAND_EYE, count=5)
     plan = make_plan(cell, request, begun=replace(begun, cell=cell))
     assert len(plan.stops) == 5
     # A tenth of the wish is what a guessed cell has to have.
-    assert 5 < plan.found < 0.1 * request.candidates
+    assert 5 < plan.candidate_count < 0.1 * request.candidates
     assert plan.design.predicted.mm < plan.design.before.mm
-    with pytest.raises(DataError, match=f"{plan.found} of {request.candidates} possible stops"):
+    with pytest.raises(
+        DataError, match=f"{plan.candidate_count} of {request.candidates} possible stops"
+    ):
         make_plan(cell, request)
 
 
@@ -321,11 +323,13 @@ def test_the_few_stops_that_a_recorded_cell_allows_are_added():
 def test_before_any_stop_the_prediction_is_the_sigma_of_the_session(options):
     cell = simulate(options)
     found = so_far_of(cell)
-    begun = begin(found)
-    world = worlds_of([begun.cell], HAND_EYE, cell.robot.joints[:3], recorded=begun.recorded)[0]
-    solved = found.known.solved
+    begun = start_from_session(found)
+    world = predict_worlds([begun.cell], HAND_EYE, cell.robot.joints[:3], recorded=begun.recorded)[
+        0
+    ]
+    solved = found.known.assessment
     # How well levels of noise are known is told of data alone.
-    covariance = solved.covariance - solved.beside["noise_level"]
+    covariance = solved.covariance - solved.covariance_by_source["noise_level"]
     sigmas = np.sqrt(np.diag(covariance)[:6])
     # The plan's weak prior of 0.2 m and rad is all that differs.
     assert np.sqrt(np.diag(world.covariance([]))[:6]) == pytest.approx(sigmas, rel=1e-4)
@@ -350,14 +354,14 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
     errors = known.robot_arm.errors
     assert errors.is_significant
     assert errors.is_estimated == (case == "estimated")
-    begun, q = begin(found), postures_in_view(CELL, 40)
+    begun, q = start_from_session(found), postures_in_view(CELL, 40)
     design = next_best(begun, HAND_EYE, q, 3).design
     # How well the sizes of the arm's errors and of the noise are known cannot be told beforehand.
     beside = ("size of arm errors", "noise_level")
-    untold = sum((known.solved.beside.get(name, 0.0) for name in beside), 0.0)
-    covariance = known.solved.covariance - untold
+    untold = sum((known.assessment.covariance_by_source.get(name, 0.0) for name in beside), 0.0)
+    covariance = known.assessment.covariance - untold
     obtained = 1e3 * np.sqrt(np.trace(covariance[3:6, 3:6]))
-    world = worlds_of([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
+    world = predict_worlds([begun.cell], HAND_EYE, q, recorded=begun.recorded)[0]
     # A result holds the board's size; in the plan it is open, and takes up errors of the arm. What
     # a lens does beyond its model is in the result alone.
     # Where errors make up for noise in some direction, the plan does not take them off.
@@ -371,7 +375,7 @@ def test_errors_of_the_arm_count_in_the_prediction_as_in_the_result(case):
 
 def test_stops_for_the_arm_say_what_of_it_they_tell():
     options = replace(CELL, views=12, seed=5, dh_sigma_m=5e-4, dh_sigma_rad=1e-3)
-    begun = begin(so_far_of(simulate(options)))
+    begun = start_from_session(so_far_of(simulate(options)))
     q = postures_in_view(options, 60)
     added = next_best(begun, KINEMATICS, q, 3, worlds=2)
     assert all("over the workspace" in name for name in added.helps)
@@ -386,18 +390,18 @@ def test_two_stops_need_a_guess():
     cell = simulate(replace(CELL, views=2))
     found = so_far_of(cell)
     with pytest.raises(DataError, match="not even roughly"):
-        begin(found)
+        start_from_session(found)
     x, z = cell.transforms.values()
-    begun = begin(found, guess=RoughEdges(x, z, 0.1, 0.03))
+    begun = start_from_session(found, guess=RoughEdges(x, z, 0.1, 0.03))
     assert len(begun.recorded.problem) == 2
 
 
 def test_what_cannot_be_is_refused(views):
-    worlds = worlds_of([true_cell(CELL)], HAND_EYE, views[:4])
+    worlds = predict_worlds([true_cell(CELL)], HAND_EYE, views[:4])
     with pytest.raises(DataError, match="5 stops cannot be chosen from 4"):
-        chosen(worlds, 5)
+        choose_stops(worlds, 5)
     with pytest.raises(DataError, match="criterion 'X'"):
-        chosen(worlds, 2, criterion="X")
+        choose_stops(worlds, 2, criterion="X")
     with pytest.raises(DataError, match="wished accuracy"):
         Wish(mm=-1.0)
     with pytest.raises(DataError, match="Did you mean kinematics"):

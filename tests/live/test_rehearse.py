@@ -16,10 +16,10 @@ from visioncal.live.capture.core import CaptureEvent, Times
 from visioncal.live.capture.drive import JointPace
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import Missed
+from visioncal.live.planning.plan_file import PlanFile, Stop
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.planning.read_back import PlanFile, Stop
 from visioncal.live.rehearsal.cell import GUESS_M, GUESS_RAD, RehearsalOptions, rehearsed_cell
-from visioncal.live.rehearsal.witness import explained, pace_of
+from visioncal.live.rehearsal.witness import check_edges, pace_of
 from visioncal.results.compare import edge_errors
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
@@ -99,13 +99,13 @@ def test_the_cell_is_guessed_as_roughly_as_is_said(mount):
 def test_errors_are_weighed_by_what_the_calibration_says():
     cell = simulate(CellOptions(views=12, seed=4))
     found = result_of(calibrated(cell))
-    fair = explained(found, cell.transforms)
+    fair = check_edges(found, cell.transforms)
     assert fair.passed
     assert fair.freedom == 12
     aside = exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2e-3]))
     true_x = cell.transforms["flange_from_cam"]
     away = {**cell.transforms, "flange_from_cam": true_x @ aside}
-    assert not explained(found, away).passed
+    assert not check_edges(found, away).passed
     # 2 mm more along an axis are at least 2 mm less what was wrong before.
     before = edge_errors(found, cell.transforms)["flange_from_cam"].mm
     assert edge_errors(found, away)["flange_from_cam"].mm > 2.0 - before
@@ -118,7 +118,7 @@ def test_what_a_recording_adds_is_told_from_motion_driving_and_settling():
     stops = (Stop(1, q[0], np.zeros((0, 6))), Stop(2, q[2], np.array([q[1]])))
     plan = PlanFile(known, purpose_of("hand-eye"), stops, None, "0" * 64)
     taking = CaptureOptions(speed=1.0, acceleration=1.0)
-    ways = [0.0, JointPace(1.0, 1.0).way_s(q[:3])]
+    ways = [0.0, JointPace(1.0, 1.0).path_duration_s(q[:3])]
     times = [Times(ways[0] + 0.1, 0.5, 0.2), Times(ways[1] + 0.3, 0.7, 0.4)]
     steps = [CaptureEvent(1, 1, 2, Missed("none"), "", None, "", time) for time in times]
     pace = pace_of(steps, plan, q[0], taking)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from visioncal.core.types import Camera
-from visioncal.live.planning.visibility import Window
+from visioncal.live.planning.visibility import FieldOfView
 from visioncal.vision.camera import project
 
 SIZE = (1280, 800)
@@ -28,14 +28,14 @@ def test_points_are_inside_where_they_project_inside(model, distortion, edge_px)
     px = project(camera, points)
     high = np.array(SIZE) - 1.0 - edge_px
     inside = ((px >= edge_px) & (px <= high)).all(axis=1)
-    holds = Window(camera, edge_px).holds(points[:, None])
+    holds = FieldOfView(camera, edge_px).holds(points[:, None])
     # A ray beyond the fold of a lens model comes back into the image; the window leaves it out.
     np.testing.assert_array_equal(holds, inside & _before_the_fold(camera, points))
     assert 0.1 < holds.mean() < 0.9
 
 
 def test_all_points_of_a_group_must_be_inside():
-    window = Window(Camera("brown", SIZE, MATRIX, np.zeros(5)), 0.0)
+    window = FieldOfView(Camera("brown", SIZE, MATRIX, np.zeros(5)), 0.0)
     ahead, aside = np.array([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 1.0])
     groups = np.array([[ahead, ahead], [ahead, aside]])
     assert window.holds(groups).tolist() == [True, False]

@@ -14,8 +14,8 @@ from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import notes, paths, read_calibration, write_recording
+from visioncal.present.recording.accuracy import ArmPicture
 from visioncal.present.recording.markdown import plain
-from visioncal.present.recording.workspace import ArmPicture
 from visioncal.present.report.page import render
 from visioncal.present.viewer import blueprint
 from visioncal.results import Calibration, to_document

@@ -15,8 +15,8 @@ from visioncal.interchange.exports import Selection, export
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_exportable
 from visioncal.present.recording import paths, read_calibration, read_evidence, read_session
-from visioncal.present.recording.frames import scan
 from visioncal.present.recording.reader import chunks
+from visioncal.present.recording.rrd_messages import scan
 from visioncal.present.recording.scene import SceneDrawing
 from visioncal.results import Calibration, Edge, ViewResult, to_document
 from visioncal.session import MemoryImages, Session

@@ -7,11 +7,11 @@ import numpy as np
 from support.aligned_cells import made_up_cell, with_cell
 
 from visioncal.core.number_format import significant
-from visioncal.present.cellmap import pairs, weakest_frame
+from visioncal.present.network_layout import pairs, weakest_frame
 from visioncal.present.report import write_report
 from visioncal.present.report.network import known_in_each_other
 from visioncal.present.report.page import render
-from visioncal.results import Calibration, Moved, RobotResult, Untied, ViewResult
+from visioncal.results import Calibration, Moved, RobotResult, UnconnectedFrame, ViewResult
 from visioncal.results.arm import ArmLevel, ArmResult
 
 CELL = made_up_cell(5)
@@ -83,7 +83,7 @@ def test_what_moved_and_what_is_untied_is_told(tmp_path):
         replace(CELL, edges=edges, joint_covariance=np.pad(CELL.joint_covariance, (0, 6))),
         tree=tree,
         moved=(Moved("cam_top", "cam_top_until_stop_4", 4, 5, 0.58, 0.03, ("target_plate",)),),
-        untied=(Untied("cam_<far>", "Let it see target_plate."),),
+        untied=(UnconnectedFrame("cam_<far>", "Let it see target_plate."),),
     )
     write_report(tmp_path / "report.html", found, None, ())
     html = (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -13,14 +13,14 @@ from support.whole_cells import OPTIONS, recorded
 
 import visioncal as package
 from visioncal.interchange.result_files import load_stored
-from visioncal.present.report.certificate import Signed, write_certificate
+from visioncal.present.report.certificate import CertificateEntries, write_certificate
 from visioncal.simulation import simulate
 
 
 def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
     sample = made_up()
     page = tmp_path / "certificate.html"
-    signed = Signed("A. Smith <1>", {"camera": "18443010"})
+    signed = CertificateEntries("A. Smith <1>", {"camera": "18443010"})
     write_certificate(page, sample.calibration, sample.session, signed)
     words = Page(page.read_text("utf-8")).words
     for name in (
@@ -37,14 +37,14 @@ def test_a_certificate_says_whose_it_is_and_has_room_to_sign(tmp_path):
         assert name in words
     # It is one page, however many views there are: they are counted, not listed.
     many = replace(sample.calibration, views=sample.calibration.views * 50)
-    write_certificate(page, many, None, Signed())
+    write_certificate(page, many, None, CertificateEntries())
     assert abs(len(Page(page.read_text("utf-8")).words) - len(words)) < 200
 
 
 def test_the_certificate_of_a_whole_cell_names_all_that_is_in_it(tmp_path):
     session = recorded(simulate(replace(OPTIONS, stops=10)))
     page = tmp_path / "certificate.html"
-    write_certificate(page, package.calibrate(session), session, Signed())
+    write_certificate(page, package.calibrate(session), session, CertificateEntries())
     words = Page(page.read_text("utf-8")).words
     assert "Robots a (ur5e); b (ur5e) Cameras left; hand Boards " in words
     assert "Mount" not in words
@@ -54,7 +54,9 @@ def test_the_certificate_of_a_whole_cell_names_all_that_is_in_it(tmp_path):
 def test_it_prints_on_one_page(tmp_path):
     sample = made_up()
     page = tmp_path / "certificate.html"
-    write_certificate(page, sample.calibration, sample.session, Signed("A. Smith", {"camera": "1"}))
+    write_certificate(
+        page, sample.calibration, sample.session, CertificateEntries("A. Smith", {"camera": "1"})
+    )
     with browser.chromium(tmp_path / "profile") as chromium:
         chromium.visit(page.as_uri())
         (printed,) = pypdfium2.PdfDocument(chromium.printed())

@@ -32,7 +32,7 @@ from visioncal.present.recording import (
     read_evidence,
     write_recording,
 )
-from visioncal.present.recording.workspace import SIGMAS_95
+from visioncal.present.recording.accuracy import SIGMAS_95
 from visioncal.present.report.content import edge_facts
 from visioncal.present.report.page import render
 from visioncal.present.report.plots import frame_plot

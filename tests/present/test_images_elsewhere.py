@@ -7,7 +7,7 @@ from support.commands import visioncal
 
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError
-from visioncal.interchange.merge_results import rewrite
+from visioncal.interchange.merge_results import rewrite_result
 from visioncal.interchange.outputs import RECORDING, write_outputs
 from visioncal.present.recording import read_calibration, read_evidence, read_session
 from visioncal.results import Calibration
@@ -52,7 +52,7 @@ def test_the_session_stays_what_it_is_without_its_images(cell, tmp_path, kept):
     else:
         assert shown is None
     # Written anew, what there is stays what it is.
-    rewrite(tmp_path / "out", Calibration.load(tmp_path / "out"))
+    rewrite_result(tmp_path / "out", Calibration.load(tmp_path / "out"))
     again = read_session(path)
     assert (again.digest(), again.images.shown(name)) == (session.digest(), shown)
     assert read_calibration(path).session_sha256 == session.digest()

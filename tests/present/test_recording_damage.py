@@ -15,8 +15,8 @@ from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
 from visioncal.present.recording import RecordingWriter, paths, read_calibration, read_session
-from visioncal.present.recording.frames import MessageFrame, scan
 from visioncal.present.recording.reader import chunks
+from visioncal.present.recording.rrd_messages import MessageFrame, scan
 from visioncal.present.viewer import blueprint
 from visioncal.session import MemoryImages, Session
 

@@ -8,7 +8,7 @@ from support.pages import Page
 from support.samples import made_up
 
 from visioncal.core.number_format import significant
-from visioncal.present import facts, parts
+from visioncal.present import facts, result_parts
 from visioncal.present.recording.markdown import table_lines
 from visioncal.present.recording.notes import figures_markdown, verdict_markdown
 from visioncal.present.report.page import render
@@ -60,11 +60,11 @@ def test_page_and_recording_have_the_same_figures():
 
 def test_one_camera_has_one_of_each_without_a_name():
     calibration = made_up().calibration
-    assert parts.cameras(calibration) == {"": calibration.camera}
+    assert result_parts.cameras(calibration) == {"": calibration.camera}
     (robot,) = calibration.by_name.robots.values()
     assert (robot.model, robot.arm) == (calibration.robot, calibration.arm)
     assert [view.view for view in calibration.views] == [view.view for view in calibration.views]
-    frames = parts.frames(calibration)
+    frames = result_parts.frames(calibration)
     assert frames.parents == {
         "base": "cell", "flange": "base", "cam": "flange", "target": "base"
     }  # fmt: skip
@@ -81,7 +81,7 @@ def test_frames_of_a_cell_hang_as_they_did_last():
         tree={**CELL.cell.tree, former: "cell"},
         moved=(Moved("cam_top", former, 4, 5, 0.58, 0.03),),
     )
-    frames = parts.frames(moved)
+    frames = result_parts.frames(moved)
     assert frames.parents == CELL.cell.tree
     assert frames.matrices.keys() == CELL.cell.tree.keys() - CELL.cell.flanges.keys()
     # The frame of the cell is that of its reference.

@@ -20,7 +20,7 @@ from support.samples import Sample, made_up, with_frames
 from visioncal.core.transforms import exp, invert
 from visioncal.present import coverage
 from visioncal.present.recording import arm, board, paths, write_recording
-from visioncal.present.recording.workspace import SIGMAS_95, Uncertainty
+from visioncal.present.recording.accuracy import SIGMAS_95, Uncertainty
 from visioncal.present.viewer import blueprint
 from visioncal.present.viewer.process import viewer_process
 from visioncal.results import Edge

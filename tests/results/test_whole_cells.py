@@ -343,7 +343,7 @@ def test_a_part_holds_by_its_own_session_of_which_rows_were_left_out():
     assert {view.view for view in found.views if not view.used} == set(cell.wrong_views)
     check = verify(session, found, camera="left", robot="b", target="plate_b")
     assert check.passed
-    assert set(check.seen.known.reasons) < set(cell.wrong_views)
+    assert set(check.predicted.observed.reasons) < set(cell.wrong_views)
 
 
 def test_a_calibrated_arm_of_a_cell_is_checked_as_it_was_calibrated():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from visioncal.robot import load_robot, robot_names
-from visioncal.robot.atlas import Atlas
 from visioncal.robot.batch import chain_frames
+from visioncal.robot.capability_map import CapabilityMap
 from visioncal.robot.inverse import Inverse
 
 ARMS = [name for name in robot_names() if load_robot(name).joint_count >= 6]
@@ -25,7 +25,7 @@ def test_frames_are_those_of_pinocchio(name):
 def test_an_atlas_knows_what_is_in_reach_and_leads_there(name):
     robot, rng = load_robot(name), np.random.default_rng(2)
     inverse = Inverse(robot)
-    atlas = Atlas(robot, inverse, rng)
+    atlas = CapabilityMap(robot, inverse, rng)
     q = robot.chain.encoded(inverse.starts(300, rng))
     poses = robot.base_from_flange(q)
     within, starts = atlas.starts(poses, rng)
@@ -50,7 +50,7 @@ def test_an_atlas_leads_to_all_branches():
     (pose,) = robot.base_from_flange(np.array([[0.4, -1.3, 1.5, -1.75, -1.2, 0.3]]))
     poses = np.repeat(pose[None], 400, axis=0)
     positions, reached = inverse.from_starts(
-        poses, Atlas(robot, inverse, rng).starts(poses, rng)[1]
+        poses, CapabilityMap(robot, inverse, rng).starts(poses, rng)[1]
     )
     branches = {tuple(np.sign(np.sin(position[[2, 4]]))) for position in positions[reached]}
     # Six neighbours of one pose lie on several branches.

@@ -57,7 +57,7 @@ def test_a_clear_way_is_clear_between_all_samples():
     joints = (starts + shares * (ends - starts)).reshape(-1, 6)
     apart = clearances(ur_arm("ur5e"), joints, 0.0, [(POST, POST_SIZE)]).reshape(150, -1)
     least = apart.min(axis=0)
-    clear = np.array([cell.on_the_way(*pair) < 0 for pair in zip(starts, ends, strict=True)])
+    clear = np.array([cell.path_contact(*pair) < 0 for pair in zip(starts, ends, strict=True)])
     assert 3 < clear.sum() < 23
     assert least[clear].min() > CLEARANCE
     # At worst a way is given up that keeps the clearance by less than half the slack.
@@ -72,8 +72,8 @@ def test_a_thin_wall_between_two_postures_is_not_jumped_over():
     free = Collisions(robot, arm_bodies(robot), 0.0, 0.0)
     walled = Collisions(robot, [*arm_bodies(robot), wall], 0.0, 0.0)
     assert np.all(walled.first_contact(np.array([start, end])) < 0)
-    assert free.on_the_way(start, end) == -1
-    assert "wall" in walled.names[walled.on_the_way(start, end)]
+    assert free.path_contact(start, end) == -1
+    assert "wall" in walled.names[walled.path_contact(start, end)]
 
 
 def test_what_is_left_out_is_named_with_its_reason():
@@ -100,7 +100,7 @@ def test_what_is_guessed_is_kept_farther_away_but_from_the_arm_that_carries_it()
     robot = load_robot("ur5e")
     flange = robot.chain.placements[-1][:3, 3]
     plug = capsule("plug", 6, flange, flange + np.array([0, 0, 0.1]), 0.01, unsure_m=0.05)
-    post = Body("post", 0, "box", POST_SIZE, POST, unsure_m=0.04)
+    post = Body("post", 0, "box", POST_SIZE, POST, uncertainty_m=0.04)
     cell = Collisions(robot, [*arm_bodies(robot), plug, post], CLEARANCE, 0.0)
     needed = dict(zip(map(frozenset, cell.names), cell.needed_m(), strict=True))
     assert needed[frozenset({"plug", "post"})] == pytest.approx(CLEARANCE + np.hypot(0.04, 0.05))

@@ -8,8 +8,8 @@ from support.urdf_arm import of_urdf, some_changes, some_joints
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
-from visioncal.interchange.exports.arm import omission_mm
-from visioncal.robot import Robot, load_robot, unwritten
+from visioncal.interchange.exports.arm import joint_function_error_mm
+from visioncal.robot import Robot, load_robot, unexportable_functions
 
 
 def some_harmonics(robot: Robot, orders: int = 5) -> np.ndarray:
@@ -86,8 +86,8 @@ def test_what_is_no_pairs_of_numbers_is_refused(wavy: Robot, bad: object) -> Non
 
 
 def test_files_that_cannot_hold_them_say_what_that_costs(wavy: Robot) -> None:
-    (first, *_) = unwritten(wavy)
+    (first, *_) = unexportable_functions(wavy)
     assert "harmonics from order 2 on" in first
     robot = load_robot("ur5e")
-    assert omission_mm(robot.corrected(harmonics=some_harmonics(robot))) > 1.0
-    assert omission_mm(robot) == 0.0
+    assert joint_function_error_mm(robot.corrected(harmonics=some_harmonics(robot))) > 1.0
+    assert joint_function_error_mm(robot) == 0.0

@@ -21,7 +21,7 @@ from visioncal.robot import (
     table_from_document,
     table_of,
     table_toml,
-    unwritten,
+    unexportable_functions,
     ur_kinematics_yaml,
 )
 
@@ -173,8 +173,10 @@ def test_a_given_urdf_changes_in_its_origins_alone(tip: str) -> None:
 def test_what_a_urdf_cannot_hold_is_said() -> None:
     robot = of_urdf()
     corrected = other(robot)
-    assert [name.partition(":")[0] for name in unwritten(corrected)] == list(robot.joint_names)
-    assert unwritten(robot) == ()
+    assert [name.partition(":")[0] for name in unexportable_functions(corrected)] == list(
+        robot.joint_names
+    )
+    assert unexportable_functions(robot) == ()
     for text in (corrected_urdf(robot, corrected), small_urdf(corrected)):
         assert "Not in this file" in text
         assert "turn: ratio " in text

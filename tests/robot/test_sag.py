@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from visioncal.core.errors import DataError
-from visioncal.robot import Loads, Robot, bent_joints, load_robot, placed_at, table_of
+from visioncal.robot import Loads, Robot, deflected_joints, load_robot, table_of, with_base
 from visioncal.robot.tables import table_document
 from visioncal.simulation import CellOptions, Payload, arm_named, forward, simulate
-from visioncal.simulation.sag import giving_of, sagging
+from visioncal.simulation.elasticity import elasticity_of, loaded_joints
 
 LOAD = Payload(5.0, (0.03, -0.02, 0.11), (12.0, -30.0, 4.0))
 COMPLIANCE = (5e-5, 1e-4, 8e-5, 1.5e-4, 1.2e-4, 2e-4)
@@ -28,9 +28,9 @@ def test_the_arm_gives_way_as_it_does_in_the_simulation(name):
     q, robot, arm = postures(), load_robot(name), arm_named(name)
     # An industrial arm is fifty times as stiff.
     compliance = np.array(COMPLIANCE) * (0.02 if name.startswith("generic") else 1.0)
-    giving = giving_of(arm, tuple(compliance), 1.0, ())
-    sagged = sagging(arm, giving, q, [LOAD] * len(q))
-    ours = bent_joints(robot, q, compliance, loads_of(LOAD, len(q)))
+    giving = elasticity_of(arm, tuple(compliance), 1.0, ())
+    sagged = loaded_joints(arm, giving, q, [LOAD] * len(q))
+    ours = deflected_joints(robot, q, compliance, loads_of(LOAD, len(q)))
     # Three looks at the bent arm leave less than a micrometre at its end.
     assert ours == pytest.approx(sagged, abs=1e-6)
     assert np.abs(sagged - q).max() > 1e-3
@@ -60,8 +60,8 @@ def test_masses_survive_what_becomes_of_a_robot():
     # Seen from another frame the arm hangs as it did.
     turn = np.eye(4)
     turn[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
-    assert placed_at(robot, turn).load_torques(q) == pytest.approx(held, abs=1e-9)
-    assert placed_at(robot, turn).gravity == pytest.approx([-9.80665, 0, 0])
+    assert with_base(robot, turn).load_torques(q) == pytest.approx(held, abs=1e-9)
+    assert with_base(robot, turn).gravity == pytest.approx([-9.80665, 0, 0])
     # A wall is another matter: the first joint has to hold something then.
     leaning = Robot.from_document(dict(robot.document) | {"gravity_m_s2": [9.81, 0, 0]})
     assert np.abs(leaning.load_torques(q)[:, 0]).max() > 1.0 > np.abs(held[:, 0]).max()

@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.robot import Robot
 from visioncal.session import MemoryImages, Session
 from visioncal.session.loads import loads_of
-from visioncal.simulation.tracked import Tracked, session_of, tracked
+from visioncal.simulation.instrument_session import InstrumentOptions, session_of, tracked
 
 HEADER = ("view", "cft_x_m", "cft_y_m", "cft_z_m", "cft_qx", "cft_qy", "cft_qz", "cft_qw")
 SEEN = ("0", "0", "0", "1", "0", "0", "0", "1")
@@ -54,13 +54,13 @@ def test_what_can_be_no_load_is_refused(cells, words):
 
 
 def test_a_load_that_changes_while_the_arm_stands_still_is_refused():
-    options = Tracked(robot=NOMINAL.name, payloads=HUNG)
+    options = InstrumentOptions(robot=NOMINAL.name, payloads=HUNG)
     with pytest.raises(DegenerateError, match=r"changes \(0 to 5.09858 kg\), and all 12 views"):
         known_of(hung(options, np.repeat(postures(1)[:1], 12, axis=0)))
 
 
 def test_views_of_one_stop_share_its_load():
-    session = hung(Tracked(robot=NOMINAL.name, payloads=HUNG), postures(6))
+    session = hung(InstrumentOptions(robot=NOMINAL.name, payloads=HUNG), postures(6))
     views = tuple(replace(view, stop=view.stop // 4) for view in session.views)
     with pytest.raises(DataError, match="views 0 and 1 are of stop 0 and differ in payload"):
         known_of(replace(session, views=views))
@@ -70,7 +70,7 @@ def test_views_of_one_stop_share_its_load():
 
 
 def test_springs_need_something_that_bends_them():
-    options = Tracked(robot=NOMINAL.name)
+    options = InstrumentOptions(robot=NOMINAL.name)
     session = hung(options, postures(6)[::4])
     bare = dict(session.robot_document)
     bare["joint"] = [

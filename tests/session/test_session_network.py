@@ -116,8 +116,10 @@ def test_rows_say_who_saw_what_while_which_robots_stood_how(folder):
     assert list(found[0].robots) == ["a"]
     assert not found[5].robots
     # Nothing tells where robot b stood at the second stop.
-    assert found[6].lacks == ("b",)
-    assert [index for index in found if found[index].view.is_of_lens or found[index].lacks] == [
+    assert found[6].missing_robots == ("b",)
+    assert [
+        index for index in found if found[index].view.is_of_lens or found[index].missing_robots
+    ] == [
         6,
         7,
     ]
@@ -129,7 +131,7 @@ def test_some_views_alone_keep_the_robots_of_their_stops(folder):
     found = Session.load(folder).only([0, 1, 2]).observations
     assert [observation.view.number for observation in found] == [0, 1, 2]
     assert {name: row.number for name, row in found[1].robots.items()} == {"a": 0, "b": 3}
-    assert not any(observation.lacks for observation in found)
+    assert not any(observation.missing_robots for observation in found)
 
 
 def test_a_row_with_another_pose_than_its_stop_is_of_a_state_of_its_own(folder):

@@ -67,7 +67,7 @@ def test_rows_tell_all_that_their_observations_need(cell):
     # The camera on one robot looks at the board on the other.
     assert ("cam_hand", "target_plate_b") in pairs
     for observation in session.observations:
-        assert not observation.lacks
+        assert not observation.missing_robots
         seer = chained(cell, observation.seer, observation.robots)
         seen = chained(cell, observation.seen, observation.robots)
         if observation.view.reading_m is not None:

@@ -9,7 +9,7 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.chain import chain, robot_part
-from visioncal.estimation.parts import ROBOT, Noise, State
+from visioncal.estimation.problem_parts import ROBOT, Noise, State
 from visioncal.estimation.solve import Solution, covariance_of
 from visioncal.robot import Loads
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
-from visioncal.calibration.stages.arms import ArmFound
+from visioncal.calibration.stages.arms import IdentifiedArm
 from visioncal.calibration.stages.cameras import detect_targets
-from visioncal.calibration.stages.joints import Matched
-from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.calibration.stages.joints import MatchedJoints
+from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners
 from visioncal.robot import Robot, load_robot
@@ -37,9 +37,9 @@ def session_of(cell: SimulatedCell) -> Session:
     )
 
 
-def arm_found(known: RunState) -> ArmFound:
+def arm_found(known: RunState) -> IdentifiedArm:
     """What the stops determine of the only robot's arm."""
-    return next(iter(known.solved.arms.values()))
+    return next(iter(known.assessment.arms.values()))
 
 
 def known_of(
@@ -50,9 +50,9 @@ def known_of(
     known = joints or robot is not None
     stops = {sight.view: sight.stop for sight in cell.sights}
     told = {view: cell.robot.joints[at] for view, at in stops.items()} if joints else {}
-    reported = Reported(
+    reported = RobotReport(
         {view: cell.robot.base_from_flange[at] for view, at in stops.items()},
-        matched=Matched(model, told) if known else None,
+        matched=MatchedJoints(model, told) if known else None,
     )
     known = replace(RunState(session_of(cell)), robots={"": reported}, **changes)
     return detect_targets(known, {view_corners.view: view_corners for view_corners in cell.corners})
@@ -102,7 +102,7 @@ def board_numbers(cell: SimulatedCell) -> np.ndarray:
 def error_of(cell: SimulatedCell, known: RunState) -> np.ndarray:
     """(6 + 6 b,) right perturbations of all edges, true to estimated (rotation, translation)."""
     true = np.array(list(cell.transforms.values()))
-    return log(invert(true) @ known.solved.state.edges).ravel()
+    return log(invert(true) @ known.assessment.state.edges).ravel()
 
 
 def exact(options: CellOptions | None = None) -> CellOptions:

@@ -12,9 +12,9 @@ from visioncal.estimation.observability import (
     directions,
     refuse_too_few,
 )
-from visioncal.estimation.outliers import Agreed, closed_form, inliers
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.outliers import InlierFit, closed_form, find_inliers
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
@@ -50,9 +50,9 @@ def mount_of(problem: Problem) -> str:
     return "eye-in-hand" if carried else "eye-to-hand"
 
 
-def inliers_of(problem: Problem) -> Agreed:
+def inliers_of(problem: Problem) -> InlierFit:
     """The observations of a chain that agree, found from a closed form of all."""
-    return inliers(problem, closed_form(problem, np.arange(len(problem))))
+    return find_inliers(problem, closed_form(problem, np.arange(len(problem))))
 
 
 def solved(problem: Problem, solver: str = "joint") -> Solved:

@@ -28,10 +28,11 @@ from visioncal.simulation import (
     SweepOptions,
     cell_session,
     fine_camera,
+    instrument_session,
     simulate,
     sweep,
-    tracked,
 )
+from visioncal.simulation.elasticity import Payload
 from visioncal.simulation.layout import (
     CameraAt,
     InstrumentAt,
@@ -40,7 +41,6 @@ from visioncal.simulation.layout import (
     PointAt,
     RobotAt,
 )
-from visioncal.simulation.sag import Payload
 
 KEPT = Path(__file__).parents[1] / "data" / "answers.json"
 
@@ -146,9 +146,9 @@ def _cell(options: CellOptions, **changes) -> Callable[[], Answer]:
     return lambda: _of_calibration(result_of(calibrated(simulate(options), **changes)))
 
 
-def _tracked(options: tracked.Tracked, **document) -> Callable[[], Answer]:
+def _tracked(options: instrument_session.InstrumentOptions, **document) -> Callable[[], Answer]:
     def case() -> Answer:
-        session = tracked.session_of(tracked.tracked(options), **document)
+        session = instrument_session.session_of(instrument_session.tracked(options), **document)
         return _of_calibration(calibrate(session))
 
     return case
@@ -219,7 +219,7 @@ def cases() -> dict[str, Callable[[], Answer]]:
     )
     add("wrong arm, two boards", replace(_WRONG_ARM, second=_SHELF), 1)
 
-    shop = tracked.Tracked(points=tracked.THREE)
+    shop = instrument_session.InstrumentOptions(points=instrument_session.THREE)
     found["tracker, places"] = _tracked(shop)
     found["tracker, places, wrong arm"] = _tracked(
         replace(shop, dh_sigma_m=3e-4, dh_sigma_rad=3e-4, offset_sigma_rad=3e-4, stops=50)

@@ -6,8 +6,14 @@ from support.tracked import known_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.core.types import FloatArray
 from visioncal.simulation import Payload, arm_named, forward
-from visioncal.simulation.sag import giving_of, sagging
-from visioncal.simulation.tracked import Shop, Tracked, above, session_of, tracked
+from visioncal.simulation.elasticity import elasticity_of, loaded_joints
+from visioncal.simulation.instrument_session import (
+    InstrumentOptions,
+    InstrumentRecord,
+    random_postures,
+    session_of,
+    tracked,
+)
 
 # Shoulder and elbow yield, the rest does not [N m/rad].
 STIFFNESS = (np.inf, 1.4e6, 9e5, np.inf, np.inf, np.inf)
@@ -22,12 +28,16 @@ STRETCHED = np.array([[0.0, np.pi / 2, -np.pi / 2 + np.arctan2(0.18, 0.8), 0.0, 
 
 def postures(count: int, seed: int = 0) -> FloatArray:
     """So many postures, each as often as there are loads: it is loaded where it stands."""
-    return np.repeat(above(NOMINAL, count, np.random.default_rng(seed)), len(LOADS_N), axis=0)
+    return np.repeat(
+        random_postures(NOMINAL, count, np.random.default_rng(seed)), len(LOADS_N), axis=0
+    )
 
 
-def loaded(seed: int = 0, count: int = 15, sigma_m: float = 3e-5) -> tuple[Shop, RunState]:
+def loaded(
+    seed: int = 0, count: int = 15, sigma_m: float = 3e-5
+) -> tuple[InstrumentRecord, RunState]:
     """The truth, and what is made of it."""
-    options = Tracked(
+    options = InstrumentOptions(
         robot=NOMINAL.name,
         sigma_m=sigma_m,
         robot_sigma_m=1e-5,
@@ -43,11 +53,11 @@ def loaded(seed: int = 0, count: int = 15, sigma_m: float = 3e-5) -> tuple[Shop,
     return shop, known_of(session_of(shop))
 
 
-def deflection_m(shop: Shop, q: FloatArray, load: Payload) -> FloatArray:
+def deflection_m(shop: InstrumentRecord, q: FloatArray, load: Payload) -> FloatArray:
     """(m, 3) how a load moves the real flange [m]."""
-    giving = giving_of(shop.true_arm, COMPLIANCE, 1.0, ())
-    hung = sagging(shop.true_arm, giving, q, [load] * len(q))
-    free = sagging(shop.true_arm, giving, q, [Payload()] * len(q))
+    giving = elasticity_of(shop.true_arm, COMPLIANCE, 1.0, ())
+    hung = loaded_joints(shop.true_arm, giving, q, [load] * len(q))
+    free = loaded_joints(shop.true_arm, giving, q, [Payload()] * len(q))
     moved = forward(shop.true_arm, hung) - forward(shop.true_arm, free)
     return np.asarray(moved[:, :3, 3])
 

@@ -65,7 +65,7 @@ def with_moved_result(
 
 def calibration_of(known: RunState, name: str = "cell") -> Calibration:
     """A calibration with what a comparison looks at."""
-    result = known.solved
+    result = known.assessment
     covariance = result.covariance
     names = edge_names(known.session.mount)
     return Calibration(

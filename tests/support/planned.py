@@ -9,14 +9,14 @@ from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.parts import Noise
+from visioncal.estimation.problem_parts import Noise
 from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Limits, PlanCell
-from visioncal.live.planning.design import Design, chosen
-from visioncal.live.planning.information import WORLDS, worlds_of
-from visioncal.live.planning.plan import helps
+from visioncal.live.planning.design import Design, choose_stops
+from visioncal.live.planning.information import WORLDS, predict_worlds
+from visioncal.live.planning.plan import stop_contributions
 from visioncal.live.planning.purposes import Purpose
-from visioncal.live.planning.recorded import Begun, SoFar
+from visioncal.live.planning.recorded import PartialCalibration, SessionStart
 from visioncal.robot import load_robot
 from visioncal.simulation import CellOptions, SimulatedCell, simulate
 from visioncal.simulation.arms import forward, ur_arm
@@ -64,18 +64,24 @@ class Additions:
 
 
 def next_best(
-    begun: Begun, purpose: Purpose, q: FloatArray, count: int, *, wish: Wish | None = None, **draw
+    begun: SessionStart,
+    purpose: Purpose,
+    q: FloatArray,
+    count: int,
+    *,
+    wish: Wish | None = None,
+    **draw,
 ) -> Additions:
     """The stops that a plan adds to a session, wherever the arm can drive."""
     cells = (begun.cell, *begun.cell.guesses(draw.get("worlds", WORLDS) - 1, draw.get("seed", 0)))
-    worlds = worlds_of(cells, purpose, q, recorded=begun.recorded)
-    design = chosen(worlds, count, criterion="I", wish=wish)
+    worlds = predict_worlds(cells, purpose, q, recorded=begun.recorded)
+    design = choose_stops(worlds, count, criterion="I", wish=wish)
     names = [f"added stop {index + 1}" for index in range(len(design.rows))]
-    said = helps(begun.cell, purpose, q, worlds[0], design, names, begun=begun)
+    said = stop_contributions(begun.cell, purpose, q, worlds[0], design, names, begun=begun)
     return Additions(design, tuple(said))
 
 
-def so_far_of(cell: SimulatedCell, **changes) -> SoFar:
+def so_far_of(cell: SimulatedCell, **changes) -> PartialCalibration:
     """What is known of a cell's views, as far as they tell it."""
     known = known_of(cell, level="hand-eye", **changes)
     for stage in STAGES:
@@ -84,8 +90,8 @@ def so_far_of(cell: SimulatedCell, **changes) -> SoFar:
         try:
             known = stage.run(known)
         except DegenerateError as error:
-            return SoFar(known, error.message)
-    return SoFar(known)
+            return PartialCalibration(known, error.message)
+    return PartialCalibration(known)
 
 
 def cell_of(options: CellOptions, **changes) -> PlanCell:

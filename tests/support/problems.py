@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from visioncal.estimation.parts import Observations, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Observations, State
 from visioncal.estimation.tree import Branch, Tree
 
 # Of a camera's poses [rad and m]: across the view, and towards it.

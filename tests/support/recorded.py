@@ -13,7 +13,7 @@ from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
 from visioncal.live.capture.record import record
 from visioncal.live.capture.take import TakenView
-from visioncal.live.planning.read_back import PlanFile
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.session import Session
 
 # A UR repeats to 0.03 to 0.05 mm; what stands within is where it was told to be.

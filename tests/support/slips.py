@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from support.cells import session_of
 
-from visioncal.calibration.pipeline.reading_hints import reading_hint
+from visioncal.calibration.pipeline.misread_poses import misread_pose_finding
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.cameras import detect_targets
@@ -93,7 +93,7 @@ class Identifiability:
 
     def hinted(self) -> str:
         """What the guess says of the poses that the joints lead to."""
-        hint = reading_hint(self.seen())
+        hint = misread_pose_finding(self.seen())
         return hint.reason if hint else ""
 
 

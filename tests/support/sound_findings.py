@@ -74,6 +74,6 @@ def left_out(numbers, count=20):
     """Findings of views of which some disagree with the others."""
     seen = [replace(view, used=view.view not in numbers) for view in views(count)]
     out = [Rejection(at, f"disagrees with the other views: view {at}'s figures") for at in numbers]
-    pair = replace(PAIR, views=seen, disagreeing=out)
-    sensor = replace(SENSOR, used=count - len(out), lost=out, disagreeing=[*numbers])
+    pair = replace(PAIR, views=seen, outliers=out)
+    sensor = replace(SENSOR, used=count - len(out), lost=out, outliers=[*numbers])
     return replace(SOUND, pairs=(pair,), sensors=(sensor,))

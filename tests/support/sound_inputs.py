@@ -36,7 +36,7 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.dynamics import LinkBody, real_dynamics
 from visioncal.simulation.exercise import Senses, exercise_session, multi_sine, record
-from visioncal.simulation.tracked import Tracked, session_of, tracked
+from visioncal.simulation.instrument_session import InstrumentOptions, session_of, tracked
 
 CAMERA = replace(wide_camera(), resolution=(640, 400), matrix=wide_camera().matrix / 2)
 VIEWS = 7
@@ -123,7 +123,7 @@ def _warm(_: Inputs, path: Path) -> None:
 
 
 def _tracked(_: Inputs, path: Path) -> None:
-    session_of(tracked(Tracked(stops=20))).save(path)
+    session_of(tracked(InstrumentOptions(stops=20))).save(path)
 
 
 def _network(_: Inputs, path: Path) -> None:

@@ -13,7 +13,7 @@ from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.session import Session
 from visioncal.simulation.arms import forward, link_frames
-from visioncal.simulation.tracked import Shop
+from visioncal.simulation.instrument_session import InstrumentRecord
 
 
 def known_of(session: Session, **changes) -> RunState:
@@ -24,10 +24,10 @@ def known_of(session: Session, **changes) -> RunState:
     return known
 
 
-def errors_of(shop: Shop, known: RunState) -> FloatArray:
+def errors_of(shop: InstrumentRecord, known: RunState) -> FloatArray:
     """(12,) right perturbations of both edges, true to estimated (rotation, translation)."""
     true = np.array([shop.base_from_instrument, shop.flange_from_probe])
-    return log(invert(true) @ known.solved.state.edges[:2]).ravel()
+    return log(invert(true) @ known.assessment.state.edges[:2]).ravel()
 
 
 def solved_of(session: Session, **changes) -> RunState:
@@ -38,7 +38,7 @@ def solved_of(session: Session, **changes) -> RunState:
     return known
 
 
-def information(shop: Shop, arm_columns: bool = False) -> FloatArray:
+def information(shop: InstrumentRecord, arm_columns: bool = False) -> FloatArray:
     """Fisher information of what is read, by central differences of the simulation's own chain.
 
     Unknown are the instrument's frame (6), the probe's (6), each further point's place (3), and the
@@ -69,7 +69,10 @@ def information(shop: Shop, arm_columns: bool = False) -> FloatArray:
 
 
 def reads(
-    shop: Shop, change: FloatArray, slack: FloatArray | None = None, q: FloatArray | None = None
+    shop: InstrumentRecord,
+    change: FloatArray,
+    slack: FloatArray | None = None,
+    q: FloatArray | None = None,
 ) -> FloatArray:
     """What is read at each stop, (s, r), when the unknowns of `information` change.
 
@@ -106,7 +109,7 @@ def reads(
     return np.concatenate([turned, *places], axis=1)
 
 
-def mounting_bound(shop: Shop) -> FloatArray:
+def mounting_bound(shop: InstrumentRecord) -> FloatArray:
     """Least covariance of x (6) and z (6); of z's place alone (3) where places are read."""
     kept = np.arange(12) if shop.options.poses else np.r_[:6, 9:12]
     whole = information(shop)

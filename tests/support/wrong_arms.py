@@ -44,7 +44,7 @@ def error_m(cell, known, robot):
     middle seen from the camera. `robot` may be an `ArmModel`, which bends under its own weight.
     """
     q = postures(getattr(robot, "nominal", robot))
-    mount, edges = cell.options.mount, known.solved.state.edges
+    mount, edges = cell.options.mount, known.assessment.state.edges
     true = target_in_camera(mount, *cell.transforms.values(), cell.robot.flange_at(q))
     true = true @ told_frame(cell.board())
     ours = target_in_camera(mount, *edges, robot.base_from_flange(q))

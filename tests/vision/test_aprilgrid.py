@@ -12,7 +12,7 @@ from support.rendered import Shot, photograph
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
-from visioncal.interchange.formats.boards import described_target
+from visioncal.interchange.formats.boards import read_target_description
 from visioncal.session import Session
 from visioncal.simulation import BOARDS, CellOptions, simulate, write_session
 from visioncal.vision.finders import DetectedCorners, NotFound, find_target
@@ -176,8 +176,8 @@ def test_kalibrs_files_are_read(tmp_path):
         "tagSize: 0.088\ntagSpacing: 0.3\n"
     )
     expected = {"kind": "aprilgrid", "columns": 6, "rows": 5, "size_m": 0.088, "spacing": 0.3}
-    assert described_target(str(path)) == expected
-    assert described_target("aprilgrid_6x5_88mm_0.3") == expected
+    assert read_target_description(str(path)) == expected
+    assert read_target_description("aprilgrid_6x5_88mm_0.3") == expected
     path.write_text("target_type: circlegrid\n")
     with pytest.raises(DataError, match='"aprilgrid" or "checkerboard" is needed'):
-        described_target(str(path))
+        read_target_description(str(path))

@@ -58,7 +58,7 @@ def test_jacobians_agree_with_central_differences(camera, points):
         shift = np.zeros(3)
         shift[axis] = step
         slope = (project(camera, points + shift) - project(camera, points - shift)) / (2 * step)
-        np.testing.assert_allclose(projection.by_point[:, :, axis], slope, atol=tolerance)
+        np.testing.assert_allclose(projection.jacobian_point[:, :, axis], slope, atol=tolerance)
     values = intrinsics(camera)
     for index in range(len(values)):
         shift = np.zeros(len(values))
@@ -67,7 +67,9 @@ def test_jacobians_agree_with_central_differences(camera, points):
             project(with_intrinsics(camera, values + shift), points)
             - project(with_intrinsics(camera, values - shift), points)
         ) / (2 * step)
-        np.testing.assert_allclose(projection.by_intrinsics[:, :, index], slope, atol=tolerance)
+        np.testing.assert_allclose(
+            projection.jacobian_intrinsics[:, :, index], slope, atol=tolerance
+        )
 
 
 def test_points_behind_the_camera_are_not_projected(camera):

@@ -12,8 +12,8 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
 from visioncal.vision.dense import library
 from visioncal.vision.dense.blur import Blur, transfer
+from visioncal.vision.dense.board_rendering import MIDDLE, Print, render_board
 from visioncal.vision.dense.fit import fit_corners
-from visioncal.vision.dense.shown import MIDDLE, Print, explain
 from visioncal.vision.finders.template import refine
 
 CHECKERBOARD, CHARUCO = checkerboard(6, 5), charuco(6, 5)
@@ -136,7 +136,7 @@ def explained(target, shot, shift_px=0.0):
     size = image.shape[::-1]
     camera = Camera("brown", size, np.array([1300.0, 1300.0, *np.array(size) / 2]), np.zeros(5))
     px = truth + np.array([shift_px, 0.0])
-    return image, truth, explain(image, target, ids, px, camera, found.blur, found.tone)
+    return image, truth, render_board(image, target, ids, px, camera, found.blur, found.tone)
 
 
 @pytest.mark.usefixtures("torch")
@@ -145,20 +145,20 @@ def explained(target, shot, shift_px=0.0):
 def test_an_image_is_explained_up_to_its_noise(target, blurred):
     image, truth, found = explained(target, replace(SHOT, uneven=0.3, **blurred))
     # Markers have cells of three pixels, which both sides draw a little otherwise when sharp.
-    assert found.rest_rms == pytest.approx(2.0, rel=0.2)
+    assert found.difference_rms == pytest.approx(2.0, rel=0.2)
     u, v = np.rint(truth[0]).astype(int)
     near = (slice(v - 5, v + 6), slice(u - 5, u + 6))
-    assert np.abs(found.drawn[near].astype(float) - image[near]).max() < 12
+    assert np.abs(found.rendered[near].astype(float) - image[near]).max() < 12
     # Around the board, the image is shown as it is, and nothing is said to be unexplained.
-    np.testing.assert_array_equal(found.drawn[0], image[0])
-    assert set(found.rest[0].tolist()) == {MIDDLE}
+    np.testing.assert_array_equal(found.rendered[0], image[0])
+    assert set(found.difference[0].tolist()) == {MIDDLE}
 
 
 @pytest.mark.usefixtures("torch")
 def test_a_board_that_is_elsewhere_is_not_explained():
     right, wrong = (explained(CHARUCO, SHOT, value)[2] for value in (0.0, 0.3))
-    assert wrong.rest_rms > 3 * right.rest_rms
-    assert np.std(wrong.rest.astype(float)) > 2 * np.std(right.rest.astype(float))
+    assert wrong.difference_rms > 3 * right.difference_rms
+    assert np.std(wrong.difference.astype(float)) > 2 * np.std(right.difference.astype(float))
     # Predicted far outside of the image, or nowhere at all.
     for shift in (2000.0, np.nan):
         assert explained(CHARUCO, SHOT, shift)[2] is None

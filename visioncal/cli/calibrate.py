@@ -85,29 +85,29 @@ def calibrate_command(
     # Imported late, so that --help stays fast.
 
     from visioncal.calibration.pipeline import run, run_dense
-    from visioncal.calibration.pipeline.running import Asked
-    from visioncal.cli.console import naming, report_written, say
+    from visioncal.calibration.pipeline.running import CalibrationOptions
+    from visioncal.cli.console import report_written, say, with_run_paths
     from visioncal.cli.parsing import views_in
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
-    from visioncal.interchange.merge_results import leftover
+    from visioncal.interchange.merge_results import frames_to_keep
     from visioncal.interchange.outputs import RECORDING, write_outputs
 
     # Of several sessions, the recording is that of the joined session.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
-    with naming(session, out):
+    with with_run_paths(session, out):
         loaded = _joined([need.session(session) for session in sessions], shared=robot_shared)
         if views is not None:
             loaded = loaded.only(views_in(views, "--views"))
-    asked = Asked(
+    asked = CalibrationOptions(
         solver=solver,
         level=level,
         convention=convention,
         threads=work.threads,
         keep_corners=work.keep_corners,
     )
-    left = leftover(out)
-    with naming(session, out), shown_progress(quiet=as_json) as progress:
+    left = frames_to_keep(out)
+    with with_run_paths(session, out), shown_progress(quiet=as_json) as progress:
         calibrated = partial(run_dense, device=device) if dense else run
         result = calibrated(loaded, **(asked | {"progress": progress}))
         progress("write", 0, 1)

@@ -109,18 +109,18 @@ def report_written(written: "Written", *, quiet: bool = False, status: int = 0) 
 
     for file in () if quiet else written.files:
         say(f"wrote {file}")
-    for undrawn in written.undrawn:
+    for undrawn in written.failed_drawings:
         messages().print(
             f"[bold red]bug:[/] {escape(f'{undrawn.file} could not be drawn ({undrawn.cause}).')}\n"
             f"The result is safe in {escape(str(written.files[0]))}. Please report this, with the "
             "session if it can be given away."
         )
-    if status or written.undrawn:
+    if status or written.failed_drawings:
         raise typer.Exit(status or _EXIT_BUG)
 
 
 @contextmanager
-def naming(session: Path, out: Path | str = "") -> Iterator[None]:
+def with_run_paths(session: Path, out: Path | str = "") -> Iterator[None]:
     """Puts a run's paths into the suggested commands of errors raised in the block."""
     try:
         yield

@@ -20,7 +20,7 @@ from visioncal.core.errors import DataError
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.calibration.guess import Candidate, Guess
-    from visioncal.interchange.formats import Foreign, ImportOptions, InDoubt
+    from visioncal.interchange.formats import DoubtfulSession, ForeignRecording, ImportOptions
 
 _FORMATS = ", ".join(FOREIGN_NAMES)
 _other = partial(typer.Option, rich_help_panel="The recording itself")
@@ -171,13 +171,13 @@ def convert_command(
     say(f"wrote {dest}\nsha256 {session.digest()}")
 
 
-def _chosen(recorded: "InDoubt | Foreign", *, yes: bool) -> "Candidate":
+def _chosen(recorded: "DoubtfulSession | ForeignRecording", *, yes: bool) -> "Candidate":
     """Tries other readings, prints them, and returns the clearly best or confirmed one."""
     from visioncal.calibration.pipeline.guess_inputs import guess_session
-    from visioncal.interchange.formats import Foreign, guess_foreign
+    from visioncal.interchange.formats import ForeignRecording, guess_foreign
 
     with shown_progress(quiet=False) as progress:
-        if isinstance(recorded, Foreign):
+        if isinstance(recorded, ForeignRecording):
             guess = guess_foreign(recorded, progress=progress)
         else:
             guess = guess_session(recorded.session, recorded.robot, progress=progress)

@@ -87,6 +87,6 @@ def correct_command(options: CorrectOptions) -> None:
     Exit status 2: nothing was written, for the reason given; targets out of reach are named.
     """
     # Imported late, so that --help stays fast.
-    from visioncal.cli.corrected import correct_table
+    from visioncal.cli.corrected_targets import correct_table
 
     correct_table(options)

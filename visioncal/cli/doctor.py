@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, naming, print_json
+from visioncal.cli.console import answers, print_json, with_run_paths
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
 
@@ -27,7 +27,7 @@ def doctor_command(session: SessionArgument, as_json: AsJson = False) -> None:
     """
     from visioncal.calibration.pipeline.checkup import doctor, to_document
 
-    with naming(session), shown_progress(quiet=as_json) as progress:
+    with with_run_paths(session), shown_progress(quiet=as_json) as progress:
         found = doctor(session, progress=progress)
     if as_json:
         print_json(to_document(found))

@@ -35,6 +35,6 @@ def dynamics_gains_command(options: GainsOptions) -> None:
     Exit status 0: there are gains; 2: there are none, for the reason given.
     """
     # Imported late, so that --help stays fast.
-    from visioncal.cli.weighed import print_gains
+    from visioncal.cli.payload_and_gains import print_gains
 
     print_gains(options)

@@ -58,6 +58,6 @@ def dynamics_identify_command(options: IdentifyOptions) -> None:
     Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
     """
     # Imported late, so that --help stays fast.
-    from visioncal.cli.identified import identify_into
+    from visioncal.cli.identified_dynamics import identify_into
 
     identify_into(options)

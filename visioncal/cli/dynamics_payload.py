@@ -35,6 +35,6 @@ def dynamics_payload_command(options: PayloadOptions) -> None:
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
     # Imported late, so that --help stays fast.
-    from visioncal.cli.weighed import print_payload
+    from visioncal.cli.payload_and_gains import print_payload
 
     print_payload(options)

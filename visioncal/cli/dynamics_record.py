@@ -34,7 +34,7 @@ def dynamics_record_command(
     # Imported late, so that --help stays fast.
 
     from visioncal.cli.console import messages, say
-    from visioncal.core.interrupts import ended_like_ctrl_c
+    from visioncal.core.interrupts import signals_as_interrupts
     from visioncal.live.capture.motions import record_motion
     from visioncal.live.drivers.ur import UrMotion
     from visioncal.session import STREAMS, check_stream
@@ -48,7 +48,7 @@ def dynamics_record_command(
         )
     path = out / STREAMS / f"{stream}.csv"
     check_free(path, force=False, replaceable=False)
-    with ended_like_ctrl_c(), closing(UrMotion(host)) as joints:
+    with signals_as_interrupts(), closing(UrMotion(host)) as joints:
         found = record_motion(joints, rest_s=rest_s, report=messages().print)
         model = robot or joints.model
     check_stream(stream, found)

@@ -15,6 +15,6 @@ def dynamics_validate_command(
     Exit status 0: there are figures; 2: there are none, for the reason given.
     """
     # Imported late, so that --help stays fast.
-    from visioncal.cli.identified import print_predictions
+    from visioncal.cli.identified_dynamics import print_predictions
 
     print_predictions(session, streams, against, as_json=as_json)

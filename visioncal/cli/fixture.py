@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.framing import Asked, FrameOptions, PointOption, TouchOptions, place_frame
+from visioncal.cli.framing import FrameOptions, FrameRequest, PointOption, TouchOptions, place_frame
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.core.choices import UNITS_M
 from visioncal.core.errors import DataError
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
-    from visioncal.frames.measured import Tool
+    from visioncal.frames.measured_points import Tool
     from visioncal.results import Calibration, Frame
 
 
@@ -69,7 +69,7 @@ def fixture_command(
             rows, touched_with, drawing, robot_calibration, written.model, touch_noise_m=noise_m
         )
 
-    asked = Asked("fixture", touches, goes, written, part, point, as_json)
+    asked = FrameRequest("fixture", touches, goes, written, part, point, as_json)
     place_frame(asked, by_touches, drawing, tool)
 
 
@@ -77,8 +77,8 @@ def _tool(
     option: str | None, calibration: "Calibration | None", robot: str | None
 ) -> "Tool | None":
     """Finds the tool that touched the points."""
-    from visioncal.frames.measured import NO_TOOL, Tool
-    from visioncal.interchange.result_files import load_placed
+    from visioncal.frames.measured_points import NO_TOOL, Tool
+    from visioncal.interchange.result_files import load_result_or_frames
 
     if option == "none":
         return None
@@ -89,9 +89,9 @@ def _tool(
         return Tool.among(frames, "The calibration", option)
     path, _, name = option.rpartition(":")
     if Path(option).exists():
-        return Tool.among(load_placed(Path(option), robot).frames, option, None)
+        return Tool.among(load_result_or_frames(Path(option), robot).frames, option, None)
     if path and Path(path).exists():
-        return Tool.among(load_placed(Path(path), robot).frames, path, name)
+        return Tool.among(load_result_or_frames(Path(path), robot).frames, path, name)
     if frames:
         return Tool.among(frames, "The calibration", option)
     raise DataError(

@@ -133,7 +133,7 @@ class FrameLocation:
             DataError: A frame of that name exists, or the destination cannot take one.
         """
         from visioncal.interchange.result_files import load_result
-        from visioncal.results.selecting import placed_name
+        from visioncal.results.selecting import transform_name_in_cell
 
         name, path, out = transform_name(kind, options.name), options.calibration, options.out
         result = None if path is None else load_result(path)
@@ -142,7 +142,7 @@ class FrameLocation:
             choice = replace(choice, robot=touched_by)
         calibration = None if result is None else result.chosen(choice, needs)
         if result is not None:
-            name = placed_name(result, choice, needs, name)
+            name = transform_name_in_cell(result, choice, needs, name)
         folder = None if path is None or out is not None else _folder(path)
         location = cls(name, calibration, result, folder, out)
         location._check_names()
@@ -179,7 +179,7 @@ class FrameLocation:
 
     def keep(self, frame: "Frame") -> Written:
         """Writes the frame to its destination, if any."""
-        from visioncal.interchange.merge_results import rewrite
+        from visioncal.interchange.merge_results import rewrite_result
         from visioncal.results import FrameFile
 
         if self.file is not None:
@@ -188,7 +188,7 @@ class FrameLocation:
         if self.folder is None or self.result is None:
             return Written(())
         frames = {**self.result.frames, self.name: frame}
-        return rewrite(self.folder, replace(self.result, frames=frames))
+        return rewrite_result(self.folder, replace(self.result, frames=frames))
 
 
 def _folder(path: Path) -> Path:
@@ -235,7 +235,7 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
     fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
     console.print(escape(f"{frame.method}: {fit}"))
     _report_before(place, frame)
-    undrawn = [undrawn.file for undrawn in written.undrawn]
+    undrawn = [undrawn.file for undrawn in written.failed_drawings]
     recording = None if place.folder is None else place.folder / RECORDING
     if recording is not None and recording not in (*written.files, *undrawn):
         say(f"{recording} was not renewed: it is missing or of another result")
@@ -254,7 +254,7 @@ def _report_before(place: FrameLocation, frame: "Frame") -> None:
 
 
 @dataclass(frozen=True)
-class Asked:
+class FrameRequest:
     """Request of `tcp` or `fixture`.
 
     Attributes:
@@ -273,7 +273,7 @@ class Asked:
 
 
 def place_frame(
-    request: Asked,
+    request: FrameRequest,
     by_touches: "Callable[[Calibration | None], Frame]",
     drawing: "NominalPoints | None" = None,
     tool: str | None = None,
@@ -341,21 +341,24 @@ def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session 
 
 
 def _by_images(
-    request: Asked, session: "Session", calibration: "Calibration", drawing: "NominalPoints | None"
+    request: FrameRequest,
+    session: "Session",
+    calibration: "Calibration",
+    drawing: "NominalPoints | None",
 ) -> "Frame":
     import numpy as np
 
-    from visioncal.frames.fixture_from_markers import marked_fixture
+    from visioncal.frames.fixture_from_markers import fixture_from_marker_images
     from visioncal.frames.frame_from_images import seen_frame
     from visioncal.session.selecting import has_several, select
 
     if has_several(session):
-        session = select(session, request.part.choice, parted=False)
+        session = select(session, request.part.choice, robot_between=False)
     if drawing is not None:
         refuse_given(
             {"--point-mm": request.point_mm}, "beside --cad the drawing's origin is the frame's"
         )
-        return marked_fixture(session, calibration, drawing)
+        return fixture_from_marker_images(session, calibration, drawing)
     point = 1e-3 * np.array(numbers_in(request.point_mm or "0,0,0", "--point-mm", "x,y,z"))
     with shown_progress(quiet=request.as_json) as progress:
         return seen_frame(session, calibration, request.kind, point, progress=progress)

@@ -99,10 +99,10 @@ def locate_command(
     """
     import numpy as np
 
-    from visioncal.frames.camera_chain import Eye
-    from visioncal.frames.target_in_image import check_size
+    from visioncal.frames.camera_chain import CalibratedCamera
+    from visioncal.frames.target_in_image import check_image_size
     from visioncal.interchange.result_files import load_result
-    from visioncal.results.selecting import boards_before
+    from visioncal.results.selecting import targets_fixed_to_base
     from visioncal.session.choosing import EYE, Choice
     from visioncal.session.selecting import has_several, select
     from visioncal.vision.finders.imaging import read_image
@@ -113,7 +113,7 @@ def locate_command(
     if session is not None and several:
         is_own_target = target in session.plates
         session = select(
-            session, Choice(camera, robot, target if is_own_target else None), parted=False
+            session, Choice(camera, robot, target if is_own_target else None), robot_between=False
         )
         target = None if is_own_target else target
     # Names may be those of the session alone.
@@ -129,8 +129,8 @@ def locate_command(
         if session is not None:
             flange, joints_rad = _flange_of(session, _chosen(session, view), calibrated)
         elif source is not None:
-            check_size(Eye.of(calibrated), read_image(source), source.name)
-        boards = boards_before(result, Choice(camera, robot), EYE)
+            check_image_size(CalibratedCamera.of(calibrated), read_image(source), source.name)
+        boards = targets_fixed_to_base(result, Choice(camera, robot), EYE)
         points = _by_plane(
             calibrated, boards, pixel, plane, plane_sigma or 0.0, flange, joints_rad, sigma_px
         )

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from visioncal.core.types import Progress
     from visioncal.live.planning.cell import PlanCell
     from visioncal.live.planning.plan import Plan
-    from visioncal.live.planning.recorded import Begun
+    from visioncal.live.planning.recorded import SessionStart
 
 _SHOWN = 12
 # Cosine between the z axes of board and base above which only a camera below would see the board.
@@ -79,7 +79,7 @@ def _begin(
     kept: "Kept",
     wanted: PlanOptions,
     progress: "Progress",
-) -> "tuple[PlanCell, Begun | None]":
+) -> "tuple[PlanCell, SessionStart | None]":
     """The cell, and the recorded session where stops are added to one."""
     from visioncal.cli.planned_cell import begun_session, cell_of
 
@@ -101,8 +101,8 @@ def _report(plan: "Plan") -> None:
 
     console = answers()
     console.print(escape(f"{plan.request.purpose.name}: {summary_of(plan)}"))
-    if plan.begun is not None and plan.begun.refusal:
-        console.print(escape(f"  so far: {plan.begun.refusal}"))
+    if plan.start is not None and plan.start.refusal:
+        console.print(escape(f"  so far: {plan.start.refusal}"))
     for stop in sorted(plan.stops, key=lambda value: value.rank)[:_SHOWN]:
         console.print(escape(f"  view {stop.view}: {stop.words}"))
     if len(plan.stops) > _SHOWN:

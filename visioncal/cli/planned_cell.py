@@ -13,7 +13,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.transforms import compose
 from visioncal.core.types import Camera, FloatArray, Progress
-from visioncal.estimation.parts import Noise
+from visioncal.estimation.problem_parts import Noise
 from visioncal.interchange.formats.boards import target_named
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.outputs import CALIBRATION
@@ -26,12 +26,17 @@ from visioncal.live.planning.cell import (
     PlanCell,
     cell_of_calibration,
 )
-from visioncal.live.planning.recorded import Begun, RoughEdges, begin, so_far
+from visioncal.live.planning.recorded import (
+    RoughEdges,
+    SessionStart,
+    calibrate_partially,
+    start_from_session,
+)
 from visioncal.results import Calibration
 from visioncal.robot import Robot, load_robot
 from visioncal.session import Session
 from visioncal.session.choosing import ANY, LENS, Choice
-from visioncal.session.selecting import is_to_be_parted, select
+from visioncal.session.selecting import must_select_one, select
 from visioncal.vision.targets import target_from_document
 
 _SESSION = "session.toml"
@@ -87,9 +92,9 @@ def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCel
     session, result = source.session, source.calibration
     is_cell = result is not None and result.cell is not None
     choice = Choice(words.camera, words.robot, words.target)
-    if not is_cell and (session is None or not is_to_be_parted(session, choice)):
+    if not is_cell and (session is None or not must_select_one(session, choice)):
         return source, words
-    if session is not None and is_to_be_parted(session, choice):
+    if session is not None and must_select_one(session, choice):
         session = select(session, choice)
     if result is not None:
         result = result.chosen(choice)
@@ -97,7 +102,9 @@ def chosen_part(source: Source, words: PlanCellOptions) -> tuple[Source, PlanCel
     return replace(source, session=session, calibration=result), others
 
 
-def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: Progress) -> Begun:
+def begun_session(
+    source: Source, words: PlanCellOptions, kept: Kept, progress: Progress
+) -> SessionStart:
     """The session to which stops are added.
 
     Raises:
@@ -116,8 +123,8 @@ def begun_session(source: Source, words: PlanCellOptions, kept: Kept, progress: 
     if words.robot is not None:
         session = _with_robot(session, words.robot)
     guess = _guess(words) if words.cam or words.board else None
-    recorded = so_far(session, progress=progress)
-    begun = begin(recorded, guess=guess, limits=kept[0], boxes=kept[1])
+    recorded = calibrate_partially(session, progress=progress)
+    begun = start_from_session(recorded, guess=guess, limits=kept[0], boxes=kept[1])
     return replace(begun, cell=_with_noise(begun.cell, words))
 
 

@@ -15,9 +15,9 @@ from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.excitation import ExcitationRequest, excite
-from visioncal.dynamics.limits import Missing, Share, allowed_motion
+from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
+from visioncal.dynamics.plan_files import MotionPlan, motion_document
 from visioncal.dynamics.sweeps import SweepRequest, plan_sweeps
-from visioncal.dynamics.written import MotionPlan, motion_document
 from visioncal.interchange.outputs import write_motions
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.messages import plan_warnings, plan_words
@@ -39,7 +39,7 @@ def plan_motions(
     Raises:
         DataError: The robot cannot be read, an option is invalid, or the limits allow no motion.
     """
-    share = Share(
+    share = MotionMargins(
         float(np.deg2rad(kept.margin_deg)),
         arm_options.speed,
         arm_options.acceleration,
@@ -49,10 +49,10 @@ def plan_motions(
     )
     arm = load_robot(robot)
     missing = (arm_options.range_deg, arm_options.speed_deg, arm_options.acceleration_deg)
-    allowed = allowed_motion(
+    allowed = motion_limits(
         arm,
         share,
-        missing=Missing(*map(_radians, missing)),
+        missing=DefaultLimits(*map(_radians, missing)),
         bodies=_bodies(arm, kept.bodies, arm_options.tool),
         payload=None if arm_options.payload is None else _payload(arm_options.payload),
     )

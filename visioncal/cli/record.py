@@ -9,7 +9,7 @@ import typer
 from visioncal.cli.console import asked, say
 from visioncal.cli.options import AsJson, View
 from visioncal.cli.record_options import DeviceOptions, RecordCellOptions, TakingOptions
-from visioncal.core.interrupts import ended_like_ctrl_c
+from visioncal.core.interrupts import signals_as_interrupts
 from visioncal.live.capture.options import CaptureOptions
 
 
@@ -74,31 +74,33 @@ def record_command(
         check_all,
         check_driven,
         check_not_begun,
-        driven,
         facts_of,
         finish,
-        guided,
         opened,
+        record_driven,
+        record_guided,
         report_departure,
         scene_of,
         shown_in,
     )
-    from visioncal.live.capture.devices import ArmWish, is_folder
+    from visioncal.live.capture.devices import ArmSetup, is_folder
     from visioncal.live.capture.journal import Journal
-    from visioncal.live.capture.record import departure
+    from visioncal.live.capture.record import motion_summary
 
     scene = scene_of(plan, described)
     drives = not follow and arm.partition(":")[0] != "manual"
     if drives or dry_run:
         check_driven(scene, drives=drives)
-    taking = takes.options(single=is_folder(camera), lost=CaptureOptions.lost if drives else 0)
+    taking = takes.options(
+        single=is_folder(camera), lost=CaptureOptions.missed_in_a_row if drives else 0
+    )
     requested = device.setup()
     answers = sys.stdin.isatty()
-    wish = ArmWish("", not drives or dry_run, asked, described.pose_form, answers)
-    with ended_like_ctrl_c(), opened(arm, wish, camera, requested) as cell:
+    wish = ArmSetup("", not drives or dry_run, asked, described.pose_form, answers)
+    with signals_as_interrupts(), opened(arm, wish, camera, requested) as cell:
         scene.check(cell.camera.resolution, drives=drives)
         if dry_run:
-            report_departure(departure(cell, scene.planned, (), taking), cell, taking)
+            report_departure(motion_summary(cell, scene.planned, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
             return
         start = Journal.resume if resume else Journal.begin
@@ -110,10 +112,10 @@ def record_command(
         with shown_in(scene, cell, wanted=view) as viewers:
             watchers = [ViewLines(), *viewers]
             if drives:
-                steps = driven(cell, scene, journal, taking, watchers, asks=not yes)
+                steps = record_driven(cell, scene, journal, taking, watchers, asks=not yes)
             else:
                 ask = asked if answers else None
-                steps = guided(cell, scene, journal, taking, watchers, views, ask)
+                steps = record_guided(cell, scene, journal, taking, watchers, views, ask)
     if drives:
         check_all(journal, steps)
     finish(journal, steps, as_json=as_json)

@@ -74,7 +74,7 @@ class TakingOptions:
             keep=self.keep,
             still=Stillness(image_px=self.still_px, quiet_s=self.settle_s),
             single=single,
-            lost=lost,
+            missed_in_a_row=lost,
         )
 
 

@@ -19,8 +19,15 @@ from visioncal.core.number_format import counted, figure
 from visioncal.core.types import Camera, Mount, Target
 from visioncal.interchange.formats.boards import target_named
 from visioncal.live.capture.coach import Coach
-from visioncal.live.capture.core import Capture, CaptureEvent, Watcher, line_of, missed, note_of
-from visioncal.live.capture.devices import ArmWish, open_arm, open_camera
+from visioncal.live.capture.core import (
+    Capture,
+    CaptureEvent,
+    Watcher,
+    line_of,
+    missed_stops,
+    note_of,
+)
+from visioncal.live.capture.devices import ArmSetup, open_arm, open_camera
 from visioncal.live.capture.facts import CaptureFacts
 from visioncal.live.capture.follow import ask_and_take, follow
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
@@ -28,10 +35,10 @@ from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import HostClock, LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.predict import RecordedAccuracy
-from visioncal.live.capture.record import Departure, departure, record
+from visioncal.live.capture.record import MotionSummary, motion_summary, record
 from visioncal.live.capture.take import Missed
 from visioncal.live.drivers.protocols import DeviceSetup, MovingArm
-from visioncal.live.planning.read_back import PlanFile, read_plan
+from visioncal.live.planning.plan_file import PlanFile, read_plan
 from visioncal.robot import Robot, load_robot
 
 if TYPE_CHECKING:
@@ -180,7 +187,7 @@ def facts_of(scene: RecordedSetup, cell: LiveCell, name: str) -> CaptureFacts:
     )
 
 
-def guided(
+def record_guided(
     cell: LiveCell,
     scene: RecordedSetup,
     journal: Journal,
@@ -249,7 +256,7 @@ def shown_in(scene: RecordedSetup, cell: LiveCell, *, wanted: bool) -> Iterator[
 
 
 @contextmanager
-def opened(arm: str, wish: ArmWish, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
+def opened(arm: str, wish: ArmSetup, camera: str, requested: DeviceSetup) -> Iterator[LiveCell]:
     """Opens both devices, and closes them at the end of the block."""
     with closing(open_arm(arm, wish)) as opened:
         if not wish.watch_only and not isinstance(opened, MovingArm):
@@ -270,7 +277,7 @@ class ViewLines:
         say(line_of(step))
 
 
-def driven(
+def record_driven(
     cell: LiveCell,
     scene: RecordedSetup,
     journal: Journal,
@@ -280,7 +287,7 @@ def driven(
     asks: bool,
 ) -> list[CaptureEvent]:
     """Drives the plan's stops, after the user's confirmation."""
-    leaving = departure(cell, scene.planned, [view.number for view in journal.views], taking)
+    leaving = motion_summary(cell, scene.planned, [view.number for view in journal.views], taking)
     report_departure(leaving, cell, taking)
     if not leaving.stops:
         return []
@@ -289,7 +296,7 @@ def driven(
     return record(cell, scene.planned, journal, taking, watchers, lens=cell.camera.factory)
 
 
-def report_departure(leaving: Departure, cell: LiveCell, taking: CaptureOptions) -> None:
+def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOptions) -> None:
     """Prints what is about to be driven."""
     say, count = messages().print, len(leaving.stops)
     if not count:
@@ -330,7 +337,7 @@ def _confirm(cell: LiveCell) -> None:
 
 def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:
     """Ends with status 2 where stops of the plan gave no view."""
-    missing = dict(missed(steps))
+    missing = dict(missed_stops(steps))
     if missing:
         words = "; ".join(f"view {key}: {reason}" for key, reason in missing.items())
         raise DataError(

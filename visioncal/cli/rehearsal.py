@@ -19,20 +19,20 @@ from visioncal.cli.progress import shown_progress
 from visioncal.cli.recorded_cell import (
     RecordedSetup,
     ViewLines,
-    driven,
     facts_of,
+    record_driven,
     scene_of,
     shown_in,
 )
 from visioncal.cli.summary import print_summary, truth_table
 from visioncal.core.choices import Faults
 from visioncal.core.errors import DataError, DriverError, VisioncalError
-from visioncal.core.interrupts import ended_like_ctrl_c
+from visioncal.core.interrupts import signals_as_interrupts
 from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
-from visioncal.frames.touch_test import finding_of, judged, touch_points
+from visioncal.frames.touch_test import evaluate_gaps, touch_points, touch_test_finding
 from visioncal.interchange.outputs import Written, write_outputs, write_plan
-from visioncal.live.capture.core import CaptureEvent, Watcher, missed
+from visioncal.live.capture.core import CaptureEvent, Watcher, missed_stops
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import TakenView
@@ -42,7 +42,7 @@ from visioncal.live.planning.purposes import purpose_of
 from visioncal.live.planning.written import plan_document
 from visioncal.live.rehearsal.bench import Bench, FaultInjection
 from visioncal.live.rehearsal.cell import RehearsalOptions, RehearsedCell, rehearsed_cell
-from visioncal.live.rehearsal.witness import EdgeCheck, Pace, Witness, explained, pace_of
+from visioncal.live.rehearsal.witness import EdgeCheck, Pace, Witness, check_edges, pace_of
 from visioncal.results import Calibration
 from visioncal.results.arm import NOMINAL
 from visioncal.results.compare import edge_errors
@@ -60,7 +60,9 @@ TAKING = CaptureOptions(speed=1.05, acceleration=1.4)
 _CANDIDATES = 600
 
 
-def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray) -> TouchTest:
+def simulated_touch_test(
+    folder: Path, calibration: Calibration, base_from_target: FloatArray
+) -> TouchTest:
     """Simulated touch test of located points, with the board's true (4, 4) pose [m]."""
     points = touch_points(Session.load(folder), calibration)
     true_points = [
@@ -70,7 +72,7 @@ def touched(folder: Path, calibration: Calibration, base_from_target: FloatArray
         1e3 * float(np.linalg.norm(point.base_m - true))
         for point, true in zip(points, true_points, strict=True)
     ]
-    return judged(points, gaps)
+    return evaluate_gaps(points, gaps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +85,11 @@ class RehearsedRecording:
     """
 
     steps: tuple[CaptureEvent, ...]
-    fault: "Suffered | None"
+    fault: "FaultEffect | None"
 
 
 @dataclass(frozen=True)
-class Suffered:
+class FaultEffect:
     """Effect of a fault on a recording.
 
     Attributes:
@@ -149,7 +151,7 @@ def recorded(
         if injection.injected_s is None:
             raise
         report_error(error, as_json=False)
-        suffered = Suffered(
+        suffered = FaultEffect(
             fault,
             error.message,
             error.next_step,
@@ -160,7 +162,7 @@ def recorded(
     else:
         raise DriverError(f"rehearse: {fault} did not happen before all views were taken.")
     say(f"  ({fault} is mended; on with --resume)")
-    injection.mend()
+    injection.clear_fault()
     resumed_steps = _drive(bench, scene, folder, watchers, resume=True, view=view)
     return RehearsedRecording((*keeper.steps, *resumed_steps), suffered)
 
@@ -183,14 +185,14 @@ def _drive(
     resume: bool,
     view: bool,
 ) -> list[CaptureEvent]:
-    with ExitStack() as opened, ended_like_ctrl_c():
+    with ExitStack() as opened, signals_as_interrupts():
         cell = opened.enter_context(bench.connected())
         begin = Journal.resume if resume else Journal.begin
         facts = facts_of(scene, cell, folder.name)
         journal = begin(folder, facts, cell.clock.unix_offset_s(), len(scene.planned.stops))
         shown = opened.enter_context(shown_in(scene, cell, wanted=view))
         all_watchers = [ViewLines(), *shown, *watchers]
-        return driven(cell, scene, journal, TAKING, all_watchers, asks=False)
+        return record_driven(cell, scene, journal, TAKING, all_watchers, asks=False)
 
 
 class _KeptViews:
@@ -215,7 +217,7 @@ class _KeptViews:
 
 def _check_all_seen(steps: Sequence[CaptureEvent]) -> None:
     """Raises DataError where stops gave no view, as at the end of a recording."""
-    missing = list(missed(steps))
+    missing = list(missed_stops(steps))
     if missing:
         view, reason = missing[0]
         raise DataError(
@@ -247,14 +249,14 @@ def rehearse(
     run, written = calibrated(out / "session", out / "result")
     calibration = run.calibration
     board = cell.truth.transforms.get("base_from_target")
-    test = None if board is None else touched(out / "session", calibration, board)
+    test = None if board is None else simulated_touch_test(out / "session", calibration, board)
     ended = time.monotonic()
     return Rehearsal(
         options,
         cell,
         calibration,
         written,
-        explained(calibration, cell.truth.transforms),
+        check_edges(calibration, cell.truth.transforms),
         taken,
         None if fault else pace_of(taken.steps, scene.planned, start_q, TAKING),
         tuple(witness.away_mm),
@@ -340,7 +342,7 @@ class Rehearsal:
             f"numbers, and up to {error.limit:.0f} is believed"
         )
         if self.touch_test is not None:
-            say(escape(finding_of(self.touch_test).words))
+            say(escape(touch_test_finding(self.touch_test).words))
         if self.pace is not None:
             pace = self.pace
             say(

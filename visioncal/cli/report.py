@@ -67,10 +67,10 @@ def report_command(
         _recompute(stored)
         return
     if certificate:
-        from visioncal.present.report.certificate import Signed, write_certificate
+        from visioncal.present.report.certificate import CertificateEntries, write_certificate
 
         page = out or Path("certificate.html")
-        signed = Signed(operator, dict(map(_pair, serial or ())))
+        signed = CertificateEntries(operator, dict(map(_pair, serial or ())))
         write_certificate(page, stored.calibration, stored.session, signed)
         say(f"wrote {page}")
         return

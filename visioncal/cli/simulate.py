@@ -16,7 +16,7 @@ from visioncal.core.errors import DataError
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.simulation import CellOptions, SimulatedCell
-    from visioncal.simulation.tracked import Tracked
+    from visioncal.simulation.instrument_session import InstrumentOptions
 Read: TypeAlias = Literal["point", "points", "probe"]
 
 # Parameters of a cell of one robot, for any kind of recording.
@@ -172,7 +172,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
     from visioncal.session.saving import refuse_filled
     from visioncal.simulation import BOARDS, CAMERAS, CellOptions, Payload, Second, truth_path
     from visioncal.simulation.exercise import write_exercise
-    from visioncal.simulation.tracked import Tracked, tracked, write_tracked
+    from visioncal.simulation.instrument_session import InstrumentOptions, tracked, write_tracked
 
     given, folder = _given_for(context), asked.folder
     options = CellOptions(
@@ -201,7 +201,7 @@ def simulate_command(context: typer.Context, asked: SimulateOptions) -> None:
         cell = whole_cell(asked.cell, options, given, asked.instrument)
         _write(exercised(cell, asked) if asked.torques else cell, asked)
     elif asked.instrument is not None:
-        stops = asked.views if "views" in given else Tracked.stops
+        stops = asked.views if "views" in given else InstrumentOptions.stops
         write_tracked(tracked(_read_by(asked.instrument, options, stops)), folder)
     elif asked.torques:
         write_exercise(exercise_options(asked, asked.robot, asked.seed), folder)
@@ -248,12 +248,12 @@ def _write(cell: "SimulatedCell", asked: SimulateOptions) -> None:
         )
 
 
-def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "Tracked":
+def _read_by(instrument: Read, options: "CellOptions", stops: int) -> "InstrumentOptions":
     """Options of an instrument that measures the cell's arm."""
     from visioncal.simulation import ArmOptions
-    from visioncal.simulation.tracked import THREE, Tracked
+    from visioncal.simulation.instrument_session import THREE, InstrumentOptions
 
-    return Tracked(
+    return InstrumentOptions(
         stops=stops,
         points=THREE if instrument == "points" else THREE[:1],
         poses=instrument == "probe",

@@ -23,7 +23,7 @@ from visioncal.simulation import (
 )
 from visioncal.simulation.dynamics import LinkBody
 from visioncal.simulation.exercise import ExerciseOptions, Senses, exercise, seed_of, with_exercises
-from visioncal.simulation.tracked import THREE, Tracked
+from visioncal.simulation.instrument_session import THREE, InstrumentOptions
 
 _T = TypeVar("_T", RobotAt, CameraAt)
 
@@ -125,7 +125,7 @@ def _with_instrument(name: str, described: NetworkOptions, instrument: Read) -> 
     )
     tracker = InstrumentAt("tracker", (2.5, -1.0, 0.4), 2.5)
     if instrument == "probe":
-        tracker = replace(tracker, sigma_rad=Tracked.sigma_rad)
+        tracker = replace(tracker, sigma_rad=InstrumentOptions.sigma_rad)
     return replace(described, instruments=(tracker,), points=points)
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from visioncal.cli.framing import Asked, FrameOptions, PointOption, TouchOptions, place_frame
+from visioncal.cli.framing import FrameOptions, FrameRequest, PointOption, TouchOptions, place_frame
 from visioncal.cli.options import AsJson, PartOptions
 
 # For type hints only, so that --help stays fast.
@@ -41,4 +41,4 @@ def tcp_command(
         rows = read_touches(touches, written.requested(), part.robot)
         return touched_tool(rows, calibration, written.model, touch_noise_m=written.noise_m)
 
-    place_frame(Asked("tool", touches, goes, written, part, point, as_json), by_touches)
+    place_frame(FrameRequest("tool", touches, goes, written, part, point, as_json), by_touches)

@@ -77,9 +77,9 @@ def touch_test_command(
     all gaps, they are compared with what was predicted, and kept in the result and its report. Exit
     status 3: they are larger.
     """
-    from visioncal.frames.measured import Tool
-    from visioncal.frames.touch_test import finding_of, judged, touch_points
-    from visioncal.interchange.merge_results import rewrite
+    from visioncal.frames.measured_points import Tool
+    from visioncal.frames.touch_test import evaluate_gaps, touch_points, touch_test_finding
+    from visioncal.interchange.merge_results import rewrite_result
     from visioncal.interchange.result_files import load_result
     from visioncal.results import to_document
     from visioncal.session import Session
@@ -118,13 +118,13 @@ def touch_test_command(
     else:
         _report(points, targets, as_json=as_json)
         return
-    test = judged(points, gaps, touching)
+    test = evaluate_gaps(points, gaps, touching)
     extended = replace(result, touch_test=test)
-    written = rewrite(calibration if calibration.is_dir() else calibration.parent, extended)
+    written = rewrite_result(calibration if calibration.is_dir() else calibration.parent, extended)
     if as_json:
         print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
-        answers().print(escape(finding_of(test).reason))
+        answers().print(escape(touch_test_finding(test).reason))
     report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
 
 
@@ -199,7 +199,7 @@ def _drive(
 ) -> list[float]:
     """Drives the tip above each point, and asks for its gap."""
     from visioncal.core.transforms import invert
-    from visioncal.live.capture.devices import ArmWish, open_arm
+    from visioncal.live.capture.devices import ArmSetup, open_arm
     from visioncal.live.capture.hover import Hovering
     from visioncal.live.drivers.protocols import MovingArm
 
@@ -212,7 +212,7 @@ def _drive(
     if asks and not typer.confirm("The arm will move. Is the cell clear?", err=True):
         raise DataError("touch-test: not begun; nothing moved.", culprits=["--drive"])
     gaps = []
-    with closing(open_arm(words, ArmWish("", watch_only=False, ask=_line))) as arm:
+    with closing(open_arm(words, ArmSetup("", watch_only=False, ask=_line))) as arm:
         if not isinstance(arm, MovingArm):
             raise DataError(f"{arm.name} cannot be driven.", culprits=["--drive"])
         for point, target in zip(points, targets, strict=True):

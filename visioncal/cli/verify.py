@@ -69,14 +69,14 @@ def verify_command(
         verify,
     )
     from visioncal.interchange.result_files import load_result
-    from visioncal.results import picked
+    from visioncal.results import select_matching
     from visioncal.session import Session
 
     against = named_result(against, "--against", "verify: the calibration to check")
     if output is not None:
         refuse_calibration(output)
     triggers = load_policy(policy)
-    loaded, calibration = picked(Session.load(session), load_result(against), part.choice)
+    loaded, calibration = select_matching(Session.load(session), load_result(against), part.choice)
     with shown_progress(quiet=as_json) as progress:
         check = verify(loaded, calibration, board_placed_anew=board_moved, progress=progress)
     facts = facts_of(loaded, calibration, failed=not check.passed, collision=collision)
@@ -98,13 +98,13 @@ def _report(check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict") -
 
     console = answers()
     word, colour = ("pass", "green") if check.passed else ("fail", "red")
-    name = escape(check.seen.known.session.name)
+    name = escape(check.predicted.observed.session.name)
     against = escape(f"{check.calibration.session_name}, {check.calibration.created}")
     console.print(f"[bold {colour}]{word}[/]  {name} against {against}")
-    for line in (*verdict.top, *verdict.rest, *check.seen.warnings):
+    for line in (*verdict.top, *verdict.rest, *check.predicted.warnings):
         console.print(f"  - {escape(line)}")
     print_steps(verdict.next_steps)
-    for view, reason in sorted(check.seen.known.reasons.items()):
+    for view, reason in sorted(check.predicted.observed.reasons.items()):
         console.print(f"  view {view} was not used: {escape(reason)}")
     for state, begin in _TRIGGERED.items():
         words = "; ".join(trigger.words for trigger in triggers if trigger.state == state)

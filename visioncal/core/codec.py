@@ -142,7 +142,7 @@ def entries(cls: type) -> tuple[Entry, ...]:
     return tuple(sorted(result, key=lambda value: REST not in value.marks))
 
 
-def names_but(cls: type, others: str) -> tuple[str, ...]:
+def field_names_except(cls: type, others: str) -> tuple[str, ...]:
     """Names of a dataclass' fields except for some, given as a space-separated list."""
     return tuple(entry.name for entry in fields(cls) if entry.name not in others.split())
 
@@ -231,7 +231,7 @@ def _read(kind: Any, value: Any, path: str) -> Any:  # noqa: ANN401 - what JSON 
     if origin is Literal:
         if value not in args:
             words = ", ".join(map(repr, args))
-            raise other(value, f"one of {words}" if len(args) > 1 else words, path)
+            raise type_error(value, f"one of {words}" if len(args) > 1 else words, path)
         return value
     if origin is tuple:
         return _read_tuple(args, value, path)
@@ -282,11 +282,11 @@ def _fitting(kinds: list[Any], value: object) -> Any:  # noqa: ANN401 - a type
 
 def _read_tuple(args: tuple[Any, ...], value: object, path: str) -> tuple[Any, ...]:
     if not isinstance(value, list):
-        raise other(value, "a list", path)
+        raise type_error(value, "a list", path)
     if args[-1] is Ellipsis:
         args = (args[0],) * len(value)
     if len(value) != len(args):
-        raise other(value, f"a list of {len(args)}", path)
+        raise type_error(value, f"a list of {len(args)}", path)
     return tuple(
         _read(kind, item, f"{path}[{index}]")
         for index, (kind, item) in enumerate(zip(args, value, strict=True))
@@ -297,7 +297,7 @@ def _array(kind: Any, form: Array, value: object, path: str) -> Any:  # noqa: AN
     """Reads an array of a type such as `npt.NDArray[np.float64]`."""
     (wanted,) = get_args(get_args(kind)[1])
     sizes = " x ".join("n" if index < 0 else str(index) for index in form.shape)
-    shape_error = other(value, f"an array of {sizes} numbers", path)
+    shape_error = type_error(value, f"an array of {sizes} numbers", path)
     try:
         array = np.asarray(value)
     except ValueError as error:
@@ -321,11 +321,11 @@ def plain(kind: type[_T], value: Any, path: str) -> _T:  # noqa: ANN401 - what J
     """Checks that a value is a number, a text, or a boolean; raises DataError."""
     kinds = (int, float) if kind is float else (kind,)
     if not isinstance(value, kinds) or (isinstance(value, bool) and kind is not bool):
-        raise other(value, _WORDS[kind], path)
+        raise type_error(value, _WORDS[kind], path)
     return kind(value)  # type: ignore[call-arg] # float of an int, or what it is
 
 
-def other(value: object, needed: str, path: str) -> DataError:
+def type_error(value: object, needed: str, path: str) -> DataError:
     """Builds the error for a value of another type than needed."""
     place = path or "the document"
     return DataError(f"{place} is {value!r:.60}; {needed} is needed.", culprits=[place])
@@ -333,7 +333,7 @@ def other(value: object, needed: str, path: str) -> DataError:
 
 def _table(value: object, path: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise other(value, "a table", path)
+        raise type_error(value, "a table", path)
     return value
 
 

@@ -206,13 +206,13 @@ class PoseNumbers:
         return cls(meant[:, :3, 3] / UNITS_M[reading.unit], rotations, reading, tuple(places))
 
     @classmethod
-    def nowhere(cls, places: Sequence[str]) -> "PoseNumbers":
+    def empty(cls, places: Sequence[str]) -> "PoseNumbers":
         """Rows without poses."""
         none = np.full((len(places), 7), np.nan)
         return cls(none[:, :3], none[:, 3:], Reading(), tuple(places))
 
     @property
-    def there(self) -> Mask:
+    def present(self) -> Mask:
         """(n,) rows that have a pose, valid or not."""
         return _finite_rows(self.positions) & _finite_rows(self.rotations)
 
@@ -245,7 +245,7 @@ class PoseNumbers:
                 f"{form.words} has {form.size}.",
                 culprits=[self.places[0]],
             )
-        present = self.there
+        present = self.present
         given = np.isfinite(np.hstack([self.positions, self.rotations]))
         partly = self._places_of(given.any(axis=1) & ~present)
         if partly:

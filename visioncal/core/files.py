@@ -14,7 +14,7 @@ from typing import Any
 
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
-from visioncal.core.temporary_files import aside_file
+from visioncal.core.temporary_files import temporary_file
 
 
 def sha256(data: bytes) -> str:
@@ -36,7 +36,7 @@ def write_atomically(path: Path | str, data: bytes | str) -> None:
     Raises:
         DataError: The folder is missing or cannot be written.
     """
-    with written_beside(Path(path)) as aside, aside.open("wb") as file:
+    with replacing_file(Path(path)) as aside, aside.open("wb") as file:
         file.write(data.encode("utf-8") if isinstance(data, str) else data)
         file.flush()
         os.fsync(file.fileno())
@@ -53,12 +53,12 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 
 @contextmanager
-def written_beside(path: Path) -> Iterator[Path]:
+def replacing_file(path: Path) -> Iterator[Path]:
     """Yields a temporary file in the same folder, which replaces `path` at the end.
 
     After an exception it is removed, and `path` is unchanged; OSErrors become DataErrors.
     """
-    with named_errors(path), aside_file(path.parent) as aside:
+    with named_errors(path), temporary_file(path.parent) as aside:
         yield aside
         aside.replace(path)
 

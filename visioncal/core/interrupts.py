@@ -7,7 +7,7 @@ from types import FrameType
 
 
 @contextmanager
-def ended_like_ctrl_c(*names: str) -> Iterator[None]:
+def signals_as_interrupts(*names: str) -> Iterator[None]:
     """Runs a block in which signals raise KeyboardInterrupt, like Ctrl-C.
 
     By default SIGTERM, and SIGHUP of a closed terminal; signals that the system lacks are ignored.

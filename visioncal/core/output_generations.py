@@ -22,7 +22,7 @@ from pathlib import Path
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import flush_folder
-from visioncal.core.temporary_files import LOCK, aside_folder, free_name, locked
+from visioncal.core.temporary_files import LOCK, free_name, locked, temporary_folder
 
 _SWITCH = ".visioncal-switch"
 _OLD, _NEW, _CURRENT = "old", "new", "current"
@@ -59,7 +59,7 @@ def write_generation(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _recover(folder, wait=False)
-        with aside_folder(folder) as (aside, is_locked):
+        with temporary_folder(folder) as (aside, is_locked):
             new = aside / _NEW
             new.mkdir()
             with _final_paths_in_errors(new, folder):

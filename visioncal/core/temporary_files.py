@@ -28,7 +28,7 @@ def free_name(folder: Path) -> Path:
 
 
 @contextmanager
-def aside_file(folder: Path) -> Iterator[Path]:
+def temporary_file(folder: Path) -> Iterator[Path]:
     """Yields an empty temporary file, which is removed at the end if it still exists."""
     remove_abandoned(folder)
     while True:
@@ -36,7 +36,7 @@ def aside_file(folder: Path) -> Iterator[Path]:
         path.touch(exist_ok=False)
         with locked(path, wait=True) as held:
             # Another writer may have removed it as abandoned before it was locked.
-            if held or path.exists():
+            if held is not False:
                 try:
                     yield path
                 finally:
@@ -46,7 +46,7 @@ def aside_file(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def aside_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
+def temporary_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
     """Yields a temporary folder, which is removed at the end if it still exists.
 
     Yields:
@@ -57,25 +57,26 @@ def aside_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
         path = free_name(folder)
         path.mkdir()
         with locked(path / LOCK, wait=True) as held:
-            if held or path.exists():
+            # As with files; what several writers left of it is abandoned.
+            if held is not False:
                 try:
-                    yield path, held
+                    yield path, bool(held)
                 finally:
                     shutil.rmtree(path, ignore_errors=True)
                 return
 
 
 @contextmanager
-def locked(path: Path, *, wait: bool) -> Iterator[bool]:
+def locked(path: Path, *, wait: bool) -> Iterator[bool | None]:
     """Locks a file, which is created if needed.
 
     Yields:
-        Whether the lock is held: not if another process has it (and `wait` is false), the file was
-        moved or removed meanwhile, or there are no locks.
+        Whether the lock is held: not if another process has it (and `wait` is false), or the file
+        was moved or removed meanwhile. None where there are no locks.
     """
     if sys.platform == "win32":
         path.touch()
-        yield False
+        yield None
         return
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
@@ -83,18 +84,21 @@ def locked(path: Path, *, wait: bool) -> Iterator[bool]:
         yield False
         return
     try:
-        yield _flocked(descriptor, wait=wait) and _is_at(descriptor, path)
+        is_locked = _flocked(descriptor, wait=wait)
+        yield is_locked and _is_at(descriptor, path)
     finally:
         os.close(descriptor)
 
 
 if sys.platform != "win32":
 
-    def _flocked(descriptor: int, *, wait: bool) -> bool:
+    def _flocked(descriptor: int, *, wait: bool) -> bool | None:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             return False
+        except OSError:
+            return None
         return True
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from visioncal.core.codec import DROPPED, UNWRITTEN
 from visioncal.core.number_format import percent, ranges
-from visioncal.core.shown import html_card
+from visioncal.core.summaries import html_card
 
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 

@@ -6,18 +6,19 @@ from visioncal.dynamics.document import stribeck_rows
 from visioncal.dynamics.excitation import Excitation, ExcitationRequest, excite
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.judge import judge
-from visioncal.dynamics.limits import Missing, Share, allowed_motion
+from visioncal.dynamics.limits import DefaultLimits, MotionMargins, motion_limits
 from visioncal.dynamics.model import DynamicModel, Friction, FrictionTerms, sign
 from visioncal.dynamics.motion import JointMotion, Measured
 from visioncal.dynamics.observer import MomentumObserver, external_torques
 from visioncal.dynamics.payload import Gains, Payload, drive_gains, estimate_payload
 from visioncal.dynamics.run import Run
 from visioncal.dynamics.sweeps import SweepRequest, Sweeps, plan_sweeps
-from visioncal.dynamics.validate import Prediction, friction_at, left_for_friction
+from visioncal.dynamics.validate import Prediction, friction_at, measured_friction
 
 __all__ = [
     "ArmDynamics",
     "BaseModel",
+    "DefaultLimits",
     "DynamicModel",
     "Excitation",
     "ExcitationRequest",
@@ -27,22 +28,21 @@ __all__ = [
     "Identified",
     "JointMotion",
     "Measured",
-    "Missing",
     "MomentumObserver",
+    "MotionMargins",
     "Payload",
     "Prediction",
     "Run",
-    "Share",
     "SweepRequest",
     "Sweeps",
-    "allowed_motion",
     "drive_gains",
     "estimate_payload",
     "excite",
     "external_torques",
     "friction_at",
     "judge",
-    "left_for_friction",
+    "measured_friction",
+    "motion_limits",
     "plan_sweeps",
     "sign",
     "stribeck_rows",

@@ -9,7 +9,14 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import Friction
-from visioncal.robot import Inertias, Robot, joint_torques, momenta, moving, with_inertias
+from visioncal.robot import (
+    Inertias,
+    Robot,
+    joint_torques,
+    momenta,
+    parameter_transform,
+    with_inertias,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +86,7 @@ class ArmDynamics:
     def carrying(self, body: FloatArray) -> "ArmDynamics":
         """The arm with a payload of (10,) parameters in the flange's frame, as in `Inertias`."""
         values = self.inertias.values.copy()
-        values[-1] += moving(self.robot.chain.placements[-1]) @ body
+        values[-1] += parameter_transform(self.robot.chain.placements[-1]) @ body
         return replace(self, inertias=Inertias(values))
 
     def weighed(self) -> Robot:

@@ -208,7 +208,7 @@ def smooth_condition(rows: FloatArray, sharpness: float) -> tuple[float, FloatAr
     return float(value), np.asarray(gradient_rows)
 
 
-def check_turning(base: BaseModel, streams: Sequence[Conditioned]) -> None:
+def check_joints_move(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     """Refuses motions in which a joint stands still, by a DegenerateError."""
     fastest = np.max(
         [np.abs(piece.measured.motion.dq).max(axis=0) for item in streams for piece in item.pieces],

@@ -222,13 +222,13 @@ class Piece:
 
     Attributes:
         measured: The samples.
-        bad: (m, n) torques without information: saturated, or of a joint that stands still.
+        invalid: (m, n) torques without information: saturated, or of a joint that stands still.
         present: (m,) where torques were recorded; regressors are filtered over the same samples.
         lowpass: Filter of torques and regressors alike.
     """
 
     measured: Measured
-    bad: Mask
+    invalid: Mask
     present: Mask
     lowpass: LowPass
 
@@ -258,9 +258,9 @@ class Piece:
     @property
     def used(self) -> Mask:
         """(k, n) which of the filtered torques can be used."""
-        used = np.ones((len(self.times_s), self.bad.shape[1]), dtype=bool)
-        if self.bad.any():
-            used &= self.lowpass.share_of(self.bad) <= _MOST_INVALID
+        used = np.ones((len(self.times_s), self.invalid.shape[1]), dtype=bool)
+        if self.invalid.any():
+            used &= self.lowpass.share_of(self.invalid) <= _MOST_INVALID
         if not self.present.all():
             used &= self.lowpass.share_of(~self.present)[:, None] <= _MOST_MISSING
         return used
@@ -278,8 +278,10 @@ class Piece:
         measured = replace(self.measured, torques_nm=at(self.measured.torques_nm))
         # Of joints at rest neither the torque recorded then nor the one shifted there is
         # informative.
-        bad = self.bad | (at(self.bad.astype(float)) > 0.0)
-        return replace(self, measured=measured, bad=np.asarray(bad), present=np.asarray(present))
+        bad = self.invalid | (at(self.invalid.astype(float)) > 0.0)
+        return replace(
+            self, measured=measured, invalid=np.asarray(bad), present=np.asarray(present)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +336,7 @@ class Conditioned:
         parts = [piece.filtered(columns) for piece in self.pieces]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def advanced(self, lag_s: float) -> Self:
+    def lag_corrected(self, lag_s: float) -> Self:
         """The same with the torques shifted earlier by a lag [s]."""
         return replace(self, pieces=tuple(piece.advanced(lag_s) for piece in self.pieces))
 

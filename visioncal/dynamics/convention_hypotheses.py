@@ -56,7 +56,7 @@ class _Hypothesis:
     predicted: FloatArray
 
 
-def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
+def check_recording(base: BaseModel, streams: Sequence[Conditioned]) -> None:
     """Refuses recordings that are plainly mistaken.
 
     Without inertias, mistakes are tested by a fit of all parameters, which cannot show the unit or
@@ -89,7 +89,7 @@ def check_mistakes(base: BaseModel, streams: Sequence[Conditioned]) -> None:
 def _sampled(stream: Conditioned) -> Measured:
     """Unfiltered samples, spread over a stream, at which all torques are valid."""
     piece = max(stream.pieces, key=lambda value: len(value.measured))
-    good = np.flatnonzero(piece.present & ~piece.bad.any(axis=1))
+    good = np.flatnonzero(piece.present & ~piece.invalid.any(axis=1))
     return piece.measured.chosen(good[:: max(len(good) // _SAMPLES, 1)])
 
 

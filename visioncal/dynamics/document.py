@@ -12,7 +12,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.dynamics.base import BaseModel
 from visioncal.dynamics.consistent import Consistent
-from visioncal.dynamics.identified import Identified, Lag, StreamFacts, TorqueValidation
+from visioncal.dynamics.identified import Identified, Lag, StreamStatistics, TorqueValidation
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.stribeck import Stribeck
@@ -40,7 +40,7 @@ def to_document(identified: Identified) -> dict[str, Any]:
         ],
         "covariance": identified.covariance.tolist(),
         "stribeck": stribeck_rows(identified),
-        "streams": [write(StreamFacts, stream) for stream in identified.streams],
+        "streams": [write(StreamStatistics, stream) for stream in identified.streams],
     }
     if identified.consistent is not None:
         document["standard"] = _standard_document(identified, identified.consistent)
@@ -144,7 +144,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
 class _Figures:
     """The fields that the codec reads."""
 
-    streams: tuple[StreamFacts, ...]
+    streams: tuple[StreamStatistics, ...]
     validation: TorqueValidation | None = None
     lag: Lag | None = None
 

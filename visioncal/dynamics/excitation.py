@@ -21,7 +21,7 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Progress
 from visioncal.dynamics.base import BaseModel, Condition, condition_of, smooth_condition
 from visioncal.dynamics.fourier import Harmonics, Series
-from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept, kept_limits
+from visioncal.dynamics.limits import CHECK_HZ, MotionExtremes, MotionLimits, motion_extremes
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
 from visioncal.dynamics.motion import JointMotion
 
@@ -66,7 +66,7 @@ class Objective:
     """
 
     def __init__(
-        self, allowed: Allowed, base: BaseModel, weights: FloatArray, harmonics: Harmonics
+        self, allowed: MotionLimits, base: BaseModel, weights: FloatArray, harmonics: Harmonics
     ) -> None:
         """Prepares the samples; weights (n,) are the inverse of each joint's torque noise."""
         self.harmonics = harmonics
@@ -231,7 +231,7 @@ class Excitation:
         series: The motion.
         condition: Condition numbers of its regressor.
         random: Median of those of random motions within the limits of joints and drives.
-        kept: Its extremes, at a thousand samples a second.
+        extremes: Its extremes, at a thousand samples a second.
         starts: Number of descents made.
         seconds: Duration of the search [s of one core].
     """
@@ -242,13 +242,13 @@ class Excitation:
     series: Series
     condition: Condition
     random: Condition
-    kept: Kept
+    extremes: MotionExtremes
     starts: int
     seconds: float
 
 
 def excite(
-    allowed: Allowed, request: ExcitationRequest, progress: Progress | None = None
+    allowed: MotionLimits, request: ExcitationRequest, progress: Progress | None = None
 ) -> Excitation:
     """Searches for the motion that determines the base parameters best.
 
@@ -263,7 +263,7 @@ class _ExcitationSearch:
     """Descents from random motions; the best result is kept."""
 
     def __init__(
-        self, allowed: Allowed, request: ExcitationRequest, progress: Progress | None
+        self, allowed: MotionLimits, request: ExcitationRequest, progress: Progress | None
     ) -> None:
         self._allowed, self._request, self._progress = allowed, request, progress
         self._begin = time.process_time()
@@ -273,7 +273,7 @@ class _ExcitationSearch:
         self._harmonics = Harmonics(request.period_s, request.harmonics)
         self._objective = Objective(allowed, self._base, self._weights, self._harmonics)
         self._rng = np.random.default_rng(request.seed)
-        self._best: tuple[Condition, Series, Kept] | None = None
+        self._best: tuple[Condition, Series, MotionExtremes] | None = None
         self._breaches: tuple[str, ...] = ()
 
     def run(self) -> Excitation:
@@ -336,7 +336,7 @@ class _ExcitationSearch:
             condition = self._figures(series)
             if self._best is not None and condition.weighted >= self._best[0].weighted:
                 return
-            kept = kept_limits(self._allowed, series.sampled(CHECK_HZ))
+            kept = motion_extremes(self._allowed, series.sampled(CHECK_HZ))
             self._breaches = kept.breaches
             if not kept.breaches:
                 self._best = condition, series, kept
@@ -404,7 +404,7 @@ class _ExcitationSearch:
         return Condition(*figures.tolist())
 
 
-def _shrunk_to_limits(allowed: Allowed, series: Series) -> Series:
+def _shrunk_to_limits(allowed: MotionLimits, series: Series) -> Series:
     """Shrinks a motion to the limits of the joints' ranges, speeds and accelerations."""
     motion, middle = series.sampled(CHECK_HZ), series.coefficients[0]
     above, below = motion.q.max(axis=0) - middle, middle - motion.q.min(axis=0)

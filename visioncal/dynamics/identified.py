@@ -27,7 +27,7 @@ UNKNOWN = "not at all"
 
 
 @dataclass(frozen=True, eq=False)
-class StreamFacts:
+class StreamStatistics:
     """Statistics of a fitted stream.
 
     Attributes:
@@ -131,7 +131,7 @@ class Identified:
     covariance: FloatArray
     stribeck: Stribeck
     consistent: Consistent | None
-    streams: tuple[StreamFacts, ...]
+    streams: tuple[StreamStatistics, ...]
     validation: TorqueValidation | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     lag: Lag | None = None

@@ -13,13 +13,13 @@ import numpy as np
 
 from visioncal.core.limits import DynamicsLimits
 from visioncal.core.types import FloatArray, Mask
-from visioncal.dynamics.base import BaseModel, check_identifiable, check_turning, null_space
+from visioncal.dynamics.base import BaseModel, check_identifiable, check_joints_move, null_space
 from visioncal.dynamics.conditioning import Conditioned
 from visioncal.dynamics.consistent import fit_consistent
-from visioncal.dynamics.convention_hypotheses import check_mistakes
-from visioncal.dynamics.identified import Identified, Lag, StreamFacts
+from visioncal.dynamics.convention_hypotheses import check_recording
+from visioncal.dynamics.identified import Identified, Lag, StreamStatistics
 from visioncal.dynamics.model import DynamicModel, FrictionTerms
-from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of, spread_of
+from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of, std_of
 from visioncal.dynamics.stribeck import Stribeck, fit_stribeck
 from visioncal.robot import Robot
 
@@ -78,9 +78,9 @@ def identify(
     """
     options = Options() if options is None else options
     base = BaseModel.reduce(DynamicModel(robot, options.terms))
-    check_turning(base, streams)
+    check_joints_move(base, streams)
     if options.checked:
-        check_mistakes(base, streams)
+        check_recording(base, streams)
     blocks = [block_of(base, stream) for stream in streams]
     check_identifiable(base, blocks)
     fit = regress(blocks)
@@ -98,7 +98,13 @@ def identify(
             base, fit.values[kept], fit.covariance[kept, kept], robot.inertias
         )
     identified = Identified(
-        robot, base, fit.values[: base.rank], fit.covariance, humps, consistent, facts(streams, fit)
+        robot,
+        base,
+        fit.values[: base.rank],
+        fit.covariance,
+        humps,
+        consistent,
+        stream_statistics(streams, fit),
     )
     return Identification(identified, tuple(streams), fit)
 
@@ -109,10 +115,12 @@ def block_of(base: BaseModel, stream: Conditioned) -> NoiseBlock:
     return NoiseBlock(x, stream.torques_nm, stream.used, stream.correlation)
 
 
-def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts, ...]:
+def stream_statistics(
+    streams: Sequence[Conditioned], fit: Regression
+) -> tuple[StreamStatistics, ...]:
     """Statistics of each stream."""
     return tuple(
-        StreamFacts(
+        StreamStatistics(
             label=stream.label,
             samples=stream.count,
             left_out=int(np.sum(~block.used)),
@@ -121,7 +129,7 @@ def facts(streams: Sequence[Conditioned], fit: Regression) -> tuple[StreamFacts,
             rate_hz=stream.rate_hz,
             noise_nm=sigma,
             rms_nm=rms_of(residuals, block.used),
-            torque_nm=spread_of(block.y, block.used),
+            torque_nm=std_of(block.y, block.used),
             notes=stream.notes,
         )
         for stream, block, residuals, sigma in zip(
@@ -169,7 +177,7 @@ def _estimated_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock])
             break
     lag = Lag(lag_s, sigma, _change_share(fit, lag_s))
     residual_shares = [
-        rms_of(residual, block.used) / spread_of(block.y, block.used)
+        rms_of(residual, block.used) / std_of(block.y, block.used)
         for residual, block in zip(fit.residuals, fit.blocks, strict=True)
     ]
     significant = _SIGMAS * sigma < abs(lag_s) <= _LARGEST_S and lag.share > _LIMITS.slight_share
@@ -186,7 +194,7 @@ def _grid_lag(streams: Sequence[Conditioned], blocks: Sequence[NoiseBlock]) -> f
     for stream, block in zip(streams, blocks, strict=True):
         used = block.used & _inside(stream, _LARGEST_S)[:, None]
         used[np.arange(len(used)) % max(total // _ROWS, 1) > 0] = False
-        sizes = np.maximum(spread_of(block.y, used), 1e-12)
+        sizes = np.maximum(std_of(block.y, used), 1e-12)
         rows.append((block.x / sizes[:, None])[used])
         torques.append(np.stack([(_torques(stream, lag) / sizes)[used] for lag in lags], axis=1))
         joints.append(np.nonzero(used)[1])
@@ -243,7 +251,7 @@ def _change_share(fit: Regression, lag_s: float) -> float:
     """Greatest change of a joint's torques by a lag, over their range."""
     shares = [
         rms_of(lag_s * block.x[:, :, -1], block.used)
-        / np.maximum(spread_of(block.y, block.used), 1e-12)
+        / np.maximum(std_of(block.y, block.used), 1e-12)
         for block in fit.blocks
     ]
     return float(np.max(shares))

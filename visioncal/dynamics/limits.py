@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.motion import JointMotion
-from visioncal.robot import Inertias, Robot, joint_torques, moving
+from visioncal.robot import Inertias, Robot, joint_torques, parameter_transform
 from visioncal.robot.bodies import Body, arm_bodies
 from visioncal.robot.collision import Collisions
 
@@ -20,7 +20,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Share:
+class MotionMargins:
     """Margins of a planned motion.
 
     Attributes:
@@ -53,7 +53,7 @@ class Share:
 
 
 @dataclass(frozen=True)
-class Missing:
+class DefaultLimits:
     """Defaults of limits that the robot's description does not state; None for no default.
 
     Attributes:
@@ -68,7 +68,7 @@ class Missing:
 
 
 @dataclass(frozen=True, eq=False)
-class Allowed:
+class MotionLimits:
     """Limits of a motion, margins included.
 
     Attributes:
@@ -91,7 +91,7 @@ class Allowed:
     torque: FloatArray
     inertias: Inertias | None
     bodies: tuple[Body, ...]
-    share: Share
+    share: MotionMargins
 
     @cached_property
     def collisions(self) -> Collisions:
@@ -132,14 +132,14 @@ class Allowed:
         return joint_torques(self.robot, self.inertias, motion.q, motion.dq, motion.ddq)
 
 
-def allowed_motion(
+def motion_limits(
     robot: Robot,
-    share: Share,
+    share: MotionMargins,
     *,
-    missing: Missing | None = None,
+    missing: DefaultLimits | None = None,
     bodies: Sequence[Body] = (),
     payload: FloatArray | None = None,
-) -> Allowed:
+) -> MotionLimits:
     """Collects the limits of a motion.
 
     Args:
@@ -152,7 +152,7 @@ def allowed_motion(
     Raises:
         DataError: A limit is not stated, or the margins leave no range.
     """
-    missing = missing or Missing()
+    missing = missing or DefaultLimits()
     given = np.full(robot.joint_count, np.inf if missing.range_rad is None else missing.range_rad)
     lower = np.where(np.isfinite(robot.lower_rad), robot.lower_rad, -given)
     upper = np.where(np.isfinite(robot.upper_rad), robot.upper_rad, given)
@@ -164,7 +164,7 @@ def allowed_motion(
         )
     ]
     _check_stated(robot, np.minimum(-lower, upper), *rates)
-    allowed = Allowed(
+    allowed = MotionLimits(
         robot,
         lower + share.margin_rad,
         upper - share.margin_rad,
@@ -179,7 +179,7 @@ def allowed_motion(
     if payload is None or allowed.inertias is None:
         return allowed
     values = allowed.inertias.values.copy()
-    values[-1] += moving(robot.chain.placements[-1]) @ payload
+    values[-1] += parameter_transform(robot.chain.placements[-1]) @ payload
     return replace(allowed, inertias=Inertias(values))
 
 
@@ -206,7 +206,7 @@ def _check_stated(
             )
 
 
-def _check_left(allowed: Allowed) -> None:
+def _check_left(allowed: MotionLimits) -> None:
     for place, name in enumerate(allowed.robot.joint_names):
         left = float(allowed.upper[place] - allowed.lower[place])
         if left <= 0.0:
@@ -221,7 +221,7 @@ def _check_left(allowed: Allowed) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class MotionExtremes:
     """Extremes of a motion, against its limits.
 
     Attributes:
@@ -236,7 +236,7 @@ class Kept:
         nearest_s: Time at which it is nearest [s].
     """
 
-    allowed: Allowed
+    allowed: MotionLimits
     lowest: FloatArray
     highest: FloatArray
     speed: FloatArray
@@ -293,11 +293,11 @@ class Kept:
         return tuple(messages)
 
 
-def kept_limits(allowed: Allowed, motion: JointMotion) -> Kept:
+def motion_extremes(allowed: MotionLimits, motion: JointMotion) -> MotionExtremes:
     """Computes the extremes of a densely sampled motion."""
     torques = allowed.torques(motion)
     apart_m, nearest, row = _nearest(allowed, motion.q)
-    return Kept(
+    return MotionExtremes(
         allowed,
         motion.q.min(axis=0),
         motion.q.max(axis=0),
@@ -310,7 +310,7 @@ def kept_limits(allowed: Allowed, motion: JointMotion) -> Kept:
     )
 
 
-def _nearest(allowed: Allowed, q: FloatArray) -> tuple[float, tuple[str, ...], int]:
+def _nearest(allowed: MotionLimits, q: FloatArray) -> tuple[float, tuple[str, ...], int]:
     """Least excess of the distances at (m, n) postures [m], its pair, and its posture's index."""
     collisions = allowed.collisions
     if not collisions.names:

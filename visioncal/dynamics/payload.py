@@ -23,7 +23,7 @@ from visioncal.dynamics.identified import Identified
 from visioncal.dynamics.model import FrictionTerms
 from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.regression import NoiseBlock, Regression, regress, rms_of
-from visioncal.robot import Inertias, body_regressor, entries
+from visioncal.robot import Inertias, body_regressor, symmetric_entries
 
 # Relative sigma from which on a mass does not differ from none [-].
 _WORST = 0.5
@@ -80,7 +80,7 @@ class Payload:
     @property
     def inertia_kg_m2(self) -> FloatArray:
         """(6,) xx, xy, yy, xz, yz, zz about the centre, along the flange's axes [kg m^2]."""
-        return entries(self._inertias.about_centres[0])
+        return symmetric_entries(self._inertias.about_centres[0])
 
     @property
     def consistent(self) -> bool:

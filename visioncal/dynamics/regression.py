@@ -131,7 +131,7 @@ def rms_of(values: FloatArray, used: Mask) -> FloatArray:
     return np.asarray(np.sqrt(np.sum(used * values**2, axis=0) / counts))
 
 
-def spread_of(values: FloatArray, used: Mask) -> FloatArray:
+def std_of(values: FloatArray, used: Mask) -> FloatArray:
     """(n,) standard deviation of the used ones of (k, n) values."""
     counts = np.maximum(used.sum(axis=0), 1)
     return rms_of(values - np.sum(used * values, axis=0) / counts, used)

@@ -14,7 +14,7 @@ from visioncal.dynamics.conditioning import Conditioned, condition
 from visioncal.dynamics.identified import Identified, Lag
 from visioncal.dynamics.identify import Identification, Options, find_lag, identify
 from visioncal.dynamics.reading import RecordedSamples, read_recorded
-from visioncal.dynamics.validate import Prediction, friction_of_known, predict, validate
+from visioncal.dynamics.validate import Prediction, fit_friction_to_known, predict, validate
 from visioncal.robot import Robot
 from visioncal.session import STREAMS, Session
 from visioncal.session.choosing import ARM, Choice
@@ -93,7 +93,7 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
         DegenerateError: The motion does not determine all base parameters.
     """
     request = IdentificationRequest() if request is None else request
-    session = of_one_arm(session, request.robot)
+    session = select_arm(session, request.robot)
     robot = robot_of(session)
     candidates = _torque_streams(session, request.streams)
     names = [name for name in candidates if name != request.validate_on]
@@ -132,7 +132,7 @@ def identify_session(session: Session, request: IdentificationRequest | None = N
             "session": {"name": session.name, "sha256": session.digest()},
         },
     )
-    friction = friction_of_known(identification)
+    friction = fit_friction_to_known(identification)
     fitted = tuple(predict(identified, stream, friction) for stream in streams)
     return Run(session, identified, identification, predicted, fitted)
 
@@ -159,7 +159,7 @@ def conditioned_streams(
     Raises:
         DataError: The robot is another one, there is no such stream, or a stream is wrong.
     """
-    robot, session = identified.robot, of_one_arm(session, request.robot)
+    robot, session = identified.robot, select_arm(session, request.robot)
     names = _torque_streams(session, request.streams)
     recorded = [_read(session, robot, name, request) for name in names]
     cutoff_hz = request.cutoff_hz or identified.streams[0].cutoff_hz
@@ -196,7 +196,7 @@ def current_streams(
     return [condition(item, cutoff_hz) for item in recorded]
 
 
-def of_one_arm(session: Session, robot: str | None = None) -> Session:
+def select_arm(session: Session, robot: str | None = None) -> Session:
     """Selects one robot and its streams from a session; raises DataError if that is ambiguous."""
     return select(session, Choice(robot=robot), ARM)
 
@@ -256,7 +256,7 @@ def _conditioned(
     robot: Robot, recorded: RecordedSamples, request: IdentificationRequest
 ) -> Conditioned:
     conditioned = condition(recorded, request.cutoff_hz, robot.torque_nm)
-    return conditioned.advanced(request.lag_s) if request.lag_s else conditioned
+    return conditioned.lag_corrected(request.lag_s) if request.lag_s else conditioned
 
 
 def _lag_corrected(
@@ -266,7 +266,9 @@ def _lag_corrected(
     lag = None
     if request.lag_s is None:
         lag = find_lag(robot, streams, request.options.terms)
-    return streams if lag is None else [stream.advanced(lag.seconds) for stream in streams], lag
+    return streams if lag is None else [
+        stream.lag_corrected(lag.seconds) for stream in streams
+    ], lag
 
 
 def _split(
@@ -317,5 +319,5 @@ def _speed(stream: Conditioned) -> FloatArray:
 
 
 def _predicted(identification: Identification, stream: Conditioned, which: str = "") -> Prediction:
-    predicted = predict(identification.identified, stream, friction_of_known(identification))
+    predicted = predict(identification.identified, stream, fit_friction_to_known(identification))
     return replace(predicted, label=f"{which}{stream.label}")

@@ -13,7 +13,7 @@ import numpy as np
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.dynamics.fourier import even_times
-from visioncal.dynamics.limits import Allowed, Kept, kept_limits
+from visioncal.dynamics.limits import MotionExtremes, MotionLimits, motion_extremes
 from visioncal.dynamics.motion import JointMotion
 
 # Least duration of ramps, and of constant speed [s].
@@ -116,13 +116,13 @@ class Sweeps:
     Attributes:
         home: (n,) posture of the other joints [rad].
         strokes: The strokes in order.
-        kept: Extremes of the motion.
+        extremes: Extremes of the motion.
         left_out: Names of joints with too little free range.
     """
 
     home: FloatArray
     strokes: tuple[Stroke, ...]
-    kept: Kept
+    extremes: MotionExtremes
     left_out: tuple[str, ...]
 
     @cached_property
@@ -135,7 +135,7 @@ class Sweeps:
         return _sampled(self.home, self.strokes, rate_hz)
 
 
-def plan_sweeps(allowed: Allowed, request: SweepRequest) -> Sweeps:
+def plan_sweeps(allowed: MotionLimits, request: SweepRequest) -> Sweeps:
     """Plans sweeps of every joint, at several speeds, in both directions.
 
     The home posture maximises the least free range of the joints, over random postures.
@@ -156,9 +156,9 @@ def plan_sweeps(allowed: Allowed, request: SweepRequest) -> Sweeps:
     breaches: tuple[str, ...] = ("everywhere something is too near",)
     for row in order[:_PLANNED].tolist():
         sweeps = _in_posture(allowed, request, clear[row], ranges[row])
-        if sweeps.strokes and not sweeps.kept.breaches:
+        if sweeps.strokes and not sweeps.extremes.breaches:
             return sweeps
-        breaches = sweeps.kept.breaches or ("no joint has room",)
+        breaches = sweeps.extremes.breaches or ("no joint has room",)
     raise DegenerateError(
         f"robot {allowed.robot.name}: no posture was found from which its joints could sweep; of "
         f"the last one tried, {breaches[0]}.",
@@ -169,7 +169,7 @@ def plan_sweeps(allowed: Allowed, request: SweepRequest) -> Sweeps:
 
 
 def _in_posture(
-    allowed: Allowed, request: SweepRequest, home: FloatArray, ranges: FloatArray
+    allowed: MotionLimits, request: SweepRequest, home: FloatArray, ranges: FloatArray
 ) -> Sweeps:
     strokes: list[Stroke] = []
     left_out = []
@@ -179,12 +179,12 @@ def _in_posture(
             left_out.append(name)
             continue
         strokes += _joint_strokes(allowed, request, joint, float(home[joint]), low, high)
-    kept = kept_limits(allowed, _sampled(home, tuple(strokes), _FIGURES_HZ))
+    kept = motion_extremes(allowed, _sampled(home, tuple(strokes), _FIGURES_HZ))
     return Sweeps(home, tuple(strokes), kept, tuple(left_out))
 
 
 def _joint_strokes(
-    allowed: Allowed, request: SweepRequest, joint: int, home: float, low: float, high: float
+    allowed: MotionLimits, request: SweepRequest, joint: int, home: float, low: float, high: float
 ) -> Iterator[Stroke]:
     """Strokes there and back at every speed, about the centre of the joint's free range."""
     acceleration, middle, free_range = (
@@ -208,7 +208,7 @@ def _joint_strokes(
     yield from _move(allowed, joint, position, home)
 
 
-def _move(allowed: Allowed, joint: int, begin: float, end: float) -> Iterator[Stroke]:
+def _move(allowed: MotionLimits, joint: int, begin: float, end: float) -> Iterator[Stroke]:
     """The move to the start of a sweep, if any."""
     distance, acceleration = abs(end - begin), _UNHURRIED * float(allowed.acceleration[joint])
     if distance == 0.0:
@@ -223,7 +223,7 @@ def _move(allowed: Allowed, joint: int, begin: float, end: float) -> Iterator[St
     yield Stroke(joint, begin, end, speed, ramp_s, sweeps=False)
 
 
-def _free_ranges(allowed: Allowed, home: FloatArray) -> FloatArray:
+def _free_ranges(allowed: MotionLimits, home: FloatArray) -> FloatArray:
     """(n, 2) free range of each joint from a clear posture, as lowest and highest [rad]."""
     joints = range(len(home))
     return np.array(
@@ -231,7 +231,7 @@ def _free_ranges(allowed: Allowed, home: FloatArray) -> FloatArray:
     )
 
 
-def _free_end(allowed: Allowed, home: FloatArray, joint: int, sense: int) -> float:
+def _free_end(allowed: MotionLimits, home: FloatArray, joint: int, sense: int) -> float:
     """End of a joint's free range to one side, searched in steps [rad]."""
     limit = (allowed.upper if sense > 0 else allowed.lower)[joint]
     distance = min(abs(float(limit - home[joint])), 0.5 * _WIDEST_RAD)
@@ -244,14 +244,14 @@ def _free_end(allowed: Allowed, home: FloatArray, joint: int, sense: int) -> flo
 
 
 def _checked_range(
-    allowed: Allowed, home: FloatArray, joint: int, low: float, high: float
+    allowed: MotionLimits, home: FloatArray, joint: int, low: float, high: float
 ) -> tuple[float, float]:
     """A joint's free range, reduced until its path is clear between the steps, too."""
     ends = []
     for end in (low, high):
         posture = home.copy()
         posture[joint] = end
-        while posture[joint] != home[joint] and allowed.collisions.on_the_way(home, posture) >= 0:
+        while posture[joint] != home[joint] and allowed.collisions.path_contact(home, posture) >= 0:
             offset = posture[joint] - home[joint]
             posture[joint] = home[joint] + np.sign(offset) * max(abs(offset) - _STEP_RAD, 0.0)
         ends.append(float(posture[joint]))

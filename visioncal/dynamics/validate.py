@@ -12,7 +12,7 @@ from visioncal.dynamics.identified import Identified, TorqueValidation
 from visioncal.dynamics.identify import Identification
 from visioncal.dynamics.model import DynamicModel
 from visioncal.dynamics.motion import JointMotion
-from visioncal.dynamics.regression import NoiseBlock, regress, rms_of, spread_of
+from visioncal.dynamics.regression import NoiseBlock, regress, rms_of, std_of
 from visioncal.robot import joint_torques
 
 
@@ -52,7 +52,7 @@ class Prediction:
     @property
     def torque_nm(self) -> FloatArray:
         """(n,) standard deviation of the measured torques, as their range [N m]."""
-        return spread_of(self.measured_nm, self.used)
+        return std_of(self.measured_nm, self.used)
 
 
 def predict(
@@ -63,7 +63,7 @@ def predict(
     Args:
         identified: The arm's dynamics.
         stream: The samples.
-        own_friction: (f,) friction fitted to the robot's own inertias; see `friction_of_known`.
+        own_friction: (f,) friction fitted to the robot's own inertias; see `fit_friction_to_known`.
     """
     with_bodies = identified.consistent is not None
     known = None
@@ -96,7 +96,7 @@ def validate(identified: Identified, prediction: Prediction) -> TorqueValidation
     )
 
 
-def friction_of_known(identification: Identification) -> FloatArray | None:
+def fit_friction_to_known(identification: Identification) -> FloatArray | None:
     """Fits friction to the robot's own inertias.
 
     Returns:
@@ -141,7 +141,7 @@ def friction_at(identified: Identified, dq: FloatArray) -> FloatArray:
     return np.asarray(own + identified.stribeck.torques(motion))
 
 
-def left_for_friction(identified: Identified, prediction: Prediction) -> FloatArray:
+def measured_friction(identified: Identified, prediction: Prediction) -> FloatArray:
     """Measured torques less all predicted ones but friction's: (k, n) [N m]."""
     error = prediction.measured_nm - prediction.predicted_nm
     return np.asarray(friction_at(identified, prediction.dq) + error)

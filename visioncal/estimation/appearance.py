@@ -22,9 +22,9 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Target
 from visioncal.estimation.corners import CornerStack, WithoutPoses, reproject
 from visioncal.estimation.lens_field import Coefficients, LensLevels, breathing_columns, field_modes
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.parts import Effect
 from visioncal.estimation.poses import fit_poses
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.problem_parts import Effect
+from visioncal.estimation.variance import PriorInformation
 from visioncal.vision.camera import intrinsics, with_intrinsics
 from visioncal.vision.targets import corner_positions
 
@@ -157,7 +157,7 @@ class LensBoardParameters:
 
     def effect(self, shift: FloatArray) -> Effect:
         """Puts it as the chain takes it, with the (m, 6, k) shifts of its views."""
-        known = Knowledge(self.information, self.gradient)
+        known = PriorInformation(self.information, self.gradient)
         return replace(Effect.free(LENS_AND_BOARD, known, shift), held=self.anchored)
 
 
@@ -302,6 +302,6 @@ def compress_points(
         away += every[:, :, shared:last] @ found.mean[2 * modes.shape[1] :]
         away += stack.products_with_views(now.by_pose, moved_poses[:, :, None])[:, :, 0]
         residuals, own = residuals + roots * away, own + away
-        by_field = by_field @ found.open
+        by_field = by_field @ found.moving_roots
     pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
     return Compressed(poses, without.information, answer, information, pulls, own, by_field, found)

@@ -15,10 +15,10 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.solve import RobotLikelihood, normal_equations
-from visioncal.estimation.variance import LEAST_SIGMA, Components, Knowledge, level_weight
+from visioncal.estimation.variance import LEAST_SIGMA, Components, PriorInformation, level_weight
 from visioncal.robot import Robot
 
 # Arms are off by some 0.5 mm for each mrad.
@@ -49,13 +49,13 @@ class ArmErrors:
             basis is generic for any arm, and only their size is meaningful.
         white: (2,) white noise left beside them, of rotation [rad] and position [m]; None where
             that is the noise of the fit.
-        look: (2,) noise of the fit: white noise and errors together as single stops show them,
-            without what is the same at all stops. None of links.
-        away: (2, 2) errors at postures far from all others of the fit, of rotation [rad] and
-            position [m], measured and predicted; see `pose_errors.left_out_clusters`. None where
-            that is not known.
-        lasting: Number of errors, the last ones, that are correlated in time; the others are
-            correlated over the posture. At another time they have other values.
+        fit_sigmas: (2,) noise of the fit: white noise and errors together as single stops show
+            them, without what is the same at all stops. None of links.
+        far_posture_errors: (2, 2) errors at postures far from all others of the fit, of rotation
+            [rad] and position [m], measured and predicted; see `pose_errors.left_out_clusters`.
+            None where that is not known.
+        time_correlated_count: Number of errors, the last ones, that are correlated in time; the
+            others are correlated over the posture. At another time they have other values.
     """
 
     basis: FloatArray
@@ -63,15 +63,15 @@ class ArmErrors:
     gain: float
     of_links: bool
     white: FloatArray | None = None
-    look: FloatArray | None = None
-    away: FloatArray | None = None
-    lasting: int = 0
+    fit_sigmas: FloatArray | None = None
+    far_posture_errors: FloatArray | None = None
+    time_correlated_count: int = 0
 
     @property
-    def last(self) -> Mask:
+    def is_time_correlated(self) -> Mask:
         """(p,) mask of the errors that are correlated in time."""
         count = self.basis.shape[2]
-        return np.asarray(np.arange(count) >= count - self.lasting)
+        return np.asarray(np.arange(count) >= count - self.time_correlated_count)
 
     @property
     def is_significant(self) -> bool:
@@ -93,7 +93,7 @@ class ArmErrors:
         size = self.basis.shape[2]
         start = np.zeros(size) if values is None else values
         information = np.eye(size) / self.sigma**2
-        prior = Knowledge(information, information @ start)
+        prior = PriorInformation(information, information @ start)
         held = np.zeros(size, dtype=bool)
         return Effect(f"{name} of {robot}", start, prior, held, flange_jacobian={robot: self.basis})
 
@@ -132,7 +132,7 @@ def find_arm_errors(
     basis: FloatArray,
     *,
     of_links: bool,
-    least: float | None = None,
+    min_gain: float | None = None,
 ) -> ArmErrors | None:
     """Estimates the size of one robot's arm errors, if they are significant.
 
@@ -141,8 +141,8 @@ def find_arm_errors(
         robot: Index of the robot.
         basis: (s, 6, p) by stop, of `link_basis` or `pose_basis`.
         of_links: Whether the basis is of this arm's links.
-        least: Least gain over white noise; None for the limit of likelihood, and of links for any
-            gain at all.
+        min_gain: Least gain over white noise; None for the limit of likelihood, and of links for
+            any gain at all.
 
     Returns:
         The errors; None where the gain is no larger.
@@ -156,13 +156,13 @@ def find_arm_errors(
     if start <= _NOTHING:
         return None
     widened = likelihood.beside(robot, basis)
-    if least is None:
+    if min_gain is None:
         # Every arm has link errors: their size counts even where it hardly gains likelihood.
-        least = 0.0 if of_links else _LIKELY
+        min_gain = 0.0 if of_links else _LIKELY
     white_value = likelihood.white[1]
-    sigma, value = _most_likely_size(widened, size, levels, start, white_value - 0.5 * least)
+    sigma, value = _most_likely_size(widened, size, levels, start, white_value - 0.5 * min_gain)
     gain = 2.0 * (white_value - value)
-    if gain <= least:
+    if gain <= min_gain:
         return None
     return ArmErrors(basis, float(np.sqrt(level_weight(gain))) * sigma, gain, of_links)
 

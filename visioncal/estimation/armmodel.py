@@ -10,7 +10,7 @@ from visioncal.core.quantiles import f_limit
 from visioncal.core.transforms import adjoint, invert, log, mean_transform
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors
-from visioncal.robot import Loads, Robot, WeightFunctions, bent_joints
+from visioncal.robot import Loads, Robot, WeightFunctions, deflected_joints
 
 # Columns of a joint's function (see `Robot.function_jacobian`) by block.
 _FUNCTIONS = {"offsets": (0,), "ratios": (1,), "eccentricity": (2, 3)}
@@ -76,7 +76,7 @@ class ArmModel:
         greatest = float(np.abs(self.robot.load_torques(q, loads)).max(initial=0.0))
         return replace(self, torque_nm=greatest or 1.0)
 
-    def erring(self, errors: Mapping[str, ArmErrors]) -> "ArmModel":
+    def with_errors(self, errors: Mapping[str, ArmErrors]) -> "ArmModel":
         """Returns the arm with error blocks to be estimated, all zero."""
         count = sum(error.basis.shape[2] for error in errors.values())
         first = next(iter(errors.values())).sigma
@@ -117,7 +117,7 @@ class ArmModel:
         """(n, 4 n) compliances times unknown masses and first moments; None without any."""
         if WEIGHT not in self.weights or self.functions is None:
             return None
-        return self.functions.moments(self.weights[WEIGHT] * self.values[self.place_of(WEIGHT)])
+        return self.functions.moments(self.weights[WEIGHT] * self.values[self.columns_of(WEIGHT)])
 
     def size_of(self, name: str) -> int:
         """Number of values in a block."""
@@ -132,10 +132,10 @@ class ArmModel:
         """(p,) values of the load-dependent blocks; zero for those that `robot` contains."""
         values = np.zeros(len(self.values))
         for name in (COMPLIANCE, BACKLASH, WEIGHT):
-            values[self.place_of(name)] = self.values[self.place_of(name)]
+            values[self.columns_of(name)] = self.values[self.columns_of(name)]
         return values
 
-    def place_of(self, name: str) -> slice:
+    def columns_of(self, name: str) -> slice:
         """Slice of a block among all values; empty where the arm lacks the block."""
         at = 0
         for block in self.weights:
@@ -150,17 +150,17 @@ class ArmModel:
         """(n, k, 2) harmonics of the joints' functions [rad]; None without any."""
         if HARMONICS not in self.weights:
             return None
-        waves = self.harmonic_directions @ self.values[self.place_of(HARMONICS)]
+        waves = self.harmonic_directions @ self.values[self.columns_of(HARMONICS)]
         return np.asarray(self.weights[HARMONICS] * waves.reshape(self.nominal.joint_count, -1, 2))
 
     @property
     def is_kept(self) -> Mask:
         """(p,) mask of the values other than harmonics."""
         kept = np.ones(len(self.values), dtype=bool)
-        kept[self.place_of(HARMONICS)] = False
+        kept[self.columns_of(HARMONICS)] = False
         return kept
 
-    def left_open(self, q: FloatArray) -> FloatArray:
+    def undetermined_covariance(self, q: FloatArray) -> FloatArray:
         """Flange covariance (m, 6, 6) by the undetermined part of the joints' functions.
 
         It is that for errors of unit size.
@@ -176,7 +176,7 @@ class ArmModel:
         """Values (n,) of a block with one per joint; zeros where the arm lacks it."""
         if name not in self.weights:
             return np.zeros(self.nominal.joint_count)
-        return np.asarray(self.weights[name] * self.values[self.place_of(name)])
+        return np.asarray(self.weights[name] * self.values[self.columns_of(name)])
 
     def bent(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Joint angles (m, n) of the rigid arm that has the same posture under load [rad].
@@ -188,7 +188,7 @@ class ArmModel:
         """
         if loads is not None and self.backlash.any():
             q = q + 0.5 * loads.side[:, None] * self.backlash
-        return bent_joints(self.robot, q, self.compliance, loads, self.moments)
+        return deflected_joints(self.robot, q, self.compliance, loads, self.moments)
 
     def base_from_flange(self, q: FloatArray, loads: Loads | None = None) -> FloatArray:
         """Poses (m, 4, 4) of the reported frame; see `bent`."""
@@ -218,7 +218,7 @@ class ArmModel:
             sides = np.zeros(len(q)) if loads is None else loads.side
             return np.asarray(0.5 * sides[:, None, None] * self.robot.axis_jacobian(bent))
         if name == WEIGHT and self.functions is not None:
-            shares = self.functions.bends(self.robot, bent)
+            shares = self.functions.values(self.robot, bent)
             return np.asarray(self.robot.axis_jacobian(bent) @ shares)
         if name == COMPLIANCE:
             torques = self.robot.load_torques(bent, loads) / self.torque_nm
@@ -245,7 +245,7 @@ class ArmModel:
             [weight * self.columns(name, q, loads) for name, weight in self.weights.items()], axis=2
         )
 
-    def kept_basis(self, q: FloatArray) -> FloatArray:
+    def basis_without_harmonics(self, q: FloatArray) -> FloatArray:
         """The columns of `basis` other than harmonics."""
         rest = (item for item in self.weights.items() if item[0] != HARMONICS)
         return np.concatenate([weight * self.columns(name, q) for name, weight in rest], axis=2)

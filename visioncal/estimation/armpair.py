@@ -7,8 +7,8 @@ import numpy as np
 from visioncal.core.transforms import adjoint, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.armmodel import HARMONICS, ArmModel
-from visioncal.estimation.parts import Noise, Observations, State
 from visioncal.estimation.problem import Linear, Problem
+from visioncal.estimation.problem_parts import Noise, Observations, State
 from visioncal.robot import Loads
 
 
@@ -222,7 +222,7 @@ class ArmData:
         """(k,) predicted sigma of that position at (k, n) joint angles, over all three axes [m]."""
         by_chain, by_flange = self.place_jacobian(q)
         chain_covariance = self.covariance[np.ix_(self.chain, self.chain)]
-        undetermined = self.error_rad**2 * self.model.left_open(q)
+        undetermined = self.error_rad**2 * self.model.undetermined_covariance(q)
         variances = np.einsum("mij,jk,mik->m", by_chain, chain_covariance, by_chain)
         variances += np.einsum("mij,mjk,mik->m", by_flange, undetermined, by_flange)
         return np.asarray(np.sqrt(variances))
@@ -241,7 +241,7 @@ class ArmData:
         waves = np.stack([np.sin(phases), np.cos(phases)], axis=2)
         first = model.weights["eccentricity"] * waves[:, 0]
         higher = model.weights[HARMONICS] * waves[:, 1:].reshape(len(angles), -1)
-        eccentric, harmonic = (model.place_of(name) for name in ("eccentricity", HARMONICS))
+        eccentric, harmonic = (model.columns_of(name) for name in ("eccentricity", HARMONICS))
         variances = np.zeros((count, len(angles)))
         for joint in range(count):
             rows = slice(2 * orders * joint, 2 * orders * (joint + 1))

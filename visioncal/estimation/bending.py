@@ -8,9 +8,9 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import COMPLIANCE, ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.parts import Effect, State
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import normal_equations, whitened
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 from visioncal.robot import Loads
 
 # Least torque at which a stop determines a joint's bend [N m], and its least share of the greatest
@@ -36,7 +36,7 @@ def compliance_unit(model: ArmModel) -> float:
     return model.weights[COMPLIANCE] / model.torque_nm
 
 
-def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
+def observed_bends(arm: ArmData, torques: FloatArray) -> FloatArray:
     """Bend (m, n) of each joint at each stop, as if the stop's whole residual were its own [rad].
 
     Partial residuals of a regression (Larsen and McCleary 1972): the fitted bend plus the component
@@ -45,7 +45,7 @@ def bends_seen(arm: ArmData, torques: FloatArray) -> FloatArray:
     """
     model, problem = arm.model, arm.problem
     residuals, jacobian = whitened(problem, arm.state, arm.noise, ideal=False)
-    columns = jacobian[:, :, arm.columns[model.place_of(COMPLIANCE)]]
+    columns = jacobian[:, :, arm.columns[model.columns_of(COMPLIANCE)]]
     masks = [problem.observations.stops == stop for stop in arm.stops.tolist()]
     gradient = np.array([np.einsum("mij,mi->j", columns[mask], residuals[mask]) for mask in masks])
     own = [columns[mask] for mask in masks]
@@ -72,7 +72,7 @@ def payload_factor(arm: ArmData) -> Factor | None:
     flange_jacobian = np.zeros((len(problem.poses[arm.robot]), 6, 1))
     twists = np.einsum("mij,mj->mi", robot.axis_jacobian(bent), model.compliance * load_torques)
     flange_jacobian[arm.stops] = twists[:, :, None]
-    no_prior = Knowledge(np.zeros((1, 1)), np.zeros(1))
+    no_prior = PriorInformation(np.zeros((1, 1)), np.zeros(1))
     payload = Effect.free("payload", no_prior, flange_jacobian={arm.robot: flange_jacobian})
     widened = problem.with_effects([*problem.effects, payload])
     widened_state = State(arm.state.edges, np.append(arm.state.values, 0.0))

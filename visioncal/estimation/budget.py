@@ -10,8 +10,8 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.linalg import covariance_among, gram
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Linear, Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fisher_information
 
 
@@ -56,7 +56,7 @@ def covariance_by_source(
     for name, part in _by_errors(problem, linear, gain, noise, sources):
         parts[name] += part
     edge_columns = fitted[:, : 6 * len(problem.unknown)]
-    prior_info = problem.knowledge(state).information
+    prior_info = problem.prior_information(state).information
     owned = np.concatenate([*sources.columns.values(), np.zeros(0, np.int64)])
     for prior in problem.priors:
         _, jacobian = problem.prior_rows(prior, state)

@@ -13,8 +13,8 @@ import numpy as np
 
 from visioncal.core.transforms import distances, invert, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mount
-from visioncal.estimation.parts import ROBOT, Effect, Observations, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import ROBOT, Effect, Observations, State
 from visioncal.estimation.tree import Branch, Tree
 
 BASE, FLANGE = "base", "flange"

@@ -19,11 +19,11 @@ from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
 from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.outliers import closed_form
-from visioncal.estimation.parts import Effect, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, State
 from visioncal.estimation.solve import Solution, fisher_information, fit_problem
 from visioncal.estimation.trajectory import Trajectory
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 # Frames for a start; most and fewest frames of a fit.
 _START_FRAMES, _MOST_FRAMES, _FEWEST_FRAMES = 60, 1200, 4
@@ -137,7 +137,7 @@ class _Delays:
         unknowns = 6 * len(frames) + len(self.times_s)
         weight = floored_sigma_px(stack.sigma_px(compressed.residuals, unknowns)) ** -2.0
         prior = np.array([delay.sigma_s for delay in self.delays]) ** -2.0
-        knowledge = Knowledge(
+        knowledge = PriorInformation(
             weight * compressed.shared_information + np.diag(prior),
             weight * compressed.shared_gradient + prior * self.times_s,
         )

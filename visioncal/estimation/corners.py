@@ -364,7 +364,7 @@ def reproject(
     points_cam = (rotation[:, 0] * px + rotation[:, 1] * py + rotation[:, 2] * pz).T
     points_cam = points_cam + cam_from_target[:, :3, 3][stack.view_of]
     projection = project_with_jacobian(camera, points_cam, lens=lens)
-    by_cam = np.ascontiguousarray(np.moveaxis(projection.by_point, 2, 0))
+    by_cam = np.ascontiguousarray(np.moveaxis(projection.jacobian_point, 2, 0))
     columns = rotation[:, :, :, None]
     bx, by, bz = (
         by_cam[0] * columns[0, at] + by_cam[1] * columns[1, at] + by_cam[2] * columns[2, at]
@@ -382,12 +382,12 @@ def reproject(
     if behind.any():
         residuals[behind] = max(camera.resolution)
         by_pose[behind] = 0.0
-        projection.by_intrinsics[behind] = 0.0
+        projection.jacobian_intrinsics[behind] = 0.0
     is_weighed = stack.weights is not None or stack.zooms is not None
     by_point = by_pose[:, :, 3:].copy() if is_weighed else by_pose[:, :, 3:]
     # Each of the three belongs to this call alone.
-    stack.weigh(residuals, by_pose, projection.by_intrinsics)
-    return Reprojection(residuals, by_pose, projection.by_intrinsics, by_point)
+    stack.weigh(residuals, by_pose, projection.jacobian_intrinsics)
+    return Reprojection(residuals, by_pose, projection.jacobian_intrinsics, by_point)
 
 
 def mean_square_by_view(stack: CornerStack, residuals: FloatArray) -> FloatArray:

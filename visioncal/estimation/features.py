@@ -17,7 +17,7 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.transforms import compose, exp, skew
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
+from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.groups import GroupFit, Groups
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction
 from visioncal.estimation.placing import (
@@ -174,7 +174,7 @@ def fit_features(touches: FeatureTouches, expected_noise_m: float | None = None)
     """
     _check_kinds(touches)
     _check_sides(touches)
-    agreement = agreeing_groups(FeatureProblem(touches), expected_noise_m)
+    agreement = find_inlier_groups(FeatureProblem(touches), expected_noise_m)
     fit = agreement.fit
     noise_m = _noise_of(touches, fit, expected_noise_m)
     worst = worst_directions(fit, fit.state, np.zeros(3), noise_m)

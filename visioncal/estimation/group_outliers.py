@@ -26,7 +26,7 @@ class GroupInliers(Generic[State]):
 
     Attributes:
         fit: From the inlier groups.
-        agrees: (m,) mask of them.
+        mask: (m,) mask of them.
         mahalanobis_sq: (m,) squared Mahalanobis distance of each group from the prediction of the
             others, over the number of predicted directions: one on average for noise.
         limit: (m,) its rejection limit; infinite where the others do not predict the group at all.
@@ -36,7 +36,7 @@ class GroupInliers(Generic[State]):
     """
 
     fit: GroupFit[State]
-    agrees: Mask
+    mask: Mask
     mahalanobis_sq: FloatArray
     limit: FloatArray
     doubtful: Mask
@@ -48,7 +48,7 @@ class GroupInliers(Generic[State]):
         return np.asarray(np.linalg.norm(self.fit.groups.residuals, axis=1))
 
 
-def agreeing_groups(
+def find_inlier_groups(
     problem: GroupProblem[State],
     expected_sigma: float | None = None,
     start: tuple[Mask, State] | None = None,

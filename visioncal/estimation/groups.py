@@ -18,7 +18,7 @@ from visioncal.estimation.linalg import covariance_from, damped_step, gram, spec
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     Components,
-    Knowledge,
+    PriorInformation,
     estimate_sigmas,
     profile_interval,
 )
@@ -79,7 +79,7 @@ class Groups:
             self.residuals,
             self.jacobian,
             self._components(),
-            Knowledge(np.zeros((size, size)), np.zeros(size)),
+            PriorInformation(np.zeros((size, size)), np.zeros(size)),
             np.array([start]),
             np.array([free]),
         )

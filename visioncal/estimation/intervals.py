@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import RATIO_PRIOR, robot_likelihood
 from visioncal.estimation.variance import profile_interval
 

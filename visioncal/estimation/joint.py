@@ -19,8 +19,8 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
     Solution,
@@ -30,7 +30,7 @@ from visioncal.estimation.solve import (
     normal_equations,
     robot_likelihood,
 )
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 # Freeing unknowns must gain more than noise does in one session of ten thousand.
 _FALSE_ALARM = 1e-4
@@ -47,7 +47,7 @@ _UNEVEN = 2.0
 _UNMEASURED = 1e-6
 
 
-class Side(Protocol):
+class FrameModel(Protocol):
     """The frames' side of the fit: all that is no corner."""
 
     @property
@@ -77,17 +77,17 @@ class Side(Protocol):
 class ConvergedFit:
     """The fit at rest: the linearisation, the problem of all frames, and what came out."""
 
-    seen: LinearisedCorners
+    linearised: LinearisedCorners
     problem: Problem
     fit: Solution
     # Those that were last asked for; see `Scores.of`.
-    _scores: list[tuple[Side, "Scores"]] = field(default_factory=list, init=False, repr=False)
+    _scores: list[tuple[FrameModel, "Scores"]] = field(default_factory=list, init=False, repr=False)
 
     @property
     def columns(self) -> slice:
         """The columns of lenses and boards: the first effect's."""
         first = 6 * len(self.problem.unknown)
-        return slice(first, first + len(self.seen.free))
+        return slice(first, first + len(self.linearised.free))
 
     @property
     def frames(self) -> Mapping[str, FloatArray]:
@@ -103,14 +103,18 @@ class ConvergedFit:
     @property
     def change(self) -> FloatArray:
         """(f,) by how much the free values moved from where they were linearised."""
-        free = self.seen.free
-        return np.asarray(self.fit.state.values[: len(free)] - self.seen.looks.values[free])
+        free = self.linearised.free
+        return np.asarray(
+            self.fit.state.values[: len(free)] - self.linearised.camera_parameters.values[free]
+        )
 
     @property
-    def looks(self) -> CameraParameters:
+    def camera_parameters(self) -> CameraParameters:
         """Lenses and boards as they came out; what was held is where it was."""
-        free = self.seen.free
-        return self.seen.looks.with_values(free, self.fit.state.values[: len(free)])
+        free = self.linearised.free
+        return self.linearised.camera_parameters.with_values(
+            free, self.fit.state.values[: len(free)]
+        )
 
     def covariance(self) -> FloatArray:
         """(p, p) covariance of what the fit moves, where it was measured."""
@@ -119,12 +123,12 @@ class ConvergedFit:
     @property
     def moving(self) -> IntArray:
         """Places of the values that the fit moves."""
-        return self.seen.moving
+        return self.linearised.moving
 
 
-def settle(
+def fit_jointly(
     looks: CameraParameters,
-    side: Side,
+    side: FrameModel,
     moving: IntArray,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None = None,
@@ -144,7 +148,7 @@ def settle(
         ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
     """
     with diverging():
-        return _settled(side, _fitted(side, looks.seen(moving, before), frames, others))
+        return _settled(side, _fitted(side, looks.linearised(moving, before), frames, others))
 
 
 @contextmanager
@@ -168,22 +172,27 @@ def diverging() -> Iterator[None]:
         ) from error
 
 
-def again(
-    fitted: ConvergedFit, side: Side, moving: IntArray, looks: CameraParameters | None = None
+def refit_jointly(
+    fitted: ConvergedFit, side: FrameModel, moving: IntArray, looks: CameraParameters | None = None
 ) -> ConvergedFit:
     """Settles once more from an answer, with other values free, or by other priors."""
-    return settle(
-        looks or fitted.looks, side, moving, fitted.frames, fitted.others, before=fitted.seen
+    return fit_jointly(
+        looks or fitted.camera_parameters,
+        side,
+        moving,
+        fitted.frames,
+        fitted.others,
+        before=fitted.linearised,
     )
 
 
-def _settled(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+def _settled(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     for _ in range(_ROUNDS):
         sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
         if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
             break
         seen = _stepped(fitted)
-        if seen is fitted.seen:
+        if seen is fitted.linearised:
             raise np.linalg.LinAlgError("the corners follow no part of the step")
         before, fitted = fitted, _fitted(side, seen, fitted.frames, fitted.others)
         if not (before.fit.settled or fitted.fit.settled):
@@ -195,20 +204,23 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     """Linearises where the fit came to rest, or on the way there as far as the corners follow."""
     # Far from the answer, as where a lens was stated for images of another size, the whole step
     # leads to lenses that see nothing.
-    limits = [_FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.seen.sigmas_px]
-    looks, free, change = fitted.seen.looks, fitted.seen.free, fitted.change
+    limits = [_FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
+    looks, free, change = fitted.linearised.camera_parameters, fitted.linearised.free, fitted.change
     for _ in range(_HALVINGS):
         there = looks.with_values(free, looks.values[free] + change)
         change = change / 2
         if there.has_lenses:
-            seen = there.seen(fitted.moving)
+            seen = there.linearised(fitted.moving)
             if all(sigma <= limit for sigma, limit in zip(seen.sigmas_px, limits, strict=True)):
                 return seen
-    return fitted.seen
+    return fitted.linearised
 
 
 def _fitted(
-    side: Side, seen: LinearisedCorners, frames: Mapping[str, FloatArray], others: FloatArray | None
+    side: FrameModel,
+    seen: LinearisedCorners,
+    frames: Mapping[str, FloatArray],
+    others: FloatArray | None,
 ) -> ConvergedFit:
     problem = side.problem(seen)
     start = problem.start(frames)
@@ -245,9 +257,9 @@ class MeasuredScale:
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
-def measured_scale(side: Side, fitted: ConvergedFit, board: int = 0) -> MeasuredScale:
+def measured_scale(side: FrameModel, fitted: ConvergedFit, board: int = 0) -> MeasuredScale:
     """Measures a board's size by the robots' motion; its sigma is infinite where that cannot."""
-    looks = fitted.seen.looks
+    looks = fitted.linearised.camera_parameters
     (place,) = looks.scale_of(board)
     stated, known = looks.stated_scale_sigma(board), float(looks.prior_sigma[place] ** -2.0)
     step, covariance = Scores.of(side, fitted).asked_for(np.array([place]), fitted.moving)
@@ -255,7 +267,7 @@ def measured_scale(side: Side, fitted: ConvergedFit, board: int = 0) -> Measured
     measured = 1.0 / float(covariance[0, 0]) - known
     if measured <= _UNMEASURED * known:
         return MeasuredScale(board, 0.0, np.inf, stated)
-    with_stated = float(fitted.looks.values[place] + step[0])
+    with_stated = float(fitted.camera_parameters.values[place] + step[0])
     return MeasuredScale(
         board,
         with_stated * (1.0 + known / measured),
@@ -264,7 +276,7 @@ def measured_scale(side: Side, fitted: ConvergedFit, board: int = 0) -> Measured
     )
 
 
-def measured_rig(side: Side, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
+def measured_rig(side: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
     """Measures the size of a rig of points by the robots' motion; its table is taken for exact.
 
     A larger rig farther away looks the same: its views alone say nothing of that.
@@ -326,7 +338,7 @@ def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf)
     by_size = np.zeros((len(observed), 6, len(frames)))
     by_size[:, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
     by_size *= (observed[:, None] == np.array(frames))[:, None]
-    known = Knowledge(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
+    known = PriorInformation(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
     return Effect.free("sizes of targets", known, by_size)
 
 
@@ -337,14 +349,14 @@ def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
         fitted: A fit that moves these values among others.
         places: (k,) where they stand among the values.
     """
-    at = fitted.columns.start + np.searchsorted(fitted.seen.free, places)
-    away = (fitted.looks.values - fitted.looks.stated)[places]
+    at = fitted.columns.start + np.searchsorted(fitted.linearised.free, places)
+    away = (fitted.camera_parameters.values - fitted.camera_parameters.stated)[places]
     return float(away @ np.linalg.solve(fitted.covariance()[np.ix_(at, at)], away))
 
 
 def contradicted_lens(fitted: ConvergedFit, camera: str) -> bool:
     """Whether given intrinsics are farther off than what they are known to explains."""
-    looks = fitted.looks
+    looks = fitted.camera_parameters
     away = (looks.values - looks.stated)[looks.lenses[camera]]
     return contradicts(away, lens_prior(looks.problems[camera].scene))
 
@@ -378,14 +390,14 @@ class Scores:
     places: IntArray
 
     @classmethod
-    def of(cls, side: Side, fitted: ConvergedFit) -> "Scores":
+    def of(cls, side: FrameModel, fitted: ConvergedFit) -> "Scores":
         """The scores of all values, at a fit."""
         for asked, found in fitted._scores:
             if asked is side:
                 return found
-        seen = fitted.seen.freed(np.arange(len(fitted.seen.looks.values)))
-        values = fitted.fit.state.values[len(fitted.seen.free) :]
-        values = np.concatenate([fitted.looks.values, values])
+        seen = fitted.linearised.freed(np.arange(len(fitted.linearised.camera_parameters.values)))
+        values = fitted.fit.state.values[len(fitted.linearised.free) :]
+        values = np.concatenate([fitted.camera_parameters.values, values])
         problem, there = side.problem(seen), State(fitted.fit.state.edges, values)
         first = fitted.columns.start
         found = cls(

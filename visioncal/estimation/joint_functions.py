@@ -20,15 +20,15 @@ from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGHT
 from visioncal.estimation.linalg import gram, weighted_gram
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import RobotLikelihood, ratio_prior, robot_likelihood
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     MOST_SIGMA,
-    Knowledge,
-    Likely,
-    Weighed,
+    LikelihoodValue,
+    PriorInformation,
+    WeightedResiduals,
     most_likely,
 )
 
@@ -223,7 +223,7 @@ class _ArmLikelihood:
     mine: Mask
     own: FloatArray
     others: FloatArray
-    known: Knowledge
+    known: PriorInformation
     names: tuple[str, ...]
     shares: FloatArray
     bases: Mapping[str, FloatArray]
@@ -265,7 +265,7 @@ class _ArmLikelihood:
         """(m, 6 w, q) Jacobian of the units by the process, for a size of one."""
         return np.asarray(self.own[:, :, self.random] * np.sqrt(self.shares[:, -1]))
 
-    def weighed(self, step: "_SizesAt") -> Weighed:
+    def weighed(self, step: "_SizesAt") -> WeightedResiduals:
         """The units, weighted by some levels and sizes."""
         components, known = self.nominal.components, self.known
         levels, count = len(components.parts), self.others.shape[2]
@@ -274,7 +274,7 @@ class _ArmLikelihood:
         information = known.information.copy()
         random = np.arange(count, len(information))
         information[random, random] += 1.0 / (self.shares @ np.exp(2.0 * step.logs[levels:]))
-        return Weighed.of(
+        return WeightedResiduals.of(
             self.nominal.reduced.errors,
             jacobian,
             components,
@@ -366,9 +366,11 @@ class _ArmLikelihood:
         gradients[levels:] += deviation / _SPREAD
         curvature[levels:, levels:] += np.eye(len(deviation)) / _SPREAD**2
         value += 0.5 * float(deviation @ deviation)
-        full = ratio_prior(range(levels // 2)).beside(Likely(value, gradients, curvature), logs)
+        full = ratio_prior(range(levels // 2)).beside(
+            LikelihoodValue(value, gradients, curvature), logs
+        )
         # Residuals have the opposite sign of the prediction.
-        return _SizesAt(full.value, full.slope, full.curvature, logs, -effects)
+        return _SizesAt(full.value, full.gradient, full.curvature, logs, -effects)
 
     def assembled(self, step: "_SizesAt", gain: float) -> JointFunctions:
         """The errors of all blocks with the sizes at some step."""
@@ -404,7 +406,7 @@ class _ArmLikelihood:
 
 
 @dataclass(frozen=True, eq=False)
-class _SizesAt(Likely):
+class _SizesAt(LikelihoodValue):
     """Likelihood at some levels and sizes; its curvature is average information.
 
     Attributes:

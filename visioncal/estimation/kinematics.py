@@ -15,8 +15,8 @@ import numpy as np
 from visioncal.core.types import FloatArray, Mask
 from visioncal.estimation.arm import SIGNIFICANT, ArmErrors, find_arm_errors, rows_of
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import (
     RobotLikelihood,
     Solution,
@@ -132,7 +132,7 @@ class ArmTrials:
                 self._likely[present] = robot_likelihood(self.erring(among), fit.state, fit.noise)
             index = self.problem.robots.index(self.robot)
             self._found[key] = find_arm_errors(
-                self._likely[present], index, basis, of_links=True, least=least
+                self._likely[present], index, basis, of_links=True, min_gain=least
             )
         return self._found[key]
 

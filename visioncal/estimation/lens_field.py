@@ -140,14 +140,14 @@ class Coefficients:
     Attributes:
         mean: (m,) the most likely ones.
         slope: (m, k) their derivative by the shared unknowns.
-        open: (m, o) roots of their covariance that move poses.
+        moving_roots: (m, o) roots of their covariance that move poses.
         rest: (m, m - o) roots of the rest of it.
         freedom: Number of coefficients that the corners determine.
     """
 
     mean: FloatArray
     slope: FloatArray
-    open: FloatArray
+    moving_roots: FloatArray
     rest: FloatArray
     freedom: float
 

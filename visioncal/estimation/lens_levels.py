@@ -21,10 +21,10 @@ from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigm
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, distances, field_modes, zooms
 from visioncal.estimation.linalg import covariance_from, gram
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import normal_equations, ratio_prior
-from visioncal.estimation.variance import HARDLY, Likely, most_likely
+from visioncal.estimation.variance import HARDLY, LikelihoodValue, most_likely
 
 # Lengths of the field that are tried, as shares of the image's width, from the third on; another
 # one has to gain so much.
@@ -139,7 +139,7 @@ class _Likelihood:
         modes[len(self.known) :] = self.modes[:, None] == levels
         return (self.kinds[:, :, None] == levels).astype(float), modes
 
-    def __call__(self, logs: FloatArray, *, is_sloped: bool = True) -> Likely:
+    def __call__(self, logs: FloatArray, *, is_sloped: bool = True) -> LikelihoodValue:
         """The negative logarithm, its slope and its second derivative, or zeros for these two."""
         # Where that is not positive, the average information takes its place (Gilmour, Thompson and
         # Cullis 1995): it never is negative.
@@ -176,7 +176,7 @@ class _Likelihood:
         slope, curvature = np.zeros(len(logs)), np.zeros((len(logs),) * 2)
         ratios = ratio_prior(range(self.flanges), _FLANGES)
         if not is_sloped:
-            return ratios.beside(Likely(value, slope, curvature), logs)
+            return ratios.beside(LikelihoodValue(value, slope, curvature), logs)
         # Where a level's values are, and how well they are known: in units of the level.
         levels = np.flatnonzero(self.counts)
         singles, modes = self._members
@@ -216,7 +216,7 @@ class _Likelihood:
         if np.linalg.eigvalsh(second)[0] <= 0.0:
             second = 2.0 * moved
         curvature[np.ix_(places, places)] = second
-        return ratios.beside(Likely(value, slope, curvature), logs)
+        return ratios.beside(LikelihoodValue(value, slope, curvature), logs)
 
     def _expected(
         self,
@@ -274,7 +274,7 @@ class _Likelihood:
         logs, found = most_likely(self, start, low, high, enough=enough, hardly=hardly)
         # Levels that hardly count still fall, by ever smaller gains: to nothing at once.
         for level in (_FIELD, _BREATHING, _JITTER):
-            if found.slope[level] <= 0.0 or logs[level] <= low[level]:
+            if found.gradient[level] <= 0.0 or logs[level] <= low[level]:
                 continue
             without = logs.copy()
             without[level] = low[level]
@@ -334,7 +334,7 @@ def estimate_levels(
         noise: The levels of robots and sensors.
         camera: Which camera.
     """
-    mine = seen.looks.problems[camera]
+    mine = seen.camera_parameters.problems[camera]
     if not mine.has_spare_corners:
         return LensLevels()
     found = _rows(seen, problem, rows, state, noise, camera)
@@ -398,7 +398,7 @@ def _rows(
     noise: Noise,
     camera: str,
 ) -> _Rows:
-    looks, which = seen.looks, list(seen.looks.problems).index(camera)
+    looks, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
     of_camera = looks.rows(camera)
     mine, poses = looks.problems[camera], looks.poses[of_camera]
     shape = mine.basis[mine.stack.ids]

@@ -15,9 +15,9 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Linear, Problem
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.variance import PriorInformation
 
 # Sizes of changes: from a tenth of a millimetre to a tenth of a metre, by half decades.
 SIZES_M = tuple(float(value) for value in 10.0 ** np.arange(-4.0, -0.9, 0.5))
@@ -30,7 +30,7 @@ _LEAST_SIGMA = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class CalibrationPosterior:
     """Posterior of the calibration, the prior of a verification.
 
     Attributes:
@@ -45,7 +45,7 @@ class Belief:
 
 
 @dataclass(frozen=True, eq=False)
-class Cause:
+class ChangeHypothesis:
     """A change that may have happened since the calibration, of p unknowns.
 
     Attributes:
@@ -72,7 +72,7 @@ class Cause:
 
 
 @dataclass(frozen=True, eq=False)
-class CauseEvidence:
+class HypothesisEvidence:
     """Evidence of the stops for one cause.
 
     Attributes:
@@ -92,7 +92,9 @@ class CauseEvidence:
     freedom: int
 
 
-def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> CauseEvidence:
+def evidence_of(
+    problem: Problem, belief: CalibrationPosterior, cause: ChangeHypothesis | None = None
+) -> HypothesisEvidence:
     """Computes the evidence for a cause from the stops of one robot; with None, for no change.
 
     The problem has all unknowns of `belief`.
@@ -103,14 +105,14 @@ def explain(problem: Problem, belief: Belief, cause: Cause | None = None) -> Cau
     scores = []
     for size_m, factor_tried in cause.trials:
         if factor_tried != factor:
-            stops = _at(problem, belief, cause, stops.values, factor_tried)
+            stops = _linearised(problem, belief, cause, stops.values, factor_tried)
         scores.append(_score(stops, size_m * units, belief.freedom))
     factor_tried = cause.trials[int(np.argmax(scores))][1]
-    stops = _at(problem, belief, cause, stops.values, factor_tried)
+    stops = _linearised(problem, belief, cause, stops.values, factor_tried)
     # With the widest prior on the change's size, which hardly shrinks it.
     mean, covariance = _posterior(stops, widest_m * units)
     prior_misfit = float(np.sum((mean / (widest_m * units)) ** 2))
-    return CauseEvidence(
+    return HypothesisEvidence(
         float(np.logaddexp.reduce(scores) - np.log(len(scores))),
         mean,
         covariance,
@@ -134,7 +136,7 @@ class _StopResiduals:
     covariance: FloatArray
 
 
-def _nothing(problem: Problem) -> Cause:
+def _nothing(problem: Problem) -> ChangeHypothesis:
     """The cause of no change, without unknowns."""
     (poses,) = problem.poses.values()
     sensor, flange, values = (
@@ -142,25 +144,33 @@ def _nothing(problem: Problem) -> Cause:
         np.zeros((len(poses), 6, 0)),
         np.zeros(0),
     )
-    return Cause("nothing", sensor, flange, values, values, (1.0,))
+    return ChangeHypothesis("nothing", sensor, flange, values, values, (1.0,))
 
 
 def _converged(
-    problem: Problem, belief: Belief, cause: Cause, sigmas: FloatArray, factor: float
+    problem: Problem,
+    belief: CalibrationPosterior,
+    cause: ChangeHypothesis,
+    sigmas: FloatArray,
+    factor: float,
 ) -> _StopResiduals:
     """Linearises at a cause's most likely values, by iteration."""
-    stops = _at(problem, belief, cause, cause.start, factor)
+    stops = _linearised(problem, belief, cause, cause.start, factor)
     for _ in range(_ROUNDS if len(sigmas) else 0):
         values = _posterior(stops, sigmas)[0]
         step = np.abs(values - stops.values).max()
-        stops = _at(problem, belief, cause, values, factor)
+        stops = _linearised(problem, belief, cause, values, factor)
         if step < _CONVERGED:
             break
     return stops
 
 
-def _at(
-    problem: Problem, belief: Belief, cause: Cause, values: FloatArray, factor: float
+def _linearised(
+    problem: Problem,
+    belief: CalibrationPosterior,
+    cause: ChangeHypothesis,
+    values: FloatArray,
+    factor: float,
 ) -> _StopResiduals:
     """Linearises at some values (p,) of a cause."""
     without, calibrated = undone(problem, cause, values), len(belief.covariance)
@@ -184,7 +194,7 @@ def _total_covariance(problem: Problem, linear: Linear, noise: Noise) -> FloatAr
     return np.asarray(covariance)
 
 
-def undone(problem: Problem, cause: Cause, values: FloatArray) -> Problem:
+def undone(problem: Problem, cause: ChangeHypothesis, values: FloatArray) -> Problem:
     """The stops with a change of (p,) values undone, and these as their last effect.
 
     Changes may be large: a board may have turned by any angle.
@@ -193,7 +203,7 @@ def undone(problem: Problem, cause: Cause, values: FloatArray) -> Problem:
         _stepped(jacobian, values) for jacobian in (cause.by_sensor, cause.flange_jacobian)
     )
     adjoints, observations = adjoint(invert(by_sensor.moved)), problem.observations
-    no_prior = Knowledge(np.zeros((len(values), len(values))), np.zeros(len(values)))
+    no_prior = PriorInformation(np.zeros((len(values), len(values))), np.zeros(len(values)))
     ((robot, poses),) = problem.poses.items()
     changed = Effect.free("change", no_prior, by_sensor.jacobian, {robot: flange_jacobian.jacobian})
     return replace(
@@ -207,7 +217,7 @@ def undone(problem: Problem, cause: Cause, values: FloatArray) -> Problem:
     ).with_effects([*(effect.carried(adjoints) for effect in problem.effects), changed])
 
 
-def with_change(state: State, cause: Cause) -> State:
+def with_change(state: State, cause: ChangeHypothesis) -> State:
     """The unknowns followed by those of a cause, which are zero."""
     return State(state.edges, np.concatenate([state.values, np.zeros(len(cause.units))]))
 

@@ -13,8 +13,8 @@ import numpy as np
 from visioncal.core.quantiles import chi2_limit, f_limit
 from visioncal.core.transforms import adjoint, exp, invert, log, mean_transform
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import (
     Solution,
     by_noise_alone,
@@ -179,7 +179,7 @@ def twin_name(problem: Problem, frame: str) -> str:
     return f"{first}@{count}"
 
 
-def gross_move(
+def find_gross_move(
     problem: Problem, fit: Solution, agrees: Mask, movable: Sequence[str]
 ) -> Move | None:
     """The move that explains most outliers; None where none explains enough.

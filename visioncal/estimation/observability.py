@@ -13,8 +13,8 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import edge_names, robot_part
 from visioncal.estimation.linalg import covariance_among, spectrum
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fisher_information
 
 # Scaled eigenvalue ratio below which the motion does not determine a direction.
@@ -174,7 +174,7 @@ def _at_typical_noise(
         observations=replace(seen, covariance=scale**2 * seen.covariance),
         effects=tuple(
             replace(
-                effect, known=replace(effect.known, information=effect.known.information / least**2)
+                effect, prior=replace(effect.prior, information=effect.prior.information / least**2)
             )
             for effect in problem.effects
         ),

@@ -23,15 +23,15 @@ from visioncal.estimation.moves import (
     Move,
     better_stop,
     explained_by_noise,
-    gross_move,
+    find_gross_move,
     moved,
     moved_earlier_or_later,
     needless_move,
     unmoved,
 )
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.parts import UNEVEN, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import UNEVEN, Noise, State
 from visioncal.estimation.robust import (
     Distances,
     half_of,
@@ -39,7 +39,7 @@ from visioncal.estimation.robust import (
     trimmed_start,
     widened,
 )
-from visioncal.estimation.slight_steps import slight_move
+from visioncal.estimation.slight_steps import find_slight_move
 from visioncal.estimation.solve import (
     Solution,
     fit_problem,
@@ -69,7 +69,7 @@ _SUSPECT_SHARE = 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class Agreed:
+class InlierFit:
     """The inliers, and their fit.
 
     Attributes:
@@ -139,16 +139,16 @@ def distances(problem: Problem, used: Mask, fit: Solution) -> Distances:
     return Distances(squares, directions, uneven * limit)
 
 
-def agree(problem: Problem, state: State, movable: Sequence[str] = ()) -> Agreed:
-    """Finds the inliers and the clear moves in a first pass; `settle` refines both."""
+def inliers_and_moves(problem: Problem, state: State, movable: Sequence[str] = ()) -> InlierFit:
+    """Finds the inliers and the clear moves in a first pass; `refine_inliers` refines both."""
     if not movable:
-        return inliers(problem, state)
+        return find_inliers(problem, state)
     used, fit = _trimmed_core(problem, state, _early(problem))
     moves: list[Move] = []
     used, fit = _widened(problem, used, fit)
     while len(moves) < _MOST_MOVES:
         relative_squares = _ObservationSearch(problem).distances(used, fit).beyond
-        move = gross_move(problem, fit, relative_squares < 1.0, movable)
+        move = find_gross_move(problem, fit, relative_squares < 1.0, movable)
         if move is None:
             break
         problem, fit = moved(problem, fit, move)
@@ -161,7 +161,7 @@ def agree(problem: Problem, state: State, movable: Sequence[str] = ()) -> Agreed
     return _without_needless(_timed(_inlier_fit(problem, used, fit, moves)))
 
 
-def _timed(agreed: Agreed) -> Agreed:
+def _timed(agreed: InlierFit) -> InlierFit:
     """Moves each move to the stop at which it explains most, after the joint fit."""
     problem, fit, moves = agreed.problem, agreed.fit, list(agreed.moves)
     for move in agreed.moves:
@@ -173,7 +173,7 @@ def _timed(agreed: Agreed) -> Agreed:
     return _inlier_fit(problem, *_widened(problem, agreed.used, fit), moves)
 
 
-def _without_needless(agreed: Agreed) -> Agreed:
+def _without_needless(agreed: InlierFit) -> InlierFit:
     """Removes insignificant moves, after the joint fit."""
     problem, fit, used, moves = agreed.problem, agreed.fit, agreed.used, list(agreed.moves)
     while (move := needless_move(problem.subset(used), fit, moves)) is not None:
@@ -182,20 +182,20 @@ def _without_needless(agreed: Agreed) -> Agreed:
     return agreed if len(moves) == len(agreed.moves) else _inlier_fit(problem, used, fit, moves)
 
 
-def all_as_inliers(problem: Problem, state: State) -> Agreed:
+def all_as_inliers(problem: Problem, state: State) -> InlierFit:
     """Fits all observations as inliers, for sets known not to agree."""
     used = np.ones(len(problem), dtype=bool)
     return _inlier_fit(problem, used, fit_problem(problem, state), ())
 
 
-def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
+def refine_inliers(agreed: InlierFit, movable: Sequence[str] = ()) -> InlierFit:
     """Refines the inliers one by one, and finds moves too small for single observations."""
     problem, moves = agreed.problem, list(agreed.moves)
     if not movable:
-        return inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
+        return find_inliers(problem, agreed.fit.state, agreed.used, agreed.fit.noise)
     used, fit = _refined(problem, *_widened(problem, agreed.used, agreed.fit))
     while len(moves) < _MOST_MOVES:
-        slight = slight_move(problem.subset(used), fit, movable)
+        slight = find_slight_move(problem.subset(used), fit, movable)
         if slight is None:
             break
         problem, fit = moved(problem, fit, slight)
@@ -205,9 +205,9 @@ def settle(agreed: Agreed, movable: Sequence[str] = ()) -> Agreed:
     return _without_needless(_inlier_fit(problem, used, fit, moves))
 
 
-def inliers(
+def find_inliers(
     problem: Problem, state: State, used: Mask | None = None, noise: Noise | None = None
-) -> Agreed:
+) -> InlierFit:
     """Finds the inliers where nothing moved; `used` are (n,) presumed ones, if any, of some noise.
 
     Where fewer than half are inliers, or their noise exceeds any accepted result's, the outliers
@@ -313,5 +313,5 @@ def _refined(problem: Problem, used: Mask, fit: Solution) -> tuple[Mask, Solutio
     return settled(_ObservationSearch(problem), used, fit, LEAST_VIEWS, _SUSPECT_SHARE)
 
 
-def _inlier_fit(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> Agreed:
-    return Agreed(problem, fit, used, distances(problem, used, fit), tuple(moves))
+def _inlier_fit(problem: Problem, used: Mask, fit: Solution, moves: Sequence[Move]) -> InlierFit:
+    return InlierFit(problem, fit, used, distances(problem, used, fit), tuple(moves))

@@ -10,7 +10,7 @@ from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.robot import FUNCTION_NAMES, DHTable
-from visioncal.robot.jacobians import ROW_NAMES, number_jacobian, table_moves
+from visioncal.robot.jacobians import ROW_NAMES, number_jacobian, table_jacobian
 
 _LENGTHS = ("d", "a")
 _ROW = len(ROW_NAMES)
@@ -96,7 +96,7 @@ def parameter_moves(model: ArmModel, table: DHTable, parameters: Sequence[Parame
     """
     steps = [model.changes(row) for row in np.eye(len(model.values))]
     placements, functions = (np.array(pair) for pair in zip(*steps, strict=True))
-    rows = table_moves(model.bare, table, placements, functions)
+    rows = table_jacobian(model.bare, table, placements, functions)
     moves = np.zeros((len(parameters), len(steps)))
     for row, parameter in enumerate(parameters):
         if parameter.place >= _ROW:

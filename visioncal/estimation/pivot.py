@@ -16,7 +16,7 @@ from visioncal.core.quantiles import f_limit
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray
-from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
+from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.groups import GroupFit, fit_groups
 from visioncal.estimation.linalg import covariance_from, spectrum
 from visioncal.estimation.observability import (
@@ -26,8 +26,8 @@ from visioncal.estimation.observability import (
     axis_words,
     turn_axis,
 )
-from visioncal.estimation.parts import Noise
 from visioncal.estimation.placing import LEAST_NOISE_M, TOUCH_NOISE_M, counted_noise_m
+from visioncal.estimation.problem_parts import Noise
 from visioncal.estimation.readings import readings_that_close
 from visioncal.estimation.touching import Touches, TouchProblem, TouchUnknowns, in_tool
 
@@ -86,7 +86,7 @@ class PivotFit:
     @property
     def rms_m(self) -> float:
         """Root mean square of the used touches' distances [m]."""
-        return float(np.sqrt(np.mean(self.agreement.off_m[self.agreement.agrees] ** 2)))
+        return float(np.sqrt(np.mean(self.agreement.off_m[self.agreement.mask] ** 2)))
 
     @property
     def looks_inverse(self) -> bool:
@@ -123,16 +123,18 @@ def fit_pivot(
 def _fitted(touches: Touches, noise: Noise, expected: float | None) -> PivotFit:
     tips = touches.are("point")
     problem = TouchProblem(touches.subset(tips), noise, oriented=False)
-    inliers = agreeing_groups(problem, expected)
+    inliers = find_inlier_groups(problem, expected)
     _check_doubt(problem, inliers)
     worst = check_turning(problem, inliers.fit)
     if not tips.all():
         # Touches of the axes alone determine the tool's rotation: a consensus of few would fit them
         # and nothing else, so they join the inliers of the tip.
         presumed = np.ones(len(touches), dtype=bool)
-        presumed[tips] = inliers.agrees
+        presumed[tips] = inliers.mask
         problem = TouchProblem(touches, noise, oriented=True)
-        inliers = agreeing_groups(problem, expected, (presumed, problem.turned(inliers.fit.state)))
+        inliers = find_inlier_groups(
+            problem, expected, (presumed, problem.turned(inliers.fit.state))
+        )
         _check_sides(touches, inliers)
         worst = check_turning(problem, inliers.fit)
     level = counted_noise_m(inliers.fit, TOUCH_NOISE_M if expected is None else expected)
@@ -167,7 +169,7 @@ def _check_doubt(problem: TouchProblem, inliers: GroupInliers[TouchUnknowns]) ->
 def _check_sides(touches: Touches, inliers: GroupInliers[TouchUnknowns]) -> None:
     local = in_tool(touches, inliers.fit.state)
     for kind, coordinates in (("z", local[:, 2]), ("xz", local[:, 0])):
-        used = inliers.agrees & np.array([name == kind for name in touches.kinds])
+        used = inliers.mask & np.array([name == kind for name in touches.kinds])
         behind = [touches.labels[index] for index in np.flatnonzero(used & (coordinates < 0.0))]
         before = [touches.labels[index] for index in np.flatnonzero(used & (coordinates > 0.0))]
         if behind:
@@ -198,7 +200,7 @@ def _belonging(
     problem: TouchProblem, inliers: GroupInliers[TouchUnknowns]
 ) -> tuple[int | None, ...]:
     """The other point that each outlier touch fits, by the touches beyond doubt."""
-    suspects = ~inliers.agrees | inliers.doubtful
+    suspects = ~inliers.mask | inliers.doubtful
     fit = inliers.fit
     if inliers.doubtful.any():
         fit = fit_groups(problem, ~suspects, fit.state)

@@ -18,7 +18,7 @@ from visioncal.core.number_format import figure, some_of
 from visioncal.core.quantiles import f_limit, t_chance
 from visioncal.core.transforms import apply, exp, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.group_outliers import GroupInliers, agreeing_groups
+from visioncal.estimation.group_outliers import GroupInliers, find_inlier_groups
 from visioncal.estimation.groups import GroupFit, Groups, fit_groups
 from visioncal.estimation.numbering import Numbering, find_numbering
 from visioncal.estimation.observability import SIGMA_LIMIT_M, Direction, axis_words
@@ -382,9 +382,9 @@ def fit_points(pairs: PointPairs, expected_noise_m: float | None = None) -> Poin
     check_hand(points, numbering, noise)
     agreement, scale = _fit_inliers(pairs, expected_noise_m)
     _check_numbering(
-        points, numbering, {pairs.labels[index] for index in np.flatnonzero(agreement.agrees)}
+        points, numbering, {pairs.labels[index] for index in np.flatnonzero(agreement.mask)}
     )
-    fit, agrees = agreement.fit, agreement.agrees
+    fit, agrees = agreement.fit, agreement.mask
     centre = pairs.nominal[agrees].mean(axis=0)
     worst = worst_directions(fit, fit.state.base_from_fixture, centre, fit.sigma)
     if fit.sigma > SIGMA_LIMIT_M and any(direction.sigma > direction.limit for direction in worst):
@@ -403,18 +403,18 @@ def _fit_inliers(
     pairs: PointPairs, expected_noise_m: float | None
 ) -> tuple[GroupInliers[FixturePlacement], Scale]:
     """Finds the inliers, without rejecting points that only a scale contradicts."""
-    rigid = agreeing_groups(PointProblem(pairs, scaled=False), expected_noise_m)
+    rigid = find_inlier_groups(PointProblem(pairs, scaled=False), expected_noise_m)
     if not _is_inlier(rigid).all():
-        scaled = agreeing_groups(PointProblem(pairs, scaled=True), expected_noise_m)
+        scaled = find_inlier_groups(PointProblem(pairs, scaled=True), expected_noise_m)
         scale = _scale_of(scaled.fit)
         if scale.differs and _is_inlier(scaled).sum() > _is_inlier(rigid).sum():
-            fit = fit_groups(PointProblem(pairs, scaled=False), scaled.agrees)
+            fit = fit_groups(PointProblem(pairs, scaled=False), scaled.mask)
             return _as_scaled(scaled, fit), scale
-    return rigid, _scale_of(fit_groups(PointProblem(pairs, scaled=True), rigid.agrees))
+    return rigid, _scale_of(fit_groups(PointProblem(pairs, scaled=True), rigid.mask))
 
 
 def _is_inlier(agreement: GroupInliers[FixturePlacement]) -> Mask:
-    return agreement.agrees & ~agreement.doubtful
+    return agreement.mask & ~agreement.doubtful
 
 
 def _as_scaled(

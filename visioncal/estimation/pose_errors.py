@@ -28,10 +28,10 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, rows_of, stops_of
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among, covariance_root
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import RATIO_PRIOR, normal_equations, robot_likelihood
-from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, Likely
+from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, LikelihoodValue
 
 # Distance between postures equivalent to a rotation by a radian [m].
 _REACH_M = 0.5
@@ -166,8 +166,16 @@ def find_pose_errors(problem: Problem, state: State, noise: Noise, robot: str) -
     basis = np.zeros((len(poses), 6, columns.shape[2]))
     basis[posed] = columns
     beside = np.sqrt(left)
-    found = ArmErrors(basis, 1.0, gain, of_links=False, white=beside, look=levels, lasting=lasting)
-    return replace(found, away=left_out_clusters(problem, state, noise, robot, found))
+    found = ArmErrors(
+        basis,
+        1.0,
+        gain,
+        of_links=False,
+        white=beside,
+        fit_sigmas=levels,
+        time_correlated_count=lasting,
+    )
+    return replace(found, far_posture_errors=left_out_clusters(problem, state, noise, robot, found))
 
 
 def left_out_clusters(
@@ -327,7 +335,7 @@ class _StopBlock:
 
 
 @dataclass(frozen=True, eq=False)
-class _LikelihoodAt(Likely):
+class _LikelihoodAt(LikelihoodValue):
     """The likelihood at some logarithms of sizes; its curvature is average information."""
 
     logs: FloatArray
@@ -405,7 +413,7 @@ class _Likelihood:
             if now is None or damping > _WORST_DAMPING:
                 break
             curvature = now.curvature + damping * np.diag(np.diag(now.curvature) + 1e-6)
-            step = np.clip(-np.linalg.solve(curvature, now.slope), -_LONGEST_STEP, _LONGEST_STEP)
+            step = np.clip(-np.linalg.solve(curvature, now.gradient), -_LONGEST_STEP, _LONGEST_STEP)
             trial = self._step(common, np.clip(now.logs + step, np.log(least), np.log(MOST_SIGMA)))
             if trial is None or trial.value > now.value:
                 damping *= 10.0
@@ -458,5 +466,5 @@ class _Likelihood:
             average += working @ inverse @ working.T
             projected += by_root.T @ working.T
         curvature = 0.5 * (average - projected.T @ projected)
-        full = RATIO_PRIOR.beside(Likely(0.5 * value, gradients, curvature), logs)
-        return _LikelihoodAt(full.value, full.slope, full.curvature, logs)
+        full = RATIO_PRIOR.beside(LikelihoodValue(0.5 * value, gradients, curvature), logs)
+        return _LikelihoodAt(full.value, full.gradient, full.curvature, logs)

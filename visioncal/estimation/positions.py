@@ -26,7 +26,7 @@ _SET_SIZE = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class PositionReadings:
     """Position readings of points on the flange by an instrument.
 
     Attributes:
@@ -43,9 +43,9 @@ class Places:
     stops: IntArray
     sigmas: FloatArray
 
-    def subset(self, chosen: Mask) -> "Places":
+    def subset(self, chosen: Mask) -> "PositionReadings":
         """Returns the readings of an (m,) mask."""
-        return Places(
+        return PositionReadings(
             self.base_from_flange[chosen],
             self.read[chosen],
             self.points[chosen],
@@ -67,7 +67,7 @@ class Mounting:
     on_flange: FloatArray
 
 
-def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:
+def find_mounting(places: PositionReadings) -> tuple[Mounting, FloatArray]:
     """Fits the mounting robustly to readings with outlier stops.
 
     Returns:
@@ -88,7 +88,7 @@ def find_mounting(places: Places) -> tuple[Mounting, FloatArray]:
     return best, distances(places, best)
 
 
-def _starts(places: Places, count: int) -> Iterator[Mask]:
+def _starts(places: PositionReadings, count: int) -> Iterator[Mask]:
     """Masks of readings: all of them, and small sets of stops with readings of all points."""
     yield np.ones(len(places.stops), dtype=bool)
     if count <= _SET_SIZE:
@@ -100,12 +100,12 @@ def _starts(places: Places, count: int) -> Iterator[Mask]:
             yield chosen
 
 
-def distances(places: Places, mounting: Mounting) -> FloatArray:
+def distances(places: PositionReadings, mounting: Mounting) -> FloatArray:
     """Distances (m,) [m] between the read and the predicted positions."""
     return np.asarray(np.linalg.norm(residuals(places, mounting), axis=1))
 
 
-def fit_mounting(places: Places, start: Mounting | None, count: int) -> Mounting:
+def fit_mounting(places: PositionReadings, start: Mounting | None, count: int) -> Mounting:
     """Minimises the distances between read and predicted positions of a number of points.
 
     Without a start, the flange is aligned with the readings, with the points at its origin. Points
@@ -130,7 +130,7 @@ def fit_mounting(places: Places, start: Mounting | None, count: int) -> Mounting
     return levenberg_marquardt(start, linearise, _CONVERGED)[0]
 
 
-def residuals(places: Places, at: Mounting) -> FloatArray:
+def residuals(places: PositionReadings, at: Mounting) -> FloatArray:
     """Read minus predicted positions (m, 3), in the flange's frame [m]."""
     in_base = apply(at.base_from_instrument, places.read)
     flange_from_base = invert(places.base_from_flange)
@@ -138,7 +138,7 @@ def residuals(places: Places, at: Mounting) -> FloatArray:
     return np.asarray(turned + flange_from_base[:, :3, 3] - at.on_flange[places.points])
 
 
-def _jacobian(places: Places, at: Mounting) -> FloatArray:
+def _jacobian(places: PositionReadings, at: Mounting) -> FloatArray:
     """Derivatives (m, 3, 6 + 3 p) of `residuals` by the instrument's frame and the points."""
     turns = np.swapaxes(places.base_from_flange[:, :3, :3], 1, 2) @ at.base_from_instrument[:3, :3]
     count = len(at.on_flange)

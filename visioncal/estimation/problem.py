@@ -23,9 +23,9 @@ from scipy.sparse.csgraph import connected_components
 from visioncal.core.transforms import adjoint, exp, inverse_right_jacobian, invert, log
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.parts import Effect, FramePrior, Noise, Observations, State
+from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, Observations, State
 from visioncal.estimation.tree import PathStep, Stride, Tree, TreePaths
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 # A rotation that was not measured is supplied, and counts for nothing beside a variance of one.
 _NOT_MEASURED = 1.0
@@ -218,11 +218,11 @@ class Problem:
             if effect.by_sensor is not None:
                 mine = slice(at, at + len(effect))
                 at += len(effect)
-                known = Knowledge(
-                    effect.known.information + information[mine, mine],
-                    effect.known.gradient + gradient[mine],
+                known = PriorInformation(
+                    effect.prior.information + information[mine, mine],
+                    effect.prior.gradient + gradient[mine],
                 )
-                taken = replace(taken, known=known, by_sensor=by_sensor[:, :, mine])
+                taken = replace(taken, prior=known, by_sensor=by_sensor[:, :, mine])
             effects.append(taken)
         return replace(
             self,
@@ -315,7 +315,7 @@ class Problem:
             rows.setdefault(pair, []).append(at)
         return tuple(_Group(np.array(at), self.tree.path(*pair)) for pair, at in rows.items())
 
-    def through(self, frame: str) -> Mask:
+    def observations_through(self, frame: str) -> Mask:
         """(n,) the observations on whose way a frame's edge is, a robot's where it is a flange."""
         found = np.zeros(len(self), dtype=bool)
         for group in self.groups:
@@ -418,19 +418,19 @@ class Problem:
             for robot in robots
         }
 
-    def knowledge(self, state: State) -> Knowledge:
+    def prior_information(self, state: State) -> PriorInformation:
         """What is known of all p unknowns beside the observations, and half its gradient there."""
         information, gradient = np.zeros((self.size, self.size)), np.zeros(self.size)
         for effect in self.effects:
             columns = self.effect_columns[effect.name]
-            information[columns, columns] = effect.known.information
+            information[columns, columns] = effect.prior.information
             change = self.values_of(effect.name, state) - effect.values
-            gradient[columns] = effect.known.gradient + effect.known.information @ change
+            gradient[columns] = effect.prior.gradient + effect.prior.information @ change
         for prior in self.priors:
             away, jacobian = self.prior_rows(prior, state)
             information += jacobian.T @ jacobian
             gradient += jacobian.T @ away
-        return Knowledge(information, gradient)
+        return PriorInformation(information, gradient)
 
     def prior_rows(self, prior: FramePrior, state: State) -> tuple[FloatArray, FloatArray]:
         """Residuals (d,) of a prior in units of its sigmas, and their slopes (d, p)."""
@@ -446,13 +446,13 @@ class Problem:
         away, jacobian = prior.whitened(rest)
         return away, jacobian @ by_edges
 
-    def cost_of_knowledge(self, state: State) -> float:
+    def prior_cost(self, state: State) -> float:
         """The squared error of what is known, in units of its sigmas, up to a constant."""
         cost = 0.0
         for effect in self.effects:
             change = self.values_of(effect.name, state) - effect.values
             cost += float(
-                change @ (2.0 * effect.known.gradient + effect.known.information @ change)
+                change @ (2.0 * effect.prior.gradient + effect.prior.information @ change)
             )
         for prior in self.priors:
             away, _ = self.prior_rows(prior, state)

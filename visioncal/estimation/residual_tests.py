@@ -10,10 +10,10 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of, stops_of
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.solve import fisher_information, normal_equations
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 # Share of sessions in which noise fails a test.
 _FALSE_ALARM = 1e-4
@@ -134,7 +134,7 @@ def neighbours(problem: Problem, state: State, noise: Noise, robot: str) -> Neig
     information_all = normal_equations(problem, state, noise)[0]
     fitted, metric = covariance_among(information_all, moving), information_all[edges, edges]
     rows, stops = rows_of(problem, robot), stops_of(problem, robot)
-    prior = problem.knowledge(state)
+    prior = problem.prior_information(state)
     observed = expected = scatter = 0.0
     for block in np.array_split(stops, min(_BLOCKS, len(stops) // 2)):
         part = problem.subset(rows & np.isin(problem.observations.stops, block))
@@ -167,7 +167,7 @@ def drift(problem: Problem, state: State, noise: Noise, robot: str) -> Drift | N
     jacobian = np.zeros((len(poses), 6, 6))
     time = np.linspace(-0.5, 0.5, len(stops))[:, None, None]
     jacobian[stops] = adjoint(invert(poses[stops])) * time
-    zeros, no_prior = np.zeros(6), Knowledge(np.zeros((6, 6)), np.zeros(6))
+    zeros, no_prior = np.zeros(6), PriorInformation(np.zeros((6, 6)), np.zeros(6))
     effect = Effect("creep", zeros, no_prior, zeros > 0.0, flange_jacobian={robot: jacobian})
     widened = problem.with_effects([*problem.effects, effect])
     widened_state = State(state.edges, np.concatenate([state.values, zeros]))
@@ -203,5 +203,7 @@ def inflation(
     """
     fitted = covariance_among(fisher_information(problem, state, noise), problem.counted)
     part = problem.subset(rows_of(problem, robot))
-    information = fisher_information(part, state, noise) - problem.knowledge(state).information
+    information = (
+        fisher_information(part, state, noise) - problem.prior_information(state).information
+    )
     return np.asarray((factor - 1.0) * fitted @ information @ fitted)

@@ -26,8 +26,8 @@ from visioncal.estimation.moves import (
     moved,
     twin_name,
 )
-from visioncal.estimation.parts import UNEVEN, Effect, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import UNEVEN, Effect, State
 from visioncal.estimation.solve import (
     RepeatErrors,
     Solution,
@@ -37,7 +37,7 @@ from visioncal.estimation.solve import (
     fitted_covariance,
     robot_likelihood,
 )
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 # Least information of a step beside the other unknowns, as a share of that without them.
 _LEAST_INFORMATION = 1e-6
@@ -111,7 +111,7 @@ def common_size(problem: Problem, fit: Solution, some: Mask) -> tuple[float, Mas
     return share, explained_by_noise(widened, resized, len(problem))[some]
 
 
-def slight_move(
+def find_slight_move(
     problem: Problem, fit: Solution, movable: Sequence[str], *, kinds: int = 1
 ) -> Move | None:
     """The most significant step of a frame at any stop; None where none is significant.
@@ -234,9 +234,9 @@ def _of_size(problem: Problem, fit: Solution, board: str, some: Mask | None = No
     return Effect.free(f"size of {board}", _no_prior(1), jacobian)
 
 
-def _no_prior(count: int) -> Knowledge:
+def _no_prior(count: int) -> PriorInformation:
     """Zero information on some values."""
-    return Knowledge(np.zeros((count, count)), np.zeros(count))
+    return PriorInformation(np.zeros((count, count)), np.zeros(count))
 
 
 def _as_f_tests(squares: FloatArray, freedom: float, numbers: int) -> FloatArray:
@@ -293,7 +293,7 @@ def evidence_gain(
     widened, step_fit = with_step(problem, fit, step)
     # The sensors' levels are held, the same for both.
     before, after = (
-        robot_likelihood(part, state, step_fit.noise).least_unlikely
+        robot_likelihood(part, state, step_fit.noise).negative_log_likelihood
         for part, state in ((problem, fit.state), (widened, step_fit.state))
     )
     covariance_all = fitted_covariance(widened, step_fit.state, step_fit.noise)
@@ -446,7 +446,7 @@ def differs_elsewhere(problem: Problem, fit: Solution, move: Move) -> bool:
 
 def _residual_freedom(problem: Problem, fit: Solution) -> float:
     """Degrees of freedom of the residuals; unknowns with a prior take less than one each."""
-    prior = problem.knowledge(fit.state).information
+    prior = problem.prior_information(fit.state).information
     prior_share = float(np.sum(fitted_covariance(problem, fit.state, fit.noise) * prior))
     determined = float(np.sum(problem.moving)) - prior_share
     return max(float(problem.observations.directions.sum()) - determined, 6.0)

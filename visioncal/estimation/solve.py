@@ -25,15 +25,15 @@ from visioncal.estimation.linalg import (
     squared_lengths,
     weighted_gram,
 )
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import ANYTHING, Linear, Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     SETTLED,
     Components,
-    Knowledge,
+    PriorInformation,
     RatioPrior,
-    Weighed,
+    WeightedResiduals,
     estimate_sigmas,
 )
 
@@ -272,11 +272,11 @@ class _Whitening:
             taken = np.add.reduceat(self.taken[rows[order]] @ every[order], first)
             shared[np.ix_(units, np.arange(width), columns)] += taken
         total -= gram(shared, shared)
-        known = problem.knowledge(state)
+        known = problem.prior_information(state)
         return (
             total[:-1, :-1] + known.information,
             total[:-1, -1] + known.gradient,
-            float(total[-1, -1]) + problem.cost_of_knowledge(state),
+            float(total[-1, -1]) + problem.prior_cost(state),
         )
 
 
@@ -331,11 +331,11 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
     by_flanges[joined] = inverse[joined] @ own[joined]
     # A residual is what the flange's error made of it: the error itself has the other sign.
     total = total - gram(cross[joined], answer[joined])
-    known = problem.knowledge(state)
+    known = problem.prior_information(state)
     return Reduced(
         total[:-1, :-1] + known.information,
         total[:-1, -1] + known.gradient,
-        float(total[-1, -1]) + problem.cost_of_knowledge(state),
+        float(total[-1, -1]) + problem.prior_cost(state),
         answer[:, :, -1],
         answer[:, :, :-1],
         inverse + blind,
@@ -499,12 +499,12 @@ class RobotLikelihood:
 
     reduced: Reduced
     components: Components
-    known: Knowledge
+    known: PriorInformation
     moving: Mask
     members: IntArray
     stops: IntArray
     before: FloatArray
-    _weighed: dict[int, tuple[tuple[FloatArray, Weighed], ...]] = field(
+    _weighed: dict[int, tuple[tuple[FloatArray, WeightedResiduals], ...]] = field(
         default_factory=dict, init=False, repr=False
     )
 
@@ -587,7 +587,7 @@ class RobotLikelihood:
                 start, least = (levels, size), weighed.value - gain
         return start
 
-    def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, Weighed], ...]:
+    def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, WeightedResiduals], ...]:
         """What units say, weighed by `white`, and by lower levels of one robot."""
         if robot not in self._weighed:
             lower = np.ones((len(_LOWER), *self.before.shape))
@@ -595,12 +595,12 @@ class RobotLikelihood:
             every = np.maximum(self.white[0] * lower, LEAST_SIGMA)
             given = self.reduced.errors, self.jacobian, self.components, self.known
             self._weighed[robot] = tuple(
-                (levels, Weighed.of(*given, np.log(levels.ravel()))) for levels in every
+                (levels, WeightedResiduals.of(*given, np.log(levels.ravel()))) for levels in every
             )
         return self._weighed[robot]
 
     @property
-    def least_unlikely(self) -> float:
+    def negative_log_likelihood(self) -> float:
         """The negative log-likelihood at the most likely levels, with what no level changes."""
         return self.white[1] + 0.5 * self.reduced.cost
 
@@ -711,7 +711,7 @@ def _robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLike
     return RobotLikelihood(
         reduced,
         Components(known, parts),
-        Knowledge(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
+        PriorInformation(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
         moving,
         members,
         stops,

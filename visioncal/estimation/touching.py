@@ -20,8 +20,8 @@ import numpy as np
 from visioncal.core.transforms import apply_each, compose, exp, invert, nearest_rotation, skew
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.groups import Groups
-from visioncal.estimation.parts import Noise
 from visioncal.estimation.placing import LEAST_NOISE_M
+from visioncal.estimation.problem_parts import Noise
 
 TouchKind: TypeAlias = Literal["point", "z", "xz"]
 

@@ -57,7 +57,7 @@ class Components:
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
+class PriorInformation:
     """What is known of p parameters from elsewhere.
 
     Attributes:
@@ -68,21 +68,23 @@ class Knowledge:
     information: FloatArray
     gradient: FloatArray
 
-    def beside(self, count: int) -> "Knowledge":
+    def beside(self, count: int) -> "PriorInformation":
         """The same with so many more parameters, the last ones, of which nothing is known."""
-        return Knowledge(np.pad(self.information, (0, count)), np.pad(self.gradient, (0, count)))
+        return PriorInformation(
+            np.pad(self.information, (0, count)), np.pad(self.gradient, (0, count))
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Likely:
-    """Negative log-likelihood at some logarithms of the sigmas, its slope and its curvature."""
+class LikelihoodValue:
+    """Negative log-likelihood at some logarithms of the sigmas, its gradient and its curvature."""
 
     value: float
-    slope: FloatArray
+    gradient: FloatArray
     curvature: FloatArray
 
 
-Found = TypeVar("Found", bound=Likely)
+Found = TypeVar("Found", bound=LikelihoodValue)
 
 
 @dataclass(frozen=True)
@@ -99,15 +101,15 @@ class RatioPrior:
     log_sigma: float
     places: tuple[tuple[int, int], ...] = ((0, 1),)
 
-    def beside(self, found: "Likely", logs: FloatArray) -> "Likely":
+    def beside(self, found: "LikelihoodValue", logs: FloatArray) -> "LikelihoodValue":
         """The likelihood at some logarithms of all sigmas, with what is known of their ratios."""
         lean = np.zeros((len(self.places), len(logs)))
         for row, (first, second) in zip(lean, self.places, strict=True):
             row[first], row[second] = -1.0 / self.log_sigma, 1.0 / self.log_sigma
         offset = lean @ logs - np.log(self.ratio) / self.log_sigma
-        return Likely(
+        return LikelihoodValue(
             found.value + 0.5 * float(offset @ offset),
-            found.slope + offset @ lean,
+            found.gradient + offset @ lean,
             found.curvature + lean.T @ lean,
         )
 
@@ -116,7 +118,7 @@ def estimate_sigmas(
     residuals: FloatArray,
     jacobian: FloatArray,
     components: Components,
-    known: Knowledge,
+    known: PriorInformation,
     start: FloatArray,
     free: Mask,
     prior: RatioPrior | None = None,
@@ -152,7 +154,7 @@ def estimate_sigmas(
     logs = np.clip(np.log(np.maximum(start, LEAST_SIGMA)), low, np.log(MOST_SIGMA))
     low, high = np.where(free, low, logs), np.where(free, np.log(MOST_SIGMA), logs)
 
-    def at(there: FloatArray) -> Likely:
+    def at(there: FloatArray) -> LikelihoodValue:
         return likelihood(residuals, jacobian, components, known, there, prior)
 
     logs, found = most_likely(at, logs, low, high, settled, enough)
@@ -187,21 +189,21 @@ def most_likely(
     now, damping = at(logs), 1e-3
     for _ in range(_ITERATIONS):
         # What is at a limit and would go on is held there.
-        free = np.where(now.slope > 0.0, logs > low, logs < high) & (low < high)
+        free = np.where(now.gradient > 0.0, logs > low, logs < high) & (low < high)
         curvature = now.curvature + damping * np.diag(np.maximum(np.diag(now.curvature), 1.0))
-        fading = (now.slope > 0.0) & (now.slope < hardly) & (damping < 1.0)
-        falling = free & fading & (np.diag(now.curvature) < _VARIANCES * now.slope)
+        fading = (now.gradient > 0.0) & (now.gradient < hardly) & (damping < 1.0)
+        falling = free & fading & (np.diag(now.curvature) < _VARIANCES * now.gradient)
         least = np.maximum(low - logs, np.where(falling, -_LONGEST_FALL, -_LONGEST_STEP))
         # A variance that falls to nothing moves all else like half a step of its logarithm.
         fall = np.where(falling, 0.5 * np.expm1(2.0 * least), 0.0)
         near = _bounded_step(
-            now.slope + curvature @ fall, curvature, np.where(free & ~falling, least, 0.0),
+            now.gradient + curvature @ fall, curvature, np.where(free & ~falling, least, 0.0),
             np.where(free & ~falling, np.minimum(high - logs, _LONGEST_STEP), 0.0),
         )  # fmt: skip
         step = np.where(falling, least, near)
         candidate, moved = logs + step, np.abs(step).max(initial=0.0)
-        gained = -float(near @ (now.slope + now.curvature @ (fall + 0.5 * near)))
-        gained += 0.5 * float(now.slope[falling].sum())
+        gained = -float(near @ (now.gradient + now.curvature @ (fall + 0.5 * near)))
+        gained += 0.5 * float(now.gradient[falling].sum())
         if damping < 1.0:
             if moved < settled or gained < little:
                 logs = candidate
@@ -319,7 +321,7 @@ def profile_interval(
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class WeightedResiduals:
     """Residuals (m, d) weighed by some sigmas, and what the parameters leave of them.
 
     Attributes:
@@ -344,9 +346,9 @@ class Weighed:
         residuals: FloatArray,
         jacobian: FloatArray,
         components: Components,
-        known: Knowledge,
+        known: PriorInformation,
         logs: FloatArray,
-    ) -> "Weighed":
+    ) -> "WeightedResiduals":
         """Weighs them by some logarithms of the sigmas; see `estimate_sigmas`."""
         sigmas = np.exp(logs)
         total = components.total(sigmas)
@@ -399,12 +401,15 @@ def likelihood(
     residuals: FloatArray,
     jacobian: FloatArray,
     components: Components,
-    known: Knowledge,
+    known: PriorInformation,
     logs: FloatArray,
     prior: RatioPrior | None,
-) -> Likely:
+) -> LikelihoodValue:
     """The restricted likelihood of some logarithms of the sigmas; see `estimate_sigmas`."""
-    found, columns = Weighed.of(residuals, jacobian, components, known, logs), jacobian.shape[-1]
+    found, columns = (
+        WeightedResiduals.of(residuals, jacobian, components, known, logs),
+        jacobian.shape[-1],
+    )
     weights, weighted, pulled = found.weights, found.weighted, found.pulled
     # How the residuals' covariance grows with the logarithm of each sigma.
     growth = 2 * found.sigmas[:, None, None] ** 2 * components.parts
@@ -426,5 +431,5 @@ def likelihood(
     curvature = seen - expected + 2.0 * np.diag(slope)
     if np.linalg.eigvalsh(curvature)[0] <= 0.0:
         curvature = expected
-    likely = Likely(found.value, slope, curvature)
+    likely = LikelihoodValue(found.value, slope, curvature)
     return likely if prior is None else prior.beside(likely, logs)

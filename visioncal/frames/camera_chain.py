@@ -44,7 +44,8 @@ class ArmErrors:
     Attributes:
         model: The arm's model with its p error parameters.
         covariance: (p, p) of the parameters.
-        with_camera: (6 + k + m, p) cross-covariance with the camera's edge and lens, as in `Eye`.
+        with_camera: (6 + k + m, p) cross-covariance with the camera's edge and lens, as in
+            `CalibratedCamera`.
     """
 
     model: "ArmModel"
@@ -79,7 +80,7 @@ class ArmErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
+class CalibratedCamera:
     """Calibrated camera: lens, extrinsics, their joint covariance, and the noise levels.
 
     Attributes:
@@ -92,7 +93,7 @@ class Eye:
             where there are none.
         arm: The arm's errors, where it was calibrated with the camera.
         pixel_px: Noise of a corner's coordinate [px]; None where unknown.
-        freedom: Degrees of freedom of the noise estimate; infinite where unknown.
+        noise_dof: Degrees of freedom of the noise estimate; infinite where unknown.
         warnings: Reasons not to trust the camera, in sentences.
     """
 
@@ -104,7 +105,7 @@ class Eye:
     arm_sigma: float
     arm: ArmErrors | None
     pixel_px: float | None
-    freedom: float
+    noise_dof: float
     warnings: tuple[str, ...]
 
     @classmethod
@@ -230,7 +231,7 @@ class Eye:
         """
         basis, postures = np.zeros((6, self.arm_error_count)), self.posture_error_count
         if self.arm is not None and joints_rad is not None:
-            basis[:, postures:] = self.arm.model.kept_basis(joints_rad[None])[0]
+            basis[:, postures:] = self.arm.model.basis_without_harmonics(joints_rad[None])[0]
         elif postures:
             basis[:, :postures] = self.arm_sigma * pose_basis(base_from_flange[None])[0]
         return basis

@@ -21,10 +21,10 @@ from visioncal.estimation.features import (
 from visioncal.estimation.placing import TOUCH_NOISE_M, assumed_words, counted_noise_m
 from visioncal.estimation.pointfit import FixturePlacement, PointFit, PointPairs, fit_points
 from visioncal.frames.drawing_points import NominalPoints
-from visioncal.frames.fixture_fit import FixtureFit, Setting, fixture_frame
-from visioncal.frames.measured import MeasuredPoints, Tool, touched_points
+from visioncal.frames.findings import RENAMED
+from visioncal.frames.fixture_fit import FitSettings, FixtureFit, fixture_frame
+from visioncal.frames.measured_points import MeasuredPoints, Tool, touched_points
 from visioncal.frames.touches import TouchRows, robot_noise
-from visioncal.frames.verdicts import RENAMED
 from visioncal.results import Calibration, Frame
 from visioncal.robot import Robot
 
@@ -84,7 +84,7 @@ def touched_fixture(
     if tool is not None:
         details = {"tool": {"name": tool.name, "sigma_mm": tool.edge.sigma_mm}}
     findings = tuple(_tool_findings(tool))
-    setting = Setting(touch_noise_m, findings, details, options or FixtureLimits())
+    setting = FitSettings(touch_noise_m, findings, details, options or FixtureLimits())
     if drawing is None:
         return _feature_fixture(measured, rows.kinds, setting)
     return drawn_fixture(measured, drawing, setting)
@@ -116,7 +116,7 @@ def _tool_findings(tool: Tool | None) -> list[Finding]:
     ]
 
 
-def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Setting) -> Frame:
+def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: FitSettings) -> Frame:
     """Fits the fixture to touches of its origin, x axis and xy plane."""
     touches = FeatureTouches(
         measured.labels,
@@ -141,9 +141,9 @@ def _feature_fixture(measured: MeasuredPoints, kinds: Sequence[str], setting: Se
 
 
 def _feature_fit(
-    fit: FeatureFit, measured: MeasuredPoints, setting: Setting
+    fit: FeatureFit, measured: MeasuredPoints, setting: FitSettings
 ) -> FixtureFit[FloatArray]:
-    matrix, centroid = fit.base_from_fixture, measured.points[fit.agreement.agrees].mean(axis=0)
+    matrix, centroid = fit.base_from_fixture, measured.points[fit.agreement.mask].mean(axis=0)
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
     return FixtureFit(
         measured,
@@ -159,7 +159,7 @@ def _feature_fit(
 
 
 def _redundancy_findings(
-    fitted: FixtureFit[FloatArray], kinds: Sequence[str], setting: Setting
+    fitted: FixtureFit[FloatArray], kinds: Sequence[str], setting: FitSettings
 ) -> Iterator[Finding]:
     used = [kind for kind, ok in zip(kinds, fitted.agrees.tolist(), strict=True) if ok]
     once = [_THINGS[kind] for kind in FEATURE_KINDS if used.count(kind) == 1]
@@ -180,7 +180,7 @@ def _redundancy_findings(
         )
 
 
-def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Setting) -> Frame:
+def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: FitSettings) -> Frame:
     """Fits `base_from_fixture` to measured points, which are named as in the drawing.
 
     Raises:
@@ -205,7 +205,7 @@ def drawn_fixture(measured: MeasuredPoints, drawing: NominalPoints, setting: Set
 
 
 def _drawing_fit(
-    fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting: Setting
+    fit: PointFit, measured: MeasuredPoints, pairs: PointPairs, setting: FitSettings
 ) -> FixtureFit[FixturePlacement]:
     noise_m = counted_noise_m(fit.agreement.fit, setting.expected_m)
     noise = np.hypot(noise_m, pairs.nominal_sigma_m)
@@ -215,7 +215,7 @@ def _drawing_fit(
         tuple(f"Point {label}" for label in pairs.labels),
         fit.base_from_fixture,
         measured.carried(fit.by_points, noise),
-        np.asarray(pairs.nominal[fit.agreement.agrees].mean(axis=0)),
+        np.asarray(pairs.nominal[fit.agreement.mask].mean(axis=0)),
         fit.agreement,
         _causes(fit, pairs),
         noise_m,
@@ -243,7 +243,7 @@ def _causes(fit: PointFit, pairs: PointPairs) -> list[str]:
 
 
 def _drawing_findings(
-    fit: PointFit, fitted: FixtureFit[FixturePlacement], pairs: PointPairs, setting: Setting
+    fit: PointFit, fitted: FixtureFit[FixturePlacement], pairs: PointPairs, setting: FitSettings
 ) -> Iterator[Finding]:
     yield from _scale_findings(fit, pairs)
     if not fit.hand_known:

@@ -15,14 +15,14 @@ from visioncal.estimation.group_outliers import GroupInliers
 from visioncal.estimation.groups import State
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import TOUCH_NOISE_M, worst_of
-from visioncal.frames.measured import MeasuredPoints
-from visioncal.frames.verdicts import (
+from visioncal.frames.findings import (
     noise_findings,
     off_words,
     outlier_findings,
     placed_name,
     sigma_findings,
 )
+from visioncal.frames.measured_points import MeasuredPoints
 from visioncal.results import Edge, Frame, Observation
 
 
@@ -52,7 +52,7 @@ class Words:
 
 
 @dataclass(frozen=True)
-class Setting:
+class FitSettings:
     """Noise, limits and wording of a fixture's fit.
 
     Attributes:
@@ -61,7 +61,7 @@ class Setting:
         details: Its figures, for the record.
         options: Limits of the verdict.
         words: Wording for the kind of measurement.
-        careful_m: Assumed noise where it is unknown and points are few [m].
+        assumed_noise_m: Assumed noise where it is unknown and points are few [m].
     """
 
     touch_noise_m: float | None = None
@@ -69,12 +69,12 @@ class Setting:
     details: Mapping[str, Any] = field(default_factory=dict)
     options: FixtureLimits = field(default_factory=FixtureLimits)
     words: Words = field(default_factory=Words)
-    careful_m: float = TOUCH_NOISE_M
+    assumed_noise_m: float = TOUCH_NOISE_M
 
     @property
     def expected_m(self) -> float:
         """Expected repeatability of a touch, per axis [m]."""
-        return self.careful_m if self.touch_noise_m is None else self.touch_noise_m
+        return self.assumed_noise_m if self.touch_noise_m is None else self.touch_noise_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ class FixtureFit(Generic[State]):
     @property
     def agrees(self) -> Mask:
         """(n,) inlier mask."""
-        return self.agreement.agrees
+        return self.agreement.mask
 
     @property
     def reasons(self) -> list[str]:
@@ -141,7 +141,7 @@ def fixture_frame(
     method: str,
     more: Sequence[Finding],
     details: Mapping[str, Any],
-    setting: Setting,
+    setting: FitSettings,
 ) -> Frame:
     """Builds the fixture's frame with its verdict.
 
@@ -185,7 +185,7 @@ def _observations(fitted: FixtureFit[State], kinds: Sequence[str]) -> tuple[Obse
     )
 
 
-def _findings(fitted: FixtureFit[State], setting: Setting) -> list[Finding]:
+def _findings(fitted: FixtureFit[State], setting: FitSettings) -> list[Finding]:
     names = [
         placed_name(name, place)
         for name, place in zip(fitted.names, fitted.measured.places, strict=True)

@@ -13,13 +13,13 @@ from visioncal.core.number_format import counted, some_of
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.core.verdict import remarks
 from visioncal.estimation.pointfit import FEWEST_POINTS
-from visioncal.frames.camera_chain import Eye
+from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.drawing_points import NominalPoints
 from visioncal.frames.fixture import drawn_fixture
-from visioncal.frames.fixture_fit import Setting, Words
+from visioncal.frames.fixture_fit import FitSettings, Words
 from visioncal.frames.frame_from_images import camera_details, view_findings
 from visioncal.frames.image_outliers import CandidateViews, ImageInliers, find_inliers
-from visioncal.frames.measured import MeasuredPoints
+from visioncal.frames.measured_points import MeasuredPoints
 from visioncal.frames.session_observations import SessionImages, fit_views, session_images
 from visioncal.frames.single_view import (
     Sight,
@@ -29,7 +29,11 @@ from visioncal.frames.single_view import (
     common_covariance,
     needs_robot,
 )
-from visioncal.frames.target_in_image import SeenTarget, check_size, see
+from visioncal.frames.target_in_image import (
+    PoseCandidates,
+    check_image_size,
+    target_pose_candidates,
+)
 from visioncal.frames.target_pose import inlier_warnings
 from visioncal.results import Calibration, Frame
 from visioncal.session import Session
@@ -87,10 +91,10 @@ class _Marker:
     name: str
     images: tuple[int, ...]
     views: tuple[tuple[TargetPlace, ...], ...]
-    looks: tuple[SeenTarget, ...]
+    looks: tuple[PoseCandidates, ...]
 
 
-def seen_markers(
+def measure_markers(
     calibration: Calibration,
     sights: Sequence[Sight],
     ids: Sequence[int],
@@ -115,7 +119,7 @@ def seen_markers(
         DataError: There is no camera, a marker is in no image, or a pose of the robot is missing.
     """
     check_labels(sights)
-    eye = Eye.of(calibration)
+    eye = CalibratedCamera.of(calibration)
     targets = [_target(number, dictionary, size_m, size_sigma_m) for number in ids]
     if not targets:
         raise DataError("no markers to look for: give their ids.")
@@ -129,7 +133,7 @@ def seen_markers(
         )
     common = common_covariance(eye, markers[0].looks[0].scale_sigma)
     fits = [
-        find_inliers(CandidateViews(marker.views, eye.flange_noise, common, eye.freedom))
+        find_inliers(CandidateViews(marker.views, eye.flange_noise, common, eye.noise_dof))
         for marker in markers
     ]
     warnings = [
@@ -142,7 +146,7 @@ def seen_markers(
         np.array([fit.mean.matrix[:3, 3] for fit in fits]),
         np.array([_own_covariance(*pair) for pair in zip(markers, fits, strict=True)]),
         _common_covariance(eye, markers, fits, common, len(sights)),
-        tuple(int(fit.agrees.sum()) for fit in fits),
+        tuple(int(fit.inliers.sum()) for fit in fits),
         (*eye.warnings, *warnings),
     )
 
@@ -154,13 +158,15 @@ def _target(marker: int, dictionary: str, size_m: float, sigma_m: float | None) 
     return target_from_document(document, f"marker {marker}")
 
 
-def _detect(eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float | None) -> _Marker:
+def _detect(
+    eye: CalibratedCamera, sights: Sequence[Sight], target: Target, sigma_px: float | None
+) -> _Marker:
     """Detects one marker in all images; images without it are skipped."""
     seen = [(at, _corners(eye, sight, target)) for at, sight in enumerate(sights)]
     shown = [(at, corners) for at, corners in seen if corners is not None]
     own_sights = [sights[at] for at, _ in shown]
     looks = [
-        see(eye, corners, target, sight.label, sigma_px)
+        target_pose_candidates(eye, corners, target, sight.label, sigma_px)
         for (_, corners), sight in zip(shown, own_sights, strict=True)
     ]
     views = all_places(eye, own_sights, looks, "base")
@@ -168,7 +174,7 @@ def _detect(eye: Eye, sights: Sequence[Sight], target: Target, sigma_px: float |
     return _Marker(str(target.marker_id), images, tuple(views), tuple(looks))
 
 
-def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
+def _corners(eye: CalibratedCamera, sight: Sight, target: Target) -> Corners | None:
     """A marker's corners in an image; None where the image does not show it."""
     if isinstance(sight.seen, Corners):
         raise DataError(
@@ -176,7 +182,7 @@ def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
             next_step="Give the image; or place one target by its corners with place_seen.",
         )
     image: Image = sight.seen
-    check_size(eye, image, sight.label)
+    check_image_size(eye, image, sight.label)
     detected = find_target(image, target)
     if isinstance(detected, NotFound):
         return None
@@ -184,7 +190,7 @@ def _corners(eye: Eye, sight: Sight, target: Target) -> Corners | None:
 
 
 def _warnings(
-    eye: Eye, marker: _Marker, fit: ImageInliers, sights: Sequence[Sight]
+    eye: CalibratedCamera, marker: _Marker, fit: ImageInliers, sights: Sequence[Sight]
 ) -> Iterator[str]:
     """Warnings on a marker; a single image needs none, since the other markers check it."""
     for look in marker.looks:
@@ -220,7 +226,7 @@ def _own_covariance(marker: _Marker, fit: ImageInliers) -> FloatArray:
 
 
 def _common_covariance(
-    eye: Eye,
+    eye: CalibratedCamera,
     markers: Sequence[_Marker],
     fits: Sequence[ImageInliers],
     common: FloatArray,
@@ -242,7 +248,7 @@ def _common_covariance(
     )
 
 
-def marked_fixture(
+def fixture_from_marker_images(
     session: Session,
     calibration: Calibration,
     drawing: NominalPoints,
@@ -278,7 +284,7 @@ def marked_fixture(
             next_step="Name a marker there; or leave --cad away, and the board places the fixture.",
         )
     seen = _shown_markers(shown, tuple(ids))
-    points = seen_markers(
+    points = measure_markers(
         calibration,
         shown.sights,
         seen,
@@ -296,19 +302,19 @@ def marked_fixture(
         points.common,
         _outward(calibration, shown.sights, points),
     )
-    fatal = Eye.of(calibration).warnings
+    fatal = CalibratedCamera.of(calibration).warnings
     findings = (
         *(replace(remark, is_fatal=remark.words in fatal) for remark in remarks(points.warnings)),
         *view_findings(session, shown.lost),
         *remarks(shown.warnings),
     )
-    setting = Setting(
+    setting = FitSettings(
         doubts=findings,
         details=_details(shown.target, points, calibration),
         options=options or FixtureLimits(),
         words=_WORDS,
         # Each point's own covariance already holds its noise.
-        careful_m=0.0,
+        assumed_noise_m=0.0,
     )
     return drawn_fixture(measured, drawing, setting)
 
@@ -348,7 +354,7 @@ def _listed(ids: Sequence[int]) -> str:
 
 def _outward(calibration: Calibration, sights: Sequence[Sight], points: MarkerPoints) -> FloatArray:
     """(n, 3) unit directions in the base from the markers to the camera's mean position."""
-    eye = Eye.of(calibration)
+    eye = CalibratedCamera.of(calibration)
     positions = np.array([eye.at(sight.base_from_flange).base_from_cam[:3, 3] for sight in sights])
     directions = positions.mean(axis=0) - points.points
     return np.asarray(directions / np.linalg.norm(directions, axis=1)[:, None])

@@ -16,21 +16,21 @@ from visioncal.core.types import FloatArray, Progress
 from visioncal.core.verdict import AGREEMENT, Finding, Verdict, remarks
 from visioncal.estimation.observability import Direction
 from visioncal.estimation.placing import worst_of
-from visioncal.frames.camera_chain import Eye, checked_point
+from visioncal.frames.camera_chain import CalibratedCamera, checked_point
+from visioncal.frames.findings import sigma_findings
 from visioncal.frames.naming import PARENTS, FrameKind
 from visioncal.frames.session_observations import (
     SessionImages,
+    detect_session_target,
     fit_views,
     held_out_views,
     no_usable_image,
-    session_looks,
     without_label,
 )
 from visioncal.frames.single_view import Sight, needs_robot
-from visioncal.frames.target_in_image import SeenTarget, see
+from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
 from visioncal.frames.target_pose import TargetPose, place_target
-from visioncal.frames.verdicts import sigma_findings
-from visioncal.results import HELD_BACK, Calibration, Frame, Observation, picked
+from visioncal.results import HELD_BACK, Calibration, Frame, Observation, select_matching
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
 
@@ -108,11 +108,13 @@ def seen_frame(
             camera.
     """
     choice = Choice(camera, robot, target)
-    session, calibration = picked(session, calibration, choice, EYE, parted=False)
+    session, calibration = select_matching(session, calibration, choice, EYE, parted=False)
     options = options or ImageFrameLimits()
     point = checked_point(point_target_m, "point_target_m")
-    eye, parent = Eye.of(calibration), PARENTS[kind]
-    shown = session_looks(session, calibration, parent, among=fit_views(session), progress=progress)
+    eye, parent = CalibratedCamera.of(calibration), PARENTS[kind]
+    shown = detect_session_target(
+        session, calibration, parent, among=fit_views(session), progress=progress
+    )
     views, looks, lost = _measure(eye, shown)
     lost |= held_out_views(session)
     sights = [sight for sight, view in zip(shown.sights, shown.views, strict=True) if view in views]
@@ -144,13 +146,13 @@ def seen_frame(
 
 
 def _measure(
-    eye: Eye, shown: SessionImages
-) -> tuple[tuple[View, ...], list[SeenTarget], dict[int, str]]:
+    eye: CalibratedCamera, shown: SessionImages
+) -> tuple[tuple[View, ...], list[PoseCandidates], dict[int, str]]:
     """The usable views, their target poses, and why the other views were rejected."""
     views, looks, lost = [], [], dict(shown.lost)
     for sight, view in zip(shown.sights, shown.views, strict=True):
         try:
-            looks.append(see(eye, sight.seen, shown.target, sight.label))
+            looks.append(target_pose_candidates(eye, sight.seen, shown.target, sight.label))
             views.append(view)
         except DataError as error:
             lost[view.number] = without_label(error, sight)
@@ -160,7 +162,10 @@ def _measure(
 
 
 def _check_parent(
-    eye: Eye, placed: _PlacedTarget, sights: Sequence[Sight], looks: Sequence[SeenTarget]
+    eye: CalibratedCamera,
+    placed: _PlacedTarget,
+    sights: Sequence[Sight],
+    looks: Sequence[PoseCandidates],
 ) -> None:
     """Raises an error where the target is fixed to the other parent."""
     other: FrameKind = "fixture" if placed.kind == "tool" else "tool"
@@ -208,7 +213,7 @@ def camera_details(calibration: Calibration) -> dict[str, Any]:
 
 
 def _method(placed: _PlacedTarget, point: FloatArray) -> str:
-    count, target = int(placed.seen.agrees.sum()), placed.shown.target
+    count, target = int(placed.seen.inliers.sum()), placed.shown.target
     words = {
         "charuco": "ChArUco board",
         "aprilgrid": "AprilGrid",
@@ -224,9 +229,9 @@ def _method(placed: _PlacedTarget, point: FloatArray) -> str:
 
 def _noise_mm(seen: TargetPose) -> float:
     """Noise of one image per axis [mm]: from the scatter, or predicted for a single image."""
-    count = int(seen.agrees.sum())
+    count = int(seen.inliers.sum())
     if count > 1:
-        return float(np.sqrt(np.sum(seen.away_mm[seen.agrees] ** 2) / (3 * (count - 1))))
+        return float(np.sqrt(np.sum(seen.away_mm[seen.inliers] ** 2) / (3 * (count - 1))))
     return float(1e3 * np.sqrt(np.trace(seen.independent[3:, 3:]) / 3))
 
 
@@ -237,7 +242,7 @@ def _observations(session: Session, placed: _PlacedTarget) -> Iterator[Observati
             yield Observation(str(number), used=False, reason=placed.lost[number])
             continue
         at = index_of[number]
-        away_mm, agrees = float(placed.seen.away_mm[at]), bool(placed.seen.agrees[at])
+        away_mm, agrees = float(placed.seen.away_mm[at]), bool(placed.seen.inliers[at])
         words = mm_and_deg(away_mm, float(placed.seen.away_deg[at]))
         reason = "" if agrees else f"it puts the target {words} from where the others do"
         yield Observation(str(number), agrees, reason, residual_mm=away_mm)
@@ -246,7 +251,7 @@ def _observations(session: Session, placed: _PlacedTarget) -> Iterator[Observati
 def _praise(placed: _PlacedTarget) -> str:
     seen, worst = placed.seen, placed.worst[0]
     return (
-        f"{int(seen.agrees.sum())} images agree to {mm_and_deg(seen.rms_mm, seen.rms_deg)} (rms), "
+        f"{int(seen.inliers.sum())} images agree to {mm_and_deg(seen.rms_mm, seen.rms_deg)} (rms), "
         f"and {worst.words}, the worst direction, is known to "
         f"{figure(1e3 * worst.sigma)} mm."
     )
@@ -270,6 +275,6 @@ def _sigma_mm(covariance: FloatArray) -> float:
     return float(1e3 * np.sqrt(np.trace(covariance[3:, 3:])))
 
 
-def rests_on_camera(frame: Frame) -> bool:
+def depends_on_camera(frame: Frame) -> bool:
     """Whether a frame was placed by a calibrated camera and depends on its calibration."""
     return SEEN_BY in frame.details

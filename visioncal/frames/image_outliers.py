@@ -82,7 +82,7 @@ class ImageInliers:
     Attributes:
         mean: Mean of the inliers.
         picks: (m,) index of each image's selected candidate.
-        agrees: (m,) inlier mask.
+        inliers: (m,) inlier mask.
         residuals: (m, 6) residual of each image's pose from the mean [rad, m].
         mahalanobis_sq: (m,) its squared Mahalanobis distance; six on average under noise.
         limit: Its outlier limit.
@@ -92,7 +92,7 @@ class ImageInliers:
 
     mean: Mean
     picks: IntArray
-    agrees: Mask
+    inliers: Mask
     residuals: FloatArray
     mahalanobis_sq: FloatArray
     limit: float

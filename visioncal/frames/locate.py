@@ -11,15 +11,15 @@ from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, FloatArray, Image, Target
 from visioncal.estimation.observability import SIGMA_LIMIT_M
 from visioncal.frames.camera_chain import (
+    CalibratedCamera,
     CameraPose,
-    Eye,
     Plane,
     Pose,
     checked_point,
     point_jacobian,
 )
 from visioncal.frames.located import Located
-from visioncal.frames.target_in_image import SeenTarget, see
+from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
 from visioncal.results import Calibration
 from visioncal.session.choosing import EYE, Choice
 from visioncal.vision.camera import normalise
@@ -61,7 +61,7 @@ def locate(
         DataError: There is no camera or no pose of the robot, a pixel is outside the image, or its
             ray does not meet the plane in front of the camera.
     """
-    eye = Eye.of(calibration.chosen(Choice(camera, robot), EYE))
+    eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
     noise_px, cam_pose = eye.noise_px(sigma_px), eye.at(base_from_flange, joints_rad)
     px = np.atleast_2d(np.asarray(px, dtype=float))
     rays = _rays(eye, px)
@@ -70,7 +70,7 @@ def locate(
     )
 
 
-def _rays(eye: Eye, px: FloatArray) -> FloatArray:
+def _rays(eye: CalibratedCamera, px: FloatArray) -> FloatArray:
     """(n, 3) points at unit depth in the camera's frame."""
     if px.shape[1:] != (2,):
         raise DataError(f"locate: pixels have the shape {px.shape}; (n, 2) is needed.")
@@ -116,7 +116,12 @@ def _depth(cam_pose: CameraPose, plane: Plane, ray: FloatArray, label: str) -> f
 
 
 def _on_plane(
-    eye: Eye, cam_pose: CameraPose, plane: Plane, ray: FloatArray, px: FloatArray, noise_px: float
+    eye: CalibratedCamera,
+    cam_pose: CameraPose,
+    plane: Plane,
+    ray: FloatArray,
+    px: FloatArray,
+    noise_px: float,
 ) -> Located:
     """Intersects a pixel's ray with the plane, and propagates the covariance of both."""
     label = f"pixel ({px[0]:.1f}, {px[1]:.1f})"
@@ -151,7 +156,7 @@ _LOOK_AT_PLANE = (
 
 
 def _camera_parts(
-    eye: Eye, cam_pose: CameraPose, by_camera: FloatArray, by_lens: FloatArray
+    eye: CalibratedCamera, cam_pose: CameraPose, by_camera: FloatArray, by_lens: FloatArray
 ) -> dict[str, FloatArray]:
     """Covariance parts of calibration, robot and arm from the Jacobians of a position (3, 3)."""
     flange_jacobian = by_camera @ cam_pose.flange_jacobian
@@ -173,7 +178,7 @@ def _mapped(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _located(
-    eye: Eye, p_base: FloatArray, parts: dict[str, FloatArray], warnings: Sequence[str]
+    eye: CalibratedCamera, p_base: FloatArray, parts: dict[str, FloatArray], warnings: Sequence[str]
 ) -> Located:
     """Builds the result without the sources of zero variance, and warns of a large sigma."""
     nonzero = {name: part for name, part in parts.items() if np.trace(part) > 0.0}
@@ -189,7 +194,7 @@ def _located(
     return Located(p_base, nonzero, located.freedom, (*located.warnings, warning))
 
 
-def _freedom(eye: Eye, parts: Mapping[str, FloatArray]) -> float:
+def _freedom(eye: CalibratedCamera, parts: Mapping[str, FloatArray]) -> float:
     """Effective degrees of freedom of the summed covariance (Satterthwaite 1946).
 
     Only the parts that depend on the robot's noise estimate have finite ones: the pixel noise comes
@@ -197,7 +202,7 @@ def _freedom(eye: Eye, parts: Mapping[str, FloatArray]) -> float:
     """
     total = sum(float(np.trace(part)) for part in parts.values())
     estimated = sum(float(np.trace(parts[name])) for name in _ESTIMATED & parts.keys())
-    return eye.freedom * (total / estimated) ** 2 if estimated > 0.0 else np.inf
+    return eye.noise_dof * (total / estimated) ** 2 if estimated > 0.0 else np.inf
 
 
 # Parts that scale with the robot's estimated noise.
@@ -250,10 +255,10 @@ def locate_target(
         DataError: There is no camera or no pose of the robot, or the image does not show the
             target.
     """
-    eye = Eye.of(calibration.chosen(Choice(camera, robot), EYE))
+    eye = CalibratedCamera.of(calibration.chosen(Choice(camera, robot), EYE))
     cam_pose = eye.at(base_from_flange, joints_rad)
     board = target if isinstance(target, Target) else load_target(target)
-    view = see(eye, seen, board, label, sigma_px)
+    view = target_pose_candidates(eye, seen, board, label, sigma_px)
     point = checked_point(point_target_m, "point_target_m")
     candidates_cam = view.cam_from_target[:, :3, :3] @ point + view.cam_from_target[:, :3, 3]
     pose, point_cam = view.cam_from_target[0], candidates_cam[0]
@@ -272,14 +277,14 @@ def locate_target(
     return Located(located.p_base, located.parts, located.freedom, (*located.warnings, warning))
 
 
-def _ambiguity_warning(view: SeenTarget, points_cam: FloatArray, located: Located) -> str:
+def _ambiguity_warning(view: PoseCandidates, points_cam: FloatArray, located: Located) -> str:
     """Warning where another pose fits the image as well and moves the point significantly."""
     away_mm = 1e3 * float(np.linalg.norm(points_cam - points_cam[0], axis=1).max())
     if away_mm <= located.radius95_mm:
         return ""
     why = (
         "The board looks the same when it is turned"
-        if len(set(view.turns)) > 1
+        if len(set(view.symmetries)) > 1
         else "Seen so flat, the target may as well be tilted the other way"
     )
     return (

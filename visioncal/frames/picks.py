@@ -9,8 +9,12 @@ from visioncal.core.types import FloatArray, Progress
 from visioncal.frames.camera_chain import checked_point
 from visioncal.frames.locate import locate_target
 from visioncal.frames.located import Located
-from visioncal.frames.session_observations import no_usable_image, session_looks, without_label
-from visioncal.results import Calibration, picked
+from visioncal.frames.session_observations import (
+    detect_session_target,
+    no_usable_image,
+    without_label,
+)
+from visioncal.results import Calibration, select_matching
 from visioncal.session import Session, View
 from visioncal.session.choosing import EYE, Choice
 
@@ -66,8 +70,8 @@ def locate_views(
     """
     point = checked_point(point_target_m, "point_target_m")
     choice = Choice(camera, robot, target)
-    session, calibration = picked(session, calibration, choice, EYE, parted=False)
-    shown = session_looks(session, calibration, "base", among=among, progress=progress)
+    session, calibration = select_matching(session, calibration, choice, EYE, parted=False)
+    shown = detect_session_target(session, calibration, "base", among=among, progress=progress)
     located: dict[int, Located] = {}
     lost = dict(shown.lost)
     for view, sight in zip(shown.views, shown.sights, strict=True):

@@ -7,11 +7,11 @@ import numpy as np
 
 from visioncal.calibration.stages.detect import detect, image_of
 from visioncal.calibration.stages.observed import by_reason
-from visioncal.calibration.stages.reported_poses import Reported, reported_poses
+from visioncal.calibration.stages.reported_poses import RobotReport, reported_poses
 from visioncal.calibration.verification.prediction import check_robot
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray, Image, Progress, Rejection, Target
-from visioncal.frames.camera_chain import Eye
+from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.single_view import Parent, Sight, needs_robot
 from visioncal.results import HELD_BACK, Calibration
 from visioncal.results.picking import check_mount, check_resolution
@@ -45,7 +45,7 @@ class SessionImages:
     warnings: tuple[str, ...]
 
 
-def session_looks(
+def detect_session_target(
     session: Session,
     calibration: Calibration,
     parent: Parent,
@@ -88,7 +88,7 @@ def session_images(
 ) -> SessionImages:
     """Reads a session's images for detecting several markers, one of which is its target.
 
-    As `session_looks` with the base as parent, but without detection.
+    As `detect_session_target` with the base as parent, but without detection.
     """
     target = _checked_target(session, calibration)
     wanted = session.views if among is None else tuple(among)
@@ -214,7 +214,7 @@ def _poses(
 ) -> tuple[Mapping[int, FloatArray], dict[int, str]]:
     """The robot's poses by view, and why views without pose or image are unusable."""
     lost = {view.number: _NO_IMAGE for view in wanted if not (view.image or view.has_corners)}
-    if needs_robot(Eye.of(calibration), parent):
+    if needs_robot(CalibratedCamera.of(calibration), parent):
         reported = _flange(session, calibration, wanted)
         lost = {rejection.view: rejection.reason for rejection in reported.rejections} | lost
         return reported.base_from_flange, lost
@@ -222,7 +222,7 @@ def _poses(
     return {view: np.asarray(value.as_matrix()) for view, value in poses.items()}, lost
 
 
-def _flange(session: Session, calibration: Calibration, wanted: tuple[View, ...]) -> Reported:
+def _flange(session: Session, calibration: Calibration, wanted: tuple[View, ...]) -> RobotReport:
     """The flange's poses at some views, by the calibrated arm where there is one."""
     document = session.robot_document
     robot = calibration.robot if document is None else Robot.from_document(document)

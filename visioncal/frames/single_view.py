@@ -20,8 +20,8 @@ from visioncal.core.arguments import check_fields
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import Corners, FloatArray, Image
-from visioncal.frames.camera_chain import Eye, checked_pose
-from visioncal.frames.target_in_image import SeenTarget
+from visioncal.frames.camera_chain import CalibratedCamera, checked_pose
+from visioncal.frames.target_in_image import PoseCandidates
 
 Parent: TypeAlias = Literal["base", "flange"]
 
@@ -75,29 +75,29 @@ class TargetPlace:
     by_common: FloatArray
 
 
-def common_covariance(eye: Eye, scale_sigma: float) -> FloatArray:
+def common_covariance(eye: CalibratedCamera, scale_sigma: float) -> FloatArray:
     """(c, c) covariance of common errors: the camera's edge, its lens, arm, target size."""
     return np.asarray(block_diag(eye.shared_covariance, [[scale_sigma**2]]))
 
 
-def needs_robot(eye: Eye, parent: Parent) -> bool:
+def needs_robot(eye: CalibratedCamera, parent: Parent) -> bool:
     """Whether the robot is between the parent and the target."""
     return (eye.mount == "eye-in-hand") == (parent == "base")
 
 
 def all_places(
-    eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
+    eye: CalibratedCamera, sights: Sequence[Sight], looks: Sequence[PoseCandidates], parent: Parent
 ) -> list[tuple[TargetPlace, ...]]:
-    """Candidate poses in the parent's frame, for each image; see `places`."""
+    """Candidate poses in the parent's frame, for each image; see `candidate_places`."""
     stops = [sight.stop_key for sight in sights]
     return [
-        places(eye, sight, look, parent, stops.count(stop))
+        candidate_places(eye, sight, look, parent, stops.count(stop))
         for sight, look, stop in zip(sights, looks, stops, strict=True)
     ]
 
 
-def places(
-    eye: Eye, sight: Sight, view: SeenTarget, parent: Parent, of_stop: int = 1
+def candidate_places(
+    eye: CalibratedCamera, sight: Sight, view: PoseCandidates, parent: Parent, of_stop: int = 1
 ) -> tuple[TargetPlace, ...]:
     """Candidate poses of one image in the parent's frame.
 
@@ -108,7 +108,7 @@ def places(
     """
     flange = sight.base_from_flange
     if not needs_robot(eye, parent):
-        zero = np.zeros((len(view.turns), 6, 6))
+        zero = np.zeros((len(view.symmetries), 6, 6))
         return _in_parent(view, eye.edge, zero, np.zeros((6, eye.arm_error_count)), of_stop)
     if flange is None:
         raise DataError(
@@ -128,7 +128,7 @@ def places(
 
 
 def _in_parent(
-    view: SeenTarget,
+    view: PoseCandidates,
     parent_from_cam: FloatArray,
     flange_jacobian: FloatArray,
     arm: FloatArray,

@@ -17,9 +17,9 @@ from visioncal.estimation.gating import gate
 from visioncal.estimation.lens_field import depths_m, zooms
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.poses import determines_pose
-from visioncal.frames.camera_chain import Eye
+from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.vision.finders import NotFound, find_target
-from visioncal.vision.finders.imaging import GREY, blur_at_corners, why_hard_to_see
+from visioncal.vision.finders.imaging import GREY, blur_at_corners, poor_image_reason
 from visioncal.vision.targets import corner_positions, rotations
 
 # Significance of corners that scatter more than the noise.
@@ -31,7 +31,7 @@ _ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class SeenTarget:
+class PoseCandidates:
     """Candidate poses of a target in one image, c in all, the best by reprojection first.
 
     Attributes:
@@ -41,7 +41,7 @@ class SeenTarget:
             its model.
         by_scale: (c, 6) Jacobians by the target's relative size.
         scale_sigma: Standard deviation of the relative size.
-        turns: (c,) index of the target's symmetry that each has applied.
+        symmetries: (c,) index of the target's symmetry that each has applied.
         warnings: Warnings on the image, in sentences.
     """
 
@@ -50,13 +50,17 @@ class SeenTarget:
     by_lens: FloatArray
     by_scale: FloatArray
     scale_sigma: float
-    turns: tuple[int, ...]
+    symmetries: tuple[int, ...]
     warnings: tuple[str, ...]
 
 
-def see(
-    eye: Eye, seen: Corners | Image, target: Target, label: str, sigma_px: float | None = None
-) -> SeenTarget:
+def target_pose_candidates(
+    eye: CalibratedCamera,
+    seen: Corners | Image,
+    target: Target,
+    label: str,
+    sigma_px: float | None = None,
+) -> PoseCandidates:
     """Estimates the candidate poses of a target in one image.
 
     Args:
@@ -89,7 +93,7 @@ def see(
     noise_px, warnings = _noise(noise_px, squared_sum, 2 * len(kept.ids) - 6, label)
     # Corners without noise get a millionth of a pixel, so that the covariance is not zero.
     variance, lens = max(noise_px, 1e-6) ** 2, 4 + len(eye.camera.distortion)
-    return SeenTarget(
+    return PoseCandidates(
         np.array([compressed.cam_from_target[0] for compressed, _ in fits]),
         np.array([variance * covariance_from(compressed.information[0]) for compressed, _ in fits]),
         np.array(
@@ -102,7 +106,7 @@ def see(
     )
 
 
-def check_size(eye: Eye, image: Image, label: str) -> None:
+def check_image_size(eye: CalibratedCamera, image: Image, label: str) -> None:
     """Checks that an image is grey and of the camera's resolution.
 
     Raises:
@@ -121,11 +125,11 @@ def check_size(eye: Eye, image: Image, label: str) -> None:
         )
 
 
-def _detected(eye: Eye, image: Image, target: Target, label: str) -> Corners:
-    check_size(eye, image, label)
+def _detected(eye: CalibratedCamera, image: Image, target: Target, label: str) -> Corners:
+    check_image_size(eye, image, label)
     seen = find_target(image, target)
     if isinstance(seen, NotFound):
-        cause = why_hard_to_see(image, MAX_BLUR_PX)
+        cause = poor_image_reason(image, MAX_BLUR_PX)
         raise DataError(
             f"{label}: target {target.name}: {seen.reason}{'; ' if cause else ''}{cause}.",
             culprits=[label],
@@ -158,7 +162,7 @@ def _distance_m(poses: ViewPoses, corners: Corners, target: Target) -> float:
 
 
 def _fit_poses(
-    eye: Eye, corners: Corners, target: Target, label: str, noise_px: float
+    eye: CalibratedCamera, corners: Corners, target: Target, label: str, noise_px: float
 ) -> tuple[ViewPoses, Corners, float]:
     """Candidate poses, the inlier corners of the best, and their squared residuals' sum [px^2]."""
     positions = corner_positions(target)
@@ -177,7 +181,9 @@ def _fit_poses(
     return poses, corners, float(np.sum(residuals[passed.mask] ** 2))
 
 
-def _stack(eye: Eye, corners: Corners, positions: FloatArray, noise_px: float) -> CornerStack:
+def _stack(
+    eye: CalibratedCamera, corners: Corners, positions: FloatArray, noise_px: float
+) -> CornerStack:
     """Stack of the corners, with the common effect of focal length jitter."""
     stack = CornerStack.of({corners.view: corners}, positions)
     if eye.jitter == 0.0:
@@ -186,7 +192,7 @@ def _stack(eye: Eye, corners: Corners, positions: FloatArray, noise_px: float) -
 
 
 def _with_jacobians(
-    eye: Eye,
+    eye: CalibratedCamera,
     poses: ViewPoses,
     at: int,
     corners: Corners,

@@ -12,7 +12,7 @@ from visioncal.core.number_format import figure, mm_and_deg
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, compose, invert, pose_difference
 from visioncal.core.types import FloatArray, Mask, Target
-from visioncal.frames.camera_chain import Eye
+from visioncal.frames.camera_chain import CalibratedCamera
 from visioncal.frames.image_outliers import CandidateViews, ImageInliers, find_inliers
 from visioncal.frames.single_view import (
     Parent,
@@ -22,7 +22,7 @@ from visioncal.frames.single_view import (
     common_covariance,
     needs_robot,
 )
-from visioncal.frames.target_in_image import SeenTarget, see
+from visioncal.frames.target_in_image import PoseCandidates, target_pose_candidates
 from visioncal.results import Calibration, Edge
 from visioncal.vision.targets import load_target
 
@@ -41,7 +41,7 @@ class TargetPose:
         common: (6, 6) covariance by errors that all images share: the camera's transform, its lens,
             the target's size, the arm's errors.
         labels: (m,) the images.
-        agrees: (m,) inlier mask; outliers are not used.
+        inliers: (m,) inlier mask; outliers are not used.
         away_mm: (m,) distance of each image's pose from the mean [mm].
         away_deg: (m,) the same in rotation [deg].
         scatter: Ratio of the images' scatter to the calibration's noise, at least one; its square
@@ -53,7 +53,7 @@ class TargetPose:
     independent: FloatArray
     common: FloatArray
     labels: tuple[str, ...]
-    agrees: Mask
+    inliers: Mask
     away_mm: FloatArray
     away_deg: FloatArray
     scatter: float
@@ -83,12 +83,12 @@ class TargetPose:
     @property
     def rms_mm(self) -> float:
         """Root mean square distance of the inlier images from their mean [mm]."""
-        return float(np.sqrt(np.mean(self.away_mm[self.agrees] ** 2)))
+        return float(np.sqrt(np.mean(self.away_mm[self.inliers] ** 2)))
 
     @property
     def rms_deg(self) -> float:
         """The same in rotation [deg]."""
-        return float(np.sqrt(np.mean(self.away_deg[self.agrees] ** 2)))
+        return float(np.sqrt(np.mean(self.away_deg[self.inliers] ** 2)))
 
 
 @typed
@@ -117,27 +117,29 @@ def place_seen(
             needed and missing.
     """
     check_labels(sights)
-    eye = Eye.of(calibration)
+    eye = CalibratedCamera.of(calibration)
     board = target if isinstance(target, Target) else load_target(target)
-    looks = [see(eye, sight.seen, board, sight.label, sigma_px) for sight in sights]
+    looks = [
+        target_pose_candidates(eye, sight.seen, board, sight.label, sigma_px) for sight in sights
+    ]
     return place_target(eye, sights, looks, parent)
 
 
 def place_target(
-    eye: Eye, sights: Sequence[Sight], looks: Sequence[SeenTarget], parent: Parent
+    eye: CalibratedCamera, sights: Sequence[Sight], looks: Sequence[PoseCandidates], parent: Parent
 ) -> TargetPose:
     """Estimates a target's pose from its candidate poses in the images; see `place_seen`."""
     views = all_places(eye, sights, looks, parent)
     common = common_covariance(eye, looks[0].scale_sigma)
     stops = len({sight.stop_key for sight in sights}) if needs_robot(eye, parent) else None
-    fit = find_inliers(CandidateViews(views, eye.flange_noise, common, eye.freedom))
+    fit = find_inliers(CandidateViews(views, eye.flange_noise, common, eye.noise_dof))
     labels = tuple(sight.label for sight in sights)
     return TargetPose(
         fit.mean.matrix,
         fit.variance * fit.mean.independent,
         fit.mean.by_common @ common @ fit.mean.by_common.T,
         labels,
-        fit.agrees,
+        fit.inliers,
         1e3 * np.linalg.norm(fit.residuals[:, 3:], axis=1),
         np.rad2deg(np.linalg.norm(fit.residuals[:, :3], axis=1)),
         float(np.sqrt(fit.variance)),
@@ -152,7 +154,7 @@ def place_target(
 def inlier_warnings(
     fit: ImageInliers,
     labels: Sequence[str],
-    looks: Sequence[SeenTarget],
+    looks: Sequence[PoseCandidates],
     stops: int | None,
     thing: str = "target",
 ) -> Iterator[str]:
@@ -161,12 +163,12 @@ def inlier_warnings(
     `stops` is the number of the robot's stops, None where the robot is not between.
     """
     count = len(labels)
-    for at in np.flatnonzero(~fit.agrees).tolist():
+    for at in np.flatnonzero(~fit.inliers).tolist():
         yield (
             f"{labels[at]} puts the {thing} {_distance_words(fit, at)} from where the others do, "
             "and was left out: was it moved, or is the robot's pose that of another image?"
         )
-    inliers = int(fit.agrees.sum())
+    inliers = int(fit.inliers.sum())
     if count == 1:
         yield (
             f"One image places the {thing}: nothing checks it. Take another"
@@ -177,9 +179,9 @@ def inlier_warnings(
             f"All {count} images are of one stop of the robot, whose error they share: nothing "
             "checks it. Take others, from other sides."
         )
-    elif fit.agrees.all() and np.any(fit.mahalanobis_sq > fit.limit):
+    elif fit.inliers.all() and np.any(fit.mahalanobis_sq > fit.limit):
         # Images were kept although they contradict each other.
-        worst = int(np.where(fit.agrees, fit.mahalanobis_sq, -1.0).argmax())
+        worst = int(np.where(fit.inliers, fit.mahalanobis_sq, -1.0).argmax())
         yield (
             f"The images disagree, by up to {_distance_words(fit, worst)}, and with {count} of "
             "them it is not known which are right: take more."
@@ -200,11 +202,11 @@ def _distance_words(fit: ImageInliers, at: int) -> str:
     return mm_and_deg(millimetres, degrees)
 
 
-def _ambiguity_warning(fit: ImageInliers, looks: Sequence[SeenTarget], thing: str) -> str:
+def _ambiguity_warning(fit: ImageInliers, looks: Sequence[PoseCandidates], thing: str) -> str:
     rival = np.eye(4) if fit.rival is None else fit.rival
     millimetres, degrees = pose_difference(fit.mean.matrix, rival)
     shift = f"{mm_and_deg(millimetres, degrees)} away"
-    if any(len(set(look.turns)) > 1 for look in looks):
+    if any(len(set(look.symmetries)) > 1 for look in looks):
         return (
             f"The {thing} looks the same when it is turned: it may as well be {shift}. Use a board "
             "without symmetry, or see to it that it is not turned."

@@ -17,6 +17,14 @@ from visioncal.estimation.pivot import PivotFit, fit_pivot
 from visioncal.estimation.placing import assumed_words
 from visioncal.estimation.readings import PoseReading, readings_that_close
 from visioncal.estimation.touching import Touches, TouchKind
+from visioncal.frames.findings import (
+    RENAMED,
+    noise_findings,
+    off_words,
+    outlier_findings,
+    placed_name,
+    sigma_findings,
+)
 from visioncal.frames.touches import (
     TouchRows,
     flange_poses,
@@ -24,14 +32,6 @@ from visioncal.frames.touches import (
     numbered,
     refuse_copies,
     robot_noise,
-)
-from visioncal.frames.verdicts import (
-    RENAMED,
-    noise_findings,
-    off_words,
-    outlier_findings,
-    placed_name,
-    sigma_findings,
 )
 from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
@@ -147,10 +147,10 @@ def _method(rows: TouchRows) -> str:
 def _observations(fit: PivotFit, touches: Touches) -> Iterator[Observation]:
     agreement = fit.agreement
     for at, label in enumerate(touches.labels):
-        is_suspect = not agreement.agrees[at] or bool(agreement.doubtful[at])
+        is_suspect = not agreement.mask[at] or bool(agreement.doubtful[at])
         yield Observation(
             label,
-            used=bool(agreement.agrees[at]),
+            used=bool(agreement.mask[at]),
             reason=_outlier_reason(fit, touches, at) if is_suspect else "",
             kind=touches.kinds[at],
             residual_mm=1e3 * float(agreement.off_m[at]),
@@ -212,7 +212,7 @@ def _findings(
         options.sigma_deg,
         "Add touches tilted by 30 to 45 degrees about other axes.",
     )
-    used = int(np.sum(fit.agreement.agrees & touches.are("point")))
+    used = int(np.sum(fit.agreement.mask & touches.are("point")))
     if used < options.touches:
         yield Finding(
             "few_touches",

@@ -16,7 +16,7 @@ from visioncal.core.types import FloatArray, Target
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
-from visioncal.frames.measured import Tool
+from visioncal.frames.measured_points import Tool
 from visioncal.results import Calibration, Edge
 from visioncal.results.sections import TouchedPoint, TouchTest
 from visioncal.session import Session
@@ -91,7 +91,7 @@ def touch_points(
     return tuple(points)
 
 
-def judged(
+def evaluate_gaps(
     points: Sequence[TouchPoint], gaps_mm: Sequence[float], tool: Tool | None = None
 ) -> TouchTest:
     """Compares measured distances from tip to point [mm], in the points' order, with predictions.
@@ -122,7 +122,7 @@ def judged(
     )
 
 
-def finding_of(test: TouchTest) -> Finding:
+def touch_test_finding(test: TouchTest) -> Finding:
     """Finding of a touch test, with the remedy."""
     gaps = [point.gap_mm for point in test.points]
     radius = max(point.radius95_mm for point in test.points)

@@ -10,7 +10,7 @@ from visioncal.core.number_format import did_you_mean, figure, some_of
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import Finding, Remedy
-from visioncal.estimation.parts import Noise
+from visioncal.estimation.problem_parts import Noise
 from visioncal.results import Calibration
 from visioncal.robot import Robot
 from visioncal.session import Session

@@ -13,7 +13,7 @@ from visioncal.interchange.result_files import FRAMES, load_stored
 from visioncal.results import Calibration, Frame, FrameFile
 
 
-def rewrite(folder: Path, calibration: Calibration) -> Written:
+def rewrite_result(folder: Path, calibration: Calibration) -> Written:
     """Replaces the files of an output folder by those of the same session's extended result.
 
     Session and evidence come from the recording in the folder, whose images are kept byte for byte.
@@ -39,7 +39,7 @@ def rewrite(folder: Path, calibration: Calibration) -> Written:
 
 
 @dataclass(frozen=True, eq=False)
-class Leftover:
+class EndangeredFrames:
     """Frames of a result that a new result without them is about to replace.
 
     Attributes:
@@ -60,9 +60,9 @@ class Leftover:
     def words(self) -> str:
         """Message to the user: where the frames are kept, and which to place again."""
         # Imports everything that places frames, and few results have any.
-        from visioncal.frames.frame_from_images import rests_on_camera
+        from visioncal.frames.frame_from_images import depends_on_camera
 
-        seen = [name for name, frame in self.frames.items() if rests_on_camera(frame)]
+        seen = [name for name, frame in self.frames.items() if depends_on_camera(frame)]
         words = (
             f"{some_of(list(self.frames))} had joined the result that this one replaces: kept in "
             f"{self.file}."
@@ -78,7 +78,7 @@ class Leftover:
         return words
 
 
-def leftover(folder: Path) -> Leftover | None:
+def frames_to_keep(folder: Path) -> EndangeredFrames | None:
     """Finds the frames that a new result in a folder would lose; None where there are none.
 
     An unreadable result is no error: it has nothing to lose.
@@ -96,4 +96,4 @@ def leftover(folder: Path) -> Leftover | None:
     if not frames:
         return None
     file = folder / FRAMES
-    return Leftover(file, frames, FrameFile.load(file).frames if file.exists() else {})
+    return EndangeredFrames(file, frames, FrameFile.load(file).frames if file.exists() else {})

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from visioncal.core.choices import ImagesKept
     from visioncal.core.verdict import Verdict
     from visioncal.dynamics import Run
-    from visioncal.dynamics.written import MotionPlan
+    from visioncal.dynamics.plan_files import MotionPlan
     from visioncal.live.planning.plan import Plan
     from visioncal.session import Session
 
@@ -38,7 +38,7 @@ def review_command(recording: Path) -> str:
 
 
 @dataclass(frozen=True)
-class Undrawn:
+class FailedDrawing:
     """A file whose drawing failed: a bug, which does not invalidate the result.
 
     Attributes:
@@ -59,7 +59,7 @@ class Written:
     """
 
     files: tuple[Path, ...]
-    undrawn: tuple[Undrawn, ...] = ()
+    failed_drawings: tuple[FailedDrawing, ...] = ()
 
 
 def write_outputs(
@@ -203,7 +203,7 @@ def write_motions(
         preview = motion_preview(plan)
         write_motion_preview(path, preview, motion_blueprint(preview))
 
-    from visioncal.dynamics.written import MOTION_FILES, motion_files
+    from visioncal.dynamics.plan_files import MOTION_FILES, motion_files
 
     texts = {PLAN: json_text(document), **motion_files(plan, rate_hz)}
     results = {name: _text(text) for name, text in texts.items()}
@@ -246,7 +246,7 @@ def _write(
     The main result is first in `results`; files named in `others` and `without` are removed.
     """
     drawings = {name: draw for name, draw in drawings.items() if name not in without}
-    undrawn: list[Undrawn] = []
+    undrawn: list[FailedDrawing] = []
 
     def write(staging: Path) -> None:
         for name, save in results.items():
@@ -258,7 +258,7 @@ def _write(
                 # A full disk is no bug, and is reported like a result that cannot be written.
                 if isinstance(error, OSError) or isinstance(error.__cause__, OSError):
                     raise
-                undrawn.append(Undrawn(folder / name, _cause(error)))
+                undrawn.append(FailedDrawing(folder / name, _cause(error)))
 
     # The result last: the other files belong to it.
     written = [*results, *drawings]

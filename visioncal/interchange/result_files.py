@@ -89,7 +89,7 @@ def load_result(path: Path) -> Calibration:
     return calibration
 
 
-def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile:
+def load_result_or_frames(path: Path, robot: str | None = None) -> Calibration | FrameFile:
     """Loads a result, or a file of frames.
 
     Args:
@@ -108,7 +108,7 @@ def load_placed(path: Path, robot: str | None = None) -> Calibration | FrameFile
 
 
 def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
-    """Loads anything that can be exported: as `load_placed`, a cell's result, or an arm's dynamics.
+    """Loads anything that can be exported: a result, frames, or an arm's dynamics.
 
     Args:
         path: As there, or an alignment.json or a dynamics.json, recognised by its content, a folder

@@ -19,7 +19,7 @@ _MOST_LISTED = 12
 
 
 @dataclass(frozen=True)
-class Suspects:
+class FlaggedViews:
     """Views that share a finding.
 
     Attributes:
@@ -46,7 +46,7 @@ class Suspects:
         return f"{view_list(self.views)}{of}: {self.why}"
 
 
-def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
+def suspects(calibration: Calibration) -> tuple[FlaggedViews, ...]:
     """Outlying used views, then the views that were not used, grouped by reason.
 
     A good result has no outlying views: that one view sees the board less well is no reason for
@@ -56,28 +56,28 @@ def suspects(calibration: Calibration) -> tuple[Suspects, ...]:
     for view in views if calibration.verdict.status != "good" else ():
         by_pair.setdefault(_pair_words(view), []).append(view)
     outlying = (
-        Suspects((number,), used=True, why=why, of=of)
+        FlaggedViews((number,), used=True, why=why, of=of)
         for of, pair_views in by_pair.items()
         for number, why in _outlying(pair_views).items()
     )
     return (*outlying, *left_out(views))
 
 
-def left_out(views: Iterable[ViewResult]) -> Iterator[Suspects]:
+def left_out(views: Iterable[ViewResult]) -> Iterator[FlaggedViews]:
     """Views that were not used, grouped by reason."""
     by_reason: dict[tuple[str, str], list[int]] = {}
     for view in views:
         if not view.used:
             by_reason.setdefault((_pair_words(view), view.reason), []).append(view.view)
     for (of, why), numbers in by_reason.items():
-        yield Suspects(tuple(numbers), used=False, why=why, of=of)
+        yield FlaggedViews(tuple(numbers), used=False, why=why, of=of)
 
 
 def _pair_words(view: ViewResult) -> str:
     return f"{view.seer} of {view.seen}" if view.seer else ""
 
 
-def outlying_views(suspects: Sequence[Suspects]) -> tuple[int, ...]:
+def outlying_views(suspects: Sequence[FlaggedViews]) -> tuple[int, ...]:
     """Numbers of the used views among suspects, ascending."""
     return tuple(sorted(view for group in suspects if group.used for view in group.views))
 

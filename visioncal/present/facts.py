@@ -8,8 +8,8 @@ import numpy as np
 from visioncal.core.number_format import decimals_for, matched, significant
 from visioncal.core.transforms import pose_difference
 from visioncal.core.types import Target
-from visioncal.present import parts
-from visioncal.present.cellmap import pairs
+from visioncal.present import result_parts
+from visioncal.present.network_layout import pairs
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CellResult, Edge, Rms
 from visioncal.results.sections import BoardResult, UncertaintyResult
@@ -228,7 +228,7 @@ def noise_facts(calibration: Calibration) -> tuple[Fact, ...]:
     """Noise levels, with their 95 % intervals where known."""
     return tuple(
         _noise_fact(of, name, value, levels.intervals.get(name))
-        for of, levels in parts.noise(calibration).items()
+        for of, levels in result_parts.noise(calibration).items()
         for name, value in levels.sigmas.items()
     )
 

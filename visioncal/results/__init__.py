@@ -1,13 +1,13 @@
 """Results of calibrations, tool and fixture frames, and their files."""
 
 from visioncal.core.verdict import Finding, Remedy, Verdict, VerdictStatus
-from visioncal.results.cell import CellResult, Moved, Untied
+from visioncal.results.cell import CellResult, Moved, UnconnectedFrame
 from visioncal.results.document import to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame, FrameFile, Observation
 from visioncal.results.lens import CameraResult
 from visioncal.results.parts import NeedMet, Picker, RobotResult, SolverResult
-from visioncal.results.picking import picked
+from visioncal.results.picking import select_matching
 from visioncal.results.result import Calibration
 from visioncal.results.views import HELD_BACK, Rms, Validation, ViewResult
 
@@ -32,11 +32,11 @@ __all__ = [
     "Rms",
     "RobotResult",
     "SolverResult",
-    "Untied",
+    "UnconnectedFrame",
     "Validation",
     "Verdict",
     "VerdictStatus",
     "ViewResult",
-    "picked",
+    "select_matching",
     "to_document",
 ]

@@ -10,7 +10,13 @@ from visioncal.core.types import Mount
 from visioncal.results.lens import CameraResult
 from visioncal.results.parts import RobotResult
 from visioncal.results.sections import CellDetails, CellJointFit, CellUncertainty
-from visioncal.session.frames import CELL, frame_called, frames_of_kind, robots_between, thing_name
+from visioncal.session.frames import (
+    CELL,
+    frame_of_object,
+    frames_of_kind,
+    object_name,
+    robots_between,
+)
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Untied:
+class UnconnectedFrame:
     """A frame that no observation connects to the rest, and a remedy in a sentence."""
 
     frame: str
@@ -71,7 +77,7 @@ class CellResult:
     targets: Mapping[str, Mapping[str, Any]]
     noise: Mapping[str, Mapping[str, float]]
     moved: tuple[Moved, ...]
-    untied: tuple[Untied, ...]
+    untied: tuple[UnconnectedFrame, ...]
     weakest: str
     details: CellDetails
     joint_fit: CellJointFit | None = None
@@ -80,7 +86,7 @@ class CellResult:
     @property
     def flanges(self) -> dict[str, str]:
         """Robot of each flange, by the flange's frame."""
-        return {name: thing_name(name, "robot") for name in frames_of_kind(self.tree, "flange")}
+        return {name: object_name(name, "robot") for name in frames_of_kind(self.tree, "flange")}
 
     @property
     def mount(self) -> Mount:
@@ -93,5 +99,6 @@ class CellResult:
     def lenses(self) -> dict[str, CameraResult]:
         """Cameras by frame."""
         return {
-            frame_called(self.tree, "camera", name): camera for name, camera in self.cameras.items()
+            frame_of_object(self.tree, "camera", name): camera
+            for name, camera in self.cameras.items()
         }

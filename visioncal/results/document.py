@@ -4,13 +4,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from visioncal.core.codec import INLINE, REST, Key, entries, names_but, read, read_fields, write
+from visioncal.core.codec import (
+    INLINE,
+    REST,
+    Key,
+    entries,
+    field_names_except,
+    read,
+    read_fields,
+    write,
+)
 from visioncal.core.errors import DataError
 from visioncal.core.types import Mount
 from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
 from visioncal.results.arm import StoredRobot
-from visioncal.results.cell import CellResult, Moved, Untied
+from visioncal.results.cell import CellResult, Moved, UnconnectedFrame
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, RayFrame
@@ -24,7 +33,7 @@ from visioncal.results.parts import (
 )
 from visioncal.results.sections import BoardResult, CalibrationSections, CellDetails, RigResult
 from visioncal.results.views import CellView, Rms, Validation, ViewResult, rms_of
-from visioncal.session.frames import thing_name
+from visioncal.session.frames import object_name
 
 if TYPE_CHECKING:
     from visioncal.results.result import Calibration
@@ -143,7 +152,7 @@ class AlignmentForm:
     noise: Mapping[str, Mapping[str, float]]
     views: Annotated[tuple[ViewResult, ...], Key("observations")]
     moved: tuple[Moved, ...]
-    untied: tuple[Untied, ...]
+    untied: tuple[UnconnectedFrame, ...]
     weakest: str
     verdict: StoredVerdict
     need: NeedMet | None = None
@@ -152,10 +161,10 @@ class AlignmentForm:
 
 # Fields of the forms that a calibration, or its cell, has under the same names.
 _CONVERTED = "schema visioncal session joint_covariance"
-_OF_PAIR = names_but(CalibrationForm, f"{_CONVERTED} ray_frame")
-_OF_CELL = names_but(CellForm, f"{_CONVERTED} views validation")
+_OF_PAIR = field_names_except(CalibrationForm, f"{_CONVERTED} ray_frame")
+_OF_CELL = field_names_except(CellForm, f"{_CONVERTED} views validation")
 _ALIGNED = ("created", "edges", "views", "verdict", "need")
-_IN_CELL = names_but(AlignmentForm, " ".join((_CONVERTED, "flanges lenses", *_ALIGNED)))
+_IN_CELL = field_names_except(AlignmentForm, " ".join((_CONVERTED, "flanges lenses", *_ALIGNED)))
 
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
@@ -255,7 +264,7 @@ def _cell_fields(form: CellForm) -> dict[str, Any]:
 
 def _alignment_fields(form: AlignmentForm) -> dict[str, Any]:
     cell = CellResult(
-        cameras={thing_name(name, "camera"): lens for name, lens in form.lenses.items()},
+        cameras={object_name(name, "camera"): lens for name, lens in form.lenses.items()},
         robots={},
         targets={},
         **{name: getattr(form, name) for name in _IN_CELL},

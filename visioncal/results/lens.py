@@ -196,9 +196,9 @@ class CameraResult:
         """
         projected = project_with_jacobian(self.camera, rays)
         inverse = np.zeros((len(px), 3, 2))
-        inverse[:, :2] = np.linalg.inv(projected.by_point[:, :, :2])
+        inverse[:, :2] = np.linalg.inv(projected.jacobian_point[:, :, :2])
         by_field = self.displacements(px, distance_m)
-        return inverse, -inverse @ np.concatenate([projected.by_intrinsics, by_field], axis=2)
+        return inverse, -inverse @ np.concatenate([projected.jacobian_intrinsics, by_field], axis=2)
 
     def carried(self, jacobian: FloatArray) -> "CameraResult":
         """The camera beside other edges, given their Jacobian by the present ones."""
@@ -228,7 +228,7 @@ class RefittedLens:
     most_px: float = 0.0
 
 
-def refitted(lens: CameraResult) -> RefittedLens:
+def fit_coefficients(lens: CameraResult) -> RefittedLens:
     """Fits matrix and coefficients to a lens and its field, at the views' mean distance.
 
     Only pixels where the field was observed are fitted. The camera's frame is kept, so that its
@@ -250,7 +250,9 @@ def refitted(lens: CameraResult) -> RefittedLens:
     roots, free = np.sqrt(weights)[:, None], np.arange(_fitted_count(camera))
     for _ in range(_STEPS):
         projected = project_with_jacobian(fitted, points)
-        columns = (roots[:, :, None] * projected.by_intrinsics[:, :, free]).reshape(-1, len(free))
+        columns = (roots[:, :, None] * projected.jacobian_intrinsics[:, :, free]).reshape(
+            -1, len(free)
+        )
         scale = np.linalg.norm(columns, axis=0)
         residuals = (roots * (px - projected.px)).ravel()
         step = np.linalg.lstsq(columns / scale, residuals, rcond=_DETERMINED)[0] / scale

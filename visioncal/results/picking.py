@@ -10,12 +10,12 @@ from visioncal.session.selecting import (
     check_one_of_each,
     chosen_of,
     has_several,
-    is_to_be_parted,
+    must_select_one,
     select,
 )
 
 
-def picked(
+def select_matching(
     session: Session,
     calibration: Calibration,
     choice: Choice,
@@ -35,12 +35,12 @@ def picked(
     Raises:
         DataError: There is none of that name, or the choice is ambiguous.
     """
-    several = is_to_be_parted(session, choice) if parted else has_several(session)
+    several = must_select_one(session, choice) if parted else has_several(session)
     of_session = dict[Part, str]()
     if several:
-        chosen = chosen_of(session, choice, parted=parted)
+        chosen = chosen_of(session, choice, robot_between=parted)
         of_session = {part: chosen.frame_of(part) for part in PARTS}
-        session = select(session, choice, parted=parted)
+        session = select(session, choice, robot_between=parted)
     if calibration.cell is None:
         # The names were those of the session.
         return session, calibration if several else calibration.chosen(choice)

@@ -19,7 +19,7 @@ from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
 from visioncal.core.number_format import figure
-from visioncal.core.shown import ByName, html_card, text_card
+from visioncal.core.summaries import ByName, html_card, text_card
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Remedy, Verdict
 from visioncal.estimation.chain import edge_names
@@ -35,7 +35,7 @@ from visioncal.results.sections import CalibrationSections, CellDetails, CellUnc
 from visioncal.results.selecting import selected_fields
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, ViewResult
-from visioncal.robot import Loads, Robot, bent_joints
+from visioncal.robot import Loads, Robot, deflected_joints
 from visioncal.robot.thermal import ThermalModel
 from visioncal.session.choosing import PARTS, Choice, Part
 from visioncal.session.frames import CELL
@@ -348,7 +348,7 @@ class Calibration(CalibrationSections):
                 else "It is of a whole cell: take one robot out of it with of(robot=...).",
             )
         return arm.base_from_flange(
-            bent_joints(arm, q, self.compliance, loads, self.weight_moments)
+            deflected_joints(arm, q, self.compliance, loads, self.weight_moments)
         )
 
     @property
@@ -402,7 +402,7 @@ class Calibration(CalibrationSections):
     def weight_moments(self) -> FloatArray | None:
         """(n, 4 n) compliance times unknown masses and first moments; None where not estimated.
 
-        For `bent_joints` of an arm whose model does not state the masses of its links.
+        For `deflected_joints` of an arm whose model does not state the masses of its links.
         """
         return None if self.elastic is None else self.elastic.weight_moments
 

@@ -19,7 +19,7 @@ from visioncal.results.sections import JointFit, NoiseIntervals
 from visioncal.results.tree import FrameTree
 from visioncal.results.views import Rms, Validation, rms_of
 from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
-from visioncal.session.frames import frames_of_kind, robots_between, thing_name
+from visioncal.session.frames import frames_of_kind, object_name, robots_between
 
 if TYPE_CHECKING:
     from visioncal.results.result import Calibration
@@ -38,7 +38,7 @@ def selected_fields(
     empty = np.zeros((0, len(whole.joint_covariance)))
     jacobian = np.concatenate([empty, *(pair[1] for pair in chain.values())])
     covariance = jacobian @ whole.joint_covariance @ jacobian.T
-    camera_name, robot = thing_name(chosen.camera, "camera"), chosen.robot or "robot"
+    camera_name, robot = object_name(chosen.camera, "camera"), chosen.robot or "robot"
     arm = cell.robots.get(robot, RobotResult())
     views = [
         view
@@ -46,7 +46,7 @@ def selected_fields(
         if chosen.camera in ("", view.seer) and chosen.target in ("", view.seen)
     ]
     method = whole.validation.method if whole.validation.is_of_unseen else ""
-    rms, target = rms_of(views), thing_name(chosen.target, "target")
+    rms, target = rms_of(views), object_name(chosen.target, "target")
     camera = cell.lenses.get(chosen.camera)
     return {
         "mount": chosen.mount,
@@ -77,7 +77,9 @@ def selected_fields(
     }
 
 
-def placed_name(whole: "Calibration", choice: Choice, needs: Collection[Part], name: str) -> str:
+def transform_name_in_cell(
+    whole: "Calibration", choice: Choice, needs: Collection[Part], name: str
+) -> str:
     """Name in the whole cell of a transform of the selected calibration."""
     if whole.cell is None:
         return name
@@ -87,7 +89,9 @@ def placed_name(whole: "Calibration", choice: Choice, needs: Collection[Part], n
     return f"{frames[parent]}_from_{child}"
 
 
-def boards_before(whole: "Calibration", choice: Choice, needs: Collection[Part]) -> dict[str, Edge]:
+def targets_fixed_to_base(
+    whole: "Calibration", choice: Choice, needs: Collection[Part]
+) -> dict[str, Edge]:
     """Poses of the cell's targets that are fixed to a robot's base: `base_from_target_floor`."""
     if whole.cell is None:
         return {}
@@ -178,8 +182,8 @@ def _joint_fit(cell: CellResult, chosen: Chosen, jacobian: FloatArray) -> JointF
     fit = cell.joint_fit
     if fit is None or not chosen.camera:
         return None
-    target = thing_name(chosen.target, "target") if chosen.target else ""
-    camera = thing_name(chosen.camera, "camera")
+    target = object_name(chosen.target, "target") if chosen.target else ""
+    camera = object_name(chosen.camera, "camera")
     lens = cell.lenses.get(chosen.camera)
     lens_count = 0 if lens is None else 4 + len(lens.camera.distortion)
     looks: list[int] = []

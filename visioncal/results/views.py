@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.core.codec import DROPPED, INLINE, KEPT
 from visioncal.core.number_format import figure
-from visioncal.session.frames import frame_called, frames_of_kind, robots_between, thing_name
+from visioncal.session.frames import frame_of_object, frames_of_kind, object_name, robots_between
 
 # Reason of a view with the role holdout.
 HELD_BACK = "held out of the fit by the session (role = holdout)"
@@ -103,7 +103,7 @@ def _names(view: ViewResult) -> dict[str, Any]:
     """Names of observer and observed object, by kind."""
     seer = "camera" if frames_of_kind([view.seer], "camera") else "instrument"
     seen = "target" if frames_of_kind([view.seen], "target") else "point"
-    return {seer: thing_name(view.seer, seer), seen: thing_name(view.seen, seen)}
+    return {seer: object_name(view.seer, seer), seen: object_name(view.seen, seen)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +129,7 @@ class CellView(SeerAndSeen):
     def result(self, tree: Mapping[str, str]) -> ViewResult:
         """The observation; inverse of `of`."""
         names = ((kind, getattr(self, kind)) for kind in _KINDS)
-        seer, seen = (frame_called(tree, kind, name) for kind, name in names if name is not None)
+        seer, seen = (frame_of_object(tree, kind, name) for kind, name in names if name is not None)
         return replace(self.figures, seer=seer, seen=seen)
 
 

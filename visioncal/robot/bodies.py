@@ -34,7 +34,8 @@ class Body:
         link_from_body: (4, 4) pose of the body in the joint's frame after its motion, or in the
             base [m].
         of_arm: Whether it is a part of the arm itself.
-        unsure_m: Additional distance to bodies that are not of the arm, for an uncertain pose [m].
+        uncertainty_m: Additional distance to bodies that are not of the arm, for an uncertain pose
+            [m].
     """
 
     name: str
@@ -43,7 +44,7 @@ class Body:
     size_m: FloatArray
     link_from_body: FloatArray
     of_arm: bool = False
-    unsure_m: float = 0.0
+    uncertainty_m: float = 0.0
 
     @property
     def extent_m(self) -> float:

@@ -119,7 +119,7 @@ class Collisions:
         """Required distances (k,) of the pairs in `names` [m]."""
         return self._pairs.needed_m.copy()
 
-    def on_the_way(self, start: FloatArray, end: FloatArray) -> int:
+    def path_contact(self, start: FloatArray, end: FloatArray) -> int:
         """Finds a pair of bodies that come too near while all joints move linearly.
 
         Conservative advancement (Mirtich 1996): the step from each posture to the next is bounded
@@ -201,13 +201,13 @@ def _all_pairs(robot: Robot, bodies: Sequence[Body], clearance_m: float, floor: 
             links_between = bodies[b].link - bodies[a].link
             if links_between == 0 or (links_between == 1 and bodies[a].of_arm and bodies[b].of_arm):
                 continue
-            uncertainty_m = np.hypot(bodies[a].unsure_m, bodies[b].unsure_m)
+            uncertainty_m = np.hypot(bodies[a].uncertainty_m, bodies[b].uncertainty_m)
             found_pairs.append((a, b))
             needed.append(clearance_m + (uncertainty_m if bodies[a].link == 0 else 0.0))
     if floor:
         moving = [index for index in order if bodies[index].link > 0]
         found_pairs += [(len(bodies), index) for index in moving]
-        needed += [clearance_m + bodies[index].unsure_m for index in moving]
+        needed += [clearance_m + bodies[index].uncertainty_m for index in moving]
     links = np.array([*(body.link for body in bodies), 0])
     pairs = np.array(found_pairs, dtype=np.int64).reshape(-1, 2)
     levers = [_levers(robot, links[a], bodies[b]) for a, b in pairs.tolist()]

@@ -141,7 +141,7 @@ def table_of(
     return _with_rows(table, [*rows, last])
 
 
-def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
+def with_base(robot: Robot, parent_from_base: FloatArray) -> Robot:
     """Builds the same arm in a new base frame, in which its base is at (4, 4) [m]."""
     gravity = {"gravity_m_s2": (parent_from_base[:3, :3] @ robot.gravity).tolist()}
     table = _described(robot)
@@ -154,7 +154,7 @@ def placed_at(robot: Robot, parent_from_base: FloatArray) -> Robot:
     return Robot.from_document(document | gravity)
 
 
-def with_zeros(robot: Robot, zeros_rad: FloatArray) -> Robot:
+def with_joint_offsets(robot: Robot, zeros_rad: FloatArray) -> Robot:
     """Builds the arm with (n,) offsets added to its reported joint angles [rad]."""
     added = robot.chain.functions[:, 1] * zeros_rad
     table = _described(robot)

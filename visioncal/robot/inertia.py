@@ -58,7 +58,7 @@ class Inertias:
         turned = np.array([skew(centre) for centre in centres_m])
         about_origin = about - kg[:, None, None] * turned @ turned
         moments = kg[:, None] * centres_m
-        return cls(np.column_stack([kg, moments, entries(about_origin)]))
+        return cls(np.column_stack([kg, moments, symmetric_entries(about_origin)]))
 
     @property
     def masses(self) -> Masses:
@@ -72,7 +72,7 @@ class Inertias:
         """(n, 3, 3) inertias about the centres of mass, along the frames' axes [kg m^2]."""
         masses = self.masses
         turned = np.array([skew(centre) for centre in masses.centres_m])
-        found = matrices(self.values[:, 4:]) + masses.kg[:, None, None] * turned @ turned
+        found = symmetric_matrices(self.values[:, 4:]) + masses.kg[:, None, None] * turned @ turned
         return np.asarray(found)
 
     @property
@@ -83,17 +83,17 @@ class Inertias:
 
     def rows(self) -> list[dict[str, Any]]:
         """Entries of the joints' tables, for a description whose rows end in the joints' frames."""
-        about = entries(self.about_centres).tolist()
+        about = symmetric_entries(self.about_centres).tolist()
         rows = zip(self.masses.rows(), about, strict=True)
         return [mass | {INERTIA_KEY: value} for mass, value in rows]
 
 
-def entries(full: FloatArray) -> FloatArray:
+def symmetric_entries(full: FloatArray) -> FloatArray:
     """Entries (..., 6) xx, xy, yy, xz, yz, zz of (..., 3, 3) symmetric matrices."""
     return np.asarray(full[..., _ROWS, _COLUMNS])
 
 
-def matrices(six: FloatArray) -> FloatArray:
+def symmetric_matrices(six: FloatArray) -> FloatArray:
     """Symmetric matrices (..., 3, 3) of (..., 6) entries xx, xy, yy, xz, yz, zz."""
     full = np.empty((*six.shape[:-1], 3, 3))
     full[..., _ROWS, _COLUMNS] = full[..., _COLUMNS, _ROWS] = six
@@ -110,7 +110,7 @@ def pseudo_inertias(values: FloatArray) -> FloatArray:
     Returns:
         (..., 4, 4) second moments of mass [kg m^2], bordered by first moments and mass.
     """
-    inertia = matrices(values[..., 4:])
+    inertia = symmetric_matrices(values[..., 4:])
     half = 0.5 * np.trace(inertia, axis1=-2, axis2=-1)
     pseudo = np.empty((*values.shape[:-1], 4, 4))
     pseudo[..., :3, :3] = half[..., None, None] * np.eye(3) - inertia
@@ -125,10 +125,10 @@ def parameters_of(pseudo: FloatArray) -> FloatArray:
     trace = np.trace(second, axis1=-2, axis2=-1)
     inertia = trace[..., None, None] * np.eye(3) - second
     mass, moments = pseudo[..., 3, 3][..., None], pseudo[..., :3, 3]
-    return np.concatenate([mass, moments, entries(inertia)], axis=-1)
+    return np.concatenate([mass, moments, symmetric_entries(inertia)], axis=-1)
 
 
-def moving(link_from_body: FloatArray) -> FloatArray:
+def parameter_transform(link_from_body: FloatArray) -> FloatArray:
     """Matrix (10, 10) that transforms a body's parameters from its own frame to a link's."""
     units = pseudo_inertias(np.eye(10))
     return np.asarray(parameters_of(link_from_body @ units @ link_from_body.T).T)
@@ -152,7 +152,7 @@ def inertias_of_rows(rows: Sequence[DocumentTable], joint_from_row: FloatArray) 
         return None
     kg = np.array([row.number(MASS_KEYS[0]) for row in rows])
     centres = np.array([number_list(row, MASS_KEYS[1], 3) for row in rows])
-    about = matrices(np.array([number_list(row, INERTIA_KEY, 6) for row in rows]))
+    about = symmetric_matrices(np.array([number_list(row, INERTIA_KEY, 6) for row in rows]))
     rotation, position = joint_from_row[:, :3, :3], joint_from_row[:, :3, 3]
     return Inertias.of_bodies(
         kg,

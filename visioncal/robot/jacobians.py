@@ -24,7 +24,7 @@ _THETA, _D, _A, _ALPHA, _BETA = range(5)
 _Z = [2, 5]
 
 
-def table_moves(
+def table_jacobian(
     robot: Robot, table: DHTable, placements: FloatArray, functions: FloatArray
 ) -> FloatArray:
     """Derivatives of a robot's table over its geometry.

@@ -10,9 +10,9 @@ from visioncal.core.files import DocumentTable
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import IDENTITY_FUNCTION, Chain
+from visioncal.robot.drive_limits import DriveLimits
 from visioncal.robot.inertia import Inertias
 from visioncal.robot.loads import Masses
-from visioncal.robot.rates import Rates
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -159,7 +159,7 @@ class UrdfArm(NamedTuple):
     tip: str
     masses: Masses | None
     inertias: Inertias | None
-    rates: Rates
+    rates: DriveLimits
 
 
 def arm_of_urdf(table: DocumentTable) -> UrdfArm:
@@ -215,13 +215,13 @@ def arm_of_urdf(table: DocumentTable) -> UrdfArm:
     return UrdfArm(_chain_of_model(arm, tip), tip, inertias.masses, inertias, rates)
 
 
-def _rates_of_model(model: "pin.Model") -> Rates:
+def _rates_of_model(model: "pin.Model") -> DriveLimits:
     """Limits of the joints' drives; zero in a URDF means unknown."""
     known = [
         np.where(value > 0.0, value, np.inf) for value in (model.velocityLimit, model.effortLimit)
     ]
     speed, torque = (np.where(array < np.finfo(float).max, array, np.inf) for array in known)
-    return Rates(speed, np.full(len(speed), np.inf), torque)
+    return DriveLimits(speed, np.full(len(speed), np.inf), torque)
 
 
 def _chain_of_model(model: "pin.Model", tip: str) -> Chain:

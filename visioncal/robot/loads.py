@@ -187,14 +187,14 @@ def load_torques(robot: "Robot", q: FloatArray, loads: Loads | None = None) -> F
     return np.asarray(torques + np.einsum("mij,mi->mj", robot.axis_jacobian(q), wrench))
 
 
-def bent_joints(
+def deflected_joints(
     robot: "Robot",
     q: FloatArray,
     compliance: FloatArray,
     loads: Loads | None = None,
     moments: FloatArray | None = None,
 ) -> FloatArray:
-    """Joint angles under load: iterates `bends` to its fixed point.
+    """Joint angles under load: iterates `joint_deflections` to its fixed point.
 
     Args:
         robot: The rigid arm.
@@ -211,18 +211,18 @@ def bent_joints(
     if not compliance.any() and moments is None:
         return bent
     for _ in range(_ITERATIONS):
-        bent = q + bends(robot, bent, compliance, loads, moments)
+        bent = q + joint_deflections(robot, bent, compliance, loads, moments)
     return bent
 
 
-def bends(
+def joint_deflections(
     robot: "Robot",
     q: FloatArray,
     compliance: FloatArray,
     loads: Loads | None = None,
     moments: FloatArray | None = None,
 ) -> FloatArray:
-    """Deflections (m, n) of the joints at (m, n) angles under load [rad]; see `bent_joints`."""
+    """Joint deflections (m, n) under load at (m, n) angles [rad]; see `deflected_joints`."""
     deflections = compliance * load_torques(robot, q, loads)
     if moments is None:
         return np.asarray(deflections)

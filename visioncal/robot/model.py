@@ -15,6 +15,7 @@ from visioncal.core.files import DocumentTable
 from visioncal.core.transforms import exp
 from visioncal.core.types import FloatArray
 from visioncal.robot.chain import Chain, chain_document, chain_from_document, joint_tables
+from visioncal.robot.drive_limits import RATE_KEYS, DriveLimits
 from visioncal.robot.inertia import INERTIA_KEY, Inertias, inertias_of_rows
 from visioncal.robot.kinematics import (
     arm_of_urdf,
@@ -26,7 +27,6 @@ from visioncal.robot.kinematics import (
     weight_jacobian,
 )
 from visioncal.robot.loads import MASS_KEYS, Loads, Masses, gravity_of, load_torques, masses_of_rows
-from visioncal.robot.rates import RATE_KEYS, Rates
 from visioncal.robot.tables import chain_of_table, row_frames, table_from_document
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Robot:
     chain: Chain
     masses: Masses | None
     inertias: Inertias | None
-    rates: Rates
+    rates: DriveLimits
     gravity: FloatArray
     _model: "pin.Model" = field(repr=False)
 
@@ -103,7 +103,7 @@ class Robot:
             joints = [row for _, row in joint_tables(table)]
             masses = masses_of_rows(joints, frames)
             inertias = inertias_of_rows(joints, frames)
-            rates = Rates.of_rows(joints)
+            rates = DriveLimits.of_rows(joints)
         model = build_model(name, tip, chain, masses)
         gravity = gravity_of(document, table.label)
         return cls(name, tip, dict(document), chain, masses, inertias, rates, gravity, model)

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, IntArray
-from visioncal.robot.inertia import Inertias, moving
+from visioncal.robot.inertia import Inertias, parameter_transform
 from visioncal.robot.kinematics import regressors
 from visioncal.robot.model import Robot
 
@@ -82,7 +82,9 @@ def body_regressor(robot: Robot, q: FloatArray, dq: FloatArray, ddq: FloatArray)
         DataError: A shape is wrong.
     """
     last_from_flange = robot.chain.placements[-1]
-    return np.asarray(torque_regressor(robot, q, dq, ddq)[:, :, -10:] @ moving(last_from_flange))
+    return np.asarray(
+        torque_regressor(robot, q, dq, ddq)[:, :, -10:] @ parameter_transform(last_from_flange)
+    )
 
 
 def effective_states(
@@ -123,7 +125,7 @@ def momenta(
     import pinocchio as pin
 
     positions, speeds, _ = effective_states(robot, q, dq, np.zeros_like(q))
-    model = weighed_model(robot, inertias)
+    model = model_with_inertias(robot, inertias)
     data = model.createData()
     momentum, rate = np.empty_like(speeds), np.empty_like(speeds)
     for row, (position, speed) in enumerate(zip(positions, speeds, strict=True)):
@@ -134,7 +136,7 @@ def momenta(
     return momentum, rate
 
 
-def weighed_model(robot: Robot, inertias: Inertias) -> "pin.Model":
+def model_with_inertias(robot: Robot, inertias: Inertias) -> "pin.Model":
     """Pinocchio's model of an arm with given inertias.
 
     Raises:

@@ -39,7 +39,7 @@ class WeightFunctions:
         """Total number of functions."""
         return sum(part.shape[1] for part in self.parts)
 
-    def bends(self, robot: Robot, q: FloatArray) -> FloatArray:
+    def values(self, robot: Robot, q: FloatArray) -> FloatArray:
         """Values (m, n, size) of the functions at (m, n) joint angles, zero for other joints."""
         jacobian = robot.weight_jacobian(q)
         values, at = np.zeros((*q.shape, self.size)), 0

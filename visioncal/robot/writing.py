@@ -47,7 +47,7 @@ def numbers_text(pose: FloatArray) -> tuple[list[str], list[str]]:
     return numbers[:3], numbers[3:]
 
 
-def unwritten(robot: Robot) -> tuple[str, ...]:
+def unexportable_functions(robot: Robot) -> tuple[str, ...]:
     """Texts on joint functions of a corrected robot that other formats cannot hold."""
     texts, harmonics = [], robot.chain.harmonics
     for index, (joint, function) in enumerate(
@@ -133,7 +133,7 @@ def _inertials(robot: Robot) -> list[list[str]]:
 
 def comment_lines(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
     """Lines of XML comments: the notes, and joint functions that are missing."""
-    missing = unwritten(robot)
+    missing = unexportable_functions(robot)
     said = f"Not in this file, for URDF cannot say it: {'; '.join(missing)}"
     # XML ends a comment at two hyphens.
     texts = [
@@ -180,7 +180,7 @@ def ur_kinematics_yaml(
     table = _ur_table(robot, like)
     placements = table.along_x[:-1] @ table.along_z
     placements[0] = table.base @ placements[0]
-    missing = unwritten(robot)
+    missing = unexportable_functions(robot)
     unsaid = (
         [f"Not in this file, which has no field for it: {'; '.join(missing)}"] if missing else []
     )
@@ -404,7 +404,7 @@ def _in_row_frames(inertias: Inertias, joint_from_row: FloatArray) -> Inertias:
     return Inertias.of_bodies(masses.kg, centres, about)
 
 
-def weighed_urdf(robot: Robot, inertias: Inertias, notes: Sequence[str] = ()) -> str:
+def urdf_with_inertias(robot: Robot, inertias: Inertias, notes: Sequence[str] = ()) -> str:
     """Writes the URDF of a robot with identified inertias.
 
     All that moves with a joint of the arm is one body: the link after the joint gets its inertia,

@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias, get_args
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.types import Mount
-from visioncal.session.frames import frame_name, frames_of_kind, robots_between, thing_name
+from visioncal.session.frames import frame_name, frames_of_kind, object_name, robots_between
 
 Part: TypeAlias = Literal["camera", "robot", "target"]
 PARTS: tuple[Part, ...] = get_args(Part)
@@ -77,7 +77,7 @@ def choose(
     needs: Collection[Part] = PARTS,
     *,
     label: str,
-    parted: bool = True,
+    robot_between: bool = True,
     seen: Collection[tuple[str, str]] = (),
 ) -> Chosen:
     """Finds the chosen camera, robot and target.
@@ -87,7 +87,7 @@ def choose(
         choice: The given names.
         needs: Parts that must be unambiguous; for the others, any that fits is taken, or none.
         label: Name of the cell in messages.
-        parted: Whether the robot must be between camera and target.
+        robot_between: Whether the robot must be between camera and target.
         seen: Observed pairs of camera and target frames; where targets are needed, other pairs are
             options only where none of these fits.
 
@@ -103,7 +103,7 @@ def choose(
     }
     options = [
         option
-        for option in _combinations(frames, by_part, parted=parted)
+        for option in _combinations(frames, by_part, parted=robot_between)
         if all(map(option.frame_of, needs))
     ]
     fitting = [
@@ -117,7 +117,7 @@ def choose(
     for part in PARTS:
         remaining = list(dict.fromkeys(chosen.frame_of(part) for chosen in fitting))
         if part in needs and len(remaining) > 1:
-            names = [thing_name(name, part) for name in remaining]
+            names = [object_name(name, part) for name in remaining]
             raise DataError(
                 f"{label} has several {part}s ({some_of(names)}), and which is meant is not said.",
                 culprits=[f"--{part}"],
@@ -133,9 +133,9 @@ _KINDS: Mapping[Part, str] = {"camera": "camera", "robot": "flange", "target": "
 def _frame(frames: Collection[str], part: Part, name: str, label: str) -> str:
     """Frame of a named part."""
     for frame in frames:
-        if name in (frame, thing_name(frame, part)):
+        if name in (frame, object_name(frame, part)):
             return frame
-    names = [thing_name(word, part) for word in frames]
+    names = [object_name(word, part) for word in frames]
     raise DataError(
         f"{label} has no {part} {name!r}: its {part}s are {some_of(names) or 'none'}.",
         culprits=[f"--{part}"],
@@ -176,7 +176,7 @@ def _none_fits(
         part: next(iter(collection)) for part, collection in by_part.items() if len(collection) == 1
     } | dict(named)
     camera, target, flange = (only.get(name) for name in ("camera", "target", "robot"))
-    robot = None if flange is None else thing_name(flange, "robot")
+    robot = None if flange is None else object_name(flange, "robot")
     if camera and target and "target" in needs:
         robots = robots_between(frames, camera, target)
         names = " and ".join(robot or "robot" for robot in robots)
@@ -200,8 +200,8 @@ def _none_fits(
             next_step="Name another robot, or another camera.",
         )
     pairs = [
-        f"{thing_name(option.camera, 'camera')} and {thing_name(option.target, 'target')} by robot "
-        f"{thing_name(option.flange, 'robot')}"
+        f"{object_name(option.camera, 'camera')} and {object_name(option.target, 'target')} "
+        f"by robot {object_name(option.flange, 'robot')}"
         for option in _combinations(frames, by_part, parted=True)
         if option.camera and option.target
     ]

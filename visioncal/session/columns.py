@@ -90,7 +90,7 @@ def is_number(column: str) -> bool:
     return column in _PLAIN_NUMBERS or _NUMBERED.fullmatch(column) is not None
 
 
-def no_celsius(values: FloatArray) -> str:
+def temperature_error(values: FloatArray) -> str:
     """Message for implausible temperatures [deg C]; empty for none."""
     beyond = values[(values < _COLDEST_C) | (values > _HOTTEST_C)]
     if not len(beyond):
@@ -104,7 +104,7 @@ def no_celsius(values: FloatArray) -> str:
     )
 
 
-def no_size(column: str, values: FloatArray) -> str:
+def size_error(column: str, values: FloatArray) -> str:
     """Message for an implausibly large number among a column's values (n,); empty for none."""
     rate = _RATE.fullmatch(column)
     unit = rate[1] if rate else column.rpartition("_")[2] if is_number(column) else ""

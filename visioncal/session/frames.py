@@ -12,7 +12,12 @@ from functools import cached_property
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.session.document import Declaration, Kind
-from visioncal.session.kinds import has_robot_state, is_read, is_seen, name_of
+from visioncal.session.kinds import (
+    has_robot_state,
+    is_camera_observation,
+    is_instrument_reading,
+    name_of,
+)
 from visioncal.session.table import View
 from visioncal.session.tables import RobotTable
 
@@ -75,14 +80,14 @@ def frames_of_kind(frames: Iterable[str], kind: str) -> tuple[str, ...]:
     return tuple(frame for frame in frames if frame == bare or frame.startswith(f"{bare}_"))
 
 
-def thing_name(frame: str, kind: str) -> str:
+def object_name(frame: str, kind: str) -> str:
     """Name of a frame's object: `left` for `cam_left`; its kind where it has no name."""
     return frame.partition("_")[2] or kind
 
 
-def frame_called(frames: Iterable[str], kind: str, name: str) -> str:
-    """Frame of the object with a name, inverse of `thing_name`; it need not be among the frames."""
-    known = (word for word in frames_of_kind(frames, kind) if thing_name(word, kind) == name)
+def frame_of_object(frames: Iterable[str], kind: str, name: str) -> str:
+    """Frame of a named object, the inverse of `object_name`; it may not be among the frames."""
+    known = (word for word in frames_of_kind(frames, kind) if object_name(word, kind) == name)
     return next(known, frame_name(kind, "" if name == kind else name))
 
 
@@ -120,13 +125,13 @@ class _DeclaredTree:
         ]
         for kind in ("camera", "target", "instrument"):
             listed += [(kind, name) for name in self._names(kind)]
-        points = dict.fromkeys(view.point for view in self.views if is_read(view))
+        points = dict.fromkeys(view.point for view in self.views if is_instrument_reading(view))
         listed += [("point", name) for name in points]
         return {frame_name(kind, name): (kind, name) for kind, name in listed}
 
     def _names(self, kind: Kind) -> tuple[str, ...]:
         """Names of a kind; one without a name where rows are of it and none is declared."""
-        test = is_read if kind == "instrument" else is_seen
+        test = is_instrument_reading if kind == "instrument" else is_camera_observation
         declared = tuple(self.declaration.named(kind))
         return declared or (("",) if any(test(view) for view in self.views) else ())
 
@@ -222,7 +227,7 @@ class _DeclaredTree:
     def _parent_of_point(self, frame: str) -> str | None:
         """Parent of a point: the flange of the robot in its rows; fixed where rows have no pose."""
         _, name = self.frames[frame]
-        rows = [view for view in self.views if is_read(view) and view.point == name]
+        rows = [view for view in self.views if is_instrument_reading(view) and view.point == name]
         moved = [row for row in rows if has_robot_state(row)]
         if not moved and len(self.robots) < 2:
             return CELL if self.declaration.is_network else self._flange_of(frame)
@@ -246,7 +251,7 @@ class _DeclaredTree:
         pairs = [
             observed(self.declaration, view)
             for view in self.views
-            if is_seen(view) and not view.is_of_lens
+            if is_camera_observation(view) and not view.is_of_lens
         ]
         return {other for pair in pairs if frame in pair for other in pair if other != frame}
 
@@ -273,12 +278,12 @@ class _DeclaredTree:
 
 def observed(declaration: Declaration, view: View) -> tuple[str, str]:
     """Frames of observer and observed object in a row; empty for a row without observation."""
-    if is_seen(view):
+    if is_camera_observation(view):
         camera = name_of(declaration, "camera", view)
         return frame_name("camera", camera), frame_name(
             "target", name_of(declaration, "target", view)
         )
-    if is_read(view):
+    if is_instrument_reading(view):
         instrument = name_of(declaration, "instrument", view)
         return frame_name("instrument", instrument), frame_name("point", view.point)
     return "", ""

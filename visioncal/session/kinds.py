@@ -24,7 +24,7 @@ _Test: TypeAlias = Callable[[View], bool]
 _SUFFIXES = {"target": (".toml",), "model": ROBOT_SUFFIXES}
 
 
-def is_seen(view: View) -> bool:
+def is_camera_observation(view: View) -> bool:
     """Whether a row is a camera's observation: an image, corners of one, or a measured pose."""
     return bool(view.image) or view.has_corners or "cft_x_m" in view.numbers
 
@@ -34,21 +34,21 @@ def has_robot_state(view: View) -> bool:
     return POSITION[0] in view.numbers or "q1_rad" in view.numbers
 
 
-def is_read(view: View) -> bool:
+def is_instrument_reading(view: View) -> bool:
     """Whether a row is an instrument's reading."""
     return view.reading_m is not None
 
 
 # By kind: which rows must name one of several, what the column names, and a hint for the remedy.
 _NAMING_RULES: Mapping[Kind, tuple[_Test, str, str]] = {
-    "camera": (is_seen, "the one that took a row's image", ""),
+    "camera": (is_camera_observation, "the one that took a row's image", ""),
     "robot": (has_robot_state, "the one whose pose or joints a row has", ""),
     "target": (
-        is_seen,
+        is_camera_observation,
         "the one that a row shows",
         "; one image that shows several takes a row for each, with the same stop",
     ),
-    "instrument": (is_read, "the one that read a row's meas_ columns", ""),
+    "instrument": (is_instrument_reading, "the one that read a row's meas_ columns", ""),
 }
 
 

@@ -33,7 +33,7 @@ class Observation:
         seer: The frame of the camera or instrument.
         seen: The frame of the target or point.
         robots: The row with the pose of each robot between the two at this stop.
-        lacks: The robots between the two without a pose at this stop.
+        missing_robots: The robots between the two without a pose at this stop.
     """
 
     view: View
@@ -41,7 +41,7 @@ class Observation:
     seer: str
     seen: str
     robots: Mapping[str, View]
-    lacks: tuple[str, ...] = ()
+    missing_robots: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,9 @@ def observations_of(
     return tuple(sorted(observations, key=lambda value: index_of[value.view.number]))
 
 
-def standing(declaration: Declaration, views: Sequence[View]) -> dict[int, Mapping[str, View]]:
+def robot_rows_at_stops(
+    declaration: Declaration, views: Sequence[View]
+) -> dict[int, Mapping[str, View]]:
     """Rows with the robots' poses at each row's stop: by view number, then by robot."""
     robot_rows: dict[int, Mapping[str, View]] = {}
     for stop in _stops(declaration, views):

@@ -8,7 +8,7 @@ import tomli_w
 
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
-from visioncal.core.temporary_files import aside_folder
+from visioncal.core.temporary_files import temporary_folder
 from visioncal.robot import robot_file
 from visioncal.session.digest import is_file
 from visioncal.session.document import Declaration
@@ -43,7 +43,7 @@ def write_folder(
     refuse_filled(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with aside_folder(folder.parent) as (aside, _):
+        with temporary_folder(folder.parent) as (aside, _):
             new = aside / "new"
             new.mkdir()
             for path in paths:

@@ -11,8 +11,8 @@ from visioncal.session.choosing import PARTS, Choice, Chosen, Part, choose
 from visioncal.session.columns import SELECTORS, is_number
 from visioncal.session.document import KINDS
 from visioncal.session.frames import frame_name
-from visioncal.session.kinds import has_robot_state, is_seen, name_of
-from visioncal.session.observations import standing
+from visioncal.session.kinds import has_robot_state, is_camera_observation, name_of
+from visioncal.session.observations import robot_rows_at_stops
 from visioncal.session.streams import Stream
 from visioncal.session.table import View
 
@@ -29,16 +29,26 @@ def has_several(session: "Session") -> bool:
 
 
 def chosen_of(
-    session: "Session", choice: Choice, needs: Collection[Part] = PARTS, *, parted: bool = True
+    session: "Session",
+    choice: Choice,
+    needs: Collection[Part] = PARTS,
+    *,
+    robot_between: bool = True,
 ) -> Chosen:
     """Finds the camera, robot and target chosen by names and by a session's rows; see `choose`."""
     seen = {(observation.seer, observation.seen) for observation in session.observations}
     label = f"session {session.name!r}"
-    return choose(session.frames, choice, needs, label=label, parted=parted, seen=seen)
+    return choose(
+        session.frames, choice, needs, label=label, robot_between=robot_between, seen=seen
+    )
 
 
 def select(
-    session: "Session", choice: Choice, needs: Collection[Part] = PARTS, *, parted: bool = True
+    session: "Session",
+    choice: Choice,
+    needs: Collection[Part] = PARTS,
+    *,
+    robot_between: bool = True,
 ) -> "Session":
     """Selects one camera, robot and target from a session; see `Session.of` and `choose`.
 
@@ -46,7 +56,7 @@ def select(
     """
     if not choice and not has_several(session):
         return session
-    chosen = chosen_of(session, choice, needs, parted=parted)
+    chosen = chosen_of(session, choice, needs, robot_between=robot_between)
     if not has_several(session):
         return session
     if "camera" not in needs:
@@ -96,7 +106,7 @@ def keep_views(session: "Session", numbers: Collection[int]) -> "Session":
         view
         for view in session.views
         if view.number in numbers
-        or (view.stop in stops and has_robot_state(view) and not is_seen(view))
+        or (view.stop in stops and has_robot_state(view) and not is_camera_observation(view))
     ]
     table = session.corner_table
     selected = session.assemble(
@@ -132,17 +142,25 @@ def _rows(
     session: "Session", chosen: Chosen
 ) -> Iterator[tuple[int, tuple[View, Mapping[str, float]]]]:
     """The selected rows by view number, with the robot's numbers at their stop."""
-    declaration, robot_rows = session.declaration, standing(session.declaration, session.views)
+    declaration, robot_rows = (
+        session.declaration,
+        robot_rows_at_stops(session.declaration, session.views),
+    )
     seen = {
         observation.view.number: (observation.seer, observation.seen)
         for observation in session.observations
     }
     for view in session.views:
         if chosen.camera:
-            is_selected = is_seen(view) and seen.get(view.number) == (chosen.camera, chosen.target)
+            is_selected = is_camera_observation(view) and seen.get(view.number) == (
+                chosen.camera,
+                chosen.target,
+            )
         else:
             robot = name_of(declaration, "robot", view)
-            is_selected = has_robot_state(view) and not is_seen(view) and robot == chosen.robot
+            is_selected = (
+                has_robot_state(view) and not is_camera_observation(view) and robot == chosen.robot
+            )
         if is_selected:
             robot_row = robot_rows[view.number].get(chosen.robot)
             yield view.number, (view, {} if robot_row is None else robot_row.numbers)
@@ -214,7 +232,7 @@ def is_whole_cell(session: "Session") -> bool:
     return bool(_whole_cell_words(session)) or (both and bool(session.declaration.frames))
 
 
-def is_to_be_parted(session: "Session", choice: Choice) -> bool:
+def must_select_one(session: "Session", choice: Choice) -> bool:
     """Whether one of each must be selected; several boards of one camera and robot need not be."""
     return is_whole_cell(session) or (bool(choice) and has_several(session))
 

@@ -14,7 +14,7 @@ import tomli_w
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
-from visioncal.core.shown import html_card, text_card
+from visioncal.core.summaries import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
 from visioncal.session import columns as cols
 from visioncal.session.arrays import CellArguments, Poses, of_corners, of_images
@@ -36,7 +36,7 @@ from visioncal.session.frames import check_frames, frame_name, resolve_frames, r
 from visioncal.session.images import IMAGE_ENDINGS, FolderImages, ImageStore, MemoryImages
 from visioncal.session.kinds import (
     check_kinds_named,
-    is_seen,
+    is_camera_observation,
     kind_warnings,
     outside_warnings,
     read_robots,
@@ -508,7 +508,7 @@ class Session:
     @cached_property
     def is_read_by_instrument(self) -> bool:
         """Whether all observations are an instrument's; otherwise the camera's are used."""
-        seen = any(is_seen(view) for view in self.views)
+        seen = any(is_camera_observation(view) for view in self.views)
         return not seen and any(view.reading_m is not None for view in self.views)
 
     @property

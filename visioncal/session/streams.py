@@ -121,7 +121,7 @@ def read_streams(folder: Path) -> dict[str, Stream]:
 
 def _check_sizes(stream: Stream, label: str) -> None:
     for column in dict.fromkeys(stream.columns):
-        wrong = cols.no_size(column, stream[column])
+        wrong = cols.size_error(column, stream[column])
         if wrong:
             raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
 
@@ -267,7 +267,7 @@ def check_stream(name: str, stream: Stream) -> None:
     for column in (
         column for column in stream.columns if column.endswith("_c") and cols.is_number(column)
     ):
-        wrong = cols.no_celsius(stream[column])
+        wrong = cols.temperature_error(stream[column])
         if wrong:
             raise DataError(f"{label}, column {column}: {wrong}.", culprits=[f"{label}, {column}"])
     for group in cols.QUATERNION_GROUPS:

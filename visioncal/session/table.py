@@ -405,10 +405,10 @@ class _RowReader:
     def _check_sizes(self, numbers: Mapping[str, float]) -> None:
         for column, value in numbers.items():
             # Recordings of earlier versions may have any time; see `check_times`.
-            wrong = cols.no_size(column, np.array([value])) if column != "stamp_s" else ""
+            wrong = cols.size_error(column, np.array([value])) if column != "stamp_s" else ""
             if wrong:
                 self.report(column, wrong)
-            wrong = cols.no_celsius(np.array([value])) if column.endswith("_c") else ""
+            wrong = cols.temperature_error(np.array([value])) if column.endswith("_c") else ""
             if wrong:
                 self.report(column, wrong)
 

@@ -11,7 +11,8 @@ from visioncal.simulation.cell import (
     SimulatedRobot,
     SimulatedSight,
 )
-from visioncal.simulation.described import cell_names, read_cell
+from visioncal.simulation.cell_files import cell_names, read_cell
+from visioncal.simulation.elasticity import ArmOptions, Payload
 from visioncal.simulation.heat import Heat
 from visioncal.simulation.layout import (
     BoardAt,
@@ -37,7 +38,6 @@ from visioncal.simulation.optics import (
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
 from visioncal.simulation.records import cell_session, measured_poses, write_session
 from visioncal.simulation.render import RenderScene, prepare_scene, render
-from visioncal.simulation.sag import ArmOptions, Payload
 from visioncal.simulation.sweep import sweep
 from visioncal.simulation.touching import touch
 from visioncal.simulation.truth import Truth, read_truth, truth_path

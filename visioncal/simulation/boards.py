@@ -106,7 +106,7 @@ def _around(corner: FloatArray, side_m: float) -> FloatArray:
     return np.array([corner, corner + right, corner + right + down, corner + down])
 
 
-def found_in_part(target: Target) -> bool:
+def detectable_in_part(target: Target) -> bool:
     """Whether detectors accept a part of a board."""
     return target.kind in ("charuco", "aprilgrid", "points")
 

@@ -10,6 +10,7 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import Camera, Corners, FloatArray
 from visioncal.session import Stream, frame_name
 from visioncal.simulation.arms import DhArm
+from visioncal.simulation.elasticity import Payload
 from visioncal.simulation.layout import (
     CELL,
     BoardAt,
@@ -18,7 +19,6 @@ from visioncal.simulation.layout import (
     NetworkOptions,
     RobotAt,
 )
-from visioncal.simulation.sag import Payload
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.core.types import Camera, Corners, FloatArray, Mask, Target
-from visioncal.simulation.boards import Sheet, corners_m, found_in_part
+from visioncal.simulation.boards import Sheet, corners_m, detectable_in_part
 from visioncal.simulation.optics import project, sees
 from visioncal.simulation.options import CameraOptions
 from visioncal.simulation.poses import LEAST_SHARE, MARGIN_PX
@@ -16,7 +16,7 @@ EDGE_PX = 2.0
 _LEAST_COSINE = 0.5
 
 
-def looks_at(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
+def board_in_view(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
     """(s,) mask of stops at which a board is in view and not too oblique."""
     points = corners_m(sheet) @ np.swapaxes(cam_from_target[:, :3, :3], 1, 2)
     points = points + cam_from_target[:, None, :3, 3]
@@ -26,11 +26,13 @@ def looks_at(camera: Camera, sheet: Sheet, cam_from_target: FloatArray) -> Mask:
     if not visible.any():
         return np.asarray(visible)
     share = sees(camera, points[visible], MARGIN_PX).mean(axis=1)
-    visible[visible] = share >= (LEAST_SHARE if found_in_part(sheet.target) else 1.0)
+    visible[visible] = share >= (LEAST_SHARE if detectable_in_part(sheet.target) else 1.0)
     return np.asarray(visible)
 
 
-def seen_in(camera: CameraOptions, sheet: Sheet, cam_from_target: FloatArray, view: int) -> Corners:
+def visible_corners(
+    camera: CameraOptions, sheet: Sheet, cam_from_target: FloatArray, view: int
+) -> Corners:
     """Exact corners of a sheet inside the image of one view."""
     points = corners_m(sheet) @ cam_from_target[:3, :3].T + cam_from_target[:3, 3]
     ids = np.flatnonzero(sees(camera.camera, points, EDGE_PX)).astype(np.int64)

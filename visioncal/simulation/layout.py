@@ -8,10 +8,10 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import Mount, Target
 from visioncal.simulation.boards import Sheet
 from visioncal.simulation.draws import DrawOptions
+from visioncal.simulation.elasticity import ArmOptions
 from visioncal.simulation.optics import fine_camera
 from visioncal.simulation.options import BOARDS, CameraOptions, SweepOptions
 from visioncal.simulation.poses import Motion, Viewpoints
-from visioncal.simulation.sag import ArmOptions
 
 # Centre of the cell, which robots face [m].
 MIDDLE_M = (0.0, 0.0, 0.4)

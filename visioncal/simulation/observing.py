@@ -11,7 +11,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import FloatArray, Mask
 from visioncal.session import frame_name
-from visioncal.simulation import one_robot, standing
+from visioncal.simulation import network_postures, one_robot
 from visioncal.simulation.arms import DhArm, arm_named, forward, inverse
 from visioncal.simulation.cell import (
     InstrumentReading,
@@ -21,10 +21,10 @@ from visioncal.simulation.cell import (
 )
 from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.heat import Heat, heated_flanges, warm_up
-from visioncal.simulation.imaging import detected, looks_at, seen_in
+from visioncal.simulation.imaging import board_in_view, detected, visible_corners
 from visioncal.simulation.layout import CellOptions, NetworkOptions
-from visioncal.simulation.passage import with_sweep
 from visioncal.simulation.poses import Viewpoints, filling_m
+from visioncal.simulation.sweep_path import with_sweep
 
 # Corresponding sources of randomness in cells with several robots.
 _OF_SEVERAL = {RandomStream.ARM: RandomStream.ARMS, RandomStream.ROBOT: RandomStream.ROBOTS}
@@ -55,8 +55,8 @@ def simulate(
         return replace(cell, wrong_views=tuple(wrong))
     if postures is not None:
         raise DataError("simulation: postures are taken by a cell of one robot alone.")
-    mountings = standing.mounted(options)
-    cell = observed(_moved_cell(options, mountings, standing.postures(options, mountings)))
+    mountings = network_postures.mounted(options)
+    cell = observed(_moved_cell(options, mountings, network_postures.postures(options, mountings)))
     cell = with_faults(cell)
     pushed = replace(
         cell, mountings={name: array[-1] for name, array in _parent_poses(cell).items()}
@@ -112,7 +112,7 @@ def _moved_cell(
         )
     return SimulatedCell(
         options=options,
-        parents=standing.parents_of(layout),
+        parents=network_postures.parents_of(layout),
         mountings=mountings,
         robots=robots,
         stated={
@@ -170,7 +170,7 @@ def observed(cell: SimulatedCell) -> SimulatedCell:
 def _sight(
     cell: SimulatedCell, view: int, stop: int, camera: str, board: str, pose: FloatArray
 ) -> SimulatedSight:
-    exact = seen_in(cell.camera(camera), cell.board(board), pose, view)
+    exact = visible_corners(cell.camera(camera), cell.board(board), pose, view)
     return SimulatedSight(view, stop, camera, board, pose, exact, exact)
 
 
@@ -233,7 +233,7 @@ def _cell_poses(cell: SimulatedCell) -> dict[str, FloatArray]:
 def _shown(cell: SimulatedCell, camera: str, board: str, pose: FloatArray) -> Mask:
     """(s,) mask of stops at which a camera's image of a board is recorded."""
     layout, options = cell.layout, cell.options
-    seen = looks_at(cell.camera(camera).camera, cell.board(board), pose)
+    seen = board_in_view(cell.camera(camera).camera, cell.board(board), pose)
     at_board = [board_at.name for board_at in layout.boards].index(board)
     if isinstance(options, CellOptions):
         # The board that a stop aims at is in view.

@@ -14,7 +14,7 @@ from visioncal.simulation.boards import Sheet, centre_m
 from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.layout import CellOptions, Second
 from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
-from visioncal.simulation.reach import home_posture, reached
+from visioncal.simulation.reach import home_posture, reachable_postures
 
 # Offset of a second board on the flange [m].
 _ASIDE_M = 0.10
@@ -130,7 +130,7 @@ def _aimed_postures(
         starts = np.tile(home, (len(drawn), 1))
         if options.branches:
             starts = rng.uniform(-np.pi, np.pi, starts.shape)
-        joints, good = reached(arm, flange(drawn), starts, floor_m)
+        joints, good = reachable_postures(arm, flange(drawn), starts, floor_m)
         kept.extend(joints[good])
         if len(kept) >= count:
             return np.array(kept[:count])

@@ -44,7 +44,7 @@ def fisheye_camera() -> Camera:
     )
 
 
-def mistaken(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
+def inaccurate_camera(camera: Camera, rms_px: float, rng: np.random.Generator) -> Camera:
     """Intrinsics from a slightly inaccurate calibration, with an rms pixel error over the image."""
     if rms_px == 0.0:
         return camera

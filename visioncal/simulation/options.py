@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, Target
-from visioncal.simulation.optics import mistaken, wide_camera
+from visioncal.simulation.optics import inaccurate_camera, wide_camera
 
 _APRILTAGS = "DICT_APRILTAG_36h11"
 
@@ -96,7 +96,7 @@ class CameraOptions:
 
     def stated(self, rng: np.random.Generator) -> Camera:
         """The intrinsics as the session states them."""
-        return mistaken(self.camera, self.lens_mismatch_px, rng)
+        return inaccurate_camera(self.camera, self.lens_mismatch_px, rng)
 
 
 @dataclass(frozen=True, kw_only=True)

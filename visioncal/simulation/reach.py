@@ -26,7 +26,7 @@ def home_posture(arm: DhArm, base_from_flange: FloatArray, rng: np.random.Genera
     return np.asarray((best + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def reached(
+def reachable_postures(
     arm: DhArm, base_from_flange: FloatArray, starts: FloatArray, floor_m: float
 ) -> tuple[FloatArray, Mask]:
     """(m, n) postures [rad] at (m, 4, 4) poses, and (m,) mask of acceptable ones.

@@ -11,7 +11,7 @@ from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.layout import CellOptions
 from visioncal.simulation.observing import simulate, with_detections
 from visioncal.simulation.options import SweepOptions
-from visioncal.simulation.passage import Passage
+from visioncal.simulation.sweep_path import Passage
 
 # Minimum number of corners for a pose.
 _FEWEST_CORNERS = 8
@@ -35,7 +35,7 @@ def sweep(options: CellOptions, how: SweepOptions | None = None) -> SimulatedCel
     stops = simulate(replace(options, views=how.stops, wrong_views=0)).robot.joints
     passage = Passage.through(stops, how)
     options = replace(options, views=len(passage.taken_s), wrong_views=0)
-    frames = simulate(options, passage.way(passage.taken_s))
+    frames = simulate(options, passage.path(passage.taken_s))
     if how.readout_s:
         frames = _rolling_shutter(frames, passage)
     seen = [sight.view for sight in frames.sights if len(sight.exact.ids) >= _FEWEST_CORNERS]

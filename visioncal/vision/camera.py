@@ -21,13 +21,14 @@ class Projection:
 
     Attributes:
         px: (n, 2) pixels.
-        by_point: (n, 2, 3) Jacobian with respect to the point in the camera's frame [px/m].
-        by_intrinsics: (n, 2, 4 + k) Jacobian with respect to fx, fy, cx, cy and the k coefficients.
+        jacobian_point: (n, 2, 3) Jacobian with respect to the point in the camera's frame [px/m].
+        jacobian_intrinsics: (n, 2, 4 + k) Jacobian with respect to fx, fy, cx, cy and the k
+            coefficients.
     """
 
     px: FloatArray
-    by_point: FloatArray
-    by_intrinsics: FloatArray
+    jacobian_point: FloatArray
+    jacobian_intrinsics: FloatArray
 
 
 def intrinsics(camera: Camera) -> FloatArray:

@@ -63,7 +63,7 @@ _CLOCKWISE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 # Largest diameter over spacing of circles, so that their edges remain separate.
 _WIDEST = 0.85
 # Kinds that can be detected in part; so can rigs of tags.
-FOUND_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
+DETECTABLE_IN_PART: frozenset[TargetKind] = frozenset(("charuco", "aprilgrid"))
 
 
 def _shipped() -> dict[str, Path]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visioncal.calibration.guess.fit import Fit, distances, robust_fit
-from visioncal.calibration.guess.given import CLOSING_SCORE, Recording
 from visioncal.calibration.guess.hypothesis import Hypothesis, SideReading, Turns
+from visioncal.calibration.guess.recording import CLOSING_SCORE, Recording
 from visioncal.core.conventions import ROTATION_FORMS, UNITS_M
 from visioncal.core.types import IntArray, Mask
 

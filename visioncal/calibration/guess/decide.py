@@ -11,7 +11,9 @@ from itertools import combinations
 import numpy as np
 
 from visioncal.calibration.guess.fit import Fit, distances, is_about_one_axis, robust_fit
-from visioncal.calibration.guess.given import (
+from visioncal.calibration.guess.hypothesis import HALF_TURN, ROW_ORDERS, Hypothesis
+from visioncal.calibration.guess.messages import notes, sentence
+from visioncal.calibration.guess.recording import (
     CLOSING_SCORE,
     FEWEST_ROWS,
     SCORE_FLOOR,
@@ -24,8 +26,6 @@ from visioncal.calibration.guess.given import (
     is_likely_unit,
     likeness,
 )
-from visioncal.calibration.guess.hypothesis import HALF_TURN, ROW_ORDERS, Hypothesis
-from visioncal.calibration.guess.messages import notes, sentence
 from visioncal.calibration.guess.result import Candidate, Guess
 from visioncal.calibration.guess.search import search
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers

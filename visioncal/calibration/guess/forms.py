@@ -113,12 +113,12 @@ def _read(numbers: PoseNumbers, turns: Sequence[Turns]) -> Forms:
         for turn in turns
     ]
     for _, rotations in forms:
-        rotations[~numbers.there] = np.nan
+        rotations[~numbers.present] = np.nan
     # The declared form stays first even where it is unreadable.
     usable = [
         (item, rotations)
         for at, (item, rotations) in enumerate(forms)
-        if at == 0 or np.isfinite(rotations[numbers.there]).all()
+        if at == 0 or np.isfinite(rotations[numbers.present]).all()
     ]
     return Forms(tuple(turn for turn, _ in usable), np.array([array for _, array in usable]))
 

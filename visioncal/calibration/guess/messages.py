@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from visioncal.calibration.guess.given import STANDS_OUT, Recording, Scored
+from visioncal.calibration.guess.recording import STANDS_OUT, Recording, Scored
 from visioncal.calibration.guess.result import Candidate
 
 

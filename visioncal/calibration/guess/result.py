@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.guess.given import CLOSING_SCORE
 from visioncal.calibration.guess.hypothesis import Hypothesis
+from visioncal.calibration.guess.recording import CLOSING_SCORE
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.number_format import figure
 

@@ -22,7 +22,14 @@ from visioncal.calibration.guess.forms import (
     robot_forms,
     screen,
 )
-from visioncal.calibration.guess.given import (
+from visioncal.calibration.guess.hypothesis import (
+    SIGNS,
+    Hypothesis,
+    SideReading,
+    Signs,
+    strangeness,
+)
+from visioncal.calibration.guess.recording import (
     SCORE_FLOOR,
     Recording,
     Scored,
@@ -30,13 +37,6 @@ from visioncal.calibration.guess.given import (
     is_far_likelier,
     is_likely_unit,
     likeness,
-)
-from visioncal.calibration.guess.hypothesis import (
-    SIGNS,
-    Hypothesis,
-    SideReading,
-    Signs,
-    strangeness,
 )
 from visioncal.core.conventions import UNITS_M
 from visioncal.core.transforms import compose, nearest_rotation, rotation_angle

@@ -5,22 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages import diagnose, thermal
-from visioncal.calibration.stages.arms import ArmFound, RobotArm
+from visioncal.calibration.stages import residual_findings, thermal
+from visioncal.calibration.stages.arms import IdentifiedArm, RobotArm
 from visioncal.calibration.stages.cause_ranking import MOVED_AT_ONCE
 from visioncal.calibration.stages.cell import Cell, robot_key
-from visioncal.calibration.stages.diagnose import ResidualTest
 from visioncal.calibration.stages.kinematics import doubts, findings
-from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.calibration.stages.reported_poses import RobotReport
+from visioncal.calibration.stages.residual_findings import ResidualTest
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import NOTE, Finding, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.null_space import joint_words
-from visioncal.estimation.parts import State
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.residual_tests import inflation
 from visioncal.estimation.slight_steps import Slip, step_covariance, with_step
 from visioncal.estimation.solve import Solution, covariance_of, held_shift, robot_likelihood
@@ -29,7 +29,7 @@ from visioncal.estimation.solve import Solution, covariance_of, held_shift, robo
 STEP = "what moved at once"
 
 
-def arms_of(cell: Cell, robots: Mapping[str, Reported]) -> dict[str, RobotArm]:
+def arms_of(cell: Cell, robots: Mapping[str, RobotReport]) -> dict[str, RobotArm]:
     """Reads the nominal arms of a cell."""
     arms, session = {}, cell.session
     for name, robot in robots.items():
@@ -91,8 +91,8 @@ def covariance_from_other_sources(
             )
     # What the residuals show: correlated errors of stops, and a sudden step.
     for robot, test in tests.items():
-        if test.alike is not None and test.alike.is_significant:
-            more = inflation(problem, fit.state, fit.noise, robot, test.alike.factor)
+        if test.neighbours is not None and test.neighbours.is_significant:
+            more = inflation(problem, fit.state, fit.noise, robot, test.neighbours.factor)
             parts[f"misfit{_source_suffix(arms, robot)}"] = more
         if test.step is not None:
             parts[STEP] = step_covariance(problem, fit, test.step, offsets)
@@ -119,7 +119,7 @@ def _source_suffix(arms: Mapping[str, RobotArm], robot: str) -> str:
 def doubts_of_arms(
     arms: Mapping[str, RobotArm],
     tests: Mapping[str, ResidualTest],
-    results: Mapping[str, ArmFound],
+    results: Mapping[str, IdentifiedArm],
     level: str,
     cell: Cell,
 ) -> Iterator[Finding]:
@@ -138,7 +138,9 @@ def doubts_of_arms(
             yield finding if finding.kind in MOVED_AT_ONCE else finding.of(_robot_name(arms, robot))
 
 
-def notes_on_arms(arms: Mapping[str, RobotArm], results: Mapping[str, ArmFound]) -> Iterator[str]:
+def notes_on_arms(
+    arms: Mapping[str, RobotArm], results: Mapping[str, IdentifiedArm]
+) -> Iterator[str]:
     """Notes on the arms that are no reason for doubt."""
     for robot, arm in arms.items():
         drifts = () if arm.thermal is None else thermal.findings(arm.thermal)
@@ -163,7 +165,9 @@ def _findings_on(
     if test is not None:
         calibrated = arm.model is not None
         aside = "" if arm.heat is None else arm.heat.set_aside
-        for doubt in diagnose.doubts(test, arm.errors, cell, joint, calibrated=calibrated):
+        for doubt in residual_findings.residual_findings(
+            test, arm.errors, cell, joint, calibrated=calibrated
+        ):
             if doubt.kind == "moved_slowly" and aside:
                 words = f"Whether the arm drifts with its temperature was not looked for: {aside}."
                 yield replace(doubt, words=f"{doubt.words} {words}")
@@ -199,7 +203,7 @@ def change_each(
             start = [values.get(effect, effect.values) for effect in nominal.effects]
             state = State(fit.state.edges, np.concatenate([np.zeros(0), *start]))
         changed[name] = change(arm, nominal, state)
-        problem = changed[name].put_into(problem)
+        problem = changed[name].applied_to(problem)
     return changed
 
 

@@ -5,26 +5,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.pipeline.solved import Solved, within
+from visioncal.calibration.pipeline.cell_fit import CellFit, within
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.handeye import closed_form_state
-from visioncal.calibration.stages.validate import HeldOut, validate
+from visioncal.calibration.stages.validate import HeldOutResiduals, cross_validate
 from visioncal.core.transforms import apply_each
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import shape_basis, shape_slices
 from visioncal.estimation.budget import Sources, covariance_by_source, point_covariance, radius95
 from visioncal.estimation.effects.lenses import LENSES
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.parts import State
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import solve_without
 from visioncal.session import frame_name
 from visioncal.vision.targets import corner_positions
 
 
-def left_out(solved: Solved) -> HeldOut:
+def left_out(solved: CellFit) -> HeldOutResiduals:
     """Residuals of the inliers, each by a fit without its stop."""
-    fit, used, mount = solved.agreed.fit, np.flatnonzero(solved.agreed.used), solved.cell.mount
-    part = solved.part
+    fit, used, mount = (
+        solved.inlier_fit.fit,
+        np.flatnonzero(solved.inlier_fit.used),
+        solved.cell.mount,
+    )
+    part = solved.inlier_problem
 
     def refit(kept: Mask) -> State:
         if solved.solver == "joint" or mount is None:
@@ -37,14 +41,14 @@ def left_out(solved: Solved) -> HeldOut:
         return solved.pixels(*seen, predicted, state)
 
     of = {None: "", "instrument": ", of the whole fit"}.get(mount, ", of the hand-eye fit")
-    return validate(part, refit, pixels, of)
+    return cross_validate(part, refit, pixels, of)
 
 
 def _covariances_of_edges(
-    solved: Solved, beside: Mapping[str, FloatArray]
+    solved: CellFit, beside: Mapping[str, FloatArray]
 ) -> dict[str, FloatArray]:
     """Covariances (6 e, 6 e) of the unknown frames, by source and as a `total`."""
-    fit, part = solved.agreed.fit, solved.part
+    fit, part = solved.inlier_fit.fit, solved.inlier_problem
     parts = covariance_by_source(part, fit.state, fit.noise, _sources(solved))
     size = 6 * len(part.unknown)
     parts |= {name: array[:size, :size] for name, array in beside.items()}
@@ -52,9 +56,9 @@ def _covariances_of_edges(
     return parts
 
 
-def budget_mm(solved: Solved, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
+def budget_mm(solved: CellFit, beside: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
     """Standard deviations of unknown frames' positions in their parents, by source, in all [mm]."""
-    parts, part = _covariances_of_edges(solved, beside), solved.part
+    parts, part = _covariances_of_edges(solved, beside), solved.inlier_problem
     budget: dict[str, dict[str, float]] = {}
     for key in part.unknown:
         first = part.edge_columns(key).start + 3
@@ -89,7 +93,7 @@ class WorkAccuracy:
 
 
 def work_accuracy(
-    solved: Solved, beside: Mapping[str, FloatArray], covariance: FloatArray
+    solved: CellFit, beside: Mapping[str, FloatArray], covariance: FloatArray
 ) -> WorkAccuracy:
     """Computes the accuracy of one camera and one robot where their views look.
 
@@ -98,7 +102,7 @@ def work_accuracy(
         beside: (p, p) covariances from sources other than noise, by source.
         covariance: (p, p) of its unknowns, from all sources.
     """
-    part, state = solved.part, solved.agreed.fit.state
+    part, state = solved.inlier_problem, solved.inlier_fit.fit.state
     middles = middles_of(solved.cell)
     target_points = np.array(
         [middles.get(name, np.zeros(3)) for name in part.observations.observed]
@@ -126,10 +130,12 @@ def middles_of(cell: Cell) -> dict[str, FloatArray]:
     }
 
 
-def _sources(solved: Solved) -> Sources:
+def _sources(solved: CellFit) -> Sources:
     """Sources of uncertainty by camera, robot and board; without names for a single pair."""
-    problem, is_pair = solved.agreed.problem, solved.cell.mount is not None
-    of_corners = () if solved.looks is None else tuple(solved.looks.problems)
+    problem, is_pair = solved.inlier_fit.problem, solved.cell.mount is not None
+    of_corners = (
+        () if solved.camera_parameters is None else tuple(solved.camera_parameters.problems)
+    )
     columns: dict[str, IntArray] = {}
     for name, column in problem.effect_columns.items():
         if name != LENSES:
@@ -161,7 +167,7 @@ def _sources(solved: Solved) -> Sources:
     )
 
 
-def columns_of_boards(solved: Solved) -> IntArray:
+def columns_of_boards(solved: CellFit) -> IntArray:
     """The problem's columns of the free values of boards' shapes."""
     boards = (
         columns for name, columns in _appearance_columns(solved).items() if name.startswith("board")
@@ -169,9 +175,9 @@ def columns_of_boards(solved: Solved) -> IntArray:
     return np.concatenate([np.zeros(0, dtype=np.int64), *boards])
 
 
-def middle_jacobians(solved: Solved) -> dict[str, FloatArray]:
+def middle_jacobians(solved: CellFit) -> dict[str, FloatArray]:
     """(3, b) Jacobians of targets' middles with respect to `columns_of_boards` [m], by frame."""
-    seen, looks = solved.seen, solved.looks
+    seen, looks = solved.linearised_corners, solved.camera_parameters
     if seen is None or looks is None:
         return {}
     plates, boards = solved.cell.session.plates, looks.boards
@@ -184,9 +190,9 @@ def middle_jacobians(solved: Solved) -> dict[str, FloatArray]:
     return jacobians
 
 
-def _appearance_columns(solved: Solved) -> dict[str, IntArray]:
+def _appearance_columns(solved: CellFit) -> dict[str, IntArray]:
     """The problem's columns of the free values of each lens and board."""
-    seen, looks = solved.seen, solved.looks
+    seen, looks = solved.linearised_corners, solved.camera_parameters
     if seen is None or looks is None:
         return {}
     boards, is_pair = solved.cell.session.boards, solved.cell.mount is not None

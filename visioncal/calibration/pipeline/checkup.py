@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
-from visioncal.calibration.pipeline.reading_hints import misreadings, reading_hint
+from visioncal.calibration.pipeline.misread_poses import misread_pose_finding, misreadings
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
 from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cause_ranking import LEAST_RUN
 from visioncal.calibration.stages.cell import Cell, read_cell
+from visioncal.calibration.stages.image_checks import unnamed_images, unseen_cause
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import estimate_intrinsics
-from visioncal.calibration.stages.observed import CameraLook, by_reason
-from visioncal.calibration.stages.pictures import unnamed_images, unseen_cause
+from visioncal.calibration.stages.observed import CameraObservations, by_reason
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, some_of
-from visioncal.core.shown import html_card
+from visioncal.core.summaries import html_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mask, Mount, Progress
 from visioncal.core.verdict import CALIBRATE, MISSING, Finding, Remedy, with_paths
@@ -136,7 +136,7 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     cause = unseen_cause(run) if error is not None or run.reasons else None
     if cause is not None:
         yield cause
-    hint = reading_hint(run) if error is None and run.mount is not None else None
+    hint = misread_pose_finding(run) if error is None and run.mount is not None else None
     if hint is not None:
         yield hint
     if run.mount is None:
@@ -195,7 +195,7 @@ def _lenses(run: RunState) -> Iterator[Finding]:
             yield Finding("lens", words, mend).of(frame if len(run.cameras) > 1 else "")
 
 
-def _resized(run: RunState, look: CameraLook, stated: Camera) -> tuple[str, Remedy] | None:
+def _resized(run: RunState, look: CameraObservations, stated: Camera) -> tuple[str, Remedy] | None:
     """Message and remedy on a stated matrix of other images, by estimating the lens."""
     targets, model = tuple(run.session.boards.values()), look.table.model
     try:
@@ -206,7 +206,7 @@ def _resized(run: RunState, look: CameraLook, stated: Camera) -> tuple[str, Reme
     return (words, Remedy(do)) if words else None
 
 
-def _measured_px(look: CameraLook) -> float:
+def _measured_px(look: CameraObservations) -> float:
     """Measured noise of a corner's coordinate [px]; zero where it is only stated."""
     stated = {corners.stated_px for corners in look.corners.values()}
     return 0.0 if look.pixel_px is None or look.pixel_px in stated else look.pixel_px
@@ -328,7 +328,7 @@ def _contents(run: RunState) -> Iterator[str]:
         yield f"streams {some_of(list(session.streams))}"
 
 
-def _unseen_rows(session: Session, look: CameraLook) -> Iterator[str]:
+def _unseen_rows(session: Session, look: CameraObservations) -> Iterator[str]:
     """Last rows of a ChArUco board that are in no image, though there is room for them."""
     # A board with fewer rows has the same marker numbers: nothing else shows that too many rows are
     # declared.

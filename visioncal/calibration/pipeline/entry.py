@@ -8,7 +8,13 @@ from typing import Unpack
 import numpy as np
 
 from visioncal.calibration.pipeline.result import result_of
-from visioncal.calibration.pipeline.running import Asked, Run, initial_state, run, run_stages
+from visioncal.calibration.pipeline.running import (
+    CalibrationOptions,
+    Run,
+    initial_state,
+    run,
+    run_stages,
+)
 from visioncal.calibration.stages.dense import Dense, explained
 from visioncal.core.arguments import typed
 from visioncal.core.choices import Convention, SolverName
@@ -75,7 +81,7 @@ def calibrate(
         DegenerateError: The motion leaves a direction of the result undetermined.
         ConvergenceError: The intrinsics do not converge.
     """
-    asked = Asked(
+    asked = CalibrationOptions(
         solver=solver,
         level=level,
         convention=convention,
@@ -132,7 +138,7 @@ def align(
         keep_corners=keep_corners,
     )
     with_need = state.session.needing(need_mm, need_deg)
-    return result_of(run_stages(replace(state, session=with_need, found_before=corners)))
+    return result_of(run_stages(replace(state, session=with_need, given_corners=corners)))
 
 
 def _is_worse(before: Run, after: Run) -> bool:
@@ -164,7 +170,9 @@ def _figures(rms: Rms) -> str:
     return f"{px}{figure(rms.mm)} mm"
 
 
-def run_dense(session: Session, *, device: str = "auto", **asked: Unpack[Asked]) -> Run:
+def run_dense(
+    session: Session, *, device: str = "auto", **asked: Unpack[CalibrationOptions]
+) -> Run:
     """Calibrates a session with template corners and with dense ones; see `calibrate`.
 
     Args:

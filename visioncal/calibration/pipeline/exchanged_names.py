@@ -7,7 +7,7 @@ from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.starting import agreeing_views
 from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cell import read_cell
-from visioncal.calibration.stages.pnp import given_poses
+from visioncal.calibration.stages.pnp import stated_poses
 from visioncal.core.errors import VisioncalError
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.session import Session, View, frame_name
@@ -33,7 +33,7 @@ def exchanged_names(run: RunState) -> Finding | None:
     session = run.session
     if run.mount is not None or not run.cameras:
         return None
-    seen = run.corners.keys() | session.corners.keys() | given_poses(session).keys()
+    seen = run.corners.keys() | session.corners.keys() | stated_poses(session).keys()
     usable = seen - run.held_back
     observations = (row for row in session.observations if row.view.number in usable)
     rows = [row for row in observations if not row.view.is_of_lens]
@@ -49,7 +49,11 @@ def exchanged_names(run: RunState) -> Finding | None:
             affected = {
                 row.view.number
                 for row in rows
-                if (row.seer in frames if kind == "camera" else {*pair} & {*row.robots, *row.lacks})
+                if (
+                    row.seer in frames
+                    if kind == "camera"
+                    else {*pair} & {*row.robots, *row.missing_robots}
+                )
             }
             if len(affected) < _FEWEST or len(affected & before) > _HARDLY_ANY * len(affected):
                 continue

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.cause_ranking import run_evidence
 from visioncal.calibration.stages.exchanged_rows import exchanged, other_stops
 from visioncal.calibration.stages.turned_images import ImageTurn
-from visioncal.calibration.stages.validate import apart
+from visioncal.calibration.stages.validate import pose_residuals
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import distances, invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray
@@ -79,11 +79,11 @@ class Version:
         return self.name == self.frame
 
 
-def versions(solved: Solved) -> dict[str, Version]:
+def versions(solved: CellFit) -> dict[str, Version]:
     """All unknown frames over time, by their names in the problem."""
-    starts = {move.twin: move.stop for move in solved.agreed.moves}
+    starts = {move.twin: move.stop for move in solved.inlier_fit.moves}
     parts: dict[str, list[tuple[int, str]]] = defaultdict(list)
-    for key in solved.agreed.problem.unknown:
+    for key in solved.inlier_fit.problem.unknown:
         parts[key.partition("@")[0]].append((starts.get(key, -1), key))
     versions_by_key = {}
     for frame, keys in parts.items():
@@ -95,19 +95,19 @@ def versions(solved: Solved) -> dict[str, Version]:
     return versions_by_key
 
 
-def _stops_of(solved: Solved, key: str) -> list[int]:
+def _stops_of(solved: CellFit, key: str) -> list[int]:
     """The stops of a frame's inliers, in order of time; of all its observations if it has none."""
-    observations = solved.agreed.problem.observations
+    observations = solved.inlier_fit.problem.observations
     rows = observations.involves(key)
-    used = rows & solved.agreed.used
+    used = rows & solved.inlier_fit.used
     stations = observations.stops[used if used.any() else rows]
     return [solved.cell.stops[station] for station in np.unique(stations).tolist()]
 
 
-def movements(solved: Solved) -> tuple[Moved, ...]:
+def movements(solved: CellFit) -> tuple[Moved, ...]:
     """The frames that moved, in the order of time."""
     moved, versions_by_key, edges = [], versions(solved), solved.frames
-    for move in sorted(solved.agreed.moves, key=lambda value: value.stop):
+    for move in sorted(solved.inlier_fit.moves, key=lambda value: value.stop):
         after = versions_by_key[move.twin]
         same_frame = (item for item in versions_by_key.values() if item.frame == after.frame)
         earlier = [item for item in same_frame if item.start < after.start]
@@ -143,14 +143,14 @@ def moved_finding(moved: Moved) -> Finding:
     )
 
 
-def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
+def pose_faults(solved: CellFit) -> tuple[PoseFault, ...]:
     """Turned images, exchanged or wrong poses, and pushed robots that explain outliers."""
-    outliers = np.flatnonzero(~solved.agreed.used)
+    outliers = np.flatnonzero(~solved.inlier_fit.used)
     if not len(outliers):
         return ()
     turned = _turned_images(solved)
     explained = {row for fault in turned for row in fault.rows}
-    mutual = exchanged(solved.agreed.problem, _fitting_stations(solved, outliers))
+    mutual = exchanged(solved.inlier_fit.problem, _fitting_stations(solved, outliers))
     if solved.cell.mount is not None:
         swapped = tuple(_exchanged_views(solved, mutual))
         return (*turned, *swapped, *(() if turned or swapped else _moved_runs(solved)))
@@ -163,12 +163,12 @@ def pose_faults(solved: Solved) -> tuple[PoseFault, ...]:
     return (*turned, *faults, *_wrong_poses(solved, explained))
 
 
-def _turned_images(solved: Solved) -> list[PoseFault]:
+def _turned_images(solved: CellFit) -> list[PoseFault]:
     """Turned or mirrored images, which agree with the others once they are turned back."""
     rows, faults = solved.cell.rows, []
     rows_by_turn: dict[ImageTurn, list[int]] = defaultdict(list)
     for at, row in enumerate(rows):
-        if row.view in solved.turned and not solved.agreed.used[at]:
+        if row.view in solved.turned and not solved.inlier_fit.used[at]:
             rows_by_turn[solved.turned[row.view]].append(at)
     images = {view.number: view.image for view in solved.cell.session.views}
     for how, turned_rows in rows_by_turn.items():
@@ -188,11 +188,11 @@ def _turned_images(solved: Solved) -> list[PoseFault]:
     return faults
 
 
-def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
+def _moved_runs(solved: CellFit) -> Iterator[PoseFault]:
     """Outliers at one end of the session that one step of a frame explains."""
     # Another active tool frame in the controller looks like a step of what is on the flange, and
     # another base frame like one of what is fixed in the cell.
-    inliers, rows = solved.agreed, solved.cell.rows
+    inliers, rows = solved.inlier_fit, solved.cell.rows
     problem = inliers.problem
     order = np.argsort(problem.observations.stops, kind="stable")
     used = np.flatnonzero(inliers.used[order])
@@ -231,9 +231,9 @@ def _moved_runs(solved: Solved) -> Iterator[PoseFault]:
     yield PoseFault(finding, tuple(outliers), f"{when}, something had moved")
 
 
-def _other_boards(solved: Solved, run: IntArray, *, is_behind: bool) -> Iterator[PoseFault]:
+def _other_boards(solved: CellFit, run: IntArray, *, is_behind: bool) -> Iterator[PoseFault]:
     """Outliers at one end of the session that a board of another size explains."""
-    inliers, outliers = solved.agreed, np.sort(run).tolist()
+    inliers, outliers = solved.inlier_fit, np.sort(run).tolist()
     is_in_run = np.isin(np.arange(len(inliers.used)), run)
     size = common_size(inliers.problem, inliers.fit, is_in_run)
     if size is None or not size[1].all():
@@ -251,7 +251,7 @@ def _other_boards(solved: Solved, run: IntArray, *, is_behind: bool) -> Iterator
     yield PoseFault(finding, tuple(outliers), f"{when}, the target was another one")
 
 
-def _when(solved: Solved, run: IntArray, *, is_behind: bool) -> str:
+def _when(solved: CellFit, run: IntArray, *, is_behind: bool) -> str:
     """When views at the end, or the beginning, of the session were taken, in words."""
     rows = solved.cell.rows
     if is_behind:
@@ -261,9 +261,9 @@ def _when(solved: Solved, run: IntArray, *, is_behind: bool) -> str:
     return f"before view {following.view}"
 
 
-def _common_steps(solved: Solved, run: IntArray) -> list[tuple[str, FloatArray]]:
+def _common_steps(solved: CellFit, run: IntArray) -> list[tuple[str, FloatArray]]:
     """Frames with a common step that explains some views, and the step; least scatter first."""
-    inliers, steps = solved.agreed, []
+    inliers, steps = solved.inlier_fit, []
     is_in_run = np.isin(np.arange(len(inliers.used)), run)
     for frame in inliers.problem.unknown:
         step = common_change(inliers.problem, inliers.fit, frame, is_in_run)
@@ -286,7 +286,7 @@ def _displacement_words(change: FloatArray) -> str:
     return f"{mm_and_deg(shift_mm, turn_deg)} elsewhere"
 
 
-def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
+def _exchanged_views(solved: CellFit, mutual: Mapping[int, int]) -> Iterator[PoseFault]:
     """Pairs of views of one camera, each of which fits the other's pose."""
     rows = solved.cell.rows
     for first, second in sorted(mutual.items()):
@@ -303,23 +303,23 @@ def _exchanged_views(solved: Solved, mutual: Mapping[int, int]) -> Iterator[Pose
             yield PoseFault(finding, (first, second))
 
 
-def _view_numbers(solved: Solved, rows: Sequence[int]) -> tuple[int, ...]:
+def _view_numbers(solved: CellFit, rows: Sequence[int]) -> tuple[int, ...]:
     return tuple(solved.cell.rows[row].view for row in rows)
 
 
-def _named_views(solved: Solved, rows: Sequence[int]) -> str:
+def _named_views(solved: CellFit, rows: Sequence[int]) -> str:
     return f"views {some_of([*map(str, _view_numbers(solved, rows))], _LISTED)}"
 
 
-def _pushed_bases(solved: Solved) -> list[PoseFault]:
+def _pushed_bases(solved: CellFit) -> list[PoseFault]:
     """Robots whose observations are all outliers from some stop on, as if the base had moved."""
     # Such observations are left out, and the base stays where it was: unlike other frames, a base
     # is not split in two when it moves, as all that its robot carries hangs on it.
-    problem, used = solved.agreed.problem, solved.agreed.used
+    problem, used = solved.inlier_fit.problem, solved.inlier_fit.used
     stops, faults = problem.observations.stops, []
     for robot, base in problem.tree.bases.items():
         flange = problem.tree.flanges[robot]
-        by_robot = problem.through(flange)
+        by_robot = problem.observations_through(flange)
         first = int(stops[by_robot & used].max(initial=-1)) + 1
         after = np.flatnonzero(by_robot & ~used & (stops >= first))
         if len(np.unique(stops[after])) < _FEWEST_STOPS:
@@ -339,10 +339,10 @@ def _pushed_bases(solved: Solved) -> list[PoseFault]:
 
 
 def _base_displacement(
-    solved: Solved, base: str, rows: IntArray, of: FloatArray | None = None
+    solved: CellFit, base: str, rows: IntArray, of: FloatArray | None = None
 ) -> str:
     """Mean displacement of a base by some observations, in words; empty where they disagree."""
-    changes = solved.agreed.problem.change_of(base, solved.agreed.fit.state)[rows]
+    changes = solved.inlier_fit.problem.change_of(base, solved.inlier_fit.fit.state)[rows]
     if of is not None:
         changes = invert(of) @ changes @ of
     mean = mean_transform(changes)
@@ -351,12 +351,12 @@ def _base_displacement(
     return mm_and_deg(shift_mm, turn_deg) * (scatter_mm < _ALIKE * shift_mm)
 
 
-def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
+def _wrong_poses(solved: CellFit, explained: set[int]) -> Iterator[PoseFault]:
     """Stops at which all observations through a robot agree that its pose is wrong."""
-    problem, used = solved.agreed.problem, solved.agreed.used
+    problem, used = solved.inlier_fit.problem, solved.inlier_fit.used
     stops = problem.observations.stops
     for robot, base in problem.tree.bases.items():
-        by_robot = problem.through(problem.tree.flanges[robot])
+        by_robot = problem.observations_through(problem.tree.flanges[robot])
         for stop in np.unique(stops[by_robot & ~used]).tolist():
             rows = np.flatnonzero(by_robot & (stops == stop))
             if len(rows) < _FEWEST or used[rows].any() or not explained.isdisjoint(rows.tolist()):
@@ -376,9 +376,9 @@ def _wrong_poses(solved: Solved, explained: set[int]) -> Iterator[PoseFault]:
                 yield PoseFault(finding, tuple(rows.tolist()), short)
 
 
-def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
+def reasons(solved: CellFit, faults: Sequence[PoseFault]) -> dict[int, str]:
     """Why outliers are left out, by view, with the stops that they fit instead."""
-    inliers, rows, problem = solved.agreed, solved.cell.rows, solved.agreed.problem
+    inliers, rows, problem = solved.inlier_fit, solved.cell.rows, solved.inlier_fit.problem
     outliers = np.flatnonzero(~inliers.used)
     if not len(outliers):
         return {}
@@ -420,17 +420,17 @@ def reasons(solved: Solved, faults: Sequence[PoseFault]) -> dict[int, str]:
     return reasons_by_view
 
 
-def _target_words(solved: Solved, frame: str) -> str:
+def _target_words(solved: CellFit, frame: str) -> str:
     """Name of a target or point in words."""
     if solved.cell.mount is None:
         return frame.partition("@")[0]
-    is_probe = frame.startswith("point") and frame not in solved.agreed.problem.points
+    is_probe = frame.startswith("point") and frame not in solved.inlier_fit.problem.points
     return "the probe" if is_probe else f"the {frame.partition('_')[0]}"
 
 
-def _cause(solved: Solved, at: int) -> str:
+def _cause(solved: CellFit, at: int) -> str:
     """Likely cause of an outlier, by the inliers of its stop and of its target."""
-    rows, used, problem = solved.cell.rows, solved.agreed.used, solved.agreed.problem
+    rows, used, problem = solved.cell.rows, solved.inlier_fit.used, solved.inlier_fit.problem
     seen = np.array(problem.observations.observed)
     of_its_target = np.flatnonzero((seen == seen[at]) & used)
     reading = "reading" if rows[at].seer.startswith("instrument") else "image"
@@ -447,19 +447,19 @@ def _cause(solved: Solved, at: int) -> str:
     return f"its pose or its {reading} is wrong, or something had moved"
 
 
-def _stop(solved: Solved, row: int) -> int:
+def _stop(solved: CellFit, row: int) -> int:
     return solved.cell.stops[solved.cell.rows[row].station]
 
 
-def residuals(solved: Solved) -> FloatArray:
+def residuals(solved: CellFit) -> FloatArray:
     """Residuals (n, 2) of the observations, translation and rotation [mm], [deg]."""
-    metres, radians = apart(solved.agreed.problem, solved.agreed.fit.state)
+    metres, radians = pose_residuals(solved.inlier_fit.problem, solved.inlier_fit.fit.state)
     return np.stack([1e3 * metres, np.rad2deg(radians)], axis=1)
 
 
-def _fitting_stations(solved: Solved, outliers: IntArray) -> dict[int, list[int]]:
+def _fitting_stations(solved: CellFit, outliers: IntArray) -> dict[int, list[int]]:
     """The other stations that outliers fit; see `other_stops`."""
-    agreed = solved.agreed
+    agreed = solved.inlier_fit
     turns = {
         frame_name("target", name): rotation_transforms(target)
         for name, target in solved.cell.session.boards.items()
@@ -467,12 +467,14 @@ def _fitting_stations(solved: Solved, outliers: IntArray) -> dict[int, list[int]
     return other_stops(agreed.problem, agreed.used, agreed.fit, outliers, agreed.moves, turns)
 
 
-def _exchanged_poses(solved: Solved, mutual: Mapping[int, int]) -> list[PoseFault]:
+def _exchanged_poses(solved: CellFit, mutual: Mapping[int, int]) -> list[PoseFault]:
     """Pairs of poses of one robot that are exchanged."""
-    rows, problem, used = solved.cell.rows, solved.agreed.problem, solved.agreed.used
+    rows, problem, used = solved.cell.rows, solved.inlier_fit.problem, solved.inlier_fit.used
     faults = []
     for robot in problem.robots:
-        by_robot = np.flatnonzero(problem.through(problem.tree.flanges[robot])).tolist()
+        by_robot = np.flatnonzero(
+            problem.observations_through(problem.tree.flanges[robot])
+        ).tolist()
         pairs: dict[tuple[int, int], list[int]] = defaultdict(list)
         for at in by_robot:
             if at in mutual:

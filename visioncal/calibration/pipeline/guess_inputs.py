@@ -11,8 +11,8 @@ from visioncal.calibration.guess import Guess, guess_reading
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.clocks import waits_for_clock
+from visioncal.calibration.stages.image_checks import because, unseen_cause
 from visioncal.calibration.stages.init_frames import init_frames
-from visioncal.calibration.stages.pictures import because, unseen_cause
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.errors import VisioncalError
 from visioncal.core.types import FloatArray, Progress
@@ -43,10 +43,10 @@ def guess_session(
         DegenerateError: Too few views have both poses, or the lens cannot be estimated.
         ConvergenceError: The intrinsics do not converge.
     """
-    return guess_seen(with_camera_poses(RunState(session, progress)), robot)
+    return guess_from_camera_poses(with_camera_poses(RunState(session, progress)), robot)
 
 
-def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
+def guess_from_camera_poses(run: RunState, robot: PoseNumbers | None = None) -> Guess:
     """Does what `guess_session` does, once the camera's poses are known, with all alternatives.
 
     Raises:
@@ -60,7 +60,7 @@ def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
         joint_poses = chain_poses(run.session, None if matched is None else matched.arm)
     if robot is None:
         poses = numbers_in(run.session, POSE)
-        robot = reported_or_chained(robot_numbers(run) if run.clocks else poses, joint_poses)
+        robot = reported_or_joint_poses(robot_numbers(run) if run.clocks else poses, joint_poses)
     is_measured, mount = bool(run.corners), run.session.mount
     for camera in camera_pose_choices(run, robot):
         guess = guess_reading(robot, camera, mount, chain=joint_poses, is_measured=is_measured)
@@ -69,7 +69,7 @@ def guess_seen(run: RunState, robot: PoseNumbers | None = None) -> Guess:
     return guess
 
 
-def seen_poses(session: Session, *, progress: Progress | None = None) -> PoseNumbers:
+def camera_poses_of(session: Session, *, progress: Progress | None = None) -> PoseNumbers:
     """Measures `cam_from_target` of every view, without the robot; NaN where it was not seen.
 
     Raises:
@@ -103,11 +103,11 @@ def chain_poses(session: Session, robot: Robot | None = None) -> FloatArray | No
     return poses if np.isfinite(poses).any() else None
 
 
-def reported_or_chained(read: PoseNumbers, joint_poses: FloatArray | None) -> PoseNumbers:
+def reported_or_joint_poses(read: PoseNumbers, joint_poses: FloatArray | None) -> PoseNumbers:
     """The robot's reported poses; those of its joints where none were reported."""
     return (
         read
-        if joint_poses is None or read.there.any()
+        if joint_poses is None or read.present.any()
         else PoseNumbers.of_poses(joint_poses, read.places)
     )
 

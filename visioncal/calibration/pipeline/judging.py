@@ -7,18 +7,18 @@ from typing import TypeAlias
 
 import numpy as np
 
-from visioncal.calibration.pipeline.answer import Answer
 from visioncal.calibration.pipeline.arm_results import doubts_of_arms, notes_on_arms
+from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import columns_of_boards, middle_jacobians, middles_of
-from visioncal.calibration.pipeline.fault_messages import moved_finding
-from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
-from visioncal.calibration.pipeline.network_ties import (
+from visioncal.calibration.pipeline.connectivity import (
     connection_advice,
     measuring_advice,
     robot_motion,
     sole_static_view,
     tilting_advice,
 )
+from visioncal.calibration.pipeline.fault_messages import moved_finding
+from visioncal.calibration.pipeline.lens_fields import lens_changes, lens_findings
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages.cause_ranking import MOVED_FRAME, NO_JOINTS, OF_CHAIN
 from visioncal.calibration.stages.cell import Cell
@@ -31,8 +31,8 @@ from visioncal.calibration.stages.findings import (
     Sensor,
     StandingTie,
 )
-from visioncal.calibration.stages.need import PickInputs, picks_of
-from visioncal.calibration.stages.priors import prior_words
+from visioncal.calibration.stages.need import PickInputs, predict_picks
+from visioncal.calibration.stages.priors import prior_findings
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
@@ -58,29 +58,31 @@ from visioncal.results import HELD_BACK, Edge, Rms, ViewResult
 
 def findings_of(run: RunState) -> Findings:
     """Collects the input of the verdict."""
-    answer, solved = run.solved, run.fitted
+    answer, solved = run.assessment, run.cell_fit
     frames = solved.cell.tree.branches.keys()
     connected = [view for view in answer.views if {view.seer, view.seen} <= frames]
     explained = {solved.cell.rows[row].view for fault in answer.faults for row in fault.rows}
     worst, places, warnings = _pair_accuracy(run) if run.mount else _cell_accuracy(run)
-    doubts = doubts_of_arms(solved.arms, answer.misfits, answer.arms, solved.asked, solved.cell)
+    doubts = doubts_of_arms(
+        solved.arms, answer.residual_tests, answer.arms, solved.level, solved.cell
+    )
     of_arms = [_with_alternative(doubt, run) for doubt in doubts]
     if any(warning.kind == "measured_turns" for warning in warnings):
         # These errors come from the camera's poses and appear to depend on the arm's posture; joint
         # angles would not help.
         of_arms = [arm for arm in of_arms if arm.do is not NO_JOINTS]
     of_rest = [
-        *prior_words(answer.problem, answer.state, answer.covariance, solved.cell.priors),
-        *solved.found_of_looks(answer.covariance),
+        *prior_findings(answer.problem, answer.state, answer.covariance, solved.cell.priors),
+        *solved.camera_findings(answer.covariance),
     ]
     of_lenses = [*lens_findings(answer.lenses)]
     doubted = {finding.kind for finding in (*of_arms, *of_lenses, *of_rest)}
-    if doubted & OF_CHAIN or not solved.agreed.used.all():
+    if doubted & OF_CHAIN or not solved.inlier_fit.used.all():
         of_lenses += lens_changes(solved)
     is_read = all(view.seer.startswith("instrument") for view in connected)
     return Findings(
         _pairs(connected, explained, answer, alone=run.mount is not None),
-        _sensors(connected, answer.sigmas, solved.shown_px, run),
+        _sensors(connected, answer.sigmas, solved.residual_px, run),
         _arms(answer),
         worst,
         places,
@@ -101,7 +103,7 @@ def findings_of(run: RunState) -> Findings:
         ),
         run.mount or ("instrument" if is_read else "eye-to-hand"),
         run.session.need,
-        picks_of(_pick_inputs(run), run.session.need),
+        predict_picks(_pick_inputs(run), run.session.need),
         None if run.mount else _sole_static_view(solved.cell, answer.last_edges),
     )
 
@@ -117,10 +119,12 @@ def _sole_static_view(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | No
 
 def _with_alternative(finding: Finding, run: RunState) -> Finding:
     """Adds to a frame of one camera and robot that moved what cannot be distinguished from that."""
-    steps = [test.step for test in run.solved.misfits.values() if isinstance(test.step, Move)]
+    steps = [
+        test.step for test in run.assessment.residual_tests.values() if isinstance(test.step, Move)
+    ]
     if finding.kind != MOVED_FRAME or run.mount is None or not steps:
         return finding
-    tree = run.fitted.cell.tree
+    tree = run.cell_fit.cell.tree
     on_flange = tree.body(steps[0].frame) != tree.root
     same = "Another tool frame in the controller" if on_flange else "A robot's base that was pushed"
     return replace(finding, words=f"{finding.words} {same} would look the same.")
@@ -128,7 +132,7 @@ def _with_alternative(finding: Finding, run: RunState) -> Finding:
 
 def _pick_inputs(run: RunState) -> PickInputs:
     """Input of the prediction of picks."""
-    answer, solved = run.solved, run.fitted
+    answer, solved = run.assessment, run.cell_fit
     freedom = [freedom_of(interval.tolist()) for interval in answer.intervals]
     return PickInputs(
         answer.problem,
@@ -146,7 +150,7 @@ def _pick_inputs(run: RunState) -> PickInputs:
 
 
 def _unconnected(run: RunState) -> Iterator[Finding]:
-    for frame in run.fitted.untied:
+    for frame in run.cell_fit.unconnected:
         if run.mount is not None and frame.startswith("target"):
             words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
             yield Finding("unseen_target", words)
@@ -160,7 +164,7 @@ _Parts: TypeAlias = tuple[Sequence[Direction], Sequence[PointAccuracy], Sequence
 
 def _pair_accuracy(run: RunState) -> _Parts:
     """Worst directions, accuracy where the views look, and findings of one camera and one robot."""
-    answer, work, mount = run.solved, run.work, run.session.mount
+    answer, work, mount = run.assessment, run.accuracy_at_work, run.session.mount
     budget = _in_words(work.budget_mm)
     place = PointAccuracy("Where the views look, a point", budget, work.radius95_mm)
     worst = directions(answer.problem, answer.state, answer.covariance, mount)
@@ -183,7 +187,7 @@ def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
     seen = np.array([run.poses[view].cam_from_target[0] for view in views])
     parent = poses if run.mount == "eye-in-hand" else invert(poses)
     # The camera may have a name.
-    (edge,) = (edge for name, edge in run.solved.last_edges.items() if name.startswith("cam"))
+    (edge,) = (edge for name, edge in run.assessment.last_edges.items() if name.startswith("cam"))
     if (finding := distance_scale(parent, seen, edge.matrix)) is not None:
         yield finding
     target = edge.matrix @ seen
@@ -197,7 +201,7 @@ def _measured_pose_findings(run: RunState) -> Iterator[Finding]:
 
 def _cell_accuracy(run: RunState) -> _Parts:
     """Worst directions, accuracy of the frames, and moved frames of a whole cell."""
-    answer, cell, budget = run.solved, run.fitted.cell, run.solved.budget_mm
+    answer, cell, budget = run.assessment, run.cell_fit.cell, run.assessment.budget_mm
     absorbing = {*_absorbing(run)}
     edges = {frame: edge for frame, edge in answer.last_edges.items() if frame not in absorbing}
     worst = [value for frame, edge in edges.items() for value in _directions(cell, frame, edge)]
@@ -216,9 +220,9 @@ def _absorbing(run: RunState) -> Iterator[str]:
 
     The arm's poses compensate that, so that the sigma of such a frame alone says little.
     """
-    answer, cell = run.solved, run.fitted.cell
+    answer, cell = run.assessment, run.cell_fit.cell
     for robot, base in cell.tree.bases.items():
-        if answer.arms[robot].numbers is None:
+        if answer.arms[robot].identifiability is None:
             continue
         bodies = {cell.tree.flanges[robot]}
         # Static frames are placed from the reference, and rotate with the zero of its arm.
@@ -229,7 +233,7 @@ def _absorbing(run: RunState) -> Iterator[str]:
 
 def _clock_words(run: RunState) -> Iterator[str]:
     """Notes on clock offsets of a whole cell that the fit estimates."""
-    for pair, clock in run.solved.clocks(run).items():
+    for pair, clock in run.assessment.clocks(run).items():
         if run.mount is None and clock is not run.clocks[pair].clock:
             yield (
                 f"{pair.words}: the fit of the whole cell has the camera's clock "
@@ -239,7 +243,7 @@ def _clock_words(run: RunState) -> Iterator[str]:
 
 
 def _pairs(
-    views: Sequence[ViewResult], explained: Collection[int], answer: Answer, *, alone: bool
+    views: Sequence[ViewResult], explained: Collection[int], answer: FitAssessment, *, alone: bool
 ) -> list[JudgedPair]:
     """Results by camera and target; all in one for one camera and one robot."""
     by_pair: dict[tuple[str, str], list[ViewResult]] = {}
@@ -260,7 +264,7 @@ def _pairs(
     ]
 
 
-def _weighted_rms(answer: Answer, views: Sequence[ViewResult]) -> tuple[Rms, Rms]:
+def _weighted_rms(answer: FitAssessment, views: Sequence[ViewResult]) -> tuple[Rms, Rms]:
     """Weighted rms of the sensor's noise in the poses of some views, and of left-out residuals."""
     # The variance of a square is proportional to the square of its mean, so that views are weighted
     # by the inverse square of the expected residual at the limit of doubt: a view whose own pose is
@@ -278,8 +282,8 @@ def _weighted_rms(answer: Answer, views: Sequence[ViewResult]) -> tuple[Rms, Rms
         squares = np.stack([noise, residuals[finite] ** 2], axis=1)
         return np.sqrt(np.average(squares, axis=0, weights=weights))
 
-    rad = rms(slice(3), held_out.away_rad, float(np.deg2rad(limits.scatter_deg[0])))
-    metres = rms(slice(3, 6), held_out.away_m, 1e-3 * limits.scatter_mm[0])
+    rad = rms(slice(3), held_out.residual_rad, float(np.deg2rad(limits.scatter_deg[0])))
+    metres = rms(slice(3, 6), held_out.residual_m, 1e-3 * limits.scatter_mm[0])
     noise, residual = (
         Rms(
             0.0 if metres is None else 1e3 * float(metres[at]),
@@ -323,12 +327,16 @@ def _sensors(
     return sensors
 
 
-def _arms(answer: Answer) -> list[JudgedArm]:
-    problem, solved = answer.problem, answer.solved
+def _arms(answer: FitAssessment) -> list[JudgedArm]:
+    problem, solved = answer.problem, answer.cell_fit
     modelled = {name or "robot" for name in solved.cell.session.robot_documents}
     arms = []
     for robot, intervals in zip(problem.robots, answer.intervals, strict=True):
-        noise, numbers, arm = answer.sigmas[robot], answer.arms[robot].numbers, solved.arms[robot]
+        noise, numbers, arm = (
+            answer.sigmas[robot],
+            answer.arms[robot].identifiability,
+            solved.arms[robot],
+        )
         is_known = not problem.is_combined
         lower_bounds = (1e3 * float(intervals[1, 0]), float(np.rad2deg(intervals[0, 0])))
         arms.append(
@@ -337,7 +345,7 @@ def _arms(answer: Answer) -> list[JudgedArm]:
                 noise["translation_mm"] if is_known else None,
                 noise["rotation_deg"] if is_known else None,
                 lower_bounds if is_known else None,
-                errs=arm.errors is not None and arm.errors.is_significant,
+                has_posture_errors=arm.errors is not None and arm.errors.is_significant,
                 workspace_mm=None if numbers is None else 1e3 * float(np.median(numbers.sigmas_m)),
                 modelled=robot in modelled,
                 by_functions=arm.has_functions,
@@ -367,11 +375,15 @@ def check_answer(run: RunState) -> None:
     if run.is_misread and poor_motion(run) is None:
         # With misread poses, sigmas predicted at their fit say nothing of the motion.
         return
-    inliers, cell = run.fitted.agreed, run.fitted.cell
-    part, fit = run.fitted.part, inliers.fit
-    seen = run.fitted.seen
+    inliers, cell = run.cell_fit.inlier_fit, run.cell_fit.cell
+    part, fit = run.cell_fit.inlier_problem, inliers.fit
+    seen = run.cell_fit.linearised_corners
     looks = seen is not None and any(scene.estimated for scene in run.scenes.values())
-    pixel_px = {} if seen is None else dict(zip(seen.looks.problems, seen.sigmas_px, strict=True))
+    pixel_px = (
+        {}
+        if seen is None
+        else dict(zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True))
+    )
     if run.mount is not None:
         check_observability(part, fit.state, fit.noise, run.mount, pixel_px, looks=looks)
         return
@@ -384,7 +396,9 @@ def check_answer(run: RunState) -> None:
         return sole_static_view(cell, frame) if is_tilted else None
 
     def motion(frame: str) -> str:
-        if not part.through(frame).any() and (count := int(outliers.through(frame).sum())):
+        if not part.observations_through(frame).any() and (
+            count := int(outliers.observations_through(frame).sum())
+        ):
             return f"all {count} observations of it disagree with the rest of the cell"
         view = static_view(frame)
         return _motion(cell, part, frame) if view is None else view.words
@@ -392,9 +406,13 @@ def check_answer(run: RunState) -> None:
     def advice(frame: str, culprit: str) -> str:
         if (view := static_view(frame)) is not None:
             return view.advice
-        if part.through(frame).any() or not len(outliers):
+        if part.observations_through(frame).any() or not len(outliers):
             flanges = part.tree.flanges.values()
-            between = [name for name in flanges if part.through(name)[part.through(frame)].any()]
+            between = [
+                name
+                for name in flanges
+                if part.observations_through(name)[part.observations_through(frame)].any()
+            ]
             measured = ""
             if between and "offset along" in culprit:
                 measured = measuring_advice(cell, between[0])
@@ -416,9 +434,11 @@ def _names(tree: Tree, frame: str) -> tuple[str, str]:
 
 def _motion(cell: Cell, part: Problem, frame: str) -> str:
     """Describes the motion of the robots between a frame and its observers."""
-    rows, words = part.through(frame), []
+    rows, words = part.observations_through(frame), []
     for robot, base in part.tree.bases.items():
-        stops = np.unique(part.observations.stops[rows & part.through(part.tree.flanges[robot])])
+        stops = np.unique(
+            part.observations.stops[rows & part.observations_through(part.tree.flanges[robot])]
+        )
         words += [robot_motion(cell, base, stops)] if len(stops) > 1 else []
     return "; ".join(words) or f"{int(rows.sum())} observations are too few or too poor"
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.cause_ranking import LENS_CHANGED
 from visioncal.core.number_format import figure
 from visioncal.core.types import Camera, FloatArray, IntArray
@@ -48,20 +48,20 @@ class LensErrors:
         return self.levels.field * self.noise_px
 
 
-def lens_errors(solved: Solved) -> dict[str, LensErrors]:
+def lens_errors(solved: CellFit) -> dict[str, LensErrors]:
     """Lens errors of each camera; empty for a session without images."""
-    seen = solved.seen
+    seen = solved.linearised_corners
     if seen is None:
         return {}
     return {
         name: LensErrors(
             problem.levels or LensLevels(),
             seen.sigmas_px[which],
-            _is_of_lens(seen.looks, name),
+            _is_of_lens(seen.camera_parameters, name),
             _distance_m(seen, which),
-            float(np.mean(seen.looks.camera(name).matrix[:2])),
+            float(np.mean(seen.camera_parameters.camera(name).matrix[:2])),
         )
-        for which, (name, problem) in enumerate(seen.looks.problems.items())
+        for which, (name, problem) in enumerate(seen.camera_parameters.problems.items())
     }
 
 
@@ -79,7 +79,7 @@ def _is_of_lens(looks: CameraParameters, camera: str) -> bool:
 
 
 def lens_field_of(
-    solved: Solved, camera: str, covariance: FloatArray, edges: int
+    solved: CellFit, camera: str, covariance: FloatArray, edges: int
 ) -> LensField | None:
     """The result's section on one lens's errors beyond its model; None where there are none.
 
@@ -89,10 +89,10 @@ def lens_field_of(
         covariance: (p, p) of the fit's unknowns.
         edges: How many of these, the first, belong to edges.
     """
-    seen = solved.seen
+    seen = solved.linearised_corners
     if seen is None:
         return None
-    looks, which = seen.looks, list(seen.looks.problems).index(camera)
+    looks, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
     levels, noise_px = looks.problems[camera].levels, floored_sigma_px(seen.sigmas_px[which])
     if levels is None or not (levels.field or levels.breathing or levels.jitter):
         return None
@@ -105,14 +105,14 @@ def lens_field_of(
         shared = solved.columns_of(places[is_free])
         jacobian = np.zeros((len(coefficients.mean), len(covariance)))
         jacobian[:, shared] = coefficients.slope[:, is_free]
-        jacobian[:, beyond] = coefficients.open
-        values = solved.agreed.problem.values_of(LENSES, solved.agreed.fit.state)
+        jacobian[:, beyond] = coefficients.moving_roots
+        values = solved.inlier_fit.problem.values_of(LENSES, solved.inlier_fit.fit.state)
         change = values[: len(seen.free)] - looks.values[seen.free]
         fitted = values[beyond - solved.lens_columns.start]
         mean = (
             coefficients.mean + coefficients.slope[:, is_free] @ change[np.isin(seen.free, places)]
         )
-        mean = (mean + coefficients.open @ fitted) / noise_px
+        mean = (mean + coefficients.moving_roots @ fitted) / noise_px
         rest = coefficients.rest @ coefficients.rest.T
         own = jacobian @ covariance @ jacobian.T / noise_px**2 + rest
         root = _root(own, looks.camera(camera), levels)
@@ -131,9 +131,9 @@ def lens_field_of(
     )
 
 
-def _lens_error_columns(solved: Solved, which: int) -> IntArray:
+def _lens_error_columns(solved: CellFit, which: int) -> IntArray:
     """The problem's columns of one lens's errors beyond its model."""
-    seen = solved.seen
+    seen = solved.linearised_corners
     sizes = [] if seen is None else [compressed.by_field.shape[2] for compressed in seen.compressed]
     first = sum(sizes[:which])
     return solved.field_columns[first : first + sizes[which]]
@@ -141,7 +141,7 @@ def _lens_error_columns(solved: Solved, which: int) -> IntArray:
 
 def _distance_m(seen: LinearisedCorners, which: int) -> float:
     """The mean distance of one camera's views."""
-    stack = [*seen.looks.problems.values()][which].stack
+    stack = [*seen.camera_parameters.problems.values()][which].stack
     return float(np.mean(depths_m(stack, seen.compressed[which].cam_from_target)))
 
 
@@ -156,9 +156,9 @@ def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatAr
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]) / size[:, None])
 
 
-def lens_changes(solved: Solved) -> Iterator[Finding]:
+def lens_changes(solved: CellFit) -> Iterator[Finding]:
     """Lenses that were zoomed, refocused or hit during the session, by the corners alone."""
-    seen, looks = solved.seen, solved.looks
+    seen, looks = solved.linearised_corners, solved.camera_parameters
     if seen is None or looks is None:
         return
     stations = {row.view: row.station for row in solved.cell.rows}
@@ -177,9 +177,9 @@ def lens_changes(solved: Solved) -> Iterator[Finding]:
         of = "The lens" if len(looks.problems) == 1 else f"The lens of {name}"
         yield Finding(
             LENS_CHANGED,
-            f"{of} changed: {solved.cell.from_when(first)}, {_step_words(step)}, by the corners "
+            f"{of} changed: {solved.cell.start_words(first)}, {_step_words(step)}, by the corners "
             "alone; the result is between both lenses.",
-            solved.cell.or_apart(
+            solved.cell.or_separately(
                 "Switch off autofocus and image stabilisation, fasten zoom and focus rings", first
             ),
             mahalanobis_sq=step.gain,

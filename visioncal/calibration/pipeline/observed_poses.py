@@ -10,12 +10,12 @@ import numpy as np
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.refine import remade
+from visioncal.calibration.stages.refine import recompute_poses
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.chain import chain, edge_names
-from visioncal.estimation.parts import ROBOT
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import ROBOT
 from visioncal.session import frame_name
 
 
@@ -51,7 +51,7 @@ class ObservedPoses(Observed):
                 for view in given.values()
                 if view.corners is not None and len(view.cam_from_target) == 1
             ]
-            given |= {view.view: view for view in remade(single, self.free, self.pixel_px)}
+            given |= {view.view: view for view in recompute_poses(single, self.free, self.pixel_px)}
         return replace(self, poses={**self.poses, **given})
 
     @cached_property
@@ -90,7 +90,7 @@ class ObservedPoses(Observed):
             # Measured poses do not depend on lens and boards.
             shift = np.zeros((len(poses), 6, len(self.free.columns)))
             if from_corners:
-                shift = np.array([pose.by_shared[0] for pose in poses]).reshape(shift.shape)
+                shift = np.array([pose.shared_jacobian[0] for pose in poses]).reshape(shift.shape)
             effects = [self.free.effect(shift)]
         if from_corners:
             covariance = np.array([pose.covariance[0] for pose in poses]).reshape(-1, 6, 6)

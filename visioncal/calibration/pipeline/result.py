@@ -10,12 +10,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from visioncal.calibration.pipeline.answer import held_back_by_arm
+from visioncal.calibration.pipeline.assessment import held_back_by_arm
+from visioncal.calibration.pipeline.cell_fit import within
+from visioncal.calibration.pipeline.connectivity import connection_advice
 from visioncal.calibration.pipeline.judging import weakest_link
 from visioncal.calibration.pipeline.lens_fields import lens_field_of
-from visioncal.calibration.pipeline.network_ties import connection_advice
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.solved import within
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.handeye import compare_solvers
@@ -34,7 +34,7 @@ from visioncal.results import (
     CellResult,
     RobotResult,
     SolverResult,
-    Untied,
+    UnconnectedFrame,
     Validation,
     ViewResult,
 )
@@ -55,7 +55,7 @@ from visioncal.results.sections import (
 from visioncal.results.views import rms_of
 from visioncal.robot import Robot
 from visioncal.session import View, frame_name
-from visioncal.session.frames import thing_name
+from visioncal.session.frames import object_name
 from visioncal.vision.targets import target_document
 
 _T = TypeVar("_T")
@@ -76,11 +76,11 @@ def result_of(run: RunState) -> Calibration:
     findings, verdict = run.findings, run.verdict
     if findings is None or verdict is None:
         raise RuntimeError("a stage is missing")
-    session, answer = run.session, run.solved
+    session, answer = run.session, run.assessment
     cell = cell_of(run) if run.mount is None else None
     names = _edge_names(run) if cell is None else cell_edges(run)
     size = 6 * len(names)
-    was_left_out = np.isfinite(answer.held_out.away_m).any()
+    was_left_out = np.isfinite(answer.held_out.residual_m).any()
     method = answer.held_out.method if was_left_out else ""
     boards, rigs = shapes_of(run)
     calibration = Calibration(
@@ -115,7 +115,7 @@ def _complete_pair(
         solvers=_solvers(run, names),
         noise=_noise(run),
         views=_views(run),
-        validation=Validation.of(run.solved.held_out.method, run.solved.views),
+        validation=Validation.of(run.assessment.held_out.method, run.assessment.views),
         camera=next(iter(cameras_of(run).values()), None),
         robot=run.robot,
         clock=next((clocked.clock.result() for clocked in run.clocks.values()), None),
@@ -134,7 +134,7 @@ def _complete_pair(
 
 def _edge_names(run: RunState) -> dict[str, str]:
     """The names of the edges by their child frames, the camera's first."""
-    frames, names = run.solved.problem.unknown, edge_names(run.session.mount)
+    frames, names = run.assessment.problem.unknown, edge_names(run.session.mount)
     if run.mount == "instrument":
         # Of the points that an instrument read, the first is the probe.
         return dict(zip(frames, names, strict=False))
@@ -143,7 +143,7 @@ def _edge_names(run: RunState) -> dict[str, str]:
 
 
 def _solvers(run: RunState, names: Mapping[str, str]) -> dict[str, SolverResult]:
-    answer, mount = run.solved, run.session.mount
+    answer, mount = run.assessment, run.session.mount
     solutions = compare_solvers(answer.problem, answer.state, mount, run.solver)
     return {
         name: SolverResult(
@@ -157,7 +157,7 @@ def _solvers(run: RunState, names: Mapping[str, str]) -> dict[str, SolverResult]
 
 def _views(run: RunState) -> tuple[ViewResult, ...]:
     """Result of each view of the session, in its order."""
-    results = {view.view: view.of_pair for view in run.solved.views}
+    results = {view.view: view.of_pair for view in run.assessment.views}
     return tuple(
         results.get(view.number) or ViewResult(view.number, used=False, reason=_reason(run, view))
         for view in run.session.views
@@ -177,7 +177,7 @@ def _arm(run: RunState) -> ArmSections:
     sections = arm_sections(run, arm.robot)
     if sections.arm is None or arm.model is None:
         return sections
-    views = held_back_by_arm(run.fitted, run, arm.robot)
+    views = held_back_by_arm(run.cell_fit, run, arm.robot)
     return replace(sections, arm=replace(sections.arm, holdout=views))
 
 
@@ -195,16 +195,16 @@ def _instrument(readings: Readings) -> InstrumentResult:
 def _points(run: RunState) -> Iterator[PointResult]:
     """The positions of the points that an instrument read on the flange."""
     if run.readings is not None and not run.readings.are_poses:
-        for frame, edge in run.solved.edges.items():
+        for frame, edge in run.assessment.edges.items():
             if frame.startswith("point"):
                 x_m, y_m, z_m = edge.matrix[:3, 3].tolist()
-                name = thing_name(frame, "probe")
+                name = object_name(frame, "probe")
                 yield PointResult(point=name, x_m=x_m, y_m=y_m, z_m=z_m, sigma_mm=edge.sigma_mm)
 
 
 def _uncertainty(run: RunState) -> UncertaintyResult:
-    work, answer = run.work, run.solved
-    tests = (misfit.alike for misfit in answer.misfits.values())
+    work, answer = run.accuracy_at_work, run.assessment
+    tests = (misfit.neighbours for misfit in answer.residual_tests.values())
     alike = [test.factor for test in tests if test is not None and test.is_significant]
     return UncertaintyResult(
         point_cam_m=work.point_cam,
@@ -218,7 +218,7 @@ def _uncertainty(run: RunState) -> UncertaintyResult:
 
 def _noise(run: RunState) -> dict[str, float]:
     """Standard deviations per axis, of corners and flange, or of both together without corners."""
-    px = [sigmas["pixel_px"] for sigmas in run.solved.sigmas.values() if "pixel_px" in sigmas]
+    px = [sigmas["pixel_px"] for sigmas in run.assessment.sigmas.values() if "pixel_px" in sigmas]
     noise = {"pixel_px": px[-1]} if px else {}
     if not noise and run.pixel_px is not None:
         noise["pixel_px"] = run.pixel_px
@@ -226,12 +226,12 @@ def _noise(run: RunState) -> dict[str, float]:
         noise["instrument_mm"] = 1e3 * run.readings.sigma_m
         if run.readings.are_poses:
             noise["instrument_deg"] = float(np.rad2deg(run.readings.instrument.sigma_rad or 0.0))
-    return noise | _of_robot(run, run.solved.sigmas)
+    return noise | _of_robot(run, run.assessment.sigmas)
 
 
 def _of_robot(run: RunState, levels: Mapping[str, Mapping[str, _T]]) -> dict[str, _T]:
     """Figures on the noise of the only robot, or on that of robot and camera combined, by name."""
-    problem = run.solved.problem
+    problem = run.assessment.problem
     of = "combined" if problem.is_combined else "robot"
     return {f"{of}_{name}": level for name, level in levels[problem.robots[0]].items()}
 
@@ -240,8 +240,8 @@ def _joint_fit_of(run: RunState) -> JointFit | None:
     """The unknowns of the fit with their covariance; None for a calibration by an instrument."""
     if run.mount == "instrument":
         return None
-    boards, seen = run.session.boards, run.fitted.seen
-    unknown = run.solved.problem.unknown
+    boards, seen = run.session.boards, run.cell_fit.linearised_corners
+    unknown = run.assessment.problem.unknown
     names = [board for board in boards if len(boards) < 2 or frame_name("target", board) in unknown]
     return JointFit(
         targets={name: target_document(board) for name, board in boards.items()},
@@ -269,9 +269,9 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
         return None
     # Errors that are not estimated are zero. Estimates of a model are the change from its
     # linearisation point, which its arm contains.
-    problem, name = run.solved.problem, f"arm of {arm.robot}"
+    problem, name = run.assessment.problem, f"arm of {arm.robot}"
     start = problem.start({frame: np.eye(4) for frame in problem.unknown})
-    values = problem.values_of(name, run.solved.state) - problem.values_of(name, start)
+    values = problem.values_of(name, run.assessment.state) - problem.values_of(name, start)
     values = values if errors.is_estimated else np.zeros(errors.basis.shape[2])
     if model is None:
         return FittedArm(of="links", values=values)
@@ -294,7 +294,7 @@ def _fitted_arm(run: RunState, arm: RobotArm) -> FittedArm | None:
 
 def _covariance(run: RunState) -> FloatArray:
     """Covariance of the written unknowns, and of the arm's errors that are not estimated."""
-    answer, arm, written = run.solved, run.robot_arm, _written_jacobian(run)
+    answer, arm, written = run.assessment, run.robot_arm, _written_jacobian(run)
     own = written @ answer.covariance @ written.T
     if arm.errors is None or arm.errors.is_estimated or not arm.errors.of_links:
         return own
@@ -309,16 +309,16 @@ def _covariance(run: RunState) -> FloatArray:
 def _written_jacobian(run: RunState) -> FloatArray:
     """(w, p) Jacobian of the unknowns as they are written with respect to those of the fit."""
     # Further boards are written relative to the first; clocks and drift are left out.
-    problem, rows = run.solved.problem, np.eye(run.solved.problem.size)
-    boards = run.solved.state.edges[1:]
+    problem, rows = run.assessment.problem, np.eye(run.assessment.problem.size)
+    boards = run.assessment.state.edges[1:]
     # z_k exp(d_k) = z exp(d) exp(-d_u) target_1_from_target_k
     further = [
         rows[6:12] - adjoint(invert(boards[0]) @ boards[at]) @ rows[6 * at + 6 : 6 * at + 12]
         for at in range(1, len(boards))
     ]
     nothing, arm = slice(0, 0), f"arm of {run.robot_arm.robot}"
-    errors, seen = problem.effect_columns.get(arm, nothing), run.fitted.seen
-    looks = run.fitted.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
+    errors, seen = problem.effect_columns.get(arm, nothing), run.cell_fit.linearised_corners
+    looks = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
     of_errors, model = rows[errors], run.robot_arm.model
     kept = slice(None) if model is None else model.is_kept
     return np.concatenate([rows[:12], rows[looks], *further, of_errors[kept]])
@@ -326,7 +326,7 @@ def _written_jacobian(run: RunState) -> FloatArray:
 
 def cell_of(run: RunState) -> CellResult:
     """Assembles the sections of a whole cell, by name, when all stages have run."""
-    session, cell, solved, answer = run.session, run.cell, run.fitted, run.solved
+    session, cell, solved, answer = run.session, run.cell, run.cell_fit, run.assessment
     edges = cell_edges(run)
     kept = {
         name: branch.parent
@@ -337,14 +337,16 @@ def cell_of(run: RunState) -> CellResult:
     return CellResult(
         reference=cell.reference,
         tree=kept | parents,
-        cameras={thing_name(name, "camera"): lens for name, lens in cameras_of(run).items()},
+        cameras={object_name(name, "camera"): lens for name, lens in cameras_of(run).items()},
         robots=_robots(run),
         targets={
             name or "target": target_document(plate) for name, plate in session.plates.items()
         },
         noise=answer.sigmas,
         moved=answer.moved,
-        untied=tuple(Untied(name, connection_advice(cell, name)) for name in solved.untied),
+        untied=tuple(
+            UnconnectedFrame(name, connection_advice(cell, name)) for name in solved.unconnected
+        ),
         weakest=weakest_link(solved.cell, answer.last_edges),
         details=CellDetails(
             {pair.words: clock.result() for pair, clock in answer.clocks(run).items()}
@@ -359,15 +361,15 @@ def cell_of(run: RunState) -> CellResult:
 
 def cell_edges(run: RunState) -> dict[str, str]:
     """The names of a whole cell's edges by their child frames."""
-    branches = run.solved.problem.tree.branches
+    branches = run.assessment.problem.tree.branches
     return {
         version.name: f"{branches[key].parent}_from_{version.name}"
-        for key, version in run.solved.versions.items()
+        for key, version in run.assessment.versions.items()
     }
 
 
 def _robots(run: RunState) -> dict[str, RobotResult]:
-    session, solved = run.session, run.fitted
+    session, solved = run.session, run.cell_fit
     models = session.robot_documents
     found = {
         robot_key(name): RobotResult(Robot.from_document(models[name]) if name in models else None)
@@ -380,7 +382,7 @@ def _robots(run: RunState) -> dict[str, RobotResult]:
 
 def arm_sections(run: RunState, robot: str) -> ArmSections:
     """The result's sections on a robot's arm."""
-    solved, answer, first = run.fitted, run.solved, dict[int, int]()
+    solved, answer, first = run.cell_fit, run.assessment, dict[int, int]()
     for row in solved.cell.rows:
         first.setdefault(row.station, row.view)
     stops = stops_of(answer.problem, robot)
@@ -390,7 +392,7 @@ def arm_sections(run: RunState, robot: str) -> ArmSections:
 
 def noise_intervals(run: RunState) -> dict[str, Intervals]:
     """95 % intervals of the robots' noise levels, by robot and by name."""
-    pairs = zip(run.solved.problem.robots, run.solved.intervals, strict=True)
+    pairs = zip(run.assessment.problem.robots, run.assessment.intervals, strict=True)
     return {
         robot: {
             "translation_mm": _bounds(1e3 * interval_m),
@@ -412,8 +414,12 @@ def cameras_of(run: RunState) -> dict[str, CameraResult]:
     intrinsics of which only a part is uncertain (the matrix and not the distortion) have zeros for
     the rest.
     """
-    solved, covariance, edges = run.fitted, run.solved.covariance, 6 * len(run.solved.edges)
-    seen, looks = solved.seen, solved.looks
+    solved, covariance, edges = (
+        run.cell_fit,
+        run.assessment.covariance,
+        6 * len(run.assessment.edges),
+    )
+    seen, looks = solved.linearised_corners, solved.camera_parameters
     # Measured poses need no camera, but later use of the result may.
     cameras = {
         frame: CameraResult(camera, estimated=False)
@@ -440,8 +446,12 @@ def cameras_of(run: RunState) -> dict[str, CameraResult]:
 
 def fit_section(run: RunState) -> CellJointFit:
     """The unknowns of a whole cell's fit, with their covariance."""
-    solved, covariance, edges = run.fitted, run.solved.covariance, 6 * len(run.solved.edges)
-    seen, looks = solved.seen, solved.looks
+    solved, covariance, edges = (
+        run.cell_fit,
+        run.assessment.covariance,
+        6 * len(run.assessment.edges),
+    )
+    seen, looks = solved.linearised_corners, solved.camera_parameters
     arms, of_arms = _calibrated_arms(run)
     if seen is None or looks is None:
         columns = [*range(edges), *of_arms]
@@ -451,7 +461,7 @@ def fit_section(run: RunState) -> CellJointFit:
     columns = [*range(edges), *solved.columns_of(seen.free).tolist(), *of_arms]
     return CellJointFit(
         cameras={
-            thing_name(name, "camera"): _relative_indices(seen.free, at)
+            object_name(name, "camera"): _relative_indices(seen.free, at)
             for name, at in looks.lenses.items()
         },
         targets={
@@ -465,8 +475,8 @@ def fit_section(run: RunState) -> CellJointFit:
 def _calibrated_arms(run: RunState) -> tuple[dict[str, FittedArm], list[int]]:
     """The errors of the calibrated arms, by name, and their columns in the fit."""
     arms, columns = dict[str, FittedArm](), list[int]()
-    effects = run.solved.problem.effect_columns
-    for robot, arm in run.fitted.arms.items():
+    effects = run.assessment.problem.effect_columns
+    for robot, arm in run.cell_fit.arms.items():
         fitted, effect = _fitted_arm(run, arm), effects.get(f"arm of {arm.robot}")
         if fitted is not None and arm.model is not None and effect is not None:
             arms[robot or "robot"] = fitted
@@ -476,8 +486,8 @@ def _calibrated_arms(run: RunState) -> tuple[dict[str, FittedArm], list[int]]:
 
 def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
     """The estimated shapes of boards and rigs, by name; exact rigs are left out."""
-    solved, covariance = run.fitted, run.solved.covariance
-    seen, looks = solved.seen, solved.looks
+    solved, covariance = run.cell_fit, run.assessment.covariance
+    seen, looks = solved.linearised_corners, solved.camera_parameters
     boards, rigs = dict[str, BoardResult](), dict[str, RigResult]()
     if seen is None or looks is None:
         return boards, rigs
@@ -485,7 +495,7 @@ def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResul
     all_sigmas[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
     shapes = zip(_shape_slices(run).items(), run.session.boards.items(), looks.corners, strict=True)
     for (name, shape), (plate, target), corners in shapes:
-        if frame_name("target", plate) not in solved.part.tree.branches:
+        if frame_name("target", plate) not in solved.inlier_problem.tree.branches:
             continue
         values, sigmas, free = (
             looks.values[shape],
@@ -506,7 +516,7 @@ def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResul
 
 def _shape_slices(run: RunState) -> dict[str, slice]:
     """The slice of each target's shape in the values of lenses and boards, by name."""
-    looks = run.fitted.looks
+    looks = run.cell_fit.camera_parameters
     if looks is None:
         return {}
     targets = tuple(run.session.boards.values())

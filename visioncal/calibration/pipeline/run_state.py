@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
-from visioncal.calibration.pipeline.answer import Answer
+from visioncal.calibration.pipeline.assessment import FitAssessment
 from visioncal.calibration.pipeline.budget import WorkAccuracy, work_accuracy
-from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.findings import Findings
@@ -33,11 +33,11 @@ class RunState(Observed):
         solver: The requested solver, for one robot and one camera.
         level: How far arms are calibrated: a key of `stages.kinematics.ASKED`.
         convention: Joint table convention of calibrated arms; None for the stated one.
-        found_before: Corners by view that were detected before this run.
+        given_corners: Corners by view that were detected before this run.
         readings: The readings of an instrument, where these are all that was observed.
-        read: The cell as the session states it.
-        fit: The fit of the cell.
-        answer: The fit with its covariance and diagnosis.
+        cell_or_none: The cell as the session states it.
+        cell_fit_or_none: The fit of the cell.
+        assessment_or_none: The fit with its covariance and diagnosis.
         findings: Input of the verdict.
         verdict: The verdict on the result.
     """
@@ -45,11 +45,11 @@ class RunState(Observed):
     solver: SolverName = "joint"
     level: str = "auto"
     convention: Convention | None = None
-    found_before: Mapping[int, Corners] | None = None
+    given_corners: Mapping[int, Corners] | None = None
     readings: Readings | None = None
-    read: Cell | None = None
-    fit: Solved | None = None
-    answer: Answer | None = None
+    cell_or_none: Cell | None = None
+    cell_fit_or_none: CellFit | None = None
+    assessment_or_none: FitAssessment | None = None
     findings: Findings | None = None
     verdict: Verdict | None = None
 
@@ -69,39 +69,44 @@ class RunState(Observed):
     @property
     def cell(self) -> Cell:
         """The cell as the session states it."""
-        return _there(self.read, "the cell")
+        return _there(self.cell_or_none, "the cell")
 
     @property
-    def fitted(self) -> Solved:
+    def cell_fit(self) -> CellFit:
         """The fit of the cell."""
-        return _there(self.fit, "the fit")
+        return _there(self.cell_fit_or_none, "the fit")
 
     @property
-    def solved(self) -> Answer:
+    def assessment(self) -> FitAssessment:
         """The fit with its covariance and diagnosis."""
-        return _there(self.answer, "the answer")
+        return _there(self.assessment_or_none, "the answer")
 
     @cached_property
-    def work(self) -> WorkAccuracy:
+    def accuracy_at_work(self) -> WorkAccuracy:
         """Accuracy of one camera and one robot where their views look."""
-        return work_accuracy(self.fitted, self.solved.beside, self.solved.covariance)
+        return work_accuracy(
+            self.cell_fit, self.assessment.covariance_by_source, self.assessment.covariance
+        )
 
     @property
     def robot_arm(self) -> RobotArm:
         """The only robot's arm."""
-        return next(iter(self.fitted.arms.values()))
+        return next(iter(self.cell_fit.arms.values()))
 
     @property
     def pixel_px(self) -> float | None:
         """Standard deviation of a corner coordinate of the only camera, after the fit [px]."""
-        if self.fit is not None and self.fit.seen is not None:
-            return self.fit.seen.sigmas_px[0]
+        if (
+            self.cell_fit_or_none is not None
+            and self.cell_fit_or_none.linearised_corners is not None
+        ):
+            return self.cell_fit_or_none.linearised_corners.sigmas_px[0]
         return super().pixel_px
 
     @property
     def used(self) -> tuple[int, ...]:
         """The views that the fit uses, in the session's order."""
-        rows, used = self.fitted.cell.rows, self.fitted.agreed.used.tolist()
+        rows, used = self.cell_fit.cell.rows, self.cell_fit.inlier_fit.used.tolist()
         return tuple(row.view for row, is_used in zip(rows, used, strict=True) if is_used)
 
 

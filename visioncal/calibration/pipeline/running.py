@@ -8,10 +8,14 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 
-from visioncal.calibration.pipeline.answer import held_back
+from visioncal.calibration.pipeline.assessment import held_back
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.judging import poor_motion
-from visioncal.calibration.pipeline.reading_hints import may_be_misread, misreadings, reading_hint
+from visioncal.calibration.pipeline.misread_poses import (
+    may_be_misread,
+    misread_pose_finding,
+    misreadings,
+)
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import STAGES
@@ -19,8 +23,8 @@ from visioncal.calibration.stages.cause_ranking import with_misread, with_other_
 from visioncal.calibration.stages.cell import robot_key
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.handeye import SOLVER_NAMES
+from visioncal.calibration.stages.image_checks import because, unseen_cause
 from visioncal.calibration.stages.kinematics import check_level
-from visioncal.calibration.stages.pictures import because, unseen_cause
 from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import CONVENTIONS, Convention, SolverName
 from visioncal.core.errors import DataError, VisioncalError
@@ -61,7 +65,7 @@ class Run:
         return replace(self, calibration=replace(self.calibration, verdict=verdict))
 
 
-class Asked(TypedDict, total=False):
+class CalibrationOptions(TypedDict, total=False):
     """Options of `calibrate`, by name; the defaults are its own."""
 
     solver: SolverName
@@ -73,17 +77,20 @@ class Asked(TypedDict, total=False):
 
 
 def run(
-    session: Session | Path | str, *, dense: Dense | None = None, **asked: Unpack[Asked]
+    session: Session | Path | str,
+    *,
+    dense: Dense | None = None,
+    **asked: Unpack[CalibrationOptions],
 ) -> Run:
     """Calibrates a session and keeps the evidence; see `calibrate`."""
     state = run_stages(replace(initial_state(session, **asked), dense=dense))
-    held_out = state.solved.held_out
-    residuals = zip(held_out.away_m.tolist(), held_out.rms_px.tolist(), strict=True)
+    held_out = state.assessment.held_out
+    residuals = zip(held_out.residual_m.tolist(), held_out.rms_px.tolist(), strict=True)
     left_out = dict(zip(state.used, residuals, strict=True))
     return Run(result_of(state), view_evidence(state), state.dense, left_out)
 
 
-def initial_state(session: Session | Path | str, **asked: Unpack[Asked]) -> RunState:
+def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOptions]) -> RunState:
     """Loads the session and checks the options: the state before the first stage."""
     threads, solver = asked.get("threads"), asked.get("solver", "joint")
     level, convention = asked.get("level", "auto"), asked.get("convention")
@@ -156,7 +163,7 @@ def _with_hint(
     """Adds the likely misreading of the robot's poses to an error, or a command for more views."""
     if located is None:
         return error
-    hint = hint or reading_hint(located)
+    hint = hint or misread_pose_finding(located)
     if hint is not None:
         # Directions that are undetermined with misread poses mean nothing.
         return type(error)(hint.words, next_step=str(hint.do))
@@ -184,15 +191,15 @@ def _with_reading(state: RunState, located: RunState | None, hint: Finding | Non
     if state.verdict is None or located is None or not may_be_misread(state):
         return state
     if hint is None and state.mount is not None:
-        hint = reading_hint(located)
+        hint = misread_pose_finding(located)
     return state if hint is None else replace(state, verdict=with_misread(state.verdict, hint))
 
 
 def view_evidence(state: RunState) -> tuple[ViewEvidence, ...]:
     """Collects the evidence of each view: corners, predictions, poses."""
-    solved, fit_state = state.fitted, state.solved.state
-    held, looks = held_back(solved, state), solved.looks
-    problems = [(solved.cell.rows, solved.poses, solved.agreed.problem)]
+    solved, fit_state = state.cell_fit, state.assessment.state
+    held, looks = held_back(solved, state), solved.camera_parameters
+    problems = [(solved.cell.rows, solved.poses, solved.inlier_fit.problem)]
     problems += [] if held is None else [(held.rows, held.views, held.problem)]
     evidence = dict[int, ViewEvidence]()
     for cell_rows, views, problem in problems:
@@ -227,8 +234,8 @@ def _evidence(
 def _flange(state: RunState, view: int, observation: Observation | None) -> FloatArray | None:
     """(4, 4) `base_from_flange` of a view, by the calibrated arm where there is one."""
     if observation is not None and len(observation.robots) == 1:
-        arm = state.fitted.arms.get(robot_key(next(iter(observation.robots))))
-        if arm is not None and arm.stood[observation.station]:
+        arm = state.cell_fit.arms.get(robot_key(next(iter(observation.robots))))
+        if arm is not None and arm.has_pose[observation.station]:
             return np.asarray(arm.poses[observation.station])
     return state.base_from_flange.get(view)
 

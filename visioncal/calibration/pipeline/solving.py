@@ -13,24 +13,24 @@ from visioncal.calibration.pipeline.arm_results import (
     with_errors,
     with_pose_errors,
 )
-from visioncal.calibration.pipeline.solved import Solved
+from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.starting import Start, find_start, sensors_of
-from visioncal.calibration.stages.arms import RobotArm, check_arms, effects_of
+from visioncal.calibration.stages.arms import RobotArm, arm_effects, check_arms
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.clocks import clock_effects
 from visioncal.calibration.stages.handeye import closed_form_state
-from visioncal.calibration.stages.kinematics import check_asked
+from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.priors import loosened, without_most_contradicted
-from visioncal.calibration.stages.refine import lens_levels, refined
-from visioncal.calibration.stages.turned_images import ImageTurn, turned_how
+from visioncal.calibration.stages.priors import with_loose_positions, without_most_contradicted
+from visioncal.calibration.stages.refine import lens_levels, refine_jointly
+from visioncal.calibration.stages.turned_images import ImageTurn, find_image_turn
 from visioncal.calibration.stages.validate import predict_corners
 from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
-from visioncal.estimation.joint import settle as settle_looks
+from visioncal.estimation.joint import fit_jointly as settle_looks
 from visioncal.estimation.joint import target_sizes
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.observability import (
@@ -38,9 +38,14 @@ from visioncal.estimation.observability import (
     refuse_open_motion,
     too_little_motion,
 )
-from visioncal.estimation.outliers import Agreed, agree, all_as_inliers, settle
-from visioncal.estimation.parts import Effect, Observations, State
+from visioncal.estimation.outliers import (
+    InlierFit,
+    all_as_inliers,
+    inliers_and_moves,
+    refine_inliers,
+)
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Observations, State
 from visioncal.estimation.slight_steps import log_gain, slipped_joint
 from visioncal.estimation.solve import (
     Solution,
@@ -65,7 +70,7 @@ _SIZE_SIGMA = 0.03
 
 def solve(
     cell: Cell, observed: Observed, level: str = "auto", solver: SolverName = "joint"
-) -> Solved:
+) -> CellFit:
     """Solves a cell, of one robot and one camera or of many.
 
     Args:
@@ -83,7 +88,7 @@ def solve(
     check_arms(arms, level)
     if cell.mount is not None:
         can = solver == "joint" and all(arm.is_modelled for arm in arms.values())
-        check_asked(level, can=can)
+        check_level_is_possible(level, can=can)
     if solver != "joint":
         cell, level = replace(cell, priors=()), "hand-eye"
     start = find_start(cell, observed)
@@ -100,16 +105,16 @@ def solve(
     return solved if solver == "joint" else _by_closed_form(solved, solver)
 
 
-def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> Solved:
+def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: str) -> CellFit:
     """Alternates between inliers, lenses and boards, and arms."""
     cell, poses = start.cell, start.poses
     sizes: Mapping[str, float] = {}
     if observed.is_misread:
         inliers = all_as_inliers(start.problem, start.state)
     else:
-        inliers, sizes = find_inliers(start)
+        inliers, sizes = initial_inliers(start)
     clock_errors = clock_effects(cell, observed.clocks)
-    initial = Solved(
+    initial = CellFit(
         cell, inliers, None, poses, start.untied, arms, level, clock_errors, observed.turned
     )
     solved = _fit_with_inliers(initial, observed, sizes)
@@ -117,18 +122,22 @@ def _fit(start: Start, observed: Observed, arms: Mapping[str, RobotArm], level: 
         # Their corners would be explained by a lens that changes from view to view.
         observed = replace(observed, turned=turned)
         solved = _fit_with_inliers(replace(initial, turned=turned), observed, sizes)
-    solved = replace(solved, arms=with_drifts(solved.arms, solved.part, solved.agreed.fit, level))
+    solved = replace(
+        solved, arms=with_drifts(solved.arms, solved.inlier_problem, solved.inlier_fit.fit, level)
+    )
     if any(arm.drift is not None for arm in solved.arms.values()):
         solved = _fit_with_inliers(solved, observed, sizes)
     # Of one camera and one robot without priors, the inliers are final with lenses and boards.
-    final = None if cell.mount is None or cell.priors else solved.agreed
-    solved = replace(solved, agreed=with_camera_levels(cell, poses, solved.agreed))
+    final = None if cell.mount is None or cell.priors else solved.inlier_fit
+    solved = replace(solved, inlier_fit=with_camera_levels(cell, poses, solved.inlier_fit))
     # Misread poses determine neither the arm nor which views are outliers.
     solved = solved if observed.is_misread else _calibrate_arms(solved, observed, final)
     if level != "hand-eye" and not observed.is_misread:
         solved = _with_functions(solved)
-    solved = replace(solved, agreed=with_repeats(solved.agreed))
-    return replace(solved, arms=with_pose_errors(solved.arms, solved.part, solved.agreed.fit))
+    solved = replace(solved, inlier_fit=with_repeats(solved.inlier_fit))
+    return replace(
+        solved, arms=with_pose_errors(solved.arms, solved.inlier_problem, solved.inlier_fit.fit)
+    )
 
 
 def _refuse_undetermined_lens(observed: Observed, problem: Problem, mount: Mount) -> None:
@@ -151,21 +160,23 @@ def _refuse_undetermined_lens(observed: Observed, problem: Problem, mount: Mount
             )
 
 
-def _without_misreported(inliers: Agreed, arms: Mapping[str, RobotArm], before: Mask) -> Agreed:
+def _without_misreported(
+    inliers: InlierFit, arms: Mapping[str, RobotArm], before: Mask
+) -> InlierFit:
     """Removes new inliers whose reported robot pose contradicts the arm's joint angles."""
     # They agree with joints and camera, but their reported poses would mislead the next fit.
     problem, used = inliers.problem, inliers.used.copy()
     stops = problem.observations.stops
     for robot, arm in arms.items():
         by_robot = rows_of(problem, robot)
-        sound = np.isin(np.arange(len(arm.stood)), stops[by_robot & before])
-        used &= before | ~by_robot | arm.reported_alike(sound)[stops]
+        sound = np.isin(np.arange(len(arm.has_pose)), stops[by_robot & before])
+        used &= before | ~by_robot | arm.reports_matching_joints(sound)[stops]
     if np.array_equal(used, inliers.used):
         return inliers
     return replace(inliers, used=used).refitted()
 
 
-def _calibrate_arms(solved: Solved, observed: Observed, final: Agreed | None) -> Solved:
+def _calibrate_arms(solved: CellFit, observed: Observed, final: InlierFit | None) -> CellFit:
     """Alternates between calibrating the arms and updating the inliers until neither changes.
 
     Args:
@@ -174,19 +185,19 @@ def _calibrate_arms(solved: Solved, observed: Observed, final: Agreed | None) ->
         final: Inliers that need no update, if any.
     """
     for iteration in range(_ROUNDS + 1):
-        if solved.asked != "hand-eye":
+        if solved.level != "hand-eye":
             arms = _choose_levels(solved)
-            erring = [name for name, arm in arms.items() if arm.frees_errors()]
+            erring = [name for name, arm in arms.items() if arm.has_free_errors()]
             clock_errors = clock_effects(solved.cell, observed.clocks, erring)
-            solved = _converge_arms(replace(solved, arms=arms, late=clock_errors))
-        before = solved.agreed
+            solved = _converge_arms(replace(solved, arms=arms, clock_effects=clock_errors))
+        before = solved.inlier_fit
         # The arms are calibrated with the last inliers.
         if iteration == _ROUNDS or before is final:
             break
         inliers = _without_misreported(
             updated_inliers(solved.cell, before), solved.arms, before.used
         )
-        solved = _converge_arms(replace(solved, agreed=inliers))
+        solved = _converge_arms(replace(solved, inlier_fit=inliers))
         # Other inliers, or other moved frames, may allow another calibration level.
         same_frames = before.problem.unknown.keys() == inliers.problem.unknown.keys()
         if same_frames and np.array_equal(before.used, inliers.used):
@@ -194,40 +205,44 @@ def _calibrate_arms(solved: Solved, observed: Observed, final: Agreed | None) ->
     return solved
 
 
-def _by_closed_form(solved: Solved, solver: str) -> Solved:
+def _by_closed_form(solved: CellFit, solver: str) -> CellFit:
     """Replaces the edges by those of a closed form, and the noise by that of its residuals."""
-    inliers, part, mount = solved.agreed, solved.part, solved.cell.mount
+    inliers, part, mount = solved.inlier_fit, solved.inlier_problem, solved.cell.mount
     if mount is None:
         raise RuntimeError("closed forms are for one robot and one camera")
     state = closed_form_state(part, solver, inliers.fit.state, mount)
     noise = estimate_noise(part, state, starting_noise(part), from_above=True)
-    return replace(solved, agreed=replace(inliers, fit=Solution(state, noise)), solver=solver)
+    return replace(solved, inlier_fit=replace(inliers, fit=Solution(state, noise)), solver=solver)
 
 
-def _fit_with_inliers(start: Solved, observed: Observed, sizes: Mapping[str, float]) -> Solved:
+def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, float]) -> CellFit:
     """Fits lenses, boards and frames, and updates the inliers until they do not change."""
     # In a whole cell the inliers are updated at the end, once the arms are calibrated: a frame
     # that moved must not be taken for outliers.
     solved, levels = start, dict[str, LensLevels]()
     for _ in range(_ROUNDS):
         solved = _fit_lenses_and_frames(replace(solved, arms=start.arms), observed, levels, sizes)
-        levels = {} if solved.seen is None else dict(solved.seen.looks.levels)
+        levels = (
+            {}
+            if solved.linearised_corners is None
+            else dict(solved.linearised_corners.camera_parameters.levels)
+        )
         if solved.cell.mount is None or observed.is_misread:
             break
-        before = solved.agreed.used
-        solved = replace(solved, agreed=settle(solved.agreed))
-        if np.array_equal(before, solved.agreed.used):
+        before = solved.inlier_fit.used
+        solved = replace(solved, inlier_fit=refine_inliers(solved.inlier_fit))
+        if np.array_equal(before, solved.inlier_fit.used):
             break
     return solved
 
 
-def _turned_images(solved: Solved) -> dict[int, ImageTurn]:
+def _turned_images(solved: CellFit) -> dict[int, ImageTurn]:
     """How images of outliers were turned or mirrored, by view."""
-    inliers, looks = solved.agreed, solved.looks
+    inliers, looks = solved.inlier_fit, solved.camera_parameters
     problem, state = inliers.problem, inliers.fit.state
     if looks is None or inliers.used.all():
         return {}
-    typical_px = float(np.nanmedian(solved.chain_px(np.flatnonzero(inliers.used), state)))
+    typical_px = float(np.nanmedian(solved.reprojection_px(np.flatnonzero(inliers.used), state)))
     predicted, turns = problem.predicted(state), {}
     for row in np.flatnonzero(~inliers.used).tolist():
         seer, view = solved.cell.rows[row].seer, solved.poses[row]
@@ -235,26 +250,31 @@ def _turned_images(solved: Solved) -> dict[int, ImageTurn]:
             continue
         camera = looks.camera(seer)
         predicted_px = predict_corners(camera, predicted[row], looks.corners[view.board])
-        how = turned_how(view.corners.px, predicted_px, camera.resolution, typical_px)
+        how = find_image_turn(view.corners.px, predicted_px, camera.resolution, typical_px)
         if how is not None:
             turns[view.view] = how
     return turns
 
 
 def _fit_lenses_and_frames(
-    solved: Solved, observed: Observed, levels: Mapping[str, LensLevels], sizes: Mapping[str, float]
-) -> Solved:
+    solved: CellFit,
+    observed: Observed,
+    levels: Mapping[str, LensLevels],
+    sizes: Mapping[str, float],
+) -> CellFit:
     """Fits lenses, boards and frames, with posture-dependent errors of the arms and their drift."""
-    solved = replace(solved, arms={name: arm.erring(None) for name, arm in solved.arms.items()})
-    solved = solved.posed()
-    if observed.scenes and not solved.agreed.problem.is_combined:
-        side, frames = solved.side, solved.frames
+    solved = replace(
+        solved, arms={name: arm.with_found_errors(None) for name, arm in solved.arms.items()}
+    )
+    solved = solved.with_arm_poses()
+    if observed.scenes and not solved.inlier_fit.problem.is_combined:
+        side, frames = solved.frame_model, solved.frames
         views = _views_by_camera(observed, solved.poses)
         looks = side.looks(observed.scenes, views).with_levels(levels)
         if observed.is_misread:
-            return solved.settled(side, settle_looks(looks, side, looks.first, frames))
+            return solved.with_joint_fit(side, settle_looks(looks, side, looks.first, frames))
         try:
-            fitted, side = refined(side, looks, frames)
+            fitted, side = refine_jointly(side, looks, frames)
         except ConvergenceError:
             names = next(iter(observed.scenes.values())).names
             targets = [frame_name("target", name) for name in names]
@@ -262,39 +282,43 @@ def _fit_lenses_and_frames(
             far = {board: size for board, size in size_errors.items() if abs(size) > _FAR_SIZE}
             if not far:
                 raise
-            fitted, side = refined(side, looks.with_sizes(far), frames)
-        return solved.settled(side, fitted)
-    solved = replace(solved, seen=None)
-    if drifts := tuple(effects_of(solved.arms)):
-        solved = replace(solved, agreed=_with_effects(solved.agreed, drifts))
-    solved = replace(solved, arms=with_errors(solved.arms, solved.part, solved.agreed.fit))
-    effects = (*solved.late, *effects_of(solved.arms))
-    return replace(solved, agreed=_with_effects(solved.agreed, effects)) if effects else solved
+            fitted, side = refine_jointly(side, looks.with_sizes(far), frames)
+        return solved.with_joint_fit(side, fitted)
+    solved = replace(solved, linearised_corners=None)
+    if drifts := tuple(arm_effects(solved.arms)):
+        solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, drifts))
+    solved = replace(
+        solved, arms=with_errors(solved.arms, solved.inlier_problem, solved.inlier_fit.fit)
+    )
+    effects = (*solved.clock_effects, *arm_effects(solved.arms))
+    return (
+        replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects)) if effects else solved
+    )
 
 
-def _choose_levels(solved: Solved) -> dict[str, RobotArm]:
+def _choose_levels(solved: CellFit) -> dict[str, RobotArm]:
     """Chooses the calibration level of each arm."""
-    fit = solved.agreed.fit
-    views = [solved.cell.rows[index].view for index in np.flatnonzero(solved.agreed.used)]
+    fit = solved.inlier_fit.fit
+    views = [solved.cell.rows[index].view for index in np.flatnonzero(solved.inlier_fit.used)]
 
     def with_level(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        return arm.with_level(nominal, start, solved.asked, views, fit.noise)
+        return arm.with_level(nominal, start, solved.level, views, fit.noise)
 
-    return change_each(solved.arms, solved.part, fit, with_level)
+    return change_each(solved.arms, solved.inlier_problem, fit, with_level)
 
 
-def _with_functions(solved: Solved) -> Solved:
+def _with_functions(solved: CellFit) -> CellFit:
     """Fits error functions of the joints of each arm that supports them."""
     # Their many unknowns would slow each update of the inliers down, so that they come last. They
     # also explain much of a slipped joint: where the slip explains more, they are left out.
-    part, fit = solved.part, solved.agreed.fit
+    part, fit = solved.inlier_problem, solved.inlier_fit.fit
 
     def with_functions(arm: RobotArm, nominal: Problem, start: State) -> RobotArm:
-        extended = arm.with_functions(nominal, start, solved.asked, fit.noise)
-        if not extended.gain_of_functions:
+        extended = arm.with_functions(nominal, start, solved.level, fit.noise)
+        if not extended.function_gain:
             return extended
         slip = slipped_joint(part, fit, joint_offsets({arm.robot: arm}))
-        slips = slip and log_gain(part, fit, slip.mahalanobis_sq) > extended.gain_of_functions
+        slips = slip and log_gain(part, fit, slip.mahalanobis_sq) > extended.function_gain
         return arm if slips else extended
 
     arms = change_each(solved.arms, part, fit, with_functions)
@@ -303,23 +327,25 @@ def _with_functions(solved: Solved) -> Solved:
     return _converge_arms(replace(solved, arms=arms))
 
 
-def _converge_arms(solved: Solved) -> Solved:
+def _converge_arms(solved: CellFit) -> CellFit:
     """Fits and relinearises the calibrated arms in turn until they converge."""
     is_modelled = any(arm.model is not None for arm in solved.arms.values())
     for iteration in range(_ROUNDS if is_modelled else 0):
-        solved = solved.posed()
-        if solved.seen is None:
-            effects = (*solved.late, *effects_of(solved.arms))
-            solved = replace(solved, agreed=_with_effects(solved.agreed, effects))
+        solved = solved.with_arm_poses()
+        if solved.linearised_corners is None:
+            effects = (*solved.clock_effects, *arm_effects(solved.arms))
+            solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects))
         else:
-            side, corners = solved.side, solved.seen
-            fitted = settle_looks(corners.looks, side, corners.moving, solved.frames, None, corners)
+            side, corners = solved.frame_model, solved.linearised_corners
+            fitted = settle_looks(
+                corners.camera_parameters, side, corners.moving, solved.frames, None, corners
+            )
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
-                looks = fitted.looks.with_levels(lens_levels(side, fitted))
+                looks = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
                 fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)
-            solved = solved.settled(side, fitted)
-        problem, state = solved.agreed.problem, solved.agreed.fit.state
-        moved = {name: arm.moved(problem, state) for name, arm in solved.arms.items()}
+            solved = solved.with_joint_fit(side, fitted)
+        problem, state = solved.inlier_fit.problem, solved.inlier_fit.fit.state
+        moved = {name: arm.relinearised(problem, state) for name, arm in solved.arms.items()}
         solved = replace(solved, arms={name: arm for name, (arm, _) in moved.items()})
         if max(step for _, step in moved.values()) < _CONVERGED_RAD:
             break
@@ -337,13 +363,13 @@ def _views_by_camera(observed: Observed, views: Sequence[ViewPoses]) -> dict[str
     }
 
 
-def _with_effects(inliers: Agreed, effects: Sequence[Effect]) -> Agreed:
+def _with_effects(inliers: InlierFit, effects: Sequence[Effect]) -> InlierFit:
     problem = inliers.problem.with_effects(effects)
     state = State(inliers.fit.state.edges, problem.start_values)
     return replace(inliers, problem=problem, fit=replace(inliers.fit, state=state)).refitted()
 
 
-def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, Agreed]:
+def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, InlierFit]:
     """Inliers of one robot and one camera before lens, board and arm are fitted.
 
     Returns:
@@ -354,10 +380,10 @@ def first_inliers(cell: Cell, observed: Observed, mount: Mount) -> tuple[Cell, A
     """
     start = find_start(cell, observed)
     check_observability(start.problem, start.state, starting_noise(start.problem), mount)
-    return start.cell, find_inliers(start)[0]
+    return start.cell, initial_inliers(start)[0]
 
 
-def find_inliers(start: Start) -> tuple[Agreed, Mapping[str, float]]:
+def initial_inliers(start: Start) -> tuple[InlierFit, Mapping[str, float]]:
     """Finds the inliers, and the priors that they do not contradict.
 
     Returns:
@@ -370,10 +396,10 @@ def find_inliers(start: Start) -> tuple[Agreed, Mapping[str, float]]:
         problem = problem.with_effects([target_sizes(problem, printed, _SIZE_SIGMA)])
         state = State(state.edges, problem.start_values)
     if not cell.priors:
-        inliers = agree(problem, state, movable)
+        inliers = inliers_and_moves(problem, state, movable)
     else:
-        loose = replace(problem, priors=loosened(cell.priors))
-        inliers = _with_priors(cell, agree(loose, state, movable)).refitted()
+        loose = replace(problem, priors=with_loose_positions(cell.priors))
+        inliers = _with_priors(cell, inliers_and_moves(loose, state, movable)).refitted()
     # Sizes are estimated from the corners, with the lenses.
     edges, sizes = inliers.fit.state.edges, inliers.fit.state.values.tolist()
     fit = replace(inliers.fit, state=State(edges, np.zeros(0)))
@@ -381,16 +407,16 @@ def find_inliers(start: Start) -> tuple[Agreed, Mapping[str, float]]:
     return inliers, dict(zip(printed, sizes, strict=True))
 
 
-def updated_inliers(cell: Cell, inliers: Agreed) -> Agreed:
+def updated_inliers(cell: Cell, inliers: InlierFit) -> InlierFit:
     """Refits inliers and priors until neither set changes."""
     if cell.priors:
-        loose = replace(inliers.problem, priors=loosened(cell.priors))
-        inliers = settle(replace(inliers, problem=loose), _movable_frames(cell, loose))
+        loose = replace(inliers.problem, priors=with_loose_positions(cell.priors))
+        inliers = refine_inliers(replace(inliers, problem=loose), _movable_frames(cell, loose))
         inliers = _with_priors(cell, inliers)
-    return settle(inliers, _movable_frames(cell, inliers.problem))
+    return refine_inliers(inliers, _movable_frames(cell, inliers.problem))
 
 
-def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: Agreed) -> Agreed:
+def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: InlierFit) -> InlierFit:
     """Estimates the noise level of cameras, too, now that outliers are removed."""
     # Corners of one image may have a common error, as those of small squares do: poses then
     # scatter by more than the corners indicate, but never by less. Where one camera sees one robot
@@ -415,7 +441,7 @@ def with_camera_levels(cell: Cell, poses: Sequence[ViewPoses], inliers: Agreed) 
     return replace(inliers, problem=problem, fit=replace(inliers.fit, noise=noise)).refitted()
 
 
-def with_repeats(inliers: Agreed) -> Agreed:
+def with_repeats(inliers: InlierFit) -> InlierFit:
     """Fits with a shared error of repeated views of a fixed board by a fixed camera."""
     # Moved frames were searched without it: differences of such views do not contain it.
     return replace(inliers, problem=replace(inliers.problem, with_repeats=True)).refitted()
@@ -427,7 +453,7 @@ def _printed_targets(observations: Observations) -> list[str]:
     return list(dict.fromkeys(target for target, sensor in pairs if sensor < 0))
 
 
-def _with_priors(cell: Cell, inliers: Agreed) -> Agreed:
+def _with_priors(cell: Cell, inliers: InlierFit) -> InlierFit:
     """Adds the components of priors that the observations do not contradict."""
     # The most contradicted is dropped first, as it biases the rest. The noise is that of a fit with
     # loose priors: estimated together with a wrong prior, it would grow until it explains it.

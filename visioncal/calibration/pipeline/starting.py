@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.pipeline.network_ties import ambiguous_error, refuse_unconnected_robots
+from visioncal.calibration.pipeline.connectivity import ambiguous_error, refuse_unconnected_robots
 from visioncal.calibration.stages.cell import Cell
 from visioncal.calibration.stages.init_frames import init_frames
 from visioncal.calibration.stages.observed import Observed, nothing_seen
@@ -16,8 +16,8 @@ from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import Target
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.observability import FEWEST_VIEWS, refuse_too_few
-from visioncal.estimation.parts import Observations, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Observations, State
 from visioncal.session import frame_name
 
 # Covariance, up to a level, of a pose that was given without one [rad^2, m^2].
@@ -70,7 +70,7 @@ def find_start(cell: Cell, observed: Observed) -> Start:
         refuse_too_few(problem, cell.mount, len(cell.rows))
         _refuse_few_of_each(cell)
     initial = init_frames(problem, views, targets_of(cell))
-    tied, chosen = initial.tied, {view.view: view for view in initial.views}
+    tied, chosen = initial.connected, {view.view: view for view in initial.views}
     if tied.untied:
         refuse_unconnected_robots(cell, tied.untied, seen=True)
         cell = _without_frames(cell, tied.untied)
@@ -160,7 +160,7 @@ def _is_sensed(seer: str, view: ViewPoses) -> bool:
 
 def _connected_part(cell: Cell) -> tuple[Cell, tuple[str, ...]]:
     """The part of a cell that observations connect, and the frames outside."""
-    tied = cell.tied()
+    tied = cell.connected_frames()
     unlinked = tuple(branch for branch in cell.tree.branches if branch not in tied)
     refuse_unconnected_robots(cell, unlinked)
     branches = cell.tree.branches

@@ -6,19 +6,19 @@ A stage is one file in `calibration.stages`, or a few lines here that pass it it
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from visioncal.calibration.pipeline.answer import answer_of
+from visioncal.calibration.pipeline.assessment import assess_fit
 from visioncal.calibration.pipeline.judging import check_answer, findings_of
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.solving import solve
 from visioncal.calibration.stages.cameras import detect_targets, estimate_lenses, locate_targets
 from visioncal.calibration.stages.cell import pair_edges, read_cell
 from visioncal.calibration.stages.clocks import set_clocks, waits_for_clock
+from visioncal.calibration.stages.image_checks import pairing, searched_images
 from visioncal.calibration.stages.judge import judge
-from visioncal.calibration.stages.kinematics import check_asked
+from visioncal.calibration.stages.kinematics import check_level_is_possible
 from visioncal.calibration.stages.loads import check_stops
 from visioncal.calibration.stages.motion import stream_of
 from visioncal.calibration.stages.observed import all_held_back
-from visioncal.calibration.stages.pictures import pairing, searched_images
 from visioncal.calibration.stages.readings import (
     exchanged_points,
     probe_poses,
@@ -117,7 +117,7 @@ def _reported(run: RunState) -> RunState:
         return run
     matched = run.reported.matched
     if matched is not None and matched.misread:
-        check_asked(run.level, can=False, misread=matched.misread)
+        check_level_is_possible(run.level, can=False, misread=matched.misread)
     if not run.base_from_flange:
         warnings = run.session.warnings
         of_model = [warning for warning in warnings if warning.startswith(_OF_MODEL)]
@@ -166,14 +166,14 @@ def _joints(run: RunState) -> RunState:
 
 def _solve(run: RunState) -> RunState:
     cell = read_cell(run)
-    return replace(run, read=cell, fit=solve(cell, run, run.level, run.solver))
+    return replace(run, cell_or_none=cell, cell_fit_or_none=solve(cell, run, run.level, run.solver))
 
 
 def _examine(run: RunState) -> RunState:
     check_answer(run)
-    answer = answer_of(run.cell, run, run.fitted, run.convention)
+    answer = assess_fit(run.cell, run, run.cell_fit, run.convention)
     rejected = (view for view in answer.views if not view.used and view.view not in run.held_back)
-    run = replace(run, fit=answer.solved, answer=answer)
+    run = replace(run, cell_fit_or_none=answer.cell_fit, assessment_or_none=answer)
     return run.noting(Rejection(view.view, view.reason) for view in rejected)
 
 
@@ -186,7 +186,7 @@ def _judge(run: RunState) -> RunState:
 STAGES: tuple[Stage, ...] = (
     Stage("robot", _read_robot),
     Stage("readings", _readings),
-    Stage("detect", lambda run: detect_targets(run, run.found_before)),
+    Stage("detect", lambda run: detect_targets(run, run.given_corners)),
     Stage("intrinsics", estimate_lenses),
     Stage("pnp", locate_targets),
     Stage("clock", _clock),

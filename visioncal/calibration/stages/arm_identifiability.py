@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.guess.joints import JointReading
+from visioncal.calibration.guess.joint_readings import JointReading
 from visioncal.core.choices import Convention
 from visioncal.core.number_format import figure, listed
 from visioncal.core.threads import one_blas_thread
@@ -247,7 +247,9 @@ def _jacobians_at_stops(arm: ArmData) -> Jacobians:
 def _error_jacobians(arm: ArmData, q: FloatArray, weight: FloatArray) -> Jacobians:
     """Jacobians by frames and arm errors at (k, n) postures, weighted as for the stops' noise."""
     flange = arm.model.base_from_flange(q)
-    return _pair_jacobians(arm.pair, flange, arm.model.kept_basis(q) * arm.error_rad, weight)
+    return _pair_jacobians(
+        arm.pair, flange, arm.model.basis_without_harmonics(q) * arm.error_rad, weight
+    )
 
 
 def _parameter_jacobians(

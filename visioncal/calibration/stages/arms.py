@@ -8,17 +8,17 @@ import numpy as np
 
 from visioncal.calibration.stages import elastic, thermal
 from visioncal.calibration.stages.arm_identifiability import ArmIdentifiability, identify_arm
-from visioncal.calibration.stages.carrying import carries_over, functions_of
+from visioncal.calibration.stages.arm_transfer import carries_over, functions_of
 from visioncal.calibration.stages.elastic import Elastic, plays_of, springs_of
-from visioncal.calibration.stages.joints import Matched
+from visioncal.calibration.stages.joints import MatchedJoints
 from visioncal.calibration.stages.kinematics import (
-    Kinematics,
+    SelectedArmLevel,
     allows_functions,
     choose_level,
     with_functions,
 )
 from visioncal.calibration.stages.loads import check_elastic, check_poses
-from visioncal.calibration.stages.reported_poses import moved_arm
+from visioncal.calibration.stages.reported_poses import move_to_arm
 from visioncal.calibration.stages.thermal import Heat, drift_result, find_drift, heating
 from visioncal.calibration.stages.thermal_fit import ThermalFit, ThermalStops
 from visioncal.core.choices import Convention
@@ -36,8 +36,8 @@ from visioncal.estimation.arm import (
 )
 from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.solve import RobotLikelihood, Solution, robot_likelihood
 from visioncal.results.arm import (
     ArmErrorsResult,
@@ -57,34 +57,34 @@ _ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class ArmFound:
+class IdentifiedArm:
     """Identified properties of an arm.
 
     Attributes:
-        numbers: Identifiability of its parameters; None for a nominal arm.
+        identifiability: Identifiability of its parameters; None for a nominal arm.
         springs: Joint compliances; None for a rigid arm.
-        plays: Backlash of the joints; empty where stops were not approached from both sides.
+        backlash: Backlash of the joints; empty where stops were not approached from both sides.
         drift: Drift with temperature; None without one.
-        carries: Where the calibrated arm beats the nominal one; None for a nominal arm.
+        carries_over: Where the calibrated arm beats the nominal one; None for a nominal arm.
         functions: Joint error functions; None without any.
         measured: Joint ranges of the stops.
     """
 
-    numbers: ArmIdentifiability | None = None
+    identifiability: ArmIdentifiability | None = None
     springs: Elastic | None = None
-    plays: tuple[JointBacklash, ...] = ()
+    backlash: tuple[JointBacklash, ...] = ()
     drift: ThermalResult | None = None
-    carries: CarriesOver | None = None
+    carries_over: CarriesOver | None = None
     functions: JointFunctions | None = None
     measured: tuple[JointRange, ...] = ()
 
     def notes(self) -> Iterator[str]:
         """Remarks that are no reason for doubt."""
-        if self.carries is not None:
-            yield self.carries.words
-        if self.numbers is not None and self.numbers.advice:
-            yield self.numbers.advice
-        yield from elastic.play_remarks(self.plays)
+        if self.carries_over is not None:
+            yield self.carries_over.words
+        if self.identifiability is not None and self.identifiability.advice:
+            yield self.identifiability.advice
+        yield from elastic.play_remarks(self.backlash)
         if self.springs is not None:
             yield from elastic.remarks(self.springs)
 
@@ -101,7 +101,7 @@ class RobotArm:
     Attributes:
         robot: Name of the robot in the problem.
         reported: (s, 4, 4) reported `base_from_flange`; NaN where unknown.
-        stood: (s,) mask of the m stops with a pose of this robot.
+        has_pose: (s,) mask of the m stops with a pose of this robot.
         joints_rad: (m, n) joints at these; None where they are missing or belong to no model.
         loads: Loads at these.
         matched: Model, matched with poses and joints; None where none is known.
@@ -114,14 +114,14 @@ class RobotArm:
 
     robot: str
     reported: FloatArray
-    stood: Mask
+    has_pose: Mask
     joints_rad: FloatArray | None
     loads: Loads
-    matched: Matched | None = None
+    matched: MatchedJoints | None = None
     heat: Heat | None = None
     thermal: ThermalFit | None = None
     errors: ArmErrors | None = None
-    kinematics: Kinematics | None = None
+    kinematics: SelectedArmLevel | None = None
     model: ArmModel | None = None
 
     @classmethod
@@ -130,7 +130,7 @@ class RobotArm:
         robot: str,
         reported: FloatArray,
         views: Sequence[View],
-        matched: Matched | None,
+        matched: MatchedJoints | None,
         recorded: tuple[Session, str],
     ) -> Self:
         """Builds a nominal arm.
@@ -177,7 +177,7 @@ class RobotArm:
         return self.kinematics is not None and self.kinematics.functions is not None
 
     @property
-    def gain_of_functions(self) -> float:
+    def function_gain(self) -> float:
         """Twice the gain in log-likelihood by joint error functions; zero without any."""
         if self.kinematics is None or self.kinematics.functions is None:
             return 0.0
@@ -186,13 +186,13 @@ class RobotArm:
 
     def at(self, stops: IntArray) -> Self:
         """The arm at a subset (k,) of its stops."""
-        stood = self.stood[stops]
-        kept = (np.cumsum(self.stood) - 1)[stops][stood]
+        stood = self.has_pose[stops]
+        kept = (np.cumsum(self.has_pose) - 1)[stops][stood]
         joints, errors = self.joints_rad, self.errors
         return replace(
             self,
             reported=self.reported[stops],
-            stood=stood,
+            has_pose=stood,
             joints_rad=None if joints is None else joints[kept],
             loads=self.loads.chosen(kept),
             heat=None if self.heat is None else self.heat.at(kept),
@@ -211,9 +211,9 @@ class RobotArm:
             raise RuntimeError("an arm drifts by its joints and what heats them")
         start_s = self.thermal.inputs.stamps_s[0]
         stamps_s = np.nan_to_num(self.heat.stamps_s, nan=start_s)
-        return ThermalStops(self.robot, np.flatnonzero(self.stood), self.joints_rad, stamps_s)
+        return ThermalStops(self.robot, np.flatnonzero(self.has_pose), self.joints_rad, stamps_s)
 
-    def erring(self, errors: ArmErrors | None) -> Self:
+    def with_found_errors(self, errors: ArmErrors | None) -> Self:
         """The arm with errors found at some of its stops, none of them estimated yet."""
         arm = replace(self, errors=errors, kinematics=None, model=None)
         return arm if errors is None else replace(arm, errors=replace(errors, basis=arm.basis))
@@ -223,12 +223,12 @@ class RobotArm:
         """(s, 4, 4) poses of the flange, by the calibrated arm where there is one."""
         poses = self.reported.copy()
         if self.model is not None and self.joints_rad is not None:
-            poses[self.stood] = self.model.base_from_flange(self.joints_rad, self.loads)
+            poses[self.has_pose] = self.model.base_from_flange(self.joints_rad, self.loads)
         if self.drift is not None:
-            poses[self.stood] = poses[self.stood] @ self.drift.motion(self.warming)
+            poses[self.has_pose] = poses[self.has_pose] @ self.drift.motion(self.warming)
         return poses
 
-    def frees_errors(self, *, freely: bool = False) -> bool:
+    def has_free_errors(self, *, freely: bool = False) -> bool:
         """Whether its errors are unknowns: estimated ones, or with `freely` any that were found."""
         return self.errors is not None and (freely or self.errors.is_estimated)
 
@@ -236,13 +236,13 @@ class RobotArm:
         """Effects that move its flange at the stops: drift uncertainty and errors."""
         drift, found = self.drift, []
         if drift is not None:
-            found.append(drift.effect(self.warming, len(self.stood)))
-        if self.errors is not None and self.frees_errors(freely=freely):
+            found.append(drift.effect(self.warming, len(self.has_pose)))
+        if self.errors is not None and self.has_free_errors(freely=freely):
             values = None if self.model is None else self.model.values
             found.append(self.errors.effect(self.robot, values=values))
         return tuple(found)
 
-    def put_into(self, problem: Problem) -> Problem:
+    def applied_to(self, problem: Problem) -> Problem:
         """A problem with this arm's poses and effects in place of its former ones."""
         mine = {f"{name} of {self.robot}" for name in ("arm", "temperature")}
         rest = [effect for effect in problem.effects if effect.name not in mine]
@@ -250,7 +250,7 @@ class RobotArm:
 
     def without_errors(self, problem: Problem) -> Problem:
         """A problem with this arm as reported, apart from its drift."""
-        return self.erring(None).put_into(problem)
+        return self.with_found_errors(None).applied_to(problem)
 
     def with_drift(self, problem: Problem, start: State, asked: str) -> Self:
         """Estimates the drift with temperature, where the session determines it.
@@ -277,16 +277,16 @@ class RobotArm:
         errors = find_arm_errors(likelihood, robot, self.basis, of_links=self.is_modelled)
         return replace(self, errors=errors)
 
-    def stated(self, problem: Problem) -> Problem | None:
+    def with_nominal_zero(self, problem: Problem) -> Problem | None:
         """A problem with a lost joint zero set to its nominal value; None where none is lost."""
         matched, q = self.matched, self.joints_rad
         if matched is None or matched.zero is None or q is None:
             return None
         poses = problem.poses[self.robot].copy()
-        poses[self.stood] = moved_arm(poses[self.stood], q, matched.arm, matched.robot)
+        poses[self.has_pose] = move_to_arm(poses[self.has_pose], q, matched.arm, matched.robot)
         return replace(problem, poses={**problem.poses, self.robot: poses})
 
-    def reported_alike(self, agrees: Mask) -> Mask:
+    def reports_matching_joints(self, agrees: Mask) -> Mask:
         """Mask (s,) of stops whose reported pose matches the joints as at the inlier stops (s,).
 
         A wrong report says nothing against joints and cameras, but would mislead the fit.
@@ -294,10 +294,10 @@ class RobotArm:
         if self.matched is None or self.joints_rad is None:
             return agrees
         nominal = self.matched.arm.base_from_flange(self.joints_rad)
-        tools, inliers = invert(nominal) @ self.reported[self.stood], agrees[self.stood]
+        tools, inliers = invert(nominal) @ self.reported[self.has_pose], agrees[self.has_pose]
         residuals = distances(tools, mean_transform(tools[inliers]))
         matches = agrees.copy()
-        matches[self.stood] = np.all(
+        matches[self.has_pose] = np.all(
             [array <= 2.0 * array[inliers].max() + _ROUNDING for array in residuals], axis=0
         )
         return matches
@@ -314,7 +314,7 @@ class RobotArm:
         if self.model is None or self.errors is None or self.joints_rad is None or columns is None:
             return None
         stops, every = stops_of(problem, self.robot), np.arange(problem.size)
-        rows = np.searchsorted(np.flatnonzero(self.stood), stops)
+        rows = np.searchsorted(np.flatnonzero(self.has_pose), stops)
         pair = ArmPair.of(problem, fit.state, self.robot)
         # A single point shows no rotation; several points make a frame.
         shows_pose = bool((problem.observations.directions[pair.rows] > 3).any())
@@ -339,14 +339,14 @@ class RobotArm:
             measured=np.repeat([shows_pose, True], 3),
         )
 
-    def found(
+    def identified(
         self,
         problem: Problem,
         fit: Solution,
         covariance: FloatArray,
         middles: Mapping[str, FloatArray],
         convention: Convention | None = None,
-    ) -> ArmFound:
+    ) -> IdentifiedArm:
         """Identified properties of the arm.
 
         Args:
@@ -365,10 +365,10 @@ class RobotArm:
             drift = drift_result(self.drift, stops, views, problem, fit)
         data = self.data(problem, fit, covariance, middles)
         if data is None or self.kinematics is None:
-            return ArmFound(drift=drift)
+            return IdentifiedArm(drift=drift)
         # With backlash and compliance alone the table stays nominal.
         has_rigid_errors = data.model.weights.keys() & set(RIGID)
-        return ArmFound(
+        return IdentifiedArm(
             identify_arm(data, convention) if has_rigid_errors else None,
             springs_of(data, self.kinematics.errors),
             plays_of(data.model, data.arm_covariance),
@@ -381,7 +381,7 @@ class RobotArm:
             ),
         )
 
-    def result(self, found: ArmFound, views: Sequence[int]) -> ArmSections:
+    def result(self, found: IdentifiedArm, views: Sequence[int]) -> ArmSections:
         """The arm's sections of a calibration; `views` are those of the stops."""
         sections = ArmSections(
             arm_errors=_size_of(self.errors) if self.errors and self.errors.is_likely else None,
@@ -393,14 +393,14 @@ class RobotArm:
         arm = replace(
             sections.arm,
             robot=self.model.robot,
-            backlash=found.plays,
+            backlash=found.backlash,
             functions=found.functions,
             measured=found.measured,
         )
-        if found.numbers is not None:
+        if found.identifiability is not None:
             zero = None if self.matched is None else self.matched.zero
-            arm = found.numbers.add_to(arm, self.model.nominal, views, zero)
-            arm = replace(arm, left_out=self.kinematics.left_out(), carries_over=found.carries)
+            arm = found.identifiability.add_to(arm, self.model.nominal, views, zero)
+            arm = replace(arm, left_out=self.kinematics.left_out(), carries_over=found.carries_over)
         springs = None if found.springs is None else found.springs.result(views)
         return replace(sections, arm=arm, elastic=springs)
 
@@ -411,7 +411,7 @@ class RobotArm:
         The errors are those of the calibrated model, else of any link, else of the pose.
         """
         if self.matched is None or self.joints_rad is None:
-            return self._by_stop(pose_basis(self.reported[self.stood]))
+            return self._by_stop(pose_basis(self.reported[self.has_pose]))
         if self.model is None:
             return self._by_stop(link_basis(self.matched.arm, self.joints_rad))
         return self._by_stop(self.model.basis(self.joints_rad, self.loads))
@@ -421,7 +421,7 @@ class RobotArm:
         """Jacobian (s, 6, n) of the flange by joint offsets; None without a model."""
         if self.matched is None or self.joints_rad is None:
             return None
-        nominal = ArmModel.of(self.matched.arm, self.joints_rad, self.reported[self.stood])
+        nominal = ArmModel.of(self.matched.arm, self.joints_rad, self.reported[self.has_pose])
         return self._block_jacobian(self.model or nominal, "offsets")
 
     def with_level(
@@ -452,13 +452,13 @@ class RobotArm:
         blocks = blocks_of(model.nominal, self.loads)
         bases = {name: self._block_jacobian(model, name) for name in blocks}
         kinematics = choose_level(
-            problem, start, self.robot, bases, asked, self.stated(problem), noise=noise
+            problem, start, self.robot, bases, asked, self.with_nominal_zero(problem), noise=noise
         )
         mine = np.flatnonzero(rows_of(problem, self.robot)).tolist()
         arm_views = tuple(views[index] for index in mine)
         arm = replace(self, kinematics=replace(kinematics, views=arm_views))
         if kinematics.errors:
-            return arm._with_model(model.erring(kinematics.errors))
+            return arm._with_model(model.with_errors(kinematics.errors))
         if self.model is None:
             return arm
         # There are fewer inliers than when it was calibrated: errors are sought at the nominal arm.
@@ -475,14 +475,14 @@ class RobotArm:
         if not allows_functions(asked, len(q)):
             return self
         model = ArmModel.of(self.matched.arm, q, reported).loaded(q, used.loads)
-        selection = np.eye(len(self.stood))[:, self.stood]
+        selection = np.eye(len(self.has_pose))[:, self.has_pose]
         stops = (selection, self.joints_rad, self.loads)
         fit = with_functions(self.kinematics, problem, start, self.robot, model, stops, noise)
         if fit.functions is None:
             return self
         model = replace(
             model, harmonic_directions=fit.functions.directions, harmonic_sizes=fit.functions.sizes
-        ).erring(fit.errors)
+        ).with_errors(fit.errors)
         return replace(self, kinematics=fit)._with_model(model)
 
     def _block_jacobian(self, model: ArmModel, name: str) -> FloatArray:
@@ -491,7 +491,7 @@ class RobotArm:
             raise RuntimeError("an arm is calibrated by its joints")
         return self._by_stop(model.columns(name, self.joints_rad, self.loads))
 
-    def moved(self, problem: Problem, state: State) -> tuple[Self, float]:
+    def relinearised(self, problem: Problem, state: State) -> tuple[Self, float]:
         """Relinearises the calibrated arm at a fit.
 
         Returns:
@@ -516,15 +516,15 @@ class RobotArm:
 
     def _by_stop(self, columns: FloatArray) -> FloatArray:
         """(m, 6, p) spread over all stops, (s, 6, p): zero where the robot has no pose."""
-        scattered = np.zeros((len(self.stood), *columns.shape[1:]))
-        scattered[self.stood] = columns
+        scattered = np.zeros((len(self.has_pose), *columns.shape[1:]))
+        scattered[self.has_pose] = columns
         return scattered
 
 
 def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     """Size of the errors, as a section of a calibration."""
-    if errors.look is not None and errors.white is not None:
-        sigma_rad, sigma_m = np.sqrt(np.maximum(errors.look**2 - errors.white**2, 0.0))
+    if errors.fit_sigmas is not None and errors.white is not None:
+        sigma_rad, sigma_m = np.sqrt(np.maximum(errors.fit_sigmas**2 - errors.white**2, 0.0))
         result = ArmErrorsResult(
             sigma_mm=1e3 * float(sigma_m),
             sigma_deg=float(np.rad2deg(sigma_rad)),
@@ -532,9 +532,11 @@ def _size_of(errors: ArmErrors) -> ArmErrorsResult:
             estimated=False,
             of="flange",
         )
-        if errors.away is None:
+        if errors.far_posture_errors is None:
             return result
-        (deg, mm), (predicted_deg, predicted_mm) = (errors.away * [np.rad2deg(1.0), 1e3]).tolist()
+        (deg, mm), (predicted_deg, predicted_mm) = (
+            errors.far_posture_errors * [np.rad2deg(1.0), 1e3]
+        ).tolist()
         return replace(
             result,
             away_mm=mm,
@@ -550,7 +552,7 @@ def _size_of(errors: ArmErrors) -> ArmErrorsResult:
     )
 
 
-def effects_of(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:
+def arm_effects(arms: Mapping[str, RobotArm], *, freely: bool = False) -> Iterator[Effect]:
     """The effects of all arms; see `RobotArm.effects`."""
     for arm in arms.values():
         yield from arm.effects(freely=freely)
@@ -564,5 +566,5 @@ def check_arms(arms: Mapping[str, RobotArm], asked: str) -> None:
         DegenerateError: Loads change while an arm stands still.
     """
     for arm in arms.values():
-        check_poses(arm.loads, arm.reported[arm.stood])
+        check_poses(arm.loads, arm.reported[arm.has_pose])
         check_elastic(asked, None if arm.matched is None else arm.matched.robot, arm.loads)

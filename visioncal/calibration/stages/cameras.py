@@ -12,8 +12,8 @@ from visioncal.calibration.stages.dense import fit_densely
 from visioncal.calibration.stages.detect import Detections, detect
 from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import Intrinsics, estimate_intrinsics
-from visioncal.calibration.stages.observed import CameraLook, Observed, nothing_seen
-from visioncal.calibration.stages.pnp import Poses, estimate_poses, given_poses, measure_poses
+from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
+from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import figure, some_of
@@ -78,7 +78,7 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
         repeated = _repeated(views, numbered)
         unique = {view: corners for view, corners in numbered.items() if view not in repeated}
         repeats = {view: f"repeats view {earlier}" for view, earlier in repeated.items()}
-        look = CameraLook(table, unique, resolution, repeats=repeats)
+        look = CameraObservations(table, unique, resolution, repeats=repeats)
         seen = seen.noting((), _repeat_findings(repeated)).with_camera(frame, look)
     return seen
 
@@ -134,7 +134,7 @@ def locate_targets(seen: T) -> T:
     """
     seen = leave_out_wrong_points(seen)
     session, targets = seen.session, tuple(seen.session.boards.values())
-    poses = {**seen.poses, **given_poses(session)}
+    poses = {**seen.poses, **stated_poses(session)}
     for frame in seen.cameras:
         look = seen.cameras[frame]
         corners = {view: px for view, px in look.corners.items() if view not in seen.reasons}

@@ -174,7 +174,7 @@ def with_other_board(verdict: Verdict, found: Finding) -> Verdict:
     return replace(verdict, findings=(cause, *rest))
 
 
-def ranked(
+def rank_causes(
     doubts: Sequence[Finding],
     picks: Sequence[Picks],
     met: NeedMet | None,

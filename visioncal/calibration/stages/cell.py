@@ -9,16 +9,16 @@ from scipy.sparse.csgraph import connected_components
 
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.priors import priors_of
-from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray, Mount
 from visioncal.core.verdict import Remedy, or_alone
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.parts import FramePrior
+from visioncal.estimation.problem_parts import FramePrior
 from visioncal.estimation.tree import Branch, Tree
 from visioncal.results import HELD_BACK
 from visioncal.session import Observation, Session, frame_name
-from visioncal.session.kinds import is_seen
+from visioncal.session.kinds import is_camera_observation
 from visioncal.session.selecting import is_whole_cell
 from visioncal.session.tables import PriorTable
 
@@ -61,13 +61,13 @@ class Cell:
     priors: tuple[FramePrior, ...] = ()
     held: tuple[ObservationRow, ...] = ()
 
-    def from_when(self, station: int) -> str:
+    def start_words(self, station: int) -> str:
         """Start at a station in words, by the session's own numbers."""
         if "stop" in self.session.columns:
             return f"from stop {self.stops[station]} on"
         return f"from view {self.stops[station]} on"
 
-    def or_apart(self, do: str, station: int) -> Remedy:
+    def or_separately(self, do: str, station: int) -> Remedy:
         """Advice to `do` something and record again, or to calibrate the longer part alone.
 
         The later part begins at a station.
@@ -90,7 +90,7 @@ class Cell:
         rows = tuple(row for row in self.rows if row.view not in reasons)
         return replace(self, rows=rows, reasons={**self.reasons, **reasons})
 
-    def tied(self) -> tuple[str, ...]:
+    def connected_frames(self) -> tuple[str, ...]:
         """The frames that observations connect to the reference, in the tree's order."""
         names = [_CELL, *self.tree.branches]
         index = {name: at for at, name in enumerate(names)}
@@ -149,7 +149,8 @@ def read_cell(seen: Observed) -> Cell:
             observation.station,
             observation.seer,
             observation.seen,
-            not is_seen(observation.view) and observation.view.instrument_from_probe() is None,
+            not is_camera_observation(observation.view)
+            and observation.view.instrument_from_probe() is None,
         )
         for observation in observations
         if _has_robot_poses(observation, seen.robots)
@@ -206,10 +207,10 @@ def robot_key(name: str) -> str:
     return name or "robot"
 
 
-def _has_robot_poses(observation: Observation, robots: Mapping[str, Reported]) -> bool:
+def _has_robot_poses(observation: Observation, robots: Mapping[str, RobotReport]) -> bool:
     """Whether the poses of all robots in an observation's chain are known."""
     view = observation.view.number
-    return not observation.lacks and all(
+    return not observation.missing_robots and all(
         view in robots[name].base_from_flange for name in observation.robots
     )
 
@@ -238,7 +239,7 @@ def _reference(cell: Cell) -> str:
     choices = [base for base in bases if base in still] or still
 
     def connected_rows(name: str) -> int:
-        connected = cell.with_reference(name).tied()
+        connected = cell.with_reference(name).connected_frames()
         return sum(row.seer in connected for row in cell.rows)
 
     return max(choices, key=connected_rows)

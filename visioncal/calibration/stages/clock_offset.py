@@ -29,9 +29,9 @@ from visioncal.estimation.effects.delays import (
     target_twists,
 )
 from visioncal.estimation.linalg import covariance_from
-from visioncal.estimation.parts import Effect
+from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.trajectory import LONGEST_GAP_S, Trajectory
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 from visioncal.results.sections import ClockResult
 from visioncal.session import View, too_far_apart
 
@@ -55,7 +55,7 @@ ClockMethod: TypeAlias = Literal["motion", "turning", "stated", "rest"]
 
 
 @dataclass(frozen=True, eq=False)
-class FoundDelay:
+class DelayEstimate:
     """Estimated delay within images, such as that of a rolling shutter.
 
     Attributes:
@@ -77,7 +77,7 @@ class FoundDelay:
         """Error of the delay as an unknown of some views; see `stages.clocks.clock_effects`."""
         unaffected = np.zeros(6)
         jacobian = np.array([self.jacobian.get(view, unaffected) for view in views])
-        prior = Knowledge(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
+        prior = PriorInformation(np.array([[self.sigma_s**-2.0]]), np.zeros(1))
         return Effect.free(name or self.of.name, prior, jacobian.reshape(-1, 6, 1))
 
     def result(self) -> dict[str, Any]:
@@ -92,7 +92,7 @@ class FoundDelay:
 
 def find_delays(
     flange: Trajectory, frames: ImageTimes, camera: Camera | None, start: ClockFit
-) -> tuple[DelayedFit | None, tuple[FoundDelay, ...]]:
+) -> tuple[DelayedFit | None, tuple[DelayEstimate, ...]]:
     """Estimates delays within images.
 
     Args:
@@ -109,7 +109,7 @@ def find_delays(
         return None, ()
     columns = (full.times_s.tolist(), full.sigmas_s.tolist(), full.is_clear.tolist())
     delays = tuple(
-        FoundDelay(of, time_s, sigma_s, is_clear, camera.resolution)
+        DelayEstimate(of, time_s, sigma_s, is_clear, camera.resolution)
         for of, time_s, sigma_s, is_clear in zip(EFFECTS, *columns, strict=True)
     )
     clear = [delay.of for delay in delays if delay.is_clear]
@@ -210,9 +210,9 @@ class ClockOffset:
     frames: int
     correlation: float | None
     speeds: Mapping[int, FloatArray]
-    delays: tuple[FoundDelay, ...] = ()
+    delays: tuple[DelayEstimate, ...] = ()
 
-    def known_s(self, *, erring: bool = False) -> float:
+    def prior_sigma_s(self, *, erring: bool = False) -> float:
         """Prior sigma of the offset in the fit of the used views [s].
 
         The used views determine it in the fit themselves; of the motion, only the share of the

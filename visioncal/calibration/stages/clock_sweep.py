@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visioncal.calibration.guess.joints import JointReading, declared_reading, unit_readings
+from visioncal.calibration.guess.joint_readings import JointReading, declared_reading, unit_readings
 from visioncal.calibration.stages.clock_offset import (
     FEWEST_VIEWS,
     LARGEST_SIGMA_S,
@@ -27,7 +27,12 @@ from visioncal.calibration.stages.clock_offset import (
     undetermined_error,
     why_undetermined,
 )
-from visioncal.calibration.stages.motion import RobotMotion, at_rest, is_open, slow_and_new
+from visioncal.calibration.stages.motion import (
+    RobotMotion,
+    is_standing_still,
+    lacks_robot_state,
+    slow_and_new,
+)
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
@@ -88,7 +93,7 @@ class ClockPair:
 
 
 @dataclass(frozen=True, eq=False)
-class Clocked:
+class ClockedViews:
     """Views with the robot's poses at their time.
 
     Attributes:
@@ -144,7 +149,7 @@ class CameraSweep:
         )
 
 
-def set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> Clocked:
+def set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> ClockedViews:
     """Gives views the robot's poses at their time.
 
     Raises:
@@ -185,7 +190,7 @@ class _Matched:
 
 def _match(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> _Matched:
     flange, stated_s = sweep.motion.flange, sweep.stated_s
-    views = [view for view in sweep.views if is_open(view) and view.number in poses]
+    views = [view for view in sweep.views if lacks_robot_state(view) and view.number in poses]
     views.sort(key=lambda view: view.stamp_s or 0.0)
     frames = _frames(sweep, [view for view in views if not view.holdout], poses)
     matches = turning_matches(flange, frames, stated_s or 0.0)
@@ -199,7 +204,7 @@ def _match(sweep: CameraSweep, poses: Mapping[int, ViewPoses]) -> _Matched:
     return _Matched(views, frames, matches, sound, fits, clear_fit(fits, stated_s))
 
 
-def _clocked(sweep: CameraSweep, matched: _Matched, poses: Mapping[int, ViewPoses]) -> Clocked:
+def _clocked(sweep: CameraSweep, matched: _Matched, poses: Mapping[int, ViewPoses]) -> ClockedViews:
     """Gives views their poses by the best available offset."""
     fit, sound = matched.fit, matched.sound
     if fit is not None and fit.sigma_s <= LARGEST_SIGMA_S:
@@ -291,7 +296,7 @@ def _by_motion(
     found: tuple[ClockFit, Match],
     frames: ImageTimes,
     poses: Mapping[int, ViewPoses],
-) -> Clocked:
+) -> ClockedViews:
     fit, match = found
     delayed, delays = find_delays(sweep.motion.flange, frames, sweep.camera, fit)
     fit = fit if delayed is None else delayed.clock
@@ -313,11 +318,11 @@ def _by_motion(
 
 def _with_corrected(
     sweep: CameraSweep,
-    clocked: Clocked,
+    clocked: ClockedViews,
     views: Sequence[View],
     poses: Mapping[int, ViewPoses],
     fit: DelayedFit,
-) -> Clocked:
+) -> ClockedViews:
     """Corrects the corners of all views that the stream covers for delays."""
     flange, clock = sweep.motion.flange, clocked.clock
     seen = [(view, poses[view.number]) for view in views if poses[view.number].corners is not None]
@@ -344,7 +349,7 @@ def _with_corrected(
     return replace(clocked, clock=replace(clock, delays=delays), poses=corrected.poses)
 
 
-def _by_turning(sweep: CameraSweep, views: Sequence[View], match: Match) -> Clocked:
+def _by_turning(sweep: CameraSweep, views: Sequence[View], match: Match) -> ClockedViews:
     """Takes the offset by rotation alone, where the chain of frames does not close."""
     clock = ClockOffset(
         match.offset_s, match.sigma_s, "turning", sweep.stated_s, 0, match.correlation, speeds={}
@@ -355,14 +360,14 @@ def _by_turning(sweep: CameraSweep, views: Sequence[View], match: Match) -> Cloc
 
 def _undetermined(
     sweep: CameraSweep, views: Sequence[View], tried: tuple[Sequence[ClockFit], Sequence[Match]]
-) -> Clocked:
+) -> ClockedViews:
     """Gives views their poses without an estimate: at the stated offset, or for views at rest."""
     why, stated_s = why_undetermined(*tried), sweep.stated_s
     reason = not_ascending(views) or why
     offset_s = stated_s or 0.0
     correlation = max((match.correlation for match in tried[1]), default=None)
     stamps_s = np.array([view.stamp_s for view in views], dtype=float)
-    resting = at_rest(sweep.motion.flange, stamps_s - offset_s)
+    resting = is_standing_still(sweep.motion.flange, stamps_s - offset_s)
     clock = ClockOffset(offset_s, 0.0, "rest", stated_s, 0, correlation, speeds={})
     if resting.all() and len(views):
         note = (
@@ -402,7 +407,7 @@ def _at_offset(
     clock: ClockOffset,
     warnings: Sequence[Finding],
     notes: Sequence[str],
-) -> Clocked:
+) -> ClockedViews:
     """Gives views their poses at an offset, and selects among very many."""
     at_s = np.array([view.stamp_s for view in views], dtype=float) - clock.camera_minus_robot_s
     covered = sweep.motion.flange.covers(at_s)
@@ -419,12 +424,12 @@ def _at_offset(
     beyond = {key for key, why in lost.items() if why == _BEYOND and len(views) > _MANY_VIEWS}
     spared = {view.number: _SPARED for view in inside if view.number not in rows}
     lost |= {view.number: _NO_TIME for view in sweep.views if _has_no_pose_or_time(view)}
-    return Clocked(
+    return ClockedViews(
         clock,
         tuple(
             replace(view, numbers={**view.numbers, **rows.get(view.number, {})})
             for view in sweep.views
-            if view.number in rows or not (is_open(view) or _has_no_pose_or_time(view))
+            if view.number in rows or not (lacks_robot_state(view) or _has_no_pose_or_time(view))
         ),
         tuple(Rejection(view, why) for view, why in lost.items() if view not in beyond),
         spared | dict.fromkeys(beyond, _BEYOND),

@@ -14,22 +14,22 @@ from visioncal.calibration.stages.cell import Cell, robot_key
 from visioncal.calibration.stages.clock_offset import ClockOffset
 from visioncal.calibration.stages.clock_sweep import (
     CameraSweep,
-    Clocked,
+    ClockedViews,
     ClockPair,
     misread_joints,
     set_clock,
 )
-from visioncal.calibration.stages.motion import is_open, motion_of, stream_of
+from visioncal.calibration.stages.motion import lacks_robot_state, motion_of, stream_of
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError, DegenerateError, VisioncalError
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.effects.clock import clock_effect
-from visioncal.estimation.parts import Effect
+from visioncal.estimation.problem_parts import Effect
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
-from visioncal.session.kinds import is_seen
+from visioncal.session.kinds import is_camera_observation
 from visioncal.session.tables import ClockTable
 from visioncal.vision.targets import numbered_positions
 
@@ -57,14 +57,14 @@ def set_clocks(seen: T) -> T:
 
 def _waiting(session: Session) -> dict[ClockPair, list[View]]:
     """Rows that lack the pose of one robot with a stream, by pair; at least one has a time."""
-    if not session.streams or not any(is_open(view) for view in session.views):
+    if not session.streams or not any(lacks_robot_state(view) for view in session.views):
         return {}
     waiting: dict[ClockPair, list[View]] = {}
     for observation in session.observations:
-        view, lacks = observation.view, observation.lacks
-        if len(lacks) == 1 and is_seen(view) and stream_of(session, lacks[0]):
+        view, lacks = observation.view, observation.missing_robots
+        if len(lacks) == 1 and is_camera_observation(view) and stream_of(session, lacks[0]):
             waiting.setdefault(ClockPair(observation.seer, lacks[0]), []).append(view)
-    return {pair: rows for pair, rows in waiting.items() if any(map(is_open, rows))}
+    return {pair: rows for pair, rows in waiting.items() if any(map(lacks_robot_state, rows))}
 
 
 def _with_clock(seen: T, pair: ClockPair, rows: list[View]) -> T:
@@ -104,7 +104,9 @@ def _with_clock(seen: T, pair: ClockPair, rows: list[View]) -> T:
     return seen.noting(clocked.rejections, (warning.of(of) for warning in clocked.warnings))
 
 
-def _set_clock(sweep: CameraSweep, poses: Mapping[int, ViewPoses], model: Robot | None) -> Clocked:
+def _set_clock(
+    sweep: CameraSweep, poses: Mapping[int, ViewPoses], model: Robot | None
+) -> ClockedViews:
     try:
         return set_clock(sweep, poses)
     except (DataError, DegenerateError) as error:
@@ -125,7 +127,7 @@ def _stated_s(session: Session, camera: str) -> float | None:
 
 
 def clock_effects(
-    cell: Cell, clocks: Mapping[ClockPair, Clocked], erring: Collection[str] = ()
+    cell: Cell, clocks: Mapping[ClockPair, ClockedViews], erring: Collection[str] = ()
 ) -> tuple[Effect, ...]:
     """Errors of clock offsets and delays [s], as effects on the cell's rows.
 
@@ -139,7 +141,7 @@ def clock_effects(
     for pair, clocked in clocks.items():
         clock, robot = clocked.clock, robot_key(pair.robot)
         if clock.speeds and robot in cell.poses:
-            sigma_s = clock.known_s(erring=robot in erring)
+            sigma_s = clock.prior_sigma_s(erring=robot in erring)
             effects.append(_offset_effect(cell, pair, clock, sigma_s))
             clear = (delay for delay in clock.delays if delay.is_clear)
             effects += [delay.effect(views, pair.delay(delay.of)) for delay in clear]
@@ -153,4 +155,4 @@ def _offset_effect(cell: Cell, pair: ClockPair, clock: ClockOffset, sigma_s: flo
     for row in cell.rows:
         if row.view in speeds:
             twists[row.station] = speeds[row.view]
-    return replace(clock_effect(twists, sigma_s, pair.effect, robot), concerned=concerned)
+    return replace(clock_effect(twists, sigma_s, pair.effect, robot), rows_concerned=concerned)

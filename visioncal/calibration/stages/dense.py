@@ -15,9 +15,9 @@ from visioncal.core.types import Camera, Corners, FloatArray, Image, Progress, R
 from visioncal.results.evidence import ExplainedImage, ViewEvidence
 from visioncal.session import Session, View
 from visioncal.vision.dense.blur import Blur
+from visioncal.vision.dense.board_rendering import MAGNIFIED, DenseImage, render_board
 from visioncal.vision.dense.fit import FittedCorners, fit_corners
 from visioncal.vision.dense.library import ONE_TORCH_THREAD
-from visioncal.vision.dense.shown import MAGNIFIED, DenseImage, explain
 from visioncal.vision.finders.template import Refined, refine
 
 # Number of views that show whether smoothing helps, its sigma [px], and the share to which it has
@@ -196,10 +196,10 @@ def explained(
         if isinstance(image, Rejection):
             return seen
         target = session.boards[session.board_of(view)]
-        rendered = explain(image, target, seen.corners.ids, px, camera, fit.blur, fit.tone)
+        rendered = render_board(image, target, seen.corners.ids, px, camera, fit.blur, fit.tone)
         if rendered is None:
             return seen
-        drawn, rest = (_as_jpeg(array) for array in (rendered.drawn, rendered.rest))
+        drawn, rest = (_as_jpeg(array) for array in (rendered.rendered, rendered.difference))
         return replace(seen, explained=ExplainedImage(drawn, rest, _words(fit, rendered)))
 
     with ONE_TORCH_THREAD.held(), ThreadPoolExecutor(dense.threads or os.cpu_count() or 1) as pool:
@@ -219,8 +219,8 @@ def _words(fit: FittedCorners, rendered: DenseImage) -> str:
         f"**{causes[blur.cause]}.** Edges are {blur.width_px:.2f} px wide as a sigma: a Gaussian "
         f"of {blur.sigma_px:.2f} px, a disc of {blur.disc_px:.2f} px radius, and a line of "
         f"{blur.length_px:.2f} px at {blur.direction_deg:.0f} deg from the image's rows.\n\n"
-        f"What is not explained has an rms of {rendered.rest_rms:.1f} grey levels on the board, "
-        f"about its corners alone {fit.noise:.1f}; it is drawn {MAGNIFIED} times as strong. Edges "
-        "that show on one side light and on the other dark are where the board is not where the "
-        "calibration has it."
+        f"What is not explained has an rms of {rendered.difference_rms:.1f} grey levels on the "
+        f"board, about its corners alone {fit.noise:.1f}; it is drawn {MAGNIFIED} times as strong. "
+        "Edges that show on one side light and on the other dark are where the board is not where "
+        "the calibration has it."
     )

@@ -13,9 +13,9 @@ from threading import Condition
 import cv2
 import numpy as np
 
+from visioncal.calibration.stages.corner_cache import CornerCache, Searched
 from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS, check_axes, check_numbers
 from visioncal.calibration.stages.image_size import other_size_step
-from visioncal.calibration.stages.kept_corners import KeptCorners, Searched
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
 from visioncal.core.threads import SharedSetting
@@ -28,7 +28,7 @@ from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
 from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
 from visioncal.vision.finders.identify_checkerboard import find_squares
-from visioncal.vision.finders.imaging import blur_at_corners, decode_image, why_hard_to_see
+from visioncal.vision.finders.imaging import blur_at_corners, decode_image, poor_image_reason
 from visioncal.vision.targets import corner_positions, point_numbers
 
 # Fewest corners of corners.csv: a homography takes four points.
@@ -112,7 +112,7 @@ def detect(
     stated = _stated_resolution(session, among)
     searches: list[Searched] = []
     others = {board for board in session.boards if _shows_another(session, board, views)}
-    budget, cache = _MemoryBudget(), KeptCorners.beside(session, grows=keeps)
+    budget, cache = _MemoryBudget(), CornerCache.beside(session, grows=keeps)
     with _ONE_OPENCV_THREAD.held(), ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
 
         def search_view(view: View) -> Searched:
@@ -208,7 +208,7 @@ def _search(
     view: View,
     stated: tuple[int, int] | None,
     budget: _MemoryBudget,
-    cache: KeptCorners,
+    cache: CornerCache,
     *,
     quick: bool,
 ) -> Searched:
@@ -234,14 +234,14 @@ def _search(
         image = _decoded(view, data)
         if isinstance(image, Rejection):
             return Searched(image, None)
-        found, misfit = look_for(image, target, view.number, quick=quick, name=name)
+        found, misfit = find_corners(image, target, view.number, quick=quick, name=name)
     searched = Searched(found, (image.shape[1], image.shape[0]), misfit)
     if not quick:
         cache.put(key, searched)
     return searched
 
 
-def look_for(
+def find_corners(
     image: Image, target: Target, view: int, *, quick: bool = False, name: str = ""
 ) -> tuple[Corners | Rejection, bool]:
     """Finds a target in one image.
@@ -259,7 +259,7 @@ def look_for(
     """
     seen = find_target(image, target, quick=quick)
     if isinstance(seen, NotFound):
-        cause = why_hard_to_see(image, MAX_BLUR_PX)
+        cause = poor_image_reason(image, MAX_BLUR_PX)
         reason = f"{seen.reason}; {cause}" if cause else seen.reason
         reason = f"{reason} (looked for target {name})" if name else reason
         return Rejection(view, reason), seen.misfit
@@ -401,7 +401,7 @@ def _sample(session: Session, views: Sequence[View], name: str) -> dict[int, Cor
         image = image_of(session, view)
         if isinstance(image, Rejection):
             continue
-        corners, _ = look_for(image, session.boards[name], view.number)
+        corners, _ = find_corners(image, session.boards[name], view.number)
         if isinstance(corners, Corners):
             sample[view.number] = corners
         if len(sample) == _LAYOUT_SAMPLE:

@@ -43,7 +43,7 @@ _LEFT_OUT = (EXCHANGED, "turned_images", "wrong_pose", "something_moved")
 _OF_NOISE = 1.5
 
 
-def doubts_of(findings: Findings) -> list[Finding]:
+def collect_findings(findings: Findings) -> list[Finding]:
     """All findings against a result, in the order of the checks."""
     limits = CalibrationLimits()
     robots = list(_robot_doubts(findings, limits))
@@ -144,7 +144,7 @@ def _is_mostly_of(findings: Findings, *sources: str) -> bool:
     return of_sources > 0.5 * total
 
 
-def helping(findings: Findings) -> Remedy | None:
+def remedy_for_uncertainty(findings: Findings) -> Remedy | None:
     """Remedy that makes a result less uncertain; None where a finding on the arm has it."""
     if _is_of_board(findings):
         return MEASURE_BOARD
@@ -164,7 +164,7 @@ def _tilted(findings: Findings) -> Remedy:
 def _pair_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     words, views, is_fatal = [], list[ViewResult](), False
     for pair in findings.pairs:
-        held = pair.away or pair.held_out
+        held = pair.weighted_held_out or pair.held_out
         beyond = [
             (f"{figure(value)} {unit} (doubt begins at {check:g})", value > bad)
             for value, unit, (check, bad), noise in zip(
@@ -206,7 +206,7 @@ def _worst_views(views: Sequence[ViewResult]) -> list[ViewResult]:
 
 def _disagreement_doubts(pair: JudgedPair) -> Iterator[Finding]:
     """Finding on outlier views of a pair."""
-    out = pair.disagreeing
+    out = pair.outliers
     if not out:
         return
     views, run = tuple(rejection.view for rejection in out), _run(pair)
@@ -238,7 +238,7 @@ def _disagreement_doubts(pair: JudgedPair) -> Iterator[Finding]:
 
 def _run(pair: JudgedPair) -> str:
     """Sentence on outlier views that are consecutive; empty where they are not."""
-    out = [rejection.view for rejection in pair.disagreeing]
+    out = [rejection.view for rejection in pair.outliers]
     compared = [view.view for view in pair.views if view.used or view.view in out]
     first = compared.index(out[0])
     end = first + len(out)
@@ -253,7 +253,7 @@ def _run(pair: JudgedPair) -> str:
 def _outlier_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Finding]:
     """Findings on single views with outstanding residuals."""
     # Where corners give the noise of each view, the outlier search has judged views better.
-    if any(arm.away_mm is not None for arm in findings.arms):
+    if any(arm.noise_mm is not None for arm in findings.arms):
         return
     for pair in findings.pairs:
         for view, ratio in _outlying_views(pair.views, limits.outlier):
@@ -425,7 +425,7 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
     total = sensor.used + sensor.spared + len(lost)
     share = len(lost) / max(total, 1)
     if share > limits.lost_share[0]:
-        details, disagree = "", {*sensor.disagreeing}
+        details, disagree = "", {*sensor.outliers}
         others = [rejection for rejection in lost if rejection.view not in disagree]
         if disagree:
             count = len(disagree) if others else "all"
@@ -473,14 +473,15 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
     # Only noise whose confidence interval is above the limit counts. For a task that needs ten
     # times as much the arm is good enough.
     for arm in findings.arms:
-        if arm.away_mm is None or arm.away_deg is None or arm.errs:
+        if arm.noise_mm is None or arm.noise_deg is None or arm.has_posture_errors:
             continue
-        least_mm, least_deg = arm.surely or (arm.away_mm, arm.away_deg)
-        ratio = max(arm.away_mm / limits.robot_mm, arm.away_deg / limits.robot_deg)
+        least_mm, least_deg = arm.lower_bounds or (arm.noise_mm, arm.noise_deg)
+        ratio = max(arm.noise_mm / limits.robot_mm, arm.noise_deg / limits.robot_deg)
         if max(least_mm / limits.robot_mm, least_deg / limits.robot_deg) > 1.0:
             words = (
                 "The residuals would take a flange that is off by "
-                f"{mm_and_deg(arm.away_mm, arm.away_deg)} from stop to stop; arms repeat to 0.1 mm."
+                f"{mm_and_deg(arm.noise_mm, arm.noise_deg)} "
+                "from stop to stop; arms repeat to 0.1 mm."
             )
             step = Remedy(
                 "Read a few stops twice to see how well readings repeat; more likely than the "

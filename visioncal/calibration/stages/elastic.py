@@ -13,9 +13,9 @@ from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT, ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.bending import (
     Factor,
-    bends_seen,
     compliance_unit,
     flange_bends,
+    observed_bends,
     payload_factor,
 )
 from visioncal.results.arm import ElasticResult, JointBacklash, JointSpring, LoadedStop, Sag
@@ -95,9 +95,9 @@ def springs_of(arm: ArmData, errors: Mapping[str, ArmErrors]) -> Elastic | None:
     sigmas = np.full(model.nominal.joint_count, prior)
     bends_rad = np.full(torques.shape, np.nan)
     if COMPLIANCE in model.weights:
-        variances = np.diag(arm.arm_covariance)[model.place_of(COMPLIANCE)]
+        variances = np.diag(arm.arm_covariance)[model.columns_of(COMPLIANCE)]
         sigmas = compliance_unit(model) * np.sqrt(variances)
-        bends_rad = bends_seen(arm, torques)
+        bends_rad = observed_bends(arm, torques)
     is_determined = (np.abs(torques).max(axis=0) > _LOADED_NM) & (sigmas < _DETERMINED * prior)
     return Elastic(
         tuple(_springs(model, np.minimum(sigmas, prior), is_determined, torques)),
@@ -192,7 +192,7 @@ def plays_of(model: ArmModel, covariance: FloatArray) -> tuple[JointBacklash, ..
     """
     if BACKLASH not in model.weights:
         return ()
-    place = model.place_of(BACKLASH)
+    place = model.columns_of(BACKLASH)
     sigmas = model.weights[BACKLASH] * np.sqrt(np.diag(covariance)[place])
     names = model.nominal.joint_names
     sign = np.copysign(1.0, np.sum(model.backlash / sigmas**2))

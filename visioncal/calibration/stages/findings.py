@@ -9,7 +9,7 @@ from visioncal.core.verdict import Finding
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
 from visioncal.results.views import holdout_rms, left_out_rms, rms_of
-from visioncal.session.frames import thing_name
+from visioncal.session.frames import object_name
 
 
 @dataclass(frozen=True)
@@ -18,17 +18,18 @@ class JudgedPair:
 
     Attributes:
         views: Result of each view.
-        disagreeing: Outliers: views whose robot pose and image do not belong together.
+        outliers: Outliers: views whose robot pose and image do not belong together.
         name: Names of both; empty for a single pair.
         noise: Expected residuals by the sensor's own noise.
-        away: `held_out` with the weights of `noise`; None where all views have equal weights.
+        weighted_held_out: `held_out` with the weights of `noise`; None where all views have equal
+            weights.
     """
 
     views: Sequence[ViewResult]
-    disagreeing: Sequence[Rejection] = ()
+    outliers: Sequence[Rejection] = ()
     name: str = ""
     noise: Rms = field(default_factory=lambda: Rms(0.0, 0.0))
-    away: Rms | None = None
+    weighted_held_out: Rms | None = None
 
     @property
     def held_out(self) -> Rms:
@@ -48,7 +49,7 @@ class Sensor:
     Attributes:
         used: Number of its used views.
         lost: Rejected views, without those held back on purpose.
-        disagreeing: The outliers among these.
+        outliers: The outliers among these.
         pixel_px: Noise of a corner's coordinate; None without images [px].
         level: Ratio of the scatter of its poses to their predicted noise.
         spared: Number of redundant views that were not needed.
@@ -57,7 +58,7 @@ class Sensor:
 
     used: int
     lost: Sequence[Rejection] = ()
-    disagreeing: Sequence[int] = ()
+    outliers: Sequence[int] = ()
     pixel_px: float | None = None
     level: float = 1.0
     spared: int = 0
@@ -70,10 +71,12 @@ class JudgedArm:
 
     Attributes:
         stops: Number of its stops in the fit.
-        away_mm: Noise of its flange; None where that cannot be separated from the cameras' [mm].
-        away_deg: The same in rotation [deg].
-        surely: Lower ends of their 95 % intervals [mm, deg]; None for the estimates themselves.
-        errs: Whether it has posture-dependent errors, which have a finding of their own.
+        noise_mm: Noise of its flange; None where that cannot be separated from the cameras' [mm].
+        noise_deg: The same in rotation [deg].
+        lower_bounds: Lower ends of their 95 % intervals [mm, deg]; None for the estimates
+            themselves.
+        has_posture_errors: Whether it has posture-dependent errors, which have a finding of their
+            own.
         workspace_mm: Median predicted position sigma of a calibrated arm's tool over the workspace;
             None for a nominal arm [mm].
         modelled: Whether its model is known.
@@ -83,10 +86,10 @@ class JudgedArm:
     """
 
     stops: int
-    away_mm: float | None = None
-    away_deg: float | None = None
-    surely: tuple[float, float] | None = None
-    errs: bool = False
+    noise_mm: float | None = None
+    noise_deg: float | None = None
+    lower_bounds: tuple[float, float] | None = None
+    has_posture_errors: bool = False
     workspace_mm: float | None = None
     modelled: bool = False
     by_functions: bool = False
@@ -164,7 +167,7 @@ class Findings:
             )
             for camera in cameras
         }
-        return f" --camera {thing_name(max(cameras, key=weak_m.__getitem__), 'camera')}"
+        return f" --camera {object_name(max(cameras, key=weak_m.__getitem__), 'camera')}"
 
     @property
     def views(self) -> tuple[ViewResult, ...]:

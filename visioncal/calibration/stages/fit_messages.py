@@ -14,8 +14,8 @@ from visioncal.estimation.appearance import MOST_LOOSE
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.joint import (
     ConvergedFit,
+    FrameModel,
     MeasuredScale,
-    Side,
     chance_limit,
     contradicted_lens,
     measured_rig,
@@ -44,8 +44,8 @@ _NEW_LENS = Remedy(
 )
 
 
-def found_of_looks(
-    side: Side, fitted: ConvergedFit, covariance: FloatArray, stated: Problem | None
+def lens_and_board_findings(
+    side: FrameModel, fitted: ConvergedFit, covariance: FloatArray, stated: Problem | None
 ) -> Iterator[Finding]:
     """Findings of a joint fit on lenses and boards; those without reason for doubt are notes.
 
@@ -55,8 +55,8 @@ def found_of_looks(
         covariance: (p, p) covariance of its unknowns, including other errors than noise.
         stated: The same observations with nominal arms; None where none was calibrated.
     """
-    looks = fitted.looks
-    cameras = zip(looks.problems.items(), fitted.seen.compressed, strict=True)
+    looks = fitted.camera_parameters
+    cameras = zip(looks.problems.items(), fitted.linearised.compressed, strict=True)
     for (camera, problem), compressed in cameras:
         moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
         noise = _noise_findings(
@@ -77,12 +77,12 @@ def found_of_looks(
         called = f"board {scene.names[board]}".strip()
         if _is_free(fitted, looks.scale_of(board)):
             (place,) = looks.scale_of(board)
-            at = fitted.columns.start + int(np.searchsorted(fitted.seen.free, place))
+            at = fitted.columns.start + int(np.searchsorted(fitted.linearised.free, place))
             measured = measured_scale(side, fitted, board)
             written = replace(
                 measured, scale=float(looks.values[place]), sigma=float(covariance[at, at] ** 0.5)
             )
-            yield scale_found(called, target, measured, written)
+            yield scale_finding(called, target, measured, written)
         if _has_changed(fitted, looks.shape_of(board)):
             yield _shape_finding(fitted, board, called)
 
@@ -117,7 +117,7 @@ _SIDES = {
 }
 
 
-def scale_found(
+def scale_finding(
     board: str, target: Target, measured: MeasuredScale, written: MeasuredScale
 ) -> Finding:
     """Finding on a board of another size than stated; a note where its stated sigma allows it.
@@ -153,7 +153,7 @@ def scale_found(
 
 def _shape_finding(fitted: ConvergedFit, board: int, called: str) -> Finding:
     """Finding on a bent, stretched or sheared board; a note within the accuracy of printing."""
-    looks = fitted.looks
+    looks = fitted.camera_parameters
     shape = looks.shape_of(board)
     aspect, *bends, shear = shape
     drawn = looks.with_values(shape, np.zeros(len(shape))).corners[board]
@@ -231,7 +231,7 @@ def _rig_size_findings(target: Target, measured: MeasuredScale) -> Iterator[Find
 
 
 def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
-    looks = fitted.looks
+    looks = fitted.camera_parameters
     problem, lens = looks.problems[camera], looks.lens_of(camera)
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
         words = (
@@ -252,7 +252,7 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
             yield _refined_lens_finding(steps, is_doubtful=is_wrong and moved_px > _LEAST_MOVE_PX)
     if problem.contested:
         at = np.arange(fitted.problem.size)[fitted.columns]
-        at = at[np.searchsorted(fitted.seen.free, lens[:4])]
+        at = at[np.searchsorted(fitted.linearised.free, lens[:4])]
         moves = held_shift(fitted.problem, fitted.fit)[at]
         if np.abs(moves).max() > _LEAST_MOVE_PX:
             covariance = covariance_of(fitted.problem, fitted.fit)[np.ix_(at, at)]

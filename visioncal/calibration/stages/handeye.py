@@ -10,14 +10,14 @@ from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import robot_part, scatter
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
 
 SOLVER_NAMES: tuple[str, ...] = get_args(SolverName)
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class SolverResult:
     """Edges (1 + b, 4, 4) by one solver, and the rms scatter of the targets.
 
     The scatter of rotation is None where only positions were measured.
@@ -28,7 +28,9 @@ class Answer:
     rms_rad: float | None
 
 
-def compare_solvers(problem: Problem, state: State, mount: Mount, solver: str) -> dict[str, Answer]:
+def compare_solvers(
+    problem: Problem, state: State, mount: Mount, solver: str
+) -> dict[str, SolverResult]:
     """Results of all solvers for the same views, by solver.
 
     Args:
@@ -62,9 +64,9 @@ def closed_form_state(problem: Problem, solver: str, start: State, mount: Mount)
     return State(np.stack([edges.x, *(edges.z @ invert(from_first))]), start.values)
 
 
-def _answer(problem: Problem, state: State) -> Answer:
+def _answer(problem: Problem, state: State) -> SolverResult:
     residuals_m, residuals_rad = scatter(problem, problem, state)
-    return Answer(
+    return SolverResult(
         state.edges,
         float(np.sqrt(np.mean(residuals_m**2))),
         None if problem.points else float(np.sqrt(np.mean(residuals_rad**2))),

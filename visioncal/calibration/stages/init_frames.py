@@ -24,12 +24,12 @@ from visioncal.calibration.stages.pairwise import (
     partial_hand_eye,
 )
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.pose_ambiguity import chosen, has_rival, settle_candidates
+from visioncal.calibration.stages.pose_ambiguity import has_rival, settle_candidates, with_candidate
 from visioncal.core.errors import DegenerateError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, IntArray, Mask, Mount, Rejection, Target
-from visioncal.estimation.parts import FramePrior
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import FramePrior
 from visioncal.estimation.tree import Tree
 from visioncal.vision.targets import rotation_transforms
 
@@ -154,13 +154,13 @@ class InitialFrames:
     """Initial poses of the frames, and one pose of each view.
 
     Attributes:
-        tied: The frames.
+        connected: The frames.
         views: The unambiguous views, with one pose each; where a turned pose was chosen, the
             corners are renumbered to match.
         rejections: The ambiguous views.
     """
 
-    tied: ConnectedFrames
+    connected: ConnectedFrames
     views: tuple[ViewPoses, ...]
     rejections: tuple[Rejection, ...]
 
@@ -205,7 +205,7 @@ def init_frames(
     why = "ambiguous: two poses of the target fit image and motion alike"
     rejections = tuple(Rejection(views[at].view, why) for at in unclear)
     targets_seen = [targets.get(frame) for frame in observations.observed]
-    chosen_views = (chosen(views[at], int(picks[at]), targets_seen[at]) for at in clear)
+    chosen_views = (with_candidate(views[at], int(picks[at]), targets_seen[at]) for at in clear)
     return InitialFrames(tied, tuple(chosen_views), rejections)
 
 

@@ -41,7 +41,7 @@ from visioncal.core.transforms import apply, compose, invert, rotation_angle
 from visioncal.core.types import FloatArray
 from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.closed_form import SOLVERS
-from visioncal.estimation.positions import Places, find_mounting
+from visioncal.estimation.positions import PositionReadings, find_mounting
 from visioncal.estimation.procrustes import align, spreads
 
 # Distances of views are capped here in a start's score [m].
@@ -266,7 +266,7 @@ def mounted_points(growth: Growth) -> Iterator[Relation]:
         if len(np.unique(stops)) < _FEWEST_STOPS:
             continue
         points = np.repeat(np.arange(len(pairs)), [len(pair.rows) for pair in pairs])
-        places = Places(
+        places = PositionReadings(
             growth.poses[robot][stops],
             growth.sighted.candidates.poses[rows, 0, :3, 3],
             points,

@@ -8,14 +8,14 @@ import numpy as np
 
 from visioncal.calibration.guess.fit import Fit, distances
 from visioncal.calibration.guess.hypothesis import HALF_TURN
-from visioncal.calibration.guess.joints import JointReading
-from visioncal.calibration.guess.misread import FEWEST_JOINT_ROWS, JointGuess, guess_joints
+from visioncal.calibration.guess.joint_guess import FEWEST_JOINT_ROWS, JointGuess, guess_joints
+from visioncal.calibration.guess.joint_readings import JointReading
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.transforms import invert, mean_transform, pose_difference
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.core.verdict import CALIBRATE, GUESS, Finding, Remedy
-from visioncal.robot import Robot, placed_at, robot_names, with_zeros
+from visioncal.robot import Robot, robot_names, with_base, with_joint_offsets
 from visioncal.session import View
 from visioncal.session.table import reported_matrices
 
@@ -43,7 +43,7 @@ EXPORT_ARM = "visioncal export OUT --to robot-urdf -o robot.urdf"
 
 
 @dataclass(frozen=True, eq=False)
-class Matched:
+class MatchedJoints:
     """Joint angles of a session, matched with its reported poses.
 
     Attributes:
@@ -69,7 +69,7 @@ class Matched:
     @property
     def arm(self) -> Robot:
         """The model with its zeros as the poses determine them."""
-        return self.robot if self.zero is None else with_zeros(self.robot, self.zero.zeros)
+        return self.robot if self.zero is None else with_joint_offsets(self.robot, self.zero.zeros)
 
     def pose(self, joints: FloatArray) -> FloatArray:
         """(4, 4) `base_from_flange` as it would have been reported for (n,) joint angles.
@@ -117,7 +117,7 @@ class _BaseAndFlange:
         return _words(self.fit.shift.max(), self.fit.angle.max())
 
 
-def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
+def match_joints(rows: Sequence[View], robot: Robot) -> MatchedJoints:
     """Compares the joint angles of a robot with its reported poses.
 
     Poses that belong to the angles are `base_from_model @ FK(q) @ flange_from_reported` with two
@@ -136,14 +136,16 @@ def match_joints(rows: Sequence[View], robot: Robot) -> Matched:
         )
         step = "Correct [robot] model in session.toml, or the columns q1_rad ... of views.csv."
         finding = Finding("misread_joints", words, Remedy(step))
-        return Matched(robot, warnings=(finding,) if poses else ())
+        return MatchedJoints(robot, warnings=(finding,) if poses else ())
     if not poses:
-        return Matched(robot, joints)
+        return MatchedJoints(robot, joints)
     views, q = tuple(poses), np.array([joints[view] for view in poses])
-    return _compared(Matched(robot, joints), views, q, np.array(list(poses.values())))
+    return _compared(MatchedJoints(robot, joints), views, q, np.array(list(poses.values())))
 
 
-def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: FloatArray) -> Matched:
+def _compared(
+    matched: MatchedJoints, views: Sequence[int], q: FloatArray, poses: FloatArray
+) -> MatchedJoints:
     robot, guess = matched.robot, None
     if len(q) >= FEWEST_JOINT_ROWS:
         guess = guess_joints(robot, q, poses)
@@ -154,7 +156,7 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
         words = f"The joint angles were not used: they are misread. {sentence}"
         misread = f"The angles of this session are misread. {sentence} {guess.fix}"
         doubt = Finding("misread_joints", words, Remedy(guess.fix))
-        return Matched(robot, misread=misread, warnings=(doubt,))
+        return MatchedJoints(robot, misread=misread, warnings=(doubt,))
     if guess is not None and (zero := guess.zero) is not None:
         words = (
             "The joint angles do not belong to the reported poses as they are declared. "
@@ -169,10 +171,10 @@ def _compared(matched: Matched, views: Sequence[int], q: FloatArray, poses: Floa
     if typical_m > _SAME_ARM_M or typical_rad > _SAME_ARM_RAD or outliers.mean() >= _HALF:
         finding = _other_arm(robot, constants.figures)
         words = f"{finding.words} The joint angles were not used."
-        return Matched(robot, warnings=(replace(finding, words=words),))
+        return MatchedJoints(robot, warnings=(replace(finding, words=words),))
     matched = _report_outliers(matched, constants, views, (model, poses))
     if not np.array_equal(constants.fit.x, np.eye(4)):
-        matched = replace(_report_base(matched, constants), robot=placed_at(robot, constants.fit.x))
+        matched = replace(_report_base(matched, constants), robot=with_base(robot, constants.fit.x))
     tool = mean_transform(invert(matched.arm.base_from_flange(q[~outliers])) @ poses[~outliers])
     return _report_tool_frame(replace(matched, flange_from_reported=tool), constants)
 
@@ -212,11 +214,11 @@ def _fit_base_and_flange(
 
 
 def _report_outliers(
-    matched: Matched,
+    matched: MatchedJoints,
     constants: _BaseAndFlange,
     views: Sequence[int],
     sides: tuple[FloatArray, FloatArray],
-) -> Matched:
+) -> MatchedJoints:
     """Reports the views whose pose is not that of their angles."""
     outliers = np.flatnonzero(constants.outliers)
     if not len(outliers):
@@ -273,7 +275,7 @@ def _exchanged(
     return pairs[0] if len(pairs) == 1 else ()
 
 
-def _report_base(matched: Matched, constants: _BaseAndFlange) -> Matched:
+def _report_base(matched: MatchedJoints, constants: _BaseAndFlange) -> MatchedJoints:
     """Reports the frame in which the poses are."""
     name, base = matched.robot.name, constants.fit.x
     away_mm, away_deg = pose_difference(HALF_TURN, base)
@@ -298,7 +300,7 @@ def _report_base(matched: Matched, constants: _BaseAndFlange) -> Matched:
     return replace(matched, notes=(*matched.notes, words))
 
 
-def _report_tool_frame(matched: Matched, constants: _BaseAndFlange) -> Matched:
+def _report_tool_frame(matched: MatchedJoints, constants: _BaseAndFlange) -> MatchedJoints:
     """Reports the frame whose poses are given, and how well the model predicts them."""
     robot, tool = matched.robot, matched.flange_from_reported
     warnings, notes = list(matched.warnings), list(matched.notes)

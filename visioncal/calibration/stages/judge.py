@@ -5,8 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import is_negligible, ranked
-from visioncal.calibration.stages.doubts import doubts_of, helping, is_scattered
+from visioncal.calibration.stages.cause_ranking import is_negligible, rank_causes
+from visioncal.calibration.stages.doubts import (
+    collect_findings,
+    is_scattered,
+    remedy_for_uncertainty,
+)
 from visioncal.calibration.stages.findings import Findings
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.limits import NeedLimits
@@ -39,7 +43,7 @@ def judge(findings: Findings) -> Verdict:
     warnings = [warning for warning in findings.warnings if warning not in small]
     notes = (*findings.notes, *(finding.words for finding in small))
     findings = replace(findings, warnings=warnings, notes=notes)
-    doubts = doubts_of(findings)
+    doubts = collect_findings(findings)
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
     status: VerdictStatus = "good" if not doubts else "check"
@@ -56,11 +60,11 @@ def judge(findings: Findings) -> Verdict:
         status = "check" if met.probability >= NeedLimits.probability[1] else "bad"
     ordered: Sequence[Finding] = sorted(doubts, key=lambda doubt: not doubt.is_fatal)
     if status != "good":
-        ordered = ranked(
+        ordered = rank_causes(
             ordered,
             findings.picks,
             met,
-            more=helping(findings),
+            more=remedy_for_uncertainty(findings),
             left_out_mm=findings.held_out.mm,
             is_scattered=is_scattered(findings),
         )

@@ -22,8 +22,8 @@ from visioncal.estimation.kinematics import (
     resized,
     without_springs,
 )
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import robot_levels, starting_noise
 from visioncal.results import Rms
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
@@ -48,7 +48,7 @@ _AUTOMATIC = ("auto", "thermal")
 
 
 @dataclass(frozen=True, eq=False)
-class Kinematics:
+class SelectedArmLevel:
     """The level of the arm's model that the views support.
 
     Attributes:
@@ -117,7 +117,7 @@ def choose_level(
     asked: str,
     stated: Problem | None = None,
     noise: Noise | None = None,
-) -> Kinematics:
+) -> SelectedArmLevel:
     """Selects the level of a robot's arm model.
 
     A level is chosen if its likelihood, with a penalty for its unknowns, exceeds the others' by
@@ -146,18 +146,18 @@ def choose_level(
     best = _best({name: fit for name, fit in possible.items() if name in allowed})
     with one_blas_thread():
         possible[best] = resized(arm, possible[best])
-    return Kinematics(best, possible, asked not in _AUTOMATIC)
+    return SelectedArmLevel(best, possible, asked not in _AUTOMATIC)
 
 
 def with_functions(
-    found: Kinematics,
+    found: SelectedArmLevel,
     problem: Problem,
     state: State,
     robot: str,
     model: ArmModel,
     stops: tuple[FloatArray, FloatArray, Loads],
     noise: Noise,
-) -> Kinematics:
+) -> SelectedArmLevel:
     """Adds functions of the joints to a level of the geometry, where they are significant.
 
     Args:
@@ -271,7 +271,7 @@ def check_level(asked: str) -> None:
         raise DataError(f"level {asked!r} is not one of {', '.join(levels)}.", culprits=["level"])
 
 
-def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
+def check_level_is_possible(asked: str, *, can: bool, misread: str = "") -> None:
     """Refuses a level that the session cannot give.
 
     `can` is whether there are joint angles that belong to the robot's model and poses, `misread`
@@ -289,7 +289,7 @@ def check_asked(asked: str, *, can: bool, misread: str = "") -> None:
         )
 
 
-def doubts(kinematics: Kinematics) -> Iterator[Finding]:
+def doubts(kinematics: SelectedArmLevel) -> Iterator[Finding]:
     """Reports where another level explains the views far better than the requested one."""
     chosen, name = kinematics.result.chosen, _best(kinematics.fits)
     best = replace(kinematics.result, level=name).chosen
@@ -303,7 +303,7 @@ def doubts(kinematics: Kinematics) -> Iterator[Finding]:
         )
 
 
-def findings(kinematics: Kinematics) -> Iterator[str]:
+def findings(kinematics: SelectedArmLevel) -> Iterator[str]:
     """States the chosen level, for the verdict."""
     if kinematics.level == NOMINAL and kinematics.was_asked:
         yield (

@@ -58,7 +58,7 @@ class RobotMotion:
         return rows
 
 
-def is_open(view: View) -> bool:
+def lacks_robot_state(view: View) -> bool:
     """Whether a view has a time and neither a robot pose nor joint angles."""
     return view.stamp_s is not None and view.base_from_flange() is None and view.joints_rad is None
 
@@ -100,7 +100,7 @@ def motion_of(session: Session, robot: Robot | None, name: str) -> RobotMotion:
     )
 
 
-def at_rest(flange: Trajectory, at_s: FloatArray) -> Mask:
+def is_standing_still(flange: Trajectory, at_s: FloatArray) -> Mask:
     """Whether the flange was standing still for a while before and after each time."""
     resting = flange.covers(at_s, _REST_S)
     pose = flange.at(at_s[resting])

@@ -28,19 +28,19 @@ from functools import cached_property
 import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.validate import HeldOut
+from visioncal.calibration.stages.validate import HeldOutResiduals
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, apply_each, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
-from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import Solution
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import NeedMet, Picker
-from visioncal.session.frames import thing_name
+from visioncal.session.frames import object_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Picks:
     distance_m: float
 
     @property
-    def spreads(self) -> FloatArray:
+    def covariances(self) -> FloatArray:
         """(k, 6, 6) total covariance."""
         return np.asarray(np.sum(list(self.parts.values()), axis=0))
 
@@ -72,7 +72,7 @@ class Picks:
         """The probability that a pick at one of the positions is within a need."""
         turn_rad = np.inf if need.deg is None else float(np.deg2rad(need.deg))
         shift_m = np.inf if need.mm is None else 1e-3 * need.mm
-        return chance_within(self.spreads, turn_rad, shift_m, self.freedom)
+        return chance_within(self.covariances, turn_rad, shift_m, self.freedom)
 
     def without(self, source: str) -> "Picks":
         """Picks without the error of one source."""
@@ -82,12 +82,12 @@ class Picks:
     @cached_property
     def good_for_mm(self) -> float:
         """The least need of position alone that would be met [mm]."""
-        return 1e3 * radius_within(self.spreads, NeedLimits.probability[0], self.freedom)
+        return 1e3 * radius_within(self.covariances, NeedLimits.probability[0], self.freedom)
 
     @cached_property
     def good_for_deg(self) -> float:
         """The least need of rotation alone that would be met [deg]."""
-        turned = np.roll(self.spreads, 3, axis=(1, 2))
+        turned = np.roll(self.covariances, 3, axis=(1, 2))
         return float(np.rad2deg(radius_within(turned, NeedLimits.probability[0], self.freedom)))
 
     @property
@@ -102,7 +102,7 @@ class Picks:
 
     def _budget(self, axes: slice) -> dict[str, float]:
         budget = {}
-        for name, covariances in {**self.parts, "total": self.spreads}.items():
+        for name, covariances in {**self.parts, "total": self.covariances}.items():
             squares = np.trace(covariances[:, axes, axes], axis1=1, axis2=2)
             # Of two sources that compensate, one may be negative.
             budget[name] = float(max(squares.mean(), 0.0) ** 0.5)
@@ -124,7 +124,7 @@ def need_met(need: Need | None, picks: Sequence[Picks], *, whole: bool = False) 
     if need is None or not picks:
         return None
     pairs = [
-        Picker(thing_name(pick.camera, "camera"), pick.robot, pick.probability(need))
+        Picker(object_name(pick.camera, "camera"), pick.robot, pick.probability(need))
         for pick in picks
     ]
     return NeedMet(need, min(pair.probability for pair in pairs), tuple(pairs) if whole else ())
@@ -139,29 +139,30 @@ class PickInputs:
         fit: Their fit.
         covariance: (p, p) of the unknowns, all sources included.
         held_out: The observations' residuals by fits without their stops.
-        middles: (3,) of each target, in its frame [m]; of others, their origin.
+        target_centres: (3,) of each target, in its frame [m]; of others, their origin.
         freedom: Degrees of freedom of each robot's noise.
         arms: The robots' arms, at the problem's stops.
-        of_boards: The problem's columns of boards' shapes.
-        moved: (3, b) Jacobian of each target's middle for these columns, by its frame [m].
-        whole: The observations of all pairs, merged or not, that the fit was made from.
+        board_columns: The problem's columns of boards' shapes.
+        centre_jacobians: (3, b) Jacobian of each target's middle for these columns, by its frame
+            [m].
+        full_problem: The observations of all pairs, merged or not, that the fit was made from.
         jitters: Relative change of the focal length of each camera from image to image.
     """
 
     problem: Problem
     fit: Solution
     covariance: FloatArray
-    held_out: HeldOut
-    middles: Mapping[str, FloatArray]
+    held_out: HeldOutResiduals
+    target_centres: Mapping[str, FloatArray]
     freedom: Mapping[str, float]
     arms: Mapping[str, RobotArm]
-    of_boards: IntArray
-    moved: Mapping[str, FloatArray]
-    whole: Problem
+    board_columns: IntArray
+    centre_jacobians: Mapping[str, FloatArray]
+    full_problem: Problem
     jitters: Mapping[str, float]
 
 
-def picks_of(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
+def predict_picks(fitted: PickInputs, need: Need | None = None) -> tuple[Picks, ...]:
     """Predicts picks, for each camera and each robot between it and what it sees.
 
     They are at the need's place, or where the views looked.
@@ -186,14 +187,14 @@ def _arm_bias(fitted: PickInputs, robot: str) -> FloatArray | None:
     if arm is None or arm.model is not None or arm.errors is None or arm.errors.is_estimated:
         return None
     state, noise = fitted.fit.state, fitted.fit.noise
-    return arm.errors.sigma * misfit_jacobian(fitted.whole, state, noise, robot, arm.errors)
+    return arm.errors.sigma * misfit_jacobian(fitted.full_problem, state, noise, robot, arm.errors)
 
 
 def _subset(fitted: PickInputs, rows: Sequence[int]) -> PickInputs:
     """The input restricted to some of the observations."""
     chosen = np.isin(np.arange(len(fitted.problem)), rows)
     held = fitted.held_out
-    kept = replace(held, away_m=held.away_m[chosen], away_rad=held.away_rad[chosen])
+    kept = replace(held, residual_m=held.residual_m[chosen], residual_rad=held.residual_rad[chosen])
     return replace(fitted, problem=fitted.problem.subset(chosen), held_out=kept)
 
 
@@ -205,7 +206,7 @@ def _picks(
     seen, base, arm = problem.observations, problem.tree.bases[robot], fitted.arms.get(robot)
     in_base = _base_from_targets(problem, state, base)
     frames = (name.partition("@")[0] for name in seen.observed)
-    middles = np.array([fitted.middles.get(frame, np.zeros(3)) for frame in frames])
+    middles = np.array([fitted.target_centres.get(frame, np.zeros(3)) for frame in frames])
     carries = np.array([_is_between(problem, observer, base, robot) for observer in seen.observers])
     calibrated = arm is not None and arm.model is not None
     errors = None if arm is None or calibrated else arm.errors
@@ -234,7 +235,7 @@ def _picks(
         pick_level = np.hypot(level, _lasting_sigma(as_noise))
     elif errors is not None:
         parts["arm"] = _arm_covariance(problem, robot, errors)
-    of_boards = _board_part(covariance, fitted.of_boards)
+    of_boards = _board_part(covariance, fitted.board_columns)
     parts["calibration"] = linearised.covariance(covariance - of_boards)
     parts["board"] = linearised.covariance(of_boards)
     carried = carries[:, None, None]
@@ -311,7 +312,7 @@ def _as_seen_by_base(fitted: PickInputs, base: str, in_base: FloatArray) -> Prob
     carry, effects = adjoint(in_base), []
     for effect in problem.effects:
         columns = problem.effect_columns[effect.name]
-        not_boards = ~np.isin(np.arange(columns.start, columns.stop), fitted.of_boards)
+        not_boards = ~np.isin(np.arange(columns.start, columns.stop), fitted.board_columns)
         by_sensor = None if effect.by_sensor is None else carry @ effect.by_sensor * not_boards
         effects.append(replace(effect, by_sensor=by_sensor))
     return replace(
@@ -333,11 +334,13 @@ def _as_things(fitted: PickInputs) -> Problem:
     # A board of another size was measured at another distance, and a thing is not: a board's shape
     # then only moves its middle.
     problem, effects = fitted.problem, []
-    unmoved, frames = np.zeros((3, len(fitted.of_boards))), problem.observations.observed
-    jacobian = np.array([fitted.moved.get(frame.partition("@")[0], unmoved) for frame in frames])
+    unmoved, frames = np.zeros((3, len(fitted.board_columns))), problem.observations.observed
+    jacobian = np.array(
+        [fitted.centre_jacobians.get(frame.partition("@")[0], unmoved) for frame in frames]
+    )
     for effect in problem.effects:
         columns, by_sensor = problem.effect_columns[effect.name], effect.by_sensor
-        of_boards = np.isin(np.arange(columns.start, columns.stop), fitted.of_boards)
+        of_boards = np.isin(np.arange(columns.start, columns.stop), fitted.board_columns)
         if by_sensor is not None and of_boards.any():
             by_sensor = by_sensor.copy()
             by_sensor[:, :3, of_boards], by_sensor[:, 3:, of_boards] = 0.0, -jacobian
@@ -377,7 +380,7 @@ def _arm_covariances(
     widened = problem.with_effects([*problem.effects, errors.effect(robot)])
     values = np.concatenate([state.values, np.zeros(bias.shape[1])])
     jacobian = widened.linear(replace(state, values=values), ideal=True).jacobian
-    size, last = problem.size, errors.last
+    size, last = problem.size, errors.is_time_correlated
     by_fit, own = jacobian[:, :, :size] @ bias, errors.sigma * jacobian[:, :, size:]
     by_posture = by_fit[:, :, ~last] - own[:, :, ~last]
     changing = own[:, :, last] - own[:, :, last].mean(axis=0)
@@ -387,10 +390,10 @@ def _arm_covariances(
 
 def _lasting_sigma(errors: ArmErrors) -> FloatArray:
     """(2,) RMS change of lasting errors among stops, of rotation [rad] and position [m]."""
-    if not errors.lasting:
+    if not errors.time_correlated_count:
         return np.zeros(2)
     used = errors.basis.any(axis=(1, 2))
-    change = errors.sigma * errors.basis[used][:, :, errors.last]
+    change = errors.sigma * errors.basis[used][:, :, errors.is_time_correlated]
     squares = np.sum((change - change.mean(axis=0)) ** 2, axis=2).reshape(-1, 2, 3)
     return np.asarray(np.sqrt(squares.mean(axis=(0, 2))))
 
@@ -408,7 +411,10 @@ def _excess_covariance(fitted: PickInputs) -> FloatArray:
     linear = problem.linear(fitted.fit.state, ideal=True)
     expected = linear.covariance(fitted.covariance) + problem.total_covariance(linear, noise)
     held_out, excess = fitted.held_out, np.zeros((6, 6))
-    for residuals, axes in ((held_out.away_rad, slice(0, 3)), (held_out.away_m, slice(3, 6))):
+    for residuals, axes in (
+        (held_out.residual_rad, slice(0, 3)),
+        (held_out.residual_m, slice(3, 6)),
+    ):
         measured = np.isfinite(residuals)
         if not measured.any():
             continue

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
-from visioncal.calibration.stages.clock_sweep import Clocked, ClockPair
+from visioncal.calibration.stages.clock_sweep import ClockedViews, ClockPair
 from visioncal.calibration.stages.dense import Dense
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.reported_poses import Reported
+from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
@@ -28,7 +28,7 @@ _LISTED = 40
 
 
 @dataclass(frozen=True, eq=False)
-class CameraLook:
+class CameraObservations:
     """Observations of one camera.
 
     Attributes:
@@ -75,11 +75,11 @@ class Observed:
     progress: Progress | None = None
     threads: int = 0
     keeps_corners: bool = False
-    cameras: Mapping[str, CameraLook] = field(default_factory=dict)
+    cameras: Mapping[str, CameraObservations] = field(default_factory=dict)
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     reasons: Mapping[int, str] = field(default_factory=dict)
-    robots: Mapping[str, Reported] = field(default_factory=dict)
-    clocks: Mapping[ClockPair, Clocked] = field(default_factory=dict)
+    robots: Mapping[str, RobotReport] = field(default_factory=dict)
+    clocks: Mapping[ClockPair, ClockedViews] = field(default_factory=dict)
     warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
     dense: Dense | None = None
@@ -93,11 +93,11 @@ class Observed:
             self, reasons={**reasons, **self.reasons}, warnings=(*self.warnings, *warnings)
         )
 
-    def with_camera(self, frame: str, look: CameraLook) -> Self:
+    def with_camera(self, frame: str, look: CameraObservations) -> Self:
         """Adds or replaces one camera's observations."""
         return replace(self, cameras={**self.cameras, frame: look})
 
-    def with_robot(self, name: str, reported: Reported) -> Self:
+    def with_robot(self, name: str, reported: RobotReport) -> Self:
         """Adds or replaces one robot's reports."""
         return replace(self, robots={**self.robots, name: reported})
 
@@ -150,9 +150,9 @@ class Observed:
         }
 
     @property
-    def reported(self) -> Reported:
+    def reported(self) -> RobotReport:
         """Reported poses and joints of the only robot."""
-        return next(iter(self.robots.values()), Reported({}))
+        return next(iter(self.robots.values()), RobotReport({}))
 
     @property
     def base_from_flange(self) -> Mapping[int, FloatArray]:

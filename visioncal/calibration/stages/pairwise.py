@@ -13,7 +13,7 @@ from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 from visioncal.estimation.linalg import covariance_from, spectrum
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
 from visioncal.estimation.solve import fisher_information
 

@@ -45,8 +45,8 @@ class ViewPoses:
         turns: (c,) which of the target's own symmetries each candidate has applied.
         covariance: (c, 6, 6) of the candidates' right perturbations; zero where the session states
             the pose itself.
-        by_shared: (c, 6, k) Jacobian of each candidate by the unknowns that all views share; k = 0
-            before these are known.
+        shared_jacobian: (c, 6, k) Jacobian of each candidate by the unknowns that all views share;
+            k = 0 before these are known.
         board: Index of the target.
         first: The number of the target's first corner, where several are numbered through.
     """
@@ -56,7 +56,7 @@ class ViewPoses:
     cam_from_target: FloatArray
     turns: tuple[int, ...]
     covariance: FloatArray
-    by_shared: FloatArray
+    shared_jacobian: FloatArray
     board: int = 0
     first: int = 0
 
@@ -190,7 +190,7 @@ def _with_rivals(
     return tuple(views)
 
 
-def given_poses(session: Session) -> dict[int, ViewPoses]:
+def stated_poses(session: Session) -> dict[int, ViewPoses]:
     """Collects the poses that the session states itself (`cft_` columns), by view."""
     boards = {name: at for at, name in enumerate(session.boards)}
     given = ((view, view.cam_from_target()) for view in session.views)

@@ -26,9 +26,11 @@ def has_rival(distances: FloatArray, typical_m: float) -> Mask:
     return np.asarray(near & (second < CLEAR_RATIO * np.maximum(best, typical_m)))
 
 
-def choose_by(view: ViewPoses, predicted: FloatArray, target: Target | None) -> ViewPoses:
+def choose_nearest(view: ViewPoses, predicted: FloatArray, target: Target | None) -> ViewPoses:
     """Chooses the candidate of one view that is nearest to a predicted `cam_from_target` (4, 4)."""
-    return chosen(view, int(Candidates.of([view]).distances(predicted[None]).argmin()), target)
+    return with_candidate(
+        view, int(Candidates.of([view]).distances(predicted[None]).argmin()), target
+    )
 
 
 def settle_candidates(robot: FloatArray, candidates: Candidates, picks: IntArray) -> FloatArray:
@@ -48,7 +50,7 @@ def settle_candidates(robot: FloatArray, candidates: Candidates, picks: IntArray
     return edges.residuals
 
 
-def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
+def with_candidate(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
     """Reduces a view to one candidate, and renumbers its corners accordingly."""
     corners, turn = view.corners, view.turns[pick]
     if corners is not None and target is not None and turn:
@@ -61,5 +63,5 @@ def chosen(view: ViewPoses, pick: int, target: Target | None) -> ViewPoses:
         cam_from_target=view.cam_from_target[pick : pick + 1],
         turns=(turn,),
         covariance=view.covariance[pick : pick + 1],
-        by_shared=view.by_shared[pick : pick + 1],
+        shared_jacobian=view.shared_jacobian[pick : pick + 1],
     )

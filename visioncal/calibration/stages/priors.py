@@ -12,8 +12,8 @@ from visioncal.core.number_format import did_you_mean, figure
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy, remarks
 from visioncal.estimation.observability import SIGMA_LIMIT_M
-from visioncal.estimation.parts import FramePrior, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import FramePrior, State
 from visioncal.estimation.tree import Tree
 from visioncal.session.tables import PriorTable
 
@@ -154,7 +154,7 @@ def _prior(name: str, table: PriorTable, tree: Tree) -> FramePrior:
     return prior
 
 
-def loosened(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]:
+def with_loose_positions(priors: Iterable[FramePrior]) -> tuple[FramePrior, ...]:
     """The priors with position sigmas so large that the observations overrule them."""
     return tuple(replace(prior, sigma_m=max(prior.sigma_m, _LOOSE_M)) for prior in priors)
 
@@ -177,7 +177,7 @@ def without_most_contradicted(
     return tuple(prior for prior in kept if prior.axes or prior.rotation is not None)
 
 
-def prior_words(
+def prior_findings(
     problem: Problem, state: State, covariance: FloatArray, stated: Iterable[FramePrior]
 ) -> Iterator[Finding]:
     """Reports used priors as notes, and contradicted ones as findings.

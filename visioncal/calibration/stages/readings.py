@@ -13,11 +13,11 @@ from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted, did_you_mean, figure, some_of
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, IntArray, Rejection
-from visioncal.estimation.positions import Mounting, Places, find_mounting, residuals
+from visioncal.estimation.positions import Mounting, PositionReadings, find_mounting, residuals
 from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
 from visioncal.session.instruments import Instrument, instrument_names, stated_instrument
-from visioncal.session.kinds import is_read, is_seen, name_of
+from visioncal.session.kinds import is_camera_observation, is_instrument_reading, name_of
 
 # Largest distance that a tracker reads [m].
 _FARTHEST_M = 160.0
@@ -62,10 +62,10 @@ class Readings:
 
     def places(
         self, views: Sequence[int], base_from_flange: Mapping[int, FloatArray], stops: IntArray
-    ) -> Places:
+    ) -> PositionReadings:
         """The readings of points in some views; the (m,) stops are numbered from 0."""
         read = np.array([self.read_m[view] for view in views]).reshape(-1, 3)
-        return Places(
+        return PositionReadings(
             np.array([base_from_flange[view] for view in views]).reshape(-1, 4, 4),
             read,
             np.array([self.points[view] for view in views], dtype=np.int64),
@@ -134,7 +134,7 @@ def read_instruments(session: Session) -> dict[int, ViewPoses]:
     """
     rows: dict[str, list[View]] = {}
     for observation in session.observations:
-        if is_read(observation.view) and not is_seen(observation.view):
+        if is_instrument_reading(observation.view) and not is_camera_observation(observation.view):
             rows.setdefault(observation.seer, []).append(observation.view)
     sightings = {}
     for of_instrument in rows.values():
@@ -300,7 +300,7 @@ def _check_stops(readings: Readings, stops: IntArray) -> None:
 
 
 def _exchanged(
-    readings: Readings, views: Sequence[int], places: Places, mounting: Mounting
+    readings: Readings, views: Sequence[int], places: PositionReadings, mounting: Mounting
 ) -> Iterator[Rejection]:
     """Finds stops at which the names of two points are exchanged."""
     # An error of the flange's pose moves all points of a stop alike: only their relative positions
@@ -330,7 +330,7 @@ def _exchanged(
 
 
 def _change(
-    places: Places, mounting: Mounting, rows: IntArray, first: int, second: int
+    places: PositionReadings, mounting: Mounting, rows: IntArray, first: int, second: int
 ) -> FloatArray:
     """Change of the residuals (r, 3) of a stop's rows when two rows exchange their points."""
     before, after = mounting.on_flange[places.points[[first, second]]]

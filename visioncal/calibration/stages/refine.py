@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from visioncal.calibration.stages.frame_model import CellFrameModel
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.priors import loosened
-from visioncal.calibration.stages.side import FramesSide
+from visioncal.calibration.stages.priors import with_loose_positions
 from visioncal.core.errors import ConvergenceError
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Corners, FloatArray, IntArray
@@ -16,22 +16,22 @@ from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import (
     ConvergedFit,
+    FrameModel,
     MeasuredScale,
     Scores,
-    Side,
-    again,
     chance_limit,
     contradicted_lens,
     diverging,
+    fit_jointly,
     measured_scale,
     moved_mahalanobis_sq,
-    settle,
+    refit_jointly,
 )
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.lens_levels import are_beyond, estimate_levels
 from visioncal.estimation.linalg import covariance_from
 from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
-from visioncal.estimation.parts import State
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import covariance_of, equations_and_cost, left_out_residuals
 from visioncal.estimation.variance import likely_sigma
@@ -45,9 +45,9 @@ _ROUGH_M, _STEP, _NOISE_RATIO = 1e-3, 5e-3, 0.5
 _FARTHEST = 0.15
 
 
-def free_of(seen: LinearisedCorners) -> LensBoardParameters:
+def free_parameters_of_camera(seen: LinearisedCorners) -> LensBoardParameters:
     """Lens and boards of the only camera, and their covariance."""
-    cameras, prior = seen.looks, seen.known
+    cameras, prior = seen.camera_parameters, seen.known
     ((name, problem),) = cameras.problems.items()
     return LensBoardParameters(
         Appearance(cameras.camera(name), cameras.values[cameras.boards]),
@@ -60,10 +60,10 @@ def free_of(seen: LinearisedCorners) -> LensBoardParameters:
     )
 
 
-def refined(
-    side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
-) -> tuple[ConvergedFit, FramesSide]:
-    """Fits lenses, boards and frames to all corners together; see `chosen`.
+def refine_jointly(
+    side: CellFrameModel, looks: CameraParameters, frames: Mapping[str, FloatArray]
+) -> tuple[ConvergedFit, CellFrameModel]:
+    """Fits lenses, boards and frames to all corners together; see `free_supported_values`.
 
     With these fitted, the residuals determine the noise of each view, and all is fitted once more
     with that. `looks` has stated lenses and boards, `frames` the initial poses of unknown frames.
@@ -74,8 +74,8 @@ def refined(
     try:
         with diverging():
             fitted, new_side = _fit_with_levels(side, looks, frames, is_plain=False)
-        levels = fitted.looks.levels
-        sigmas = zip(fitted.looks.problems, fitted.seen.sigmas_px, strict=True)
+        levels = fitted.camera_parameters.levels
+        sigmas = zip(fitted.camera_parameters.problems, fitted.linearised.sigmas_px, strict=True)
         if not any(name in levels and are_beyond(levels[name], value) for name, value in sigmas):
             return _with_lens_priors(new_side, fitted), new_side
     except ConvergenceError:
@@ -88,83 +88,97 @@ def refined(
 
 
 def _fit_with_levels(
-    side: FramesSide,
+    side: CellFrameModel,
     looks: CameraParameters,
     frames: Mapping[str, FloatArray],
     *,
     is_plain: bool,
-) -> tuple[ConvergedFit, FramesSide]:
+) -> tuple[ConvergedFit, CellFrameModel]:
     levels = looks.levels
     fitted, side = _fit_with_own_weights(side, looks, frames)
-    looks = fitted.looks.weighed(fitted.seen)
-    stacks = {name: problem.stack for name, problem in fitted.looks.problems.items()}
+    looks = fitted.camera_parameters.weighed(fitted.linearised)
+    stacks = {name: problem.stack for name, problem in fitted.camera_parameters.problems.items()}
     if any(problem.stack is not stacks[name] for name, problem in looks.problems.items()):
-        fitted = again(fitted, side, fitted.moving, looks)
+        fitted = refit_jointly(fitted, side, fitted.moving, looks)
     elif np.array_equal(fitted.moving, looks.first) and not (levels or side.has_errors):
         return fitted, side
     if is_plain:
         return fitted, side
-    looks = fitted.looks.with_levels(lens_levels(side, fitted))
-    return again(fitted, side, fitted.moving, looks), side
+    looks = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
+    return refit_jointly(fitted, side, fitted.moving, looks), side
 
 
 def _fit_with_own_weights(
-    side: FramesSide, looks: CameraParameters, frames: Mapping[str, FloatArray]
-) -> tuple[ConvergedFit, FramesSide]:
+    side: CellFrameModel, looks: CameraParameters, frames: Mapping[str, FloatArray]
+) -> tuple[ConvergedFit, CellFrameModel]:
     """Fits all with the corners' own weights."""
     # Errors of an arm are estimated once lenses and boards are fitted. Before, they may have looked
     # like another lens or board: the free values are then chosen once more with them free. Errors
     # of any arm's shape decide which values are free, but are not estimated. Their sigma is that
     # under the stated lenses and boards: a board whose size changes with the arm hides a part of
     # it.
-    stated = settle(looks, side, looks.first, frames)
+    stated = fit_jointly(looks, side, looks.first, frames)
     if not looks.levels:
         levels = lens_levels(side, _with_measured_sizes(side, stated))
-        stated = again(stated, side, stated.moving, stated.looks.with_levels(levels))
-    selected = chosen(side, stated)
+        stated = refit_jointly(
+            stated, side, stated.moving, stated.camera_parameters.with_levels(levels)
+        )
+    selected = free_supported_values(side, stated)
     new_side = side.with_errors(selected)
     if not any(error.is_significant for error in new_side.errors):
         return selected, new_side
     under_stated = side.with_errors(stated)
     freeing = (under_stated if under_stated.errors else new_side).freed(freely=True)
-    selected = chosen(freeing, _still_significant(freeing, stated, selected))
+    selected = free_supported_values(freeing, _still_significant(freeing, stated, selected))
     estimating = freeing.freed(freely=False)
     if all(error.is_estimated for error in freeing.errors):
         return selected, estimating
-    fitted = settle(
-        selected.looks, estimating, selected.moving, selected.frames, before=selected.seen
+    fitted = fit_jointly(
+        selected.camera_parameters,
+        estimating,
+        selected.moving,
+        selected.frames,
+        before=selected.linearised,
     )
     new_side = estimating.with_errors(fitted)
     # Errors that were not significant under the stated lenses may be so under these.
     if [error.is_estimated for error in new_side.errors] != [
         error.is_estimated for error in estimating.errors
     ]:
-        fitted = settle(fitted.looks, new_side, fitted.moving, fitted.frames, before=fitted.seen)
+        fitted = fit_jointly(
+            fitted.camera_parameters,
+            new_side,
+            fitted.moving,
+            fitted.frames,
+            before=fitted.linearised,
+        )
     return fitted, new_side
 
 
-def _with_measured_sizes(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+def _with_measured_sizes(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """The fit with board sizes by the motion, where these differ much from the stated ones."""
-    looks = fitted.looks
+    looks = fitted.camera_parameters
     scales = np.array([_measured_size(side, fitted, index).scale for index in looks.printed])
     if not np.any(np.abs(scales) > _NONLINEAR):
         return fitted
     sizes = np.concatenate([looks.scale_of(index) for index in looks.printed])
     looks = looks.without_prior(sizes.tolist()).with_values(sizes, scales)
-    return again(fitted, side, np.union1d(fitted.moving, sizes), looks)
+    return refit_jointly(fitted, side, np.union1d(fitted.moving, sizes), looks)
 
 
-def lens_levels(side: Side, fitted: ConvergedFit) -> dict[str, LensLevels]:
+def lens_levels(side: FrameModel, fitted: ConvergedFit) -> dict[str, LensLevels]:
     """Estimates the sizes of deviations of lenses from their models, near a fit.
 
     Lenses and boards are free for that, so that their errors do not count as such deviations.
     """
-    levels = fitted.looks.levels
+    levels = fitted.camera_parameters.levels
     if any(level.breathing for level in levels.values()):
         # Linearised at a value far from zero, breathing would be underestimated.
         no_breathing = {name: replace(level, breathing=0.0) for name, level in levels.items()}
-        fitted = again(fitted, side, fitted.moving, fitted.looks.with_levels(no_breathing))
-    looks = fitted.seen.looks
+        fitted = refit_jointly(
+            fitted, side, fitted.moving, fitted.camera_parameters.with_levels(no_breathing)
+        )
+    looks = fitted.linearised.camera_parameters
     # The board's size is left to the motion: a wrong one would look like breathing, and so would a
     # focal length.
     doubted = {name: item for name, item in looks.problems.items() if len(item.doubted)}
@@ -173,10 +187,10 @@ def lens_levels(side: Side, fitted: ConvergedFit) -> dict[str, LensLevels]:
     )
     sizes = [looks.scale_of(index) for index in looks.printed]
     unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
-    seen = fitted.seen.freed(np.arange(len(looks.values)), unsized)
+    seen = fitted.linearised.freed(np.arange(len(looks.values)), unsized)
     # Priors may be wrong, which is tested later; without them, frames may be undetermined.
     problem = side.problem(seen)
-    problem = replace(problem, priors=loosened(problem.priors))
+    problem = replace(problem, priors=with_loose_positions(problem.priors))
     values = np.append(looks.values, np.zeros(seen.by_field.shape[2]))
     state = State(fitted.fit.state.edges, np.concatenate([values, fitted.others]))
     return {
@@ -185,7 +199,7 @@ def lens_levels(side: Side, fitted: ConvergedFit) -> dict[str, LensLevels]:
     }
 
 
-def _with_lens_priors(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+def _with_lens_priors(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """Refits with priors on given lenses that were held, whose sigmas corners and motion determine.
 
     A given lens may have errors that are not significant. Where its focal length follows from the
@@ -193,7 +207,7 @@ def _with_lens_priors(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     prior each, whose sigma is estimated by restricted likelihood (REML). They are freed where the
     data determine them better than the prior, and count in the covariance where not.
     """
-    looks, moving = fitted.looks, [fitted.moving]
+    looks, moving = fitted.camera_parameters, [fitted.moving]
     # A size error within the board's sigma looks like another focal length.
     scales = np.array(
         [value for board in looks.printed for value in looks.scale_of(board)], dtype=int
@@ -234,15 +248,19 @@ def _with_lens_priors(side: Side, fitted: ConvergedFit) -> ConvergedFit:
     if not any(len(places) for _, places in doubts.values()):
         return fitted
     free = np.unique(np.concatenate(moving))
-    return _with_contested_lenses(side, again(fitted, side, free, looks.doubting(doubts)))
+    return _with_contested_lenses(side, refit_jointly(fitted, side, free, looks.doubting(doubts)))
 
 
-def _still_significant(side: Side, stated: ConvergedFit, fitted: ConvergedFit) -> ConvergedFit:
+def _still_significant(
+    side: FrameModel, stated: ConvergedFit, fitted: ConvergedFit
+) -> ConvergedFit:
     """The fit with arm errors and with those freed values that are still significant."""
     # Before, these errors were part of the noise: values that had absorbed them return to the
     # stated ones, and real deviations are clear now.
-    refit = settle(fitted.looks, side, fitted.moving, fitted.frames, before=fitted.seen)
-    looks = fitted.looks
+    refit = fit_jointly(
+        fitted.camera_parameters, side, fitted.moving, fitted.frames, before=fitted.linearised
+    )
+    looks = fitted.camera_parameters
     groups = [looks.shape_of(index) for index in looks.printed] + [
         looks.lens_of(problem) for problem in looks.problems
     ]
@@ -256,16 +274,16 @@ def _still_significant(side: Side, stated: ConvergedFit, fitted: ConvergedFit) -
     sizes, refit = _significant_sizes(side, refit)
     places = np.concatenate([stated.moving, *kept, *sizes])
     without_prior = places[np.isinf(looks.prior_sigma[places])]
-    restated = stated.looks.without_prior(without_prior.tolist())
-    restated = restated.with_values(places, refit.looks.values[places])
-    return settle(restated, side, np.unique(places), fitted.frames)
+    restated = stated.camera_parameters.without_prior(without_prior.tolist())
+    restated = restated.with_values(places, refit.camera_parameters.values[places])
+    return fit_jointly(restated, side, np.unique(places), fitted.frames)
 
 
-def _significant_sizes(side: Side, fit: ConvergedFit) -> tuple[list[IntArray], ConvergedFit]:
+def _significant_sizes(side: FrameModel, fit: ConvergedFit) -> tuple[list[IntArray], ConvergedFit]:
     """The board scales that still differ from the stated ones, and the fit with these free."""
     # An error common to all boards looks like one of the arms' links, and with all free together
     # none is significant: the least significant one is reset, and the others are measured again.
-    looks = fit.looks
+    looks = fit.camera_parameters
     boards = [board for board in looks.printed if np.isin(looks.scale_of(board), fit.moving).all()]
     while boards:
         measured = [measured_scale(side, fit, board) for board in boards]
@@ -274,25 +292,25 @@ def _significant_sizes(side: Side, fit: ConvergedFit) -> tuple[list[IntArray], C
             break
         boards.remove(least.board)
         place = looks.scale_of(least.board)
-        restated = fit.looks.with_values(place, looks.stated[place])
-        fit = again(fit, side, np.setdiff1d(fit.moving, place), restated)
+        restated = fit.camera_parameters.with_values(place, looks.stated[place])
+        fit = refit_jointly(fit, side, np.setdiff1d(fit.moving, place), restated)
     return [looks.scale_of(index) for index in boards], fit
 
 
-def _measured_size(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScale:
+def _measured_size(side: FrameModel, fitted: ConvergedFit, board: int) -> MeasuredScale:
     """Measures a board's size by the robots' motion, also beyond the linear range."""
     # A view's line of sight is determined much better than its distance. Where views and chain
     # disagree by millimetres, because a board's size is wrong, their lines of sight do, too, and
     # restrain a size that is linear about the views' poses. The costs of fits with other sizes do
     # not have this bias.
-    linear, looks = measured_scale(side, fitted, board), fitted.looks
+    linear, looks = measured_scale(side, fitted, board), fitted.camera_parameters
     noise, place = fitted.fit.noise, looks.scale_of(board)
     if linear.is_another or not any(robot[1] > _ROUGH_M for robot in noise.robots):
         return linear
 
     def refit(scale: float) -> ConvergedFit:
         value = looks.values[place] + scale
-        return again(fitted, side, fitted.moving, looks.with_values(place, value))
+        return refit_jointly(fitted, side, fitted.moving, looks.with_values(place, value))
 
     below, centre, above = (
         equations_and_cost(item.problem, item.fit.state, noise)[2]
@@ -307,7 +325,7 @@ def _measured_size(side: Side, fitted: ConvergedFit, board: int) -> MeasuredScal
     return measured_scale(side, refitted, board) if is_reduced.any() else linear
 
 
-def chosen(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
+def free_supported_values(side: CellFrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """Frees the values that the data support, beside those that are free from the start.
 
     The boards' bends, given intrinsics together with them, and the boards' scales are freed where
@@ -328,18 +346,22 @@ def chosen(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
     return _with_contested_lenses(side, resized)
 
 
-def _with_contested_lenses(side: Side, fitted: ConvergedFit) -> ConvergedFit:
+def _with_contested_lenses(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """The fit with the uncertainty of held intrinsics that corners contradict."""
     contested = _contested_cameras(side, fitted)
-    if contested == [name for name, problem in fitted.looks.problems.items() if problem.contested]:
+    if contested == [
+        name for name, problem in fitted.camera_parameters.problems.items() if problem.contested
+    ]:
         return fitted
-    return again(fitted, side, fitted.moving, fitted.looks.contesting(contested))
+    return refit_jointly(
+        fitted, side, fitted.moving, fitted.camera_parameters.contesting(contested)
+    )
 
 
-def _fit_freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
+def _fit_freed(side: FrameModel, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
     """Fits with more values free, without priors of lenses that they contradict."""
-    wider = again(fitted, side, moving)
-    looks = wider.looks
+    wider = refit_jointly(fitted, side, moving)
+    looks = wider.camera_parameters
     wrong = [
         looks.lens_of(problem)
         for problem in looks.problems
@@ -347,15 +369,15 @@ def _fit_freed(side: Side, moving: IntArray, fitted: ConvergedFit) -> ConvergedF
     ]
     if not wrong:
         return wider
-    return again(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
+    return refit_jointly(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
 
 
-def _with_freed_scales(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
+def _with_freed_scales(side: CellFrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """Frees the boards' scales where the robot measures others than are stated."""
     # One after the other: a wrong size biases the others, too, and the arm's errors, beside which a
     # size is tested.
     result, sizes = fitted, list[MeasuredScale]()
-    for _ in fitted.looks.printed:
+    for _ in fitted.camera_parameters.printed:
         size = _most_wrong_size(side, result)
         if size is None:
             break
@@ -375,40 +397,40 @@ def _with_freed_scales(side: FramesSide, fitted: ConvergedFit) -> ConvergedFit:
     return result
 
 
-def _with_scale(side: FramesSide, fitted: ConvergedFit, size: MeasuredScale) -> ConvergedFit:
+def _with_scale(side: CellFrameModel, fitted: ConvergedFit, size: MeasuredScale) -> ConvergedFit:
     """The fit with the scale of a board free, from its measured value."""
-    place = fitted.looks.scale_of(size.board)
-    looks = fitted.looks.with_values(place, np.array([size.scale]))
+    place = fitted.camera_parameters.scale_of(size.board)
+    looks = fitted.camera_parameters.with_values(place, np.array([size.scale]))
     if size.contradicts:
         looks = looks.without_prior(place.tolist())
-    return again(fitted, side, np.union1d(fitted.moving, place), looks)
+    return refit_jointly(fitted, side, np.union1d(fitted.moving, place), looks)
 
 
-def _most_wrong_size(side: FramesSide, fitted: ConvergedFit) -> MeasuredScale | None:
+def _most_wrong_size(side: CellFrameModel, fitted: ConvergedFit) -> MeasuredScale | None:
     """The held board scale that differs most significantly from the stated one, or None."""
-    looks = fitted.looks
+    looks = fitted.camera_parameters
     held = [index for index in looks.printed if looks.scale_of(index)[0] not in fitted.moving]
     measured = [_measured_size(side, fitted, board) for board in held]
     wrong = [size for size in measured if _is_wrong(side, size)]
     return max(wrong, key=lambda value: abs(value.scale) / value.sigma, default=None)
 
 
-def _is_wrong(side: FramesSide, size: MeasuredScale) -> bool:
+def _is_wrong(side: CellFrameModel, size: MeasuredScale) -> bool:
     # An arm whose links are all too long is hard to distinguish from a board that is too large.
     return size.contradicts if side.has_errors else size.is_another
 
 
 def _is_clear(
-    side: FramesSide, resized: ConvergedFit, size: MeasuredScale, covariance: FloatArray
+    side: CellFrameModel, resized: ConvergedFit, size: MeasuredScale, covariance: FloatArray
 ) -> bool:
     """Whether a board's size is still significant beside errors of arms without joint angles.
 
     Such errors depend on the posture and look like a size, whose sigma by white noise is far too
     small.
     """
-    looks = resized.looks
+    looks = resized.camera_parameters
     (place,) = looks.scale_of(size.board)
-    column = resized.columns.start + int(np.searchsorted(resized.seen.free, place))
+    column = resized.columns.start + int(np.searchsorted(resized.linearised.free, place))
     # Removes the prior's information.
     prior_information = looks.prior_sigma[place] ** -2.0
     information = 1.0 / covariance[column, column] - prior_information
@@ -437,9 +459,9 @@ def _largest_sigmas(fitted: ConvergedFit) -> FloatArray:
     return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(place, place)])[-1] for place in places])
 
 
-def _contested_cameras(side: Side, fitted: ConvergedFit) -> list[str]:
+def _contested_cameras(side: FrameModel, fitted: ConvergedFit) -> list[str]:
     """Cameras with held intrinsics that the corners contradict."""
-    looks, moving = fitted.looks, fitted.moving
+    looks, moving = fitted.camera_parameters, fitted.moving
     held = [
         problem for problem in looks.problems if not np.isin(looks.lens_of(problem), moving).all()
     ]
@@ -456,7 +478,7 @@ def _contested_cameras(side: Side, fitted: ConvergedFit) -> list[str]:
     ]
 
 
-def remade(
+def recompute_poses(
     views: Sequence[ViewPoses], free: LensBoardParameters, sigma_px: float
 ) -> tuple[ViewPoses, ...]:
     """Recomputes the poses of views that are not in the fit, with the fitted lens and board.
@@ -474,9 +496,9 @@ def remade(
     )
 
 
-def _shape_sets(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
+def _shape_sets(side: FrameModel, fitted: ConvergedFit) -> Iterator[IntArray]:
     """Sets of values to free: the bends, with given intrinsics or without, where significant."""
-    looks, moving = fitted.looks, fitted.moving
+    looks, moving = fitted.camera_parameters, fitted.moving
     if not looks.has_spare_corners:
         return
     bent = np.union1d(moving, looks.shape)
@@ -506,7 +528,7 @@ def _shape_sets(side: Side, fitted: ConvergedFit) -> Iterator[IntArray]:
 def _predicts_worse(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
     """Whether held-out views are predicted worse, in position and in rotation."""
     # Intrinsics with a stated sigma are free to move within that in any case.
-    looks = wider.looks
+    looks = wider.camera_parameters
     freed = [
         problem.scene
         for name, problem in looks.problems.items()
@@ -534,5 +556,5 @@ def _remade_view(
         view,
         cam_from_target=compressed.cam_from_target[at][None],
         covariance=covariance[None],
-        by_shared=compressed.by_shared[at][None, :, columns],
+        shared_jacobian=compressed.by_shared[at][None, :, columns],
     )

@@ -8,8 +8,8 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.guess.joints import JointReading
-from visioncal.calibration.stages.joints import Matched, match_joints
+from visioncal.calibration.guess.joint_readings import JointReading
+from visioncal.calibration.stages.joints import MatchedJoints, match_joints
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray, Rejection
@@ -26,14 +26,14 @@ _ONE_STOP_MM, _ONE_STOP_DEG = 1.0, 0.1
 _OUT_OF_REACH_M, _ALIKE = 20.0, 5.0
 
 
-def moved_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
+def move_to_arm(poses: FloatArray, q: FloatArray, before: Robot, after: Robot) -> FloatArray:
     """Converts poses (m, 4, 4) of a thing on one model's flange to those on another's."""
     on_flange = invert(before.base_from_flange(q)) @ poses
     return np.asarray(after.base_from_flange(q) @ on_flange)
 
 
 @dataclass(frozen=True, eq=False)
-class Reported:
+class RobotReport:
     """Poses and joints that a robot's rows report.
 
     Attributes:
@@ -48,7 +48,7 @@ class Reported:
     rejections: tuple[Rejection, ...] = ()
     warnings: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
-    matched: Matched | None = None
+    matched: MatchedJoints | None = None
 
     @cached_property
     def joints_rad(self) -> Mapping[int, FloatArray] | None:
@@ -73,11 +73,11 @@ class Reported:
         views = list(self.base_from_flange)
         q = np.array([joints[view] for view in views])
         poses = np.array([self.base_from_flange[view] for view in views])
-        moved = moved_arm(poses, q, before.arm, after.arm)
+        moved = move_to_arm(poses, q, before.arm, after.arm)
         return replace(self, base_from_flange=dict(zip(views, moved, strict=True)), matched=after)
 
 
-def reported_poses(session: Session, robot: Robot | None) -> Reported:
+def reported_poses(session: Session, robot: Robot | None) -> RobotReport:
     """Collects `base_from_flange` of each view, and matches joints with poses.
 
     Reported poses are preferred; for a view with joints only, the robot's model gives the pose.
@@ -111,7 +111,7 @@ def reported_poses(session: Session, robot: Robot | None) -> Reported:
         # In a whole cell, such rows are separate states.
         _check_stops(session, poses)
     remarks = ((), ()) if matched is None else (matched.warnings, matched.notes)
-    return Reported(poses, tuple(rejections), *remarks, matched)
+    return RobotReport(poses, tuple(rejections), *remarks, matched)
 
 
 def _in_millimetres(poses: Mapping[int, FloatArray]) -> set[int]:
@@ -128,7 +128,7 @@ def _in_millimetres(poses: Mapping[int, FloatArray]) -> set[int]:
     }
 
 
-def _no_pose(joints: FloatArray | None, matched: Matched | None) -> str:
+def _no_pose(joints: FloatArray | None, matched: MatchedJoints | None) -> str:
     if joints is None:
         return "no pose of the robot: x_m to qw are empty"
     if matched is None:

@@ -7,25 +7,25 @@ from typing import TypeVar
 import numpy as np
 
 from visioncal.calibration.guess.fit import distances
-from visioncal.calibration.guess.joints import JointReading
-from visioncal.calibration.guess.misread import (
+from visioncal.calibration.guess.joint_guess import (
     FEWEST_JOINT_ROWS,
     FITS_SEEN,
     JointGuess,
     guess_joints,
 )
-from visioncal.calibration.stages.joints import EXPORT_ARM, Matched, zero_taken
-from visioncal.calibration.stages.motion import is_open
+from visioncal.calibration.guess.joint_readings import JointReading
+from visioncal.calibration.stages.joints import EXPORT_ARM, MatchedJoints, zero_taken
+from visioncal.calibration.stages.motion import lacks_robot_state
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.reported_poses import Reported, reported_poses
+from visioncal.calibration.stages.reported_poses import RobotReport, reported_poses
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy, remarks
 from visioncal.robot import Robot
 from visioncal.session import Observation, Session, frame_name
-from visioncal.session.kinds import is_seen, name_of
+from visioncal.session.kinds import is_camera_observation, name_of
 
 T = TypeVar("T", bound=Observed)
 
@@ -44,7 +44,7 @@ def read_robots(observed: T) -> T:
             view
             for view in session.views
             if name_of(session.declaration, "robot", view) == name
-            and not (observed.clocks and is_open(view))
+            and not (observed.clocks and lacks_robot_state(view))
         )
         model = None if model_document is None else Robot.from_document(model_document)
         reported = reported_poses(replace(session, views=of_robot), model)
@@ -57,7 +57,7 @@ def read_robots(observed: T) -> T:
     return replace(observed, robots=reports).noting(_lost_views(session, rows, reports))
 
 
-def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
+def _with_stops(session: Session, name: str, reported: RobotReport) -> RobotReport:
     """Fills in, where a row has no pose of its robot, that of another row of its stop."""
     poses, matched = dict(reported.base_from_flange), reported.matched
     joints = {} if matched is None else dict(matched.joints_rad)
@@ -73,7 +73,7 @@ def _with_stops(session: Session, name: str, reported: Reported) -> Reported:
 
 
 def _lost_views(
-    session: Session, rows: Sequence[Observation], reports: Mapping[str, Reported]
+    session: Session, rows: Sequence[Observation], reports: Mapping[str, RobotReport]
 ) -> Iterator[Rejection]:
     """Rejections of observations without the pose of a robot."""
     reasons = {
@@ -81,12 +81,12 @@ def _lost_views(
         for name, report in reports.items()
     }
     for row in rows:
-        for name in (*row.lacks, *row.robots):
+        for name in (*row.missing_robots, *row.robots):
             if row.view.number in reports[name].base_from_flange:
                 continue
             why = reasons[name].get(row.robots.get(name, row.view).number, "")
             of = f" ({name})" if len(session.robots) > 1 else ""
-            if not why or (name in row.lacks and row.view.stop is not None):
+            if not why or (name in row.missing_robots and row.view.stop is not None):
                 why, of = f"no row of its stop has the pose of {name or 'the robot'}", ""
             yield Rejection(row.view.number, f"{why}{of}")
 
@@ -112,7 +112,11 @@ def check_joints(observed: T, *, drops: bool, takes: bool) -> T:
 
 
 def _checked(
-    observed: T, name: str, reported: Reported, matched: Matched, options: tuple[bool, bool]
+    observed: T,
+    name: str,
+    reported: RobotReport,
+    matched: MatchedJoints,
+    options: tuple[bool, bool],
 ) -> T:
     session, joints, (drops, takes) = observed.session, reported.joints_rad or {}, options
     pair = next(iter(pairs_of(observed, name)), _NO_PAIR)
@@ -194,8 +198,8 @@ def pairs_of(observed: Observed, robot: str) -> list[CameraTargetPair]:
     pairs: dict[tuple[str, str], dict[int, ViewPoses]] = {}
     for observation in observed.timed.observations:
         view = observation.view.number
-        is_alone = [*observation.robots, *observation.lacks] == [robot]
-        if view in observed.poses and is_seen(observation.view) and is_alone:
+        is_alone = [*observation.robots, *observation.missing_robots] == [robot]
+        if view in observed.poses and is_camera_observation(observation.view) and is_alone:
             pairs.setdefault((observation.seer, observation.seen), {})[view] = observed.poses[view]
     flange, found_pairs = frame_name("flange", robot), []
     for camera, target in sorted(pairs, key=lambda pair: (-len(pairs[pair]), pair)):
@@ -215,7 +219,7 @@ def _guess_seen_joints(
 
 
 def _contradicted_joints(
-    matched: Matched,
+    matched: MatchedJoints,
     guess: JointGuess | None,
     seen: Mapping[int, tuple[FloatArray, FloatArray]],
     mount: Mount,

@@ -22,8 +22,8 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import SIGNIFICANT, find_arm_errors
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
-from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
 from visioncal.estimation.solve import Solution, robot_likelihood, starting_noise
 from visioncal.results.arm import (
     DriftPoint,

@@ -17,8 +17,8 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_among, damped_step
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.solve import (
     equations_and_cost,
     estimate_noise,
@@ -26,7 +26,7 @@ from visioncal.estimation.solve import (
     fit_problem,
     robot_levels,
 )
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 from visioncal.robot import Robot
 from visioncal.robot.thermal.heating import Heating, Inputs, Kind
 from visioncal.robot.thermal.model import ThermalModel
@@ -289,7 +289,7 @@ def _effect(
     heated = model.heating.jacobian(inputs, stops.stamps_s)
     basis = np.zeros((count, 6, len(values)))
     basis[stops.places] = model.basis(stops.q, links, heated) * sigmas
-    prior = Knowledge(np.eye(len(values)), values)
+    prior = PriorInformation(np.eye(len(values)), values)
     held = np.zeros(len(values), dtype=bool)
     name = f"temperature of {stops.robot}"
     return Effect(name, values, prior, held, flange_jacobian={stops.robot: basis})

@@ -46,7 +46,7 @@ _QUARTERS: Mapping[ImageTurn, _PixelMap] = {
 }
 
 
-def turned_how(
+def find_image_turn(
     px: FloatArray, predicted_px: FloatArray, size: tuple[int, int], typical_px: float
 ) -> ImageTurn | None:
     """Finds how the image of an outlier view was turned or mirrored.

@@ -9,8 +9,8 @@ import numpy as np
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import apply, apply_each, distances
 from visioncal.core.types import Camera, Corners, FloatArray, IntArray, Mask
-from visioncal.estimation.parts import State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import State
 from visioncal.vision.camera import project
 
 # Up to this number, every stop is held out by itself; with more, ten groups are sufficient.
@@ -19,30 +19,30 @@ _FOLDS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOutResiduals:
     """Residuals of held-out observations.
 
     Attributes:
         method: The method of cross-validation, in words.
-        away_m: (n,) distance between the observed and the predicted position [m]; NaN where the
+        residual_m: (n,) distance between the observed and the predicted position [m]; NaN where the
             other
             observations do not determine it.
-        away_rad: (n,) angle between the rotations [rad]; NaN for positions alone.
+        residual_rad: (n,) angle between the rotations [rad]; NaN for positions alone.
         rms_px: (n,) reprojection error through the chain [px]; NaN without corners.
     """
 
     method: str
-    away_m: FloatArray
-    away_rad: FloatArray
+    residual_m: FloatArray
+    residual_rad: FloatArray
     rms_px: FloatArray
 
 
-def validate(
+def cross_validate(
     problem: Problem,
     refit: Callable[[Mask], State],
     pixels: Callable[[IntArray, FloatArray, State], FloatArray],
     of: str = "",
-) -> HeldOut:
+) -> HeldOutResiduals:
     """Holds stops out, one by one or in ten groups, and predicts their observations.
 
     Args:
@@ -76,7 +76,7 @@ def validate(
             rms_px[held] = pixels(np.flatnonzero(held), predicted[held], state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
     unit = "views" if count == len(problem) else "stops"
-    return HeldOut(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
+    return HeldOutResiduals(f"{method} over {unit}{of}", away_m, away_rad, rms_px)
 
 
 def _needed_frames(problem: Problem) -> Mask:
@@ -88,7 +88,7 @@ def _needed_frames(problem: Problem) -> Mask:
     return needed
 
 
-def apart(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
+def pose_residuals(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
     """Residuals (n,) [m] and (n,) [rad] of observations."""
     return _apart(problem, state, problem.predicted(state))
 

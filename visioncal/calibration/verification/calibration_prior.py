@@ -17,7 +17,7 @@ from visioncal.estimation.appearance import (
 )
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.parts import Noise, State
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.results import Calibration
 from visioncal.results.sections import BoardResult, FittedArm, JointFit, RigResult
 from visioncal.robot import Robot, WeightFunctions

@@ -10,7 +10,7 @@ from visioncal.calibration.verification.prediction import PredictedStops
 from visioncal.core.transforms import adjoint, invert, log
 from visioncal.core.types import FloatArray
 from visioncal.estimation.armmodel import ArmModel
-from visioncal.estimation.model_evidence import TURN_PER_M, Cause
+from visioncal.estimation.model_evidence import TURN_PER_M, ChangeHypothesis
 from visioncal.estimation.observability import FEWEST_VIEWS
 from visioncal.robot import Robot
 
@@ -34,7 +34,7 @@ _MOTION_UNITS = np.repeat([TURN_PER_M, 1.0], 3)
 
 def causes_of(
     predicted: PredictedStops, prior: CalibrationPrior, *, board_placed_anew: bool
-) -> tuple[Cause, ...]:
+) -> tuple[ChangeHypothesis, ...]:
     """The causes that a check of these stops compares.
 
     Args:
@@ -73,7 +73,7 @@ def kind_of(cause: str) -> str:
     return cause.partition(" ")[0]
 
 
-def _boards(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
+def _boards(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
     """Each board's edge: a twist on its right."""
     names, changes = tuple(prior.targets) or ("",), log(predicted.away(prior))
     for at, board in enumerate(prior.boards):
@@ -89,11 +89,11 @@ def _boards(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Caus
         )
 
 
-def _simultaneous(kind: str, first: Cause, second: Cause) -> Cause:
+def _simultaneous(kind: str, first: ChangeHypothesis, second: ChangeHypothesis) -> ChangeHypothesis:
     """Two simultaneous changes."""
     # If both camera and board moved, only the arm is left of the calibration; a board of another
     # size at another place is another board.
-    return Cause(
+    return ChangeHypothesis(
         f"{kind} {second.name.partition(' ')[2]}".strip(),
         np.concatenate([first.by_sensor, second.by_sensor], axis=2),
         np.concatenate([first.flange_jacobian, second.flange_jacobian], axis=2),
@@ -102,7 +102,7 @@ def _simultaneous(kind: str, first: Cause, second: Cause) -> Cause:
     )
 
 
-def _sizes(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
+def _sizes(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
     """Each board's size, as a share: a larger board is seen nearer by the same share."""
     if prior.calibration.mount == "instrument":
         return
@@ -115,7 +115,7 @@ def _sizes(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause
             yield _cause(f"{SIZE} {names[board]}".strip(), predicted, np.ones(1), by_sensor)
 
 
-def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
+def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
     """An offset of each joint, and a common scale of all lengths."""
     model, q = _arm(predicted, prior), predicted.joints_rad
     if model is None or q is None:
@@ -130,7 +130,7 @@ def _joints(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Caus
 
 def _arm(predicted: PredictedStops, prior: CalibrationPrior) -> ArmModel | None:
     """The arm for joint offsets; the nominal one where none was calibrated."""
-    robot, matched = prior.calibration.calibrated_robot, predicted.known.reported.matched
+    robot, matched = prior.calibration.calibrated_robot, predicted.observed.reported.matched
     if prior.model is not None or robot is None:
         return prior.model
     reported = np.eye(4) if matched is None else matched.flange_from_reported
@@ -146,7 +146,7 @@ def _stretch(robot: Robot, q: FloatArray) -> FloatArray:
     return np.asarray(robot.placement_jacobian(q) @ twists.reshape(-1))
 
 
-def _views(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[Cause]:
+def _views(predicted: PredictedStops, prior: CalibrationPrior) -> Iterator[ChangeHypothesis]:
     """Each stop alone: its image belongs to another pose, or something slipped meanwhile."""
     if predicted.stops < 2:
         return
@@ -173,9 +173,9 @@ def _cause(
     by_sensor: FloatArray | None = None,
     flange_jacobian: FloatArray | None = None,
     start: FloatArray | None = None,
-) -> Cause:
+) -> ChangeHypothesis:
     size = len(units)
-    return Cause(
+    return ChangeHypothesis(
         name,
         np.zeros((len(predicted.problem), 6, size)) if by_sensor is None else by_sensor,
         np.zeros((predicted.stops, 6, size)) if flange_jacobian is None else flange_jacobian,

@@ -29,14 +29,14 @@ from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import log, mean_transform
 from visioncal.core.types import FloatArray, Progress
 from visioncal.estimation.model_evidence import (
-    Belief,
-    Cause,
-    CauseEvidence,
-    explain,
+    CalibrationPosterior,
+    ChangeHypothesis,
+    HypothesisEvidence,
+    evidence_of,
     undone,
     with_change,
 )
-from visioncal.results import Calibration, picked
+from visioncal.results import Calibration, select_matching
 from visioncal.session import Session
 from visioncal.session.choosing import Choice
 
@@ -59,7 +59,7 @@ class Suspect:
 
     name: str
     probability: float
-    explained: CauseEvidence
+    explained: HypothesisEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +68,11 @@ class Check:
 
     Attributes:
         calibration: The calibration.
-        seen: The stops.
-        prior_calibration: The calibration as a prior.
-        away: (m, 6) displacement of each board from its calibrated pose, by each observation
+        predicted: The stops.
+        prior: The calibration as a prior.
+        residuals: (m, 6) displacement of each board from its calibrated pose, by each observation
             (rotation [rad], translation [m]), in the board's frame.
-        left: (m, 6) the same with the likeliest change undone, where one was found.
+        remaining: (m, 6) the same with the likeliest change undone, where one was found.
         log_evidence: Logarithm of the likelihood ratio of any change to none.
         misfit: Squared Mahalanobis distance of the stops from the prediction.
         freedom: Its degrees of freedom.
@@ -86,10 +86,10 @@ class Check:
     """
 
     calibration: Calibration
-    seen: PredictedStops
-    prior_calibration: CalibrationPrior
-    away: FloatArray
-    left: FloatArray
+    predicted: PredictedStops
+    prior: CalibrationPrior
+    residuals: FloatArray
+    remaining: FloatArray
     log_evidence: float
     misfit: float
     freedom: int
@@ -137,7 +137,7 @@ def verify(
     if not isinstance(calibration, Calibration):
         calibration = Calibration.load(calibration)
     is_its_own = session.digest() == calibration.session_sha256
-    session, calibration = picked(session, calibration, Choice(camera, robot, target))
+    session, calibration = select_matching(session, calibration, Choice(camera, robot, target))
     # Views of its own session that the calibration rejected are rejected here, too.
     without = {view.view: view.reason for view in calibration.views if is_its_own and not view.used}
     prior = CalibrationPrior.of(calibration)
@@ -159,7 +159,7 @@ def check(
             )
         change = mean_transform(predicted.away(prior))
         prior = prior.with_board_at(prior.state.edges[1] @ change, _ANYWHERE)
-    belief = Belief(
+    belief = CalibrationPosterior(
         prior.state,
         prior.covariance,
         prior.noise(from_corners=predicted.from_corners),
@@ -167,8 +167,8 @@ def check(
     )
     causes = causes_of(predicted, prior, board_placed_anew=board_placed_anew)
     with one_blas_thread():
-        unchanged = explain(predicted.problem, belief)
-        explanations = [explain(predicted.problem, belief, cause) for cause in causes]
+        unchanged = evidence_of(predicted.problem, belief)
+        explanations = [evidence_of(predicted.problem, belief, cause) for cause in causes]
     likelihoods = np.array([explained.likelihood for explained in explanations])
     scores = likelihoods + np.log(_prior_probabilities(causes))
     evidence = float(np.logaddexp.reduce(scores))
@@ -203,7 +203,7 @@ def check(
     )
 
 
-def _prior_probabilities(causes: Sequence[Cause]) -> FloatArray:
+def _prior_probabilities(causes: Sequence[ChangeHypothesis]) -> FloatArray:
     """Prior probabilities of the causes: equal for each kind, and within a kind."""
     kinds = [kind_of(cause.name) for cause in causes]
     return np.array([1.0 / (len(set(kinds)) * kinds.count(kind)) for kind in kinds])

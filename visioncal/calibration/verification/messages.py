@@ -129,14 +129,14 @@ def verdict_of(check: Check) -> Verdict:
 
 def _runnable(check: Check, step: Remedy) -> Remedy:
     """Drops a remedy's command where these stops do not allow it."""
-    session = check.seen.known.session
+    session = check.predicted.observed.session
     of_images = any(view.image for view in session.views)
     is_lens_known = not of_images or session.camera is not None
     allowed = {
-        CALIBRATE_ANEW: check.seen.stops >= CheckLimits.stops and is_lens_known,
+        CALIBRATE_ANEW: check.predicted.stops >= CheckLimits.stops and is_lens_known,
         PLAN: of_images
         and is_lens_known
-        and check.seen.stops >= _LEAST_STOPS
+        and check.predicted.stops >= _LEAST_STOPS
         and check.calibration.robot is not None,
     }
     return step if allowed.get(step.command, True) else Remedy(step.words)
@@ -144,18 +144,22 @@ def _runnable(check: Check, step: Remedy) -> Remedy:
 
 def _rivals(check: Check, best: Suspect, others: Sequence[Suspect]) -> Finding:
     """Finding on the changes that cannot be distinguished from the likeliest."""
-    named = listed([thing(check, other) for other in others])
+    named = listed([change_words(check, other) for other in others])
     robot = check.calibration.calibrated_robot
     if robot is not None and best.name in (f"{JOINT} 1", f"{JOINT} {robot.joint_count}"):
         # A rotation of the base about the first axis, or of the tool about the last, is equivalent.
         return Finding("rivals", f"No stops separate that from {named}.", Remedy("Look at both."))
-    these = "This stop does" if check.seen.stops == 1 else f"These {check.seen.stops} stops do"
+    these = (
+        "This stop does"
+        if check.predicted.stops == 1
+        else f"These {check.predicted.stops} stops do"
+    )
     words = f"{these} not separate that from {named}."
     step = _runnable(check, Remedy("Verify with stops all over the workspace.", PLAN))
     return Finding("rivals", words, step)
 
 
-def described(check: Check, suspect: Suspect) -> dict[str, Any]:
+def change_document(check: Check, suspect: Suspect) -> dict[str, Any]:
     """Estimates of a change for the JSON document: millimetres, degrees, shares."""
     kind = kind_of(suspect.name)
     values, sigmas = suspect.explained.values, np.sqrt(np.diag(suspect.explained.covariance))
@@ -198,7 +202,7 @@ def _motion(
     check: Check, name: str, twist: FloatArray, covariance: FloatArray, grown: float
 ) -> MeasuredMove:
     """Motion of a camera, or of the middle of a board that also grew by a share."""
-    x, *boards = check.prior_calibration.state.edges
+    x, *boards = check.prior.state.edges
     in_hand = check.calibration.mount == "eye-in-hand"
     if name == CAMERA:
         rotation, point, parent = x[:3, :3], np.zeros(3), "tool" if in_hand else "base"
@@ -226,7 +230,7 @@ def _motion(
 def _board(check: Check, name: str) -> int:
     """Index, among the calibration's boards, of the board of a cause."""
     kind, _, which = name.partition(" ")
-    prior, predicted = check.prior_calibration, check.seen
+    prior, predicted = check.prior, check.predicted
     if kind in (BOARD, REPLACED):
         names = list(prior.targets)
         return prior.boards.index(names.index(which)) if which in names else 0
@@ -235,10 +239,10 @@ def _board(check: Check, name: str) -> int:
 
 def _middle(check: Check, board: int) -> FloatArray:
     """(3,) middle of one of the calibration's boards, in its frame [m]."""
-    targets = tuple(check.prior_calibration.targets.values())
+    targets = tuple(check.prior.targets.values())
     if not targets:
         return np.zeros(3)
-    return np.asarray(corner_positions(targets[check.prior_calibration.boards[board]]).mean(axis=0))
+    return np.asarray(corner_positions(targets[check.prior.boards[board]]).mean(axis=0))
 
 
 def _length(vector: FloatArray, covariance: FloatArray) -> tuple[float, float]:
@@ -261,7 +265,7 @@ def _signed_axis(vector: FloatArray) -> str:
 def _changed(check: Check, suspect: Suspect) -> str:
     kind = kind_of(suspect.name)
     if kind in (JOINT, LENGTH, NOISE, SIZE, REPLACED):
-        return f"{_capital(thing(check, suspect))}."
+        return f"{_capital(change_words(check, suspect))}."
     moved = motions(check, suspect)
     if kind in (CAMERA, BOARD, BOTH):
         return f"{_capital('; '.join(f'the {name} {move.words}' for name, move in moved.items()))}."
@@ -271,7 +275,7 @@ def _changed(check: Check, suspect: Suspect) -> str:
     )
 
 
-def thing(check: Check, suspect: Suspect) -> str:
+def change_words(check: Check, suspect: Suspect) -> str:
     """A change with its estimates, as a part of a sentence."""
     kind, explained = kind_of(suspect.name), suspect.explained
     if kind == JOINT:
@@ -335,9 +339,9 @@ def _joint_figures(check: Check, suspect: Suspect) -> tuple[float, float, str]:
 
 
 def _agreement(check: Check) -> str:
-    turn, shift = np.sqrt(np.mean(np.sum(check.away.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+    turn, shift = np.sqrt(np.mean(np.sum(check.residuals.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
     chance = f"{figure(100 * check.p_value)} %"
-    sure, verb = _SURE * check.camera_sigma, "agrees" if check.seen.stops == 1 else "agree"
+    sure, verb = _SURE * check.camera_sigma, "agrees" if check.predicted.stops == 1 else "agree"
     off_deg, off_mm = figure(float(np.rad2deg(turn))), figure(1e3 * float(shift))
     return (
         f"{_stops(check)} {verb} with the calibration: off by {off_mm} mm and {off_deg} deg (rms); "
@@ -348,15 +352,15 @@ def _agreement(check: Check) -> str:
 
 
 def _doubts(check: Check) -> Iterator[Finding]:
-    if check.seen.stops < CheckLimits.stops:
-        verb = "distinguishes" if check.seen.stops == 1 else "distinguish"
+    if check.predicted.stops < CheckLimits.stops:
+        verb = "distinguishes" if check.predicted.stops == 1 else "distinguish"
         words = f"{_stops(check)} hardly {verb} one change from another."
         step = _runnable(check, Remedy(f"Take {CheckLimits.stops} stops or more.", PLAN))
         yield Finding("few_stops", words, step)
 
 
 def _stops(check: Check) -> str:
-    return counted(check.seen.stops, "stop")
+    return counted(check.predicted.stops, "stop")
 
 
 def _capital(text: str) -> str:
@@ -375,7 +379,7 @@ def to_document(
     """
     calibration, observed, verdict = (
         check.calibration,
-        check.seen.known,
+        check.predicted.observed,
         verdict or verdict_of(check),
     )
     return {
@@ -412,12 +416,14 @@ def to_document(
                 "left_mm": 1e3 * float(np.linalg.norm(left[3:])),
                 "left_deg": float(np.rad2deg(np.linalg.norm(left[:3]))),
             }
-            for views, away, left in zip(check.seen.views, check.away, check.left, strict=True)
+            for views, away, left in zip(
+                check.predicted.views, check.residuals, check.remaining, strict=True
+            )
         ],
         "not_used": [
             {"view": view, "reason": reason} for view, reason in sorted(observed.reasons.items())
         ],
-        "warnings": list(check.seen.warnings),
+        "warnings": list(check.predicted.warnings),
         "recalibrate": any(trigger.state == "fired" for trigger in triggers),
         "triggers": [_trigger(trigger) for trigger in triggers],
     }
@@ -430,7 +436,11 @@ def listed_suspects(check: Check) -> tuple[Suspect, ...]:
 
 
 def _change(check: Check, suspect: Suspect) -> dict[str, Any]:
-    return {"cause": suspect.name, "probability": suspect.probability, **described(check, suspect)}
+    return {
+        "cause": suspect.name,
+        "probability": suspect.probability,
+        **change_document(check, suspect),
+    }
 
 
 def _trigger(outcome: Outcome) -> dict[str, Any]:

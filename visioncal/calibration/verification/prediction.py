@@ -9,8 +9,8 @@ import numpy as np
 from visioncal.calibration.pipeline import STAGES
 from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.stages.observed import CameraLook
-from visioncal.calibration.stages.pose_ambiguity import choose_by
+from visioncal.calibration.stages.observed import CameraObservations
+from visioncal.calibration.stages.pose_ambiguity import choose_nearest
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
@@ -20,8 +20,8 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.corners import CornerStack, reproject
 from visioncal.estimation.lens_field import depths_m
-from visioncal.estimation.parts import ROBOT, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.results import CameraResult
 from visioncal.results.picking import check_mount, check_resolution
 from visioncal.robot import Robot
@@ -42,13 +42,13 @@ class PredictedStops:
     """The stops of a session with a calibration's lens, boards and arm.
 
     Attributes:
-        known: The session's observations, with the calibration's lens, boards and arm.
+        observed: The session's observations, with the calibration's lens, boards and arm.
         problem: The m observations of a board at a stop, with the calibration's unknowns.
         views: (m,) the views that each observation combines.
         warnings: Warnings, in sentences.
     """
 
-    known: ObservedPoses
+    observed: ObservedPoses
     problem: Problem
     views: tuple[tuple[int, ...], ...]
     warnings: tuple[str, ...]
@@ -61,7 +61,7 @@ class PredictedStops:
     @property
     def joints_rad(self) -> FloatArray | None:
         """(s, n) joint angles of the stops [rad]; None where not all have them."""
-        return self.known.arm_at_stops.joints_rad
+        return self.observed.arm_at_stops.joints_rad
 
     @property
     def boards(self) -> IntArray:
@@ -98,13 +98,13 @@ def predict_stops(
         DataError: The session is of another mount, camera, target or robot, lacks joint angles that
             the calibrated arm needs, or shows no target.
     """
-    run = _STAGES["robot"](known_before(session, prior, progress))
+    run = _STAGES["robot"](checked_state(session, prior, progress))
     run = _STAGES["detect"](run)
     rejected = {key: why for key, why in (without or {}).items() if key not in run.held_back}
-    return seen_by(run.noting(Rejection(*pair) for pair in rejected.items()), prior)
+    return predict_detected(run.noting(Rejection(*pair) for pair in rejected.items()), prior)
 
 
-def known_before(
+def checked_state(
     session: Session, prior: CalibrationPrior, progress: Progress | None = None
 ) -> RunState:
     """Initial state of a run, once it is checked that the session is of the same cell.
@@ -124,7 +124,7 @@ def known_before(
     return RunState(session, progress)
 
 
-def seen_by(run: RunState, prior: CalibrationPrior) -> PredictedStops:
+def predict_detected(run: RunState, prior: CalibrationPrior) -> PredictedStops:
     """Does what `predict_stops` does, once targets have been detected."""
     calibration, detected = prior.calibration, run.cameras
     for frame, look in run.cameras.items():
@@ -156,7 +156,7 @@ def seen_by(run: RunState, prior: CalibrationPrior) -> PredictedStops:
 
 
 def _without_breathing(
-    run: RunState, detected: Mapping[str, CameraLook], lens: CameraResult | None
+    run: RunState, detected: Mapping[str, CameraObservations], lens: CameraResult | None
 ) -> RunState:
     """Corrects corners for focus breathing, to the calibration's mean distance."""
     if lens is None or lens.field is None or lens.field.breathing == 0.0:
@@ -225,7 +225,7 @@ def _with_poses(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPos
         robot = robot_part(observed.arm_at([view]).poses, mount)[0]
         predicted = invert(robot @ x) @ boards[order[poses.board]]
         views.append(view)
-        chosen.append(choose_by(poses, predicted, targets[poses.board] if targets else None))
+        chosen.append(choose_nearest(poses, predicted, targets[poses.board] if targets else None))
     if not views:
         raise DataError(
             f"session {observed.session.name!r}: no view shows the target from a known pose of the "

@@ -3,8 +3,8 @@
 import numpy as np
 
 from visioncal.core.types import FloatArray
-from visioncal.estimation.parts import ROBOT, Effect
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.problem_parts import ROBOT, Effect
+from visioncal.estimation.variance import PriorInformation
 
 
 def clock_effect(
@@ -19,6 +19,6 @@ def clock_effect(
         name: Name of the effect.
         robot: The robot whose flange moves.
     """
-    prior = Knowledge(np.array([[sigma_s**-2.0]]), np.zeros(1))
+    prior = PriorInformation(np.array([[sigma_s**-2.0]]), np.zeros(1))
     # The farther the camera's clock is ahead, the earlier the robot's own time.
     return Effect.free(name, prior, flange_jacobian={robot: -speeds[:, :, None]})

@@ -15,9 +15,9 @@ from visioncal.core.types import Camera, FloatArray, IntArray, Mask
 from visioncal.estimation.appearance import Appearance, Compressed, compress
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.lens_field import LensLevels
-from visioncal.estimation.parts import Effect
+from visioncal.estimation.problem_parts import Effect
 from visioncal.estimation.scene import CornerProblem
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 from visioncal.vision.camera import intrinsics, with_intrinsics
 
 # The effect's name in a problem.
@@ -231,7 +231,7 @@ class CameraParameters:
         values[free] = found
         return replace(self, values=values)
 
-    def seen(
+    def linearised(
         self, moving: IntArray, before: "LinearisedCorners | None" = None
     ) -> "LinearisedCorners":
         """Compresses all corners, (f,) values being free.
@@ -254,7 +254,7 @@ class CameraParameters:
             found.append(compressed)
             sigmas.append(sigma)
         poses = np.concatenate([compressed.cam_from_target for compressed in found])
-        corners = Knowledge(information, gradient)
+        corners = PriorInformation(information, gradient)
         looks = replace(self, poses=poses)
         return LinearisedCorners(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
 
@@ -293,23 +293,23 @@ class LinearisedCorners:
     """What all corners say of poses, lenses and boards, where they were linearised.
 
     Attributes:
-        looks: Where that was.
+        camera_parameters: Where that was.
         moving: Places of the values that a fit moves.
         compressed: What each camera's corners say.
         sigmas_px: Each camera's noise of a corner's coordinate [px].
         corners: What the corners say of all values, the poses being free.
     """
 
-    looks: CameraParameters
+    camera_parameters: CameraParameters
     moving: IntArray
     compressed: tuple[Compressed, ...]
     sigmas_px: tuple[float, ...]
-    corners: Knowledge
+    corners: PriorInformation
 
     @cached_property
     def free(self) -> IntArray:
         """(f,) places of the values that are uncertain: those that move, and others that count."""
-        return np.union1d(self.moving, self.looks.counted)
+        return np.union1d(self.moving, self.camera_parameters.counted)
 
     @property
     def held(self) -> Mask:
@@ -317,28 +317,30 @@ class LinearisedCorners:
         return ~np.isin(self.free, self.moving)
 
     @property
-    def known(self) -> Knowledge:
+    def known(self) -> PriorInformation:
         """What is known of the free values without any robot."""
-        looks, free = self.looks, self.free
+        looks, free = self.camera_parameters, self.free
         prior = 1.0 / looks.prior_sigma[free] ** 2
-        return Knowledge(
+        return PriorInformation(
             self.corners.information[np.ix_(free, free)] + np.diag(prior),
             self.corners.gradient[free] + prior * (looks.values - looks.stated)[free],
         )
 
     def freed(self, moving: IntArray, looks: CameraParameters | None = None) -> "LinearisedCorners":
         """The same with other values moving, or with other priors."""
-        return replace(self, moving=np.sort(moving), looks=looks or self.looks)
+        return replace(
+            self, moving=np.sort(moving), camera_parameters=looks or self.camera_parameters
+        )
 
     def still(self, looks: CameraParameters, name: str) -> Compressed | None:
         """What one camera's corners say, if other parameters have it alike; else None."""
-        mine, there = self.looks.problems[name], looks.problems[name]
+        mine, there = self.camera_parameters.problems[name], looks.problems[name]
         places = looks.places(name)
         is_alike = (
             there.stack is mine.stack
             and there.levels == mine.levels
-            and looks.poses is self.looks.poses
-            and np.array_equal(looks.values[places], self.looks.values[places])
+            and looks.poses is self.camera_parameters.poses
+            and np.array_equal(looks.values[places], self.camera_parameters.values[places])
         )
         return self.compressed[list(looks.problems).index(name)] if is_alike else None
 
@@ -356,11 +358,11 @@ class LinearisedCorners:
     def by_free(self) -> FloatArray:
         """How all views' poses (v, 6, f) move with the free values."""
         found = np.zeros((len(self.views), 6, len(self.free)))
-        for name, compressed in zip(self.looks.problems, self.compressed, strict=True):
-            places = self.looks.places(name)
+        for name, compressed in zip(self.camera_parameters.problems, self.compressed, strict=True):
+            places = self.camera_parameters.places(name)
             own = np.isin(self.free, places)
             columns = np.searchsorted(places, self.free[own])
-            found[self.looks.rows(name), :, own] = compressed.by_shared[:, :, columns]
+            found[self.camera_parameters.rows(name), :, own] = compressed.by_shared[:, :, columns]
         return found
 
     @cached_property
@@ -386,11 +388,11 @@ class LinearisedCorners:
         sizes = [compressed.by_field.shape[2] for compressed in self.compressed]
         variances = np.repeat([floored_sigma_px(sigma) ** 2 for sigma in self.sigmas_px], sizes)
         # Coefficients follow the free values: neither says anything of the other.
-        known = Knowledge(
+        known = PriorInformation(
             np.asarray(block_diag(self.known.information, np.diag(1.0 / variances))),
             np.append(self.known.gradient, np.zeros(fields)),
         )
-        values = np.append(self.looks.values[self.free], np.zeros(fields))
+        values = np.append(self.camera_parameters.values[self.free], np.zeros(fields))
         held = np.append(self.held, np.zeros(fields, dtype=bool))
         return Effect(LENSES, values, known, held, by_sensor, random=fields)
 
@@ -398,5 +400,7 @@ class LinearisedCorners:
     def views(self) -> tuple[int, ...]:
         """The views, camera by camera."""
         return tuple(
-            view for problem in self.looks.problems.values() for view in problem.stack.views
+            view
+            for problem in self.camera_parameters.problems.values()
+            for view in problem.stack.views
         )

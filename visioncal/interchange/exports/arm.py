@@ -22,7 +22,7 @@ from visioncal.robot import (
     parallel_axes,
     table_from_document,
     table_of,
-    unwritten,
+    unexportable_functions,
     without_functions,
 )
 
@@ -34,14 +34,14 @@ _WORKSPACE_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
-class LeftBehind:
+class FitError:
     """Flange error of fitted constant links against the calibrated arm: rms and maximum [mm]."""
 
     rms_mm: float
     most_mm: float
 
     @classmethod
-    def of(cls, differences: FloatArray) -> "LeftBehind":
+    def of(cls, differences: FloatArray) -> "FitError":
         """Statistics of (m, 3) flange differences [m]."""
         distances_mm = 1e3 * np.linalg.norm(differences, axis=1)
         return cls(float(np.sqrt(np.mean(distances_mm**2))), float(distances_mm.max()))
@@ -62,8 +62,8 @@ class FittedLinks:
     """
 
     robot: Robot
-    measured: LeftBehind | None
-    workspace: LeftBehind
+    measured: FitError | None
+    workspace: FitError
 
     @property
     def words(self) -> str:
@@ -174,7 +174,7 @@ class ArmContent:
     def left_out(self) -> str:
         """What links and offsets alone leave out, with the resulting error; empty for nothing."""
         sag = ("its joints bend under its own weight, and under a load",) if self.sag_mm else ()
-        missing = (*unwritten(self.robot), *sag)
+        missing = (*unexportable_functions(self.robot), *sag)
         if not missing:
             return ""
         text = f"what is not constant about its joints ({'; '.join(missing)}) has no place in it. "
@@ -183,11 +183,11 @@ class ArmContent:
             return text if self.links is None else f"{text}: {self.links.words}"
         return (
             f"{text}The table of joint-corrections goes with it: a reader without that is off by "
-            f"up to {omission_mm(self.written):.2g} mm{self.still_bent}"
+            f"up to {joint_function_error_mm(self.written):.2g} mm{self.bending_error_words}"
         )
 
     @property
-    def still_bent(self) -> str:
+    def bending_error_words(self) -> str:
         """What links and joint corrections together leave of an arm that bends."""
         if self.links is None:
             return ""
@@ -219,7 +219,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     arm = source.arm if isinstance(source, Calibration) else None
     if not isinstance(source, Calibration) or nominal is None or arm is None or arm.robot is None:
         raise _no_arm_error(source, form)
-    if form.holds == "functions" and not unwritten(arm.robot):
+    if form.holds == "functions" and not unexportable_functions(arm.robot):
         raise DataError(
             f"--to {form.name}: nothing was found of this arm's joints that is a function of "
             "their angles: there is nothing to correct.",
@@ -229,7 +229,7 @@ def select_arm(source: Source, selection: Selection, form: ArmFormat) -> ArmCont
     sag_mm = _sag_mm(source)
     with_functions = form.holds == "functions" or selection.with_corrections
     robot = arm.robot if with_functions else without_functions(arm.robot)
-    loses = sag_mm > 0.0 or (not with_functions and bool(unwritten(arm.robot)))
+    loses = sag_mm > 0.0 or (not with_functions and bool(unexportable_functions(arm.robot)))
     links = (
         _fit_constant_links(source, robot, arm.measured) if form.holds != "all" and loses else None
     )
@@ -265,7 +265,7 @@ def _fit_constant_links(
     )
     fitted = fit_links(robot, q, calibration.standing(q), weights)
     errors = [
-        LeftBehind.of(
+        FitError.of(
             (calibration.standing(angles[1::2]) - fitted.base_from_flange(angles[1::2]))[:, :3, 3]
         )
         for angles, _ in samples
@@ -292,14 +292,14 @@ def _drift(calibration: Calibration) -> tuple[tuple[float, float] | None, float]
     return cold_c, max(point.drift_mm for point in calibration.thermal.course)
 
 
-def omission_mm(robot: Robot) -> float:
+def joint_function_error_mm(robot: Robot) -> float:
     """Largest flange error without gear ratios, eccentricity and harmonics [mm].
 
     Over random postures within the joints' limits, at most a turn from zero.
     """
     q = postures(robot, _POSTURES)
     differences = robot.base_from_flange(q) - without_functions(robot).base_from_flange(q)
-    return LeftBehind.of(differences[:, :3, 3]).most_mm
+    return FitError.of(differences[:, :3, 3]).most_mm
 
 
 def _convention(name: str) -> Convention:

@@ -10,7 +10,7 @@ from visioncal.core.files import json_text
 from visioncal.core.transforms import log
 from visioncal.core.types import IntArray
 from visioncal.dynamics import ArmDynamics, Identified
-from visioncal.interchange.exports.arm import ArmContent, ArmFormat, omission_mm
+from visioncal.interchange.exports.arm import ArmContent, ArmFormat, joint_function_error_mm
 from visioncal.interchange.exports.content import Selection
 from visioncal.robot import (
     DHTable,
@@ -21,7 +21,7 @@ from visioncal.robot import (
     table_toml,
     ur_flange,
     ur_kinematics_yaml,
-    weighed_urdf,
+    urdf_with_inertias,
     with_inertias,
     without_functions,
 )
@@ -145,7 +145,7 @@ def _warn_corrections(content: ArmContent) -> tuple[str, ...]:
         "It corrects what joints err by as functions of their angles, for the links and offsets "
         "that --to robot-urdf, robot-dh or ur-kinematics writes --with-corrections: send each "
         "joint to its angle and the correction there. Without it the flange of that arm is off by "
-        f"up to {omission_mm(content.written):.2g} mm{content.still_bent}.",
+        f"up to {joint_function_error_mm(content.written):.2g} mm{content.bending_error_words}.",
         *(f"{name}." for name in content.omitted),
     )
 
@@ -220,7 +220,7 @@ def write_dynamics(identified: Identified, to: str, selection: Selection) -> str
         document = with_inertias(arm.robot.corrected(), arm.inertias).document
         return json_text({**document, "source": notes[0]})
     if "urdf" in arm.robot.document:
-        return weighed_urdf(arm.robot, arm.inertias, notes)
+        return urdf_with_inertias(arm.robot, arm.inertias, notes)
     return small_urdf(arm.weighed(), notes)
 
 

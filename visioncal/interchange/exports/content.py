@@ -12,7 +12,7 @@ from visioncal.core.files import one_line
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import CameraResult, Edge, Verdict
-from visioncal.results.lens import RefittedLens, refitted
+from visioncal.results.lens import RefittedLens, fit_coefficients
 
 _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
 # Any transform; the camera's own, not inverted; the lens only; a pose on the flange; or one in the
@@ -72,7 +72,7 @@ class Selection:
     with_corrections: bool = False
 
     @property
-    def said(self) -> tuple[Takes, ...]:
+    def given_options(self) -> tuple[Takes, ...]:
         """The given options, other than the choice of camera, robot and target."""
         options: Mapping[Takes, object] = {
             "edge": self.edge,
@@ -125,14 +125,14 @@ class Content:
         return self.edge.matrix
 
     @cached_property
-    def plain_lens(self) -> RefittedLens | None:
+    def refitted_lens(self) -> RefittedLens | None:
         """The lens refitted without its field; None where there is no camera."""
-        return None if self.lens is None else refitted(self.lens)
+        return None if self.lens is None else fit_coefficients(self.lens)
 
     @property
-    def left_of_field(self) -> str:
+    def field_error_words(self) -> str:
         """Remaining error of the refitted lens, in words; empty where the lens has no field."""
-        lens = self.plain_lens
+        lens = self.refitted_lens
         if lens is None or lens.rms_px == 0.0:
             return ""
         return (
@@ -190,7 +190,7 @@ class Format(Generic[_T]):
         Raises:
             DataError: An option does not apply.
         """
-        unused = [name for name in selection.said if name not in (*self.takes, *also)]
+        unused = [name for name in selection.given_options if name not in (*self.takes, *also)]
         if unused:
             raise DataError(
                 f"{self.name} has no place for "

@@ -53,13 +53,13 @@ def camera_of(content: Content) -> Camera:
     Raises:
         DataError: There is none, or it has another number of coefficients.
     """
-    if content.plain_lens is None:
+    if content.refitted_lens is None:
         raise DataError(
             "This calibration has no camera: its session brought measured poses of the target, "
             "and no images.",
             next_step="Export its transform, as with --to ros.",
         )
-    camera = content.plain_lens.camera
+    camera = content.refitted_lens.camera
     if len(camera.distortion) not in _ROS_MODELS:
         raise DataError(
             f"The lens has {len(camera.distortion)} coefficients; 4 (fisheye), 5 or 8 (brown) are "
@@ -72,14 +72,14 @@ def camera_of(content: Content) -> Camera:
 def _notes(content: Content) -> list[str]:
     estimated = content.lens is not None and content.lens.estimated
     how = "estimated from the session's images" if estimated else "as the session gave it"
-    field_notes = [content.left_of_field] if content.left_of_field else []
+    field_notes = [content.field_error_words] if content.field_error_words else []
     return [content.origin, f"verdict {content.verdict.status}; the lens is {how}", *field_notes]
 
 
 def warn_of_field(content: Content) -> Iterator[str]:
     """Warns of the remaining error of a lens with a field."""
-    if content.left_of_field:
-        yield f"{content.left_of_field}."
+    if content.field_error_words:
+        yield f"{content.field_error_words}."
 
 
 def _array(matrix: FloatArray) -> dict[str, int | list[float]]:

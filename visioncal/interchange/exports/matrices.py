@@ -19,15 +19,18 @@ def _write_opencv(content: Content) -> str:
     """Writes OpenCV's FileStorage, by OpenCV itself."""
     # The lens has the names of OpenCV's own calibration (samples/cpp/calibration.cpp).
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    for line in (*content.notes, *([content.left_of_field] if content.left_of_field else [])):
+    for line in (
+        *content.notes,
+        *([content.field_error_words] if content.field_error_words else []),
+    ):
         storage.writeComment(one_line(line), append=False)
     storage.write("parent", content.parent)
     storage.write("child", content.child)
     storage.write("transform", content.matrix)
     storage.write("R", content.matrix[:3, :3].copy())
     storage.write("t", content.matrix[:3, 3:].copy())
-    if content.plain_lens is not None:
-        camera = content.plain_lens.camera
+    if content.refitted_lens is not None:
+        camera = content.refitted_lens.camera
         storage.write("image_width", camera.resolution[0])
         storage.write("image_height", camera.resolution[1])
         storage.write("distortion_model", camera.model)

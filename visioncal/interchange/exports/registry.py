@@ -194,7 +194,7 @@ def _select_all(source: Source, selection: Selection, form: ExportFormat) -> tup
 
 def _content(form: ExportFormat, selection: Selection, available: Placements, name: str) -> Content:
     placement, frames = available.find(name)
-    rotation_of = None if placement.oriented else placement.turned_as or frames[0]
+    rotation_of = None if placement.oriented else placement.rotation_of or frames[0]
     edge = placement.edge
     if selection.inverse:
         edge, frames = _inverted(edge), (frames[1], frames[0])

@@ -35,14 +35,14 @@ class Placement:
     Attributes:
         edge: `parent_from_child`.
         oriented: Whether its rotation was measured.
-        turned_as: The frame whose rotation was copied otherwise; empty for its parent's.
+        rotation_of: The frame whose rotation was copied otherwise; empty for its parent's.
     """
 
     edge: Edge
     origin: str
     verdict: Verdict
     oriented: bool = True
-    turned_as: str = ""
+    rotation_of: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ def _between(source: Calibration, first: str, second: str) -> Placement:
         origin = f"{placement.origin}; {_of_frame(frame).origin}"
         placement = replace(placement, origin=origin)
         if not frame.oriented:
-            placement = replace(placement, oriented=False, turned_as=parent)
+            placement = replace(placement, oriented=False, rotation_of=parent)
     return placement
 
 

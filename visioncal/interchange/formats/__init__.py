@@ -10,7 +10,7 @@ common name of a field needs no format: it is added to the keys in `poses`, `fie
 """
 
 from visioncal.interchange.formats.assemble import assemble
-from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.foreign import ForeignRecording
 from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.registry import (
     FOREIGN_FORMATS,
@@ -19,23 +19,23 @@ from visioncal.interchange.formats.registry import (
     write_session,
 )
 from visioncal.interchange.formats.rereading import (
-    InDoubt,
+    DoubtfulSession,
     guess_foreign,
-    load_in_doubt,
+    load_for_rereading,
     reread,
     reread_session,
 )
 
 __all__ = [
     "FOREIGN_FORMATS",
-    "Foreign",
+    "DoubtfulSession",
+    "ForeignRecording",
     "ImportOptions",
-    "InDoubt",
     "PoseImportOptions",
     "assemble",
     "convert",
     "guess_foreign",
-    "load_in_doubt",
+    "load_for_rereading",
     "read_foreign",
     "reread",
     "reread_session",

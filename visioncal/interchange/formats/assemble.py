@@ -15,9 +15,9 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, read_bytes
 from visioncal.core.number_format import some_of
 from visioncal.core.types import Mount
-from visioncal.interchange.formats.boards import described_target, target_name
+from visioncal.interchange.formats.boards import read_target_description, target_name
 from visioncal.interchange.formats.corner_lists import with_corners
-from visioncal.interchange.formats.foreign import Foreign, ForeignSweep, rows_of
+from visioncal.interchange.formats.foreign import ForeignRecording, ForeignSweep, rows_of
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.robot import ROBOT_SUFFIXES, Robot, read_robot_document
@@ -44,7 +44,7 @@ class FileImages(ImageStore):
         return absence(self.files[path]) if path in self.files else "is missing"
 
 
-def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:
+def with_user_options(foreign: ForeignRecording, requested: ImportOptions) -> ForeignRecording:
     """Adds the user's options to a recording, other than those of its poses.
 
     Raises:
@@ -53,7 +53,7 @@ def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:
     if requested.mount is not None:
         foreign = replace(foreign, mount=requested.mount)
     if requested.target is not None:
-        foreign = replace(foreign, target=described_target(requested.target))
+        foreign = replace(foreign, target=read_target_description(requested.target))
     if requested.corners is not None:
         foreign = with_corners(foreign, requested.corners)
     if requested.tip is not None and requested.robot_model is None:
@@ -64,7 +64,7 @@ def wished(foreign: Foreign, requested: ImportOptions) -> Foreign:
     return _with_lens(foreign, requested)
 
 
-def _with_lens(foreign: Foreign, requested: ImportOptions) -> Foreign:
+def _with_lens(foreign: ForeignRecording, requested: ImportOptions) -> ForeignRecording:
     lens, notes = dict(foreign.lens or {}), foreign.notes
     if requested.intrinsics == "estimate":
         lens = {name: lens[name] for name in ("name", "model", "resolution") if name in lens}
@@ -76,7 +76,7 @@ def _with_lens(foreign: Foreign, requested: ImportOptions) -> Foreign:
     return replace(foreign, lens=lens or None, notes=notes)
 
 
-def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
+def assemble(foreign: ForeignRecording, *, mount: Mount | None = None) -> Session:
     """Builds the session of a recording, as its poses are read.
 
     Args:
@@ -96,7 +96,7 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
             culprits=["mount"],
             next_step="Say --mount eye-in-hand or --mount eye-to-hand.",
         )
-    foreign = spoken(
+    foreign = with_observations_only(
         foreign if foreign.sweep is None else _with_camera_samples(foreign, foreign.sweep)
     )
     rows = _view_rows(foreign)
@@ -125,19 +125,19 @@ def assemble(foreign: Foreign, *, mount: Mount | None = None) -> Session:
     )
     if foreign.sweep is not None:
         session = session.with_streams({"robot": _stream(foreign.sweep)})
-    elif foreign.joints_rad is None and not foreign.robot.there.all():
-        missing = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.there)]
+    elif foreign.joints_rad is None and not foreign.robot.present.all():
+        missing = [foreign.robot.places[index] for index in np.flatnonzero(~foreign.robot.present)]
         notes.append(
             f"{len(missing)} of {len(rows)} rows have no pose of the robot: {some_of(missing)}."
         )
     return replace(session, warnings=(*notes, *session.warnings))
 
 
-def _with_camera_samples(foreign: Foreign, sweep: ForeignSweep) -> Foreign:
+def _with_camera_samples(foreign: ForeignRecording, sweep: ForeignSweep) -> ForeignRecording:
     """All samples of the camera, without the robot's poses: those become a stream."""
     return replace(
         foreign,
-        robot=PoseNumbers.nowhere(sweep.camera.places),
+        robot=PoseNumbers.empty(sweep.camera.places),
         camera=sweep.camera,
         stamps_s=sweep.camera_s,
         views=(),
@@ -177,7 +177,7 @@ class _ViewRow:
     image: dict[str, Path]
 
 
-def spoken(foreign: Foreign) -> Foreign:
+def with_observations_only(foreign: ForeignRecording) -> ForeignRecording:
     """Drops rows without an observation, and stored poses or images that are not used.
 
     Raises:
@@ -190,7 +190,7 @@ def spoken(foreign: Foreign) -> Foreign:
     for cells in (foreign.images, foreign.corners, points):
         saw |= np.array([bool(cell) for cell in cells] or [False])
     if foreign.camera is not None:
-        saw |= foreign.camera.there
+        saw |= foreign.camera.present
     dropped = [foreign.robot.places[index] for index in np.flatnonzero(~saw)]
     if len(dropped) == len(saw):
         raise DataError(
@@ -208,7 +208,7 @@ def spoken(foreign: Foreign) -> Foreign:
     return replace(rows_of(foreign, np.flatnonzero(saw)), notes=(*foreign.notes, *notes))
 
 
-def _images_or_poses(foreign: Foreign, notes: list[str]) -> Foreign:
+def _images_or_poses(foreign: ForeignRecording, notes: list[str]) -> ForeignRecording:
     """Chooses between images and stored target poses where there are both."""
     if not (foreign.images or foreign.corners):
         return foreign
@@ -230,7 +230,7 @@ def _images_or_poses(foreign: Foreign, notes: list[str]) -> Foreign:
     return replace(foreign, images=(), corners=())
 
 
-def _view_rows(foreign: Foreign) -> list[_ViewRow]:
+def _view_rows(foreign: ForeignRecording) -> list[_ViewRow]:
     images = _image_paths(foreign)
     robot = pose_cells(foreign.robot, session_columns.POSE)
     camera: list[dict[str, str]] = [{}] * len(foreign.robot)
@@ -249,7 +249,7 @@ def _view_rows(foreign: Foreign) -> list[_ViewRow]:
     return rows
 
 
-def _corner_table(foreign: Foreign) -> CornerTable:
+def _corner_table(foreign: ForeignRecording) -> CornerTable:
     views = foreign.views or range(len(foreign.robot))
     pairs = zip(views, foreign.corners, strict=True)
     shown = [(view, corners) for view, corners in pairs if corners is not None]
@@ -263,7 +263,7 @@ def _corner_table(foreign: Foreign) -> CornerTable:
     )
 
 
-def _scalars(foreign: Foreign, at: int) -> dict[str, str]:
+def _scalars(foreign: ForeignRecording, at: int) -> dict[str, str]:
     cells = {}
     if foreign.stamps_s is not None and np.isfinite(foreign.stamps_s[at]):
         cells["stamp_s"] = repr(float(foreign.stamps_s[at]))
@@ -280,7 +280,7 @@ def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str
     """Cells of poses that read back as the same numbers; empty for a row without a pose."""
     poses = numbers.poses()
     values = np.hstack([numbers.positions, numbers.rotations])
-    present = numbers.there
+    present = numbers.present
     # Numbers already in our own convention are copied without computation.
     if numbers.reading != Reading() and present.any():
         values = np.full((len(numbers), 7), np.nan)
@@ -292,7 +292,7 @@ def pose_cells(numbers: PoseNumbers, names: Sequence[str]) -> list[dict[str, str
     ]
 
 
-def _extra_columns(foreign: Foreign) -> dict[str, tuple[str, ...]]:
+def _extra_columns(foreign: ForeignRecording) -> dict[str, tuple[str, ...]]:
     """Further columns, renamed where a session would take their names for something else."""
     reserved = {
         "view",
@@ -324,7 +324,7 @@ def _is_meant(name: str, cells: Sequence[str]) -> bool:
     return not session_columns.is_number(name) or all(finite)
 
 
-def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
+def _image_paths(foreign: ForeignRecording) -> list[tuple[str, Path] | None]:
     """Paths of images in the session; a name already in use gets a number in front."""
     if not foreign.images:
         return [None] * len(foreign.robot)
@@ -342,7 +342,7 @@ def _image_paths(foreign: Foreign) -> list[tuple[str, Path] | None]:
     ]
 
 
-def _camera(foreign: Foreign, files: Sequence[Path]) -> dict[str, Any]:
+def _camera(foreign: ForeignRecording, files: Sequence[Path]) -> dict[str, Any]:
     lens = {name: value for name, value in (foreign.lens or {}).items() if value is not None}
     if "resolution" not in lens:
         size = next((pair for file in files if (pair := _image_size(file)) is not None), None)
@@ -377,7 +377,7 @@ def _image_bytes(file: Path) -> bytes:
     return data
 
 
-def _robot(foreign: Foreign, document: dict[str, Any]) -> dict[str, Any] | None:
+def _robot(foreign: ForeignRecording, document: dict[str, Any]) -> dict[str, Any] | None:
     """Reads and checks the robot's model, and names it in the document."""
     if foreign.arm is None:
         return None

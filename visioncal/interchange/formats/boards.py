@@ -24,7 +24,7 @@ FORMS = (
 )
 
 
-def described_target(words: str) -> Mapping[str, Any]:
+def read_target_description(words: str) -> Mapping[str, Any]:
     """Reads the description of a target.
 
     Args:
@@ -53,8 +53,8 @@ def described_target(words: str) -> Mapping[str, Any]:
 
 
 def target_named(words: str, name: str = "") -> Target:
-    """The target of `described_target`; its words are its name unless another is given."""
-    return target_from_document(described_target(words), name or words)
+    """The target of `read_target_description`; its words are its name unless another is given."""
+    return target_from_document(read_target_description(words), name or words)
 
 
 def _of_kalibr(path: Path) -> dict[str, Any]:

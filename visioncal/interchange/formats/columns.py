@@ -28,8 +28,13 @@ from visioncal.interchange.formats.fields import (
     stamp_name,
     unnamed_columns,
 )
-from visioncal.interchange.formats.finding import images_beside, images_named, is_image_name, listed
-from visioncal.interchange.formats.foreign import Foreign, ForeignFormat, ForeignSweep
+from visioncal.interchange.formats.file_search import (
+    files_in,
+    images_beside,
+    images_named,
+    is_image_name,
+)
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording, ForeignSweep
 from visioncal.interchange.formats.import_options import ImportOptions, PoseImportOptions
 from visioncal.interchange.formats.poses import joint_names, joints_from, pose_names, poses_from
 from visioncal.interchange.formats.printed import (
@@ -135,7 +140,7 @@ def _numbered(document: Mapping[str, object]) -> dict[int, dict[str, object]]:
     return dict(sorted(rows.items()))
 
 
-def _read_file(path: Path, requested: ImportOptions) -> Foreign:
+def _read_file(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads one file with a row a view, or the only one in a folder of images."""
     file = _pose_file(path)
     if file is None:
@@ -151,7 +156,7 @@ def _read_file(path: Path, requested: ImportOptions) -> Foreign:
 def _pose_file(path: Path) -> Path | None:
     if path.is_file():
         return path if path.suffix.lower() in ENDINGS else None
-    files = [file for file in listed(path) if file.suffix.lower() in ENDINGS]
+    files = [file for file in files_in(path) if file.suffix.lower() in ENDINGS]
     # Beside a file of intrinsics or notes, the file's name decides.
     named = [file for file in files if re.search("pose|robot", file.stem.lower())]
     return next((group[0] for group in (files, named) if len(group) == 1), None)
@@ -159,7 +164,7 @@ def _pose_file(path: Path) -> Path | None:
 
 def foreign_from(
     fields: Fields, requested: ImportOptions, *, images: Path | None = None
-) -> Foreign:
+) -> ForeignRecording:
     """Builds a recording from rows of named values, by their names or the user's options.
 
     `images` is the folder of the images, where the source is one.
@@ -184,7 +189,7 @@ def foreign_from(
             next_step="Name them with --robot-columns, or the joint angles with --joint-columns.",
         )
     notes: tuple[str, ...] = ()
-    robot, camera = PoseNumbers.nowhere(fields.places), None
+    robot, camera = PoseNumbers.empty(fields.places), None
     if robot_names:
         robot, notes = poses_from(fields, robot_names, requested.robot, "robot")
     if camera_names:
@@ -203,7 +208,7 @@ def foreign_from(
     paths, image_name, more = _images(fields, requested, images, used)
     if camera is None and not paths:
         _check_no_unnamed_poses(fields, used)
-    return Foreign(
+    return ForeignRecording(
         name=fields.name,
         robot=robot,
         camera=camera,
@@ -263,7 +268,7 @@ def _image_name(fields: Fields, folder: Path | None, taken: Collection[str]) -> 
     usual = (name for name in _IMAGE_NAMES if any(map(is_image_name, free.get(name, ()))))
     if name := next(usual, ""):
         return name
-    files = [] if folder is None else listed(folder)
+    files = [] if folder is None else files_in(folder)
     image_names = {
         name for file in files if is_image_name(file.name) for name in (file.name, file.stem)
     }
@@ -292,7 +297,7 @@ TABLE = ForeignFormat(
 
 def with_camera_file(
     robot_fields: Fields, camera_fields: Fields, requested: ImportOptions
-) -> Foreign:
+) -> ForeignRecording:
     """Joins a file of robot poses with one of camera poses, by time if possible, else by row.
 
     Raises:
@@ -335,14 +340,14 @@ def _poses(
 
 def _row_by_row(
     fields: Fields, robot: PoseNumbers, camera: PoseNumbers, notes: tuple[str, ...]
-) -> Foreign:
+) -> ForeignRecording:
     if len(robot) != len(camera):
         raise DataError(
             f"There are {len(robot)} poses of the robot and {len(camera)} of the camera, without "
             "times; as many of both are needed.",
             culprits=[robot.places[-1], camera.places[-1]],
         )
-    return Foreign(name=fields.name, robot=robot, camera=camera, notes=notes)
+    return ForeignRecording(name=fields.name, robot=robot, camera=camera, notes=notes)
 
 
 def _by_time(
@@ -350,13 +355,13 @@ def _by_time(
     robot: tuple[FloatArray, PoseNumbers],
     camera: tuple[FloatArray, PoseNumbers],
     notes: tuple[str, ...],
-) -> Foreign:
+) -> ForeignRecording:
     robot_s, robot_poses, robot_rows = _with_pose(*robot)
     camera_s, camera_poses, camera_rows = _with_pose(*camera)
     paired = pair_streams(robot_s, robot_poses, camera_s, camera_poses)
     seen = camera[1].rows(camera_rows)
     sampled = seen.rows(paired.rows)
-    return Foreign(
+    return ForeignRecording(
         name=name,
         robot=PoseNumbers.written(paired.base_from_flange, robot[1].reading, sampled.places),
         camera=sampled,
@@ -377,7 +382,7 @@ def _with_pose(
     stamps_s: FloatArray, numbers: PoseNumbers
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Samples that have a pose: (times [s], (m, 4, 4) poses [m], their rows)."""
-    rows = np.flatnonzero(numbers.there)
+    rows = np.flatnonzero(numbers.present)
     if len(rows) < 3:
         place = numbers.places[0]
         raise DataError(f"{place}: {len(rows)} poses; 3 or more are needed.", culprits=[place])

@@ -20,7 +20,7 @@ from visioncal.core.files import natural
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.columns import DOCUMENTS, read_document
-from visioncal.interchange.formats.foreign import Foreign, FoundCorners
+from visioncal.interchange.formats.foreign import ForeignRecording, FoundCorners
 
 # Names of the image, of a corner's number and of its pixel: of one corner, and of lists.
 _IMAGE = ("image", "img", "filename", "file", "image_name", "image_file", "image_path", "frame")
@@ -44,7 +44,7 @@ class _Image:
     corners: FoundCorners
 
 
-def with_corners(foreign: Foreign, path: Path) -> Foreign:
+def with_corners(foreign: ForeignRecording, path: Path) -> ForeignRecording:
     """Adds the corners in a file to a recording, by the images' names if possible, else in order.
 
     Raises:

@@ -46,7 +46,7 @@ class Fields:
         numbers: (n, ...) arrays by name; NaN where a row has none.
         texts: (n,) texts by name, of every column of a table and of single numbers.
         views: (n,) the rows' numbers, where their files' names have them.
-        ragged: Error messages of fields whose rows differ in shape, by name.
+        shape_errors: Error messages of fields whose rows differ in shape, by name.
         form: A name among `POSE_FORMS` where the rows state the form of the robot's poses.
     """
 
@@ -56,7 +56,7 @@ class Fields:
     numbers: Mapping[str, FloatArray]
     texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     views: tuple[int, ...] = ()
-    ragged: Mapping[str, str] = field(default_factory=dict)
+    shape_errors: Mapping[str, str] = field(default_factory=dict)
     form: str = ""
 
     def __len__(self) -> int:
@@ -78,7 +78,7 @@ class Fields:
         Raises:
             DataError: There is no such field; the message lists the existing ones.
         """
-        names = list(dict.fromkeys([*self.numbers, *self.texts, *self.ragged]))
+        names = list(dict.fromkeys([*self.numbers, *self.texts, *self.shape_errors]))
         if name in names:
             return name
         matches = [word for word in names if word.endswith(f".{name}")]
@@ -102,8 +102,8 @@ class Fields:
             DataError: There is no such field, or it holds text.
         """
         full = self.find(name)
-        if full in self.ragged:
-            raise DataError(self.ragged[full], culprits=[full])
+        if full in self.shape_errors:
+            raise DataError(self.shape_errors[full], culprits=[full])
         if full not in self.numbers:
             cells = zip(self.places, self.texts[full], strict=True)
             odd = ((place, word) for place, word in cells if word and not is_number(word))

@@ -36,7 +36,7 @@ class FoundCorners:
 
 
 @dataclass(frozen=True, eq=False)
-class Foreign:
+class ForeignRecording:
     """A recording in a foreign format: n rows, each an observation at one robot pose.
 
     Attributes:
@@ -76,7 +76,7 @@ class Foreign:
     notes: tuple[str, ...] = ()
 
 
-def rows_of(foreign: Foreign, rows: IntArray) -> Foreign:
+def rows_of(foreign: ForeignRecording, rows: IntArray) -> ForeignRecording:
     """Some rows of a recording, in the given order."""
     count = len(foreign.robot)
     return replace(
@@ -108,4 +108,4 @@ class ForeignFormat:
     name: str
     words: str
     recognises: Callable[[Path], bool]
-    read: Callable[[Path, ImportOptions], Foreign]
+    read: Callable[[Path, ImportOptions], ForeignRecording]

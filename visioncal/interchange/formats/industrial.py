@@ -12,8 +12,14 @@ from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import as_numbers, mapping, number, read_yaml
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.interchange.formats.finding import below, head, images_named, listed, number_in
-from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
+from visioncal.interchange.formats.file_search import (
+    files_in,
+    head,
+    images_named,
+    number_in,
+    path_inside,
+)
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import intrinsics_from
 
@@ -23,7 +29,7 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def _hand_eye_file(path: Path) -> Path | None:
-    files = listed(path) if path.is_dir() else (path,)
+    files = files_in(path) if path.is_dir() else (path,)
     for file in files:
         if file.suffix.lower() in (".yaml", ".yml"):
             words = head(file)
@@ -33,11 +39,11 @@ def _hand_eye_file(path: Path) -> Path | None:
 
 
 def _kinematic_file(path: Path) -> Path | None:
-    files = listed(path) if path.is_dir() else (path,)
+    files = files_in(path) if path.is_dir() else (path,)
     return next((file for file in files if "target_joints:" in head(file)), None)
 
 
-def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
+def _read_hand_eye(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads cal_data.yaml with a pose file and an image in each row."""
     # Poses are of the robot's flange in its base; `static_camera` gives the mount.
     file = _required(_hand_eye_file(path), path, "a cal_data.yaml with pose and image rows")
@@ -51,7 +57,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
         name = entry.get("pose")
         if not isinstance(name, str):
             raise DataError(f"{file}: data, row {at} names no pose.", culprits=[str(file)])
-        stored = below(file.parent, name)
+        stored = path_inside(file.parent, name)
         poses.append(_pose_numbers(read_yaml(stored), str(stored)))
         places.append(name)
         names.append(str(entry["image"]) if entry.get("image") else None)
@@ -67,7 +73,7 @@ def _read_hand_eye(path: Path, requested: ImportOptions) -> Foreign:
     target = None if requested.target else _target(document, notes)
     numbered = [number_in(place) for place in places]
     views = tuple(index for index in numbered if index is not None)
-    return Foreign(
+    return ForeignRecording(
         name=file.parent.name,
         robot=requested.robot.applied_to(
             PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), tuple(places))
@@ -136,7 +142,7 @@ def _integer(value: object, where: str) -> int:
     return int(parsed)
 
 
-def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
+def _read_kinematics(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads kinematic measurements: cam_from_target with the joints of either chain."""
     file = _required(_kinematic_file(path), path, "a file with camera_joints and target_joints")
     document = mapping(read_yaml(file), str(file))
@@ -158,9 +164,9 @@ def _read_kinematics(path: Path, requested: ImportOptions) -> Foreign:
     numbers = np.array(poses)
     places = tuple(f"{file.name}: {name}" for name in document)
     camera = PoseNumbers(numbers[:, :3], numbers[:, 3:], Reading(), places)
-    return Foreign(
+    return ForeignRecording(
         name=file.stem,
-        robot=PoseNumbers.nowhere(places),
+        robot=PoseNumbers.empty(places),
         camera=requested.camera.applied_to(camera),
         joints_rad=np.array(joints[moving[0]]),
         mount="eye-to-hand" if moving == ["target_joints"] else "eye-in-hand",

@@ -13,7 +13,12 @@ from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.fields import Fields
 from visioncal.interchange.formats.import_options import PoseImportOptions
-from visioncal.interchange.formats.worded import ANGLE_UNITS, DEGREES, without_unit, worded_poses
+from visioncal.interchange.formats.pose_words import (
+    ANGLE_UNITS,
+    DEGREES,
+    pose_fields_by_words,
+    without_unit,
+)
 from visioncal.session.columns import SELECTORS, joint_columns
 
 # Common names of pose fields, the most specific first.
@@ -88,7 +93,7 @@ def known_names(
     numbers = (
         name for name, values in fields.numbers.items() if values.ndim > 1 or name not in SELECTORS
     )
-    numeric = [*numbers, *fields.ragged]
+    numeric = [*numbers, *fields.shape_errors]
     textual = (name for name, cells in fields.texts.items() if any(cells) and name not in SELECTORS)
     names = list(dict.fromkeys([*numeric, *textual]))
     complete = _sets_of_names(names, candidates, taken)
@@ -143,7 +148,7 @@ def pose_names(
     if unnamed:
         return () if set(unnamed) & set(taken) else unnamed
     keys = ROBOT_KEYS if whose == "robot" else CAMERA_KEYS
-    return known_names(fields, keys, taken) or worded_poses(fields, whose, taken)
+    return known_names(fields, keys, taken) or pose_fields_by_words(fields, whose, taken)
 
 
 def poses_from(
@@ -272,7 +277,7 @@ def check_radians(
     Raises:
         DataError: An angle exceeds one turn.
     """
-    there, rotation = poses.there, poses.reading.rotation
+    there, rotation = poses.present, poses.reading.rotation
     radians = rotation == "rotation-vector" or rotation.endswith("-rad")
     is_degrees = rotation == "rotation-vector-deg" and requested.form is None
     if not (radians or is_degrees) or not there.any():

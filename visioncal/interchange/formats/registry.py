@@ -9,16 +9,21 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free
 from visioncal.core.number_format import did_you_mean
-from visioncal.interchange.formats.assemble import assemble, wished
+from visioncal.interchange.formats.assemble import assemble, with_user_options
 from visioncal.interchange.formats.columns import TABLE
-from visioncal.interchange.formats.exchanging import exchange_views
-from visioncal.interchange.formats.finding import listed
-from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
+from visioncal.interchange.formats.file_search import files_in
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.industrial import HAND_EYE, KINEMATICS
 from visioncal.interchange.formats.poses import check_radians
-from visioncal.interchange.formats.rereading import InDoubt, load_in_doubt, reread, reread_session
+from visioncal.interchange.formats.rereading import (
+    DoubtfulSession,
+    load_for_rereading,
+    reread,
+    reread_session,
+)
 from visioncal.interchange.formats.ros import EASY_HANDEYE, MOVEIT
+from visioncal.interchange.formats.view_exchange import exchange_views
 from visioncal.interchange.formats.views import VIEWS
 from visioncal.interchange.formats.yaml_folders import VISP, ZIVID
 from visioncal.session import Session
@@ -39,7 +44,7 @@ FOREIGN_FORMATS: tuple[ForeignFormat, ...] = (
 _DEFAULTS = ImportOptions()
 
 # Tries other readings of the poses, and selects one.
-Choose: TypeAlias = Callable[[InDoubt | Foreign], Candidate]
+Choose: TypeAlias = Callable[[DoubtfulSession | ForeignRecording], Candidate]
 
 
 @typed
@@ -97,7 +102,7 @@ def convert(
     elif choose is None:
         session = Session.load(source)
     else:
-        doubtful = load_in_doubt(source)
+        doubtful = load_for_rereading(source)
         check_one_of_each(doubtful.session)
         session = reread_session(
             doubtful.session, choose(doubtful), doubtful.robot, mirrors_poses=mirrors_poses
@@ -108,7 +113,9 @@ def convert(
     return session
 
 
-def read_foreign(source: Path, requested: ImportOptions, form: str | None = None) -> Foreign:
+def read_foreign(
+    source: Path, requested: ImportOptions, form: str | None = None
+) -> ForeignRecording:
     """Reads a foreign recording with the user's options applied.
 
     Its format is recognised unless `form` names it.
@@ -118,7 +125,7 @@ def read_foreign(source: Path, requested: ImportOptions, form: str | None = None
     """
     # With a second file, both are tables, whatever the first looks like.
     form = form or (TABLE.name if requested.camera_file is not None else None)
-    return wished(_foreign_format(source, form).read(source, requested), requested)
+    return with_user_options(_foreign_format(source, form).read(source, requested), requested)
 
 
 def write_session(session: Session, dest: Path) -> None:
@@ -198,7 +205,7 @@ def _foreign_format(source: Path, form: str | None) -> ForeignFormat:
             return candidate
     own_formats = ("a session's folder", "an .rrd recording")
     words = "; ".join([*own_formats, *(foreign_format.words for foreign_format in FOREIGN_FORMATS)])
-    contents = ", ".join(path.name for path in listed(source)[:8]) if source.is_dir() else ""
+    contents = ", ".join(path.name for path in files_in(source)[:8]) if source.is_dir() else ""
     raise DataError(
         f"{source} is no session and in no format that is known: {words}."
         + (f" It holds {contents}." if contents else ""),

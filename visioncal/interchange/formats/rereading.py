@@ -10,20 +10,20 @@ import numpy as np
 from visioncal.calibration.guess import Candidate, Guess, guess_reading
 from visioncal.calibration.guess.hypothesis import MIRROR_WORDS, Hypothesis
 from visioncal.calibration.pipeline.guess_inputs import (
+    camera_poses_of,
     chain_poses,
     guess_session,
     numbers_in,
-    reported_or_chained,
-    seen_poses,
+    reported_or_joint_poses,
 )
-from visioncal.calibration.pipeline.reading_hints import session_is_mirrored
+from visioncal.calibration.pipeline.misread_poses import session_is_mirrored
 from visioncal.core.conventions import UNITS_M, PoseNumbers, Reading
 from visioncal.core.documents.tables import is_number
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import read_text_inside, read_toml
 from visioncal.core.types import MOUNTS, FloatArray, IntArray, Progress
-from visioncal.interchange.formats.assemble import assemble, pose_cells, spoken
-from visioncal.interchange.formats.foreign import Foreign
+from visioncal.interchange.formats.assemble import assemble, pose_cells, with_observations_only
+from visioncal.interchange.formats.foreign import ForeignRecording
 from visioncal.session import Session, Stream
 from visioncal.session.columns import (
     MEASURED_CAM_POSE,
@@ -50,7 +50,7 @@ _BOARD_UNITS = ("mm", "cm", "inch")
 _LENGTHS = ("square_m", "square_sigma_m", "marker_m", "size_m")
 
 
-def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Guess:
+def guess_foreign(foreign: ForeignRecording, *, progress: Progress | None = None) -> Guess:
     """Tries every plausible reading of a foreign recording's poses, and both mounts if needed.
 
     Raises:
@@ -58,15 +58,15 @@ def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Gues
         DegenerateError: Too few views have both poses.
         ConvergenceError: The intrinsics do not converge.
     """
-    foreign = spoken(foreign)
+    foreign = with_observations_only(foreign)
     # The mount does not affect what is read from the session here.
     session = assemble(foreign, mount=MOUNTS[0])
     chain = chain_poses(session)
     camera = foreign.camera
     if camera is None:
-        camera = seen_poses(session, progress=progress)
+        camera = camera_poses_of(session, progress=progress)
     return guess_reading(
-        reported_or_chained(foreign.robot, chain),
+        reported_or_joint_poses(foreign.robot, chain),
         camera,
         foreign.mount,
         chain=chain,
@@ -74,7 +74,9 @@ def guess_foreign(foreign: Foreign, *, progress: Progress | None = None) -> Gues
     )
 
 
-def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = False) -> Foreign:
+def reread(
+    foreign: ForeignRecording, candidate: Candidate, *, mirrors_poses: bool = False
+) -> ForeignRecording:
     """Applies a candidate reading to a recording: poses, pairing, mount and the size of the board.
 
     Raises:
@@ -83,7 +85,11 @@ def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = Fals
     """
     if _mirrors(candidate) and not mirrors_poses:
         raise _not_mirrored(candidate)
-    foreign, notes, reading = spoken(foreign), _change_notes(candidate), candidate.hypothesis
+    foreign, notes, reading = (
+        with_observations_only(foreign),
+        _change_notes(candidate),
+        candidate.hypothesis,
+    )
     if foreign.mount is None:
         notes = (*notes, f"The mount is taken for {reading.mount}.")
     robot, camera, joints = foreign.robot, foreign.camera, foreign.joints_rad
@@ -100,7 +106,7 @@ def reread(foreign: Foreign, candidate: Candidate, *, mirrors_poses: bool = Fals
     return replace(
         foreign,
         sweep=sweep,
-        robot=reading.robot_numbers(robot) if robot.there.any() else robot,
+        robot=reading.robot_numbers(robot) if robot.present.any() else robot,
         camera=None if camera is None else reading.camera_numbers(camera),
         joints_rad=joints,
         mount=reading.mount,
@@ -120,7 +126,7 @@ def _is_overruled(note: str, candidate: Candidate) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class InDoubt:
+class DoubtfulSession:
     """A session whose poses may be in another convention.
 
     Attributes:
@@ -132,7 +138,7 @@ class InDoubt:
     robot: PoseNumbers | None = None
 
 
-def load_in_doubt(path: Path) -> InDoubt:
+def load_for_rereading(path: Path) -> DoubtfulSession:
     """Loads a session for rereading, even where its poses or its board's size are invalid.
 
     A board too large for metres is read in the unit with which the chain closes, else in
@@ -152,7 +158,7 @@ def load_in_doubt(path: Path) -> InDoubt:
     numbers = (side for side in lengths if isinstance(side, int | float))
     side = next((number for number in numbers if LARGEST_M < number < _LARGEST_MM), None)
     if side is None:
-        return InDoubt(Session.load(path, table=plain), robot)
+        return DoubtfulSession(Session.load(path, table=plain), robot)
     by_unit = {}
     for unit in _BOARD_UNITS:
         if UNITS_M[unit] * side <= LARGEST_M:
@@ -161,7 +167,7 @@ def load_in_doubt(path: Path) -> InDoubt:
     scores = {unit: _closing_score(session, robot) for unit, session in by_unit.items()}
     unit = min(scores, key=lambda index: scores[index])
     note = f"{name} cannot be in metres: {side:g} is read as {side:g} {unit}."
-    return InDoubt(replace(by_unit[unit], warnings=(note, *by_unit[unit].warnings)), robot)
+    return DoubtfulSession(replace(by_unit[unit], warnings=(note, *by_unit[unit].warnings)), robot)
 
 
 def _closing_score(session: Session, robot: PoseNumbers | None) -> float:
@@ -260,9 +266,9 @@ def reread_session(
     _check_applies(candidate, robot)
     if _is_one_log(chain_poses(session), robot):
         _reorder(cells, reading.rows(len(cells)), joint_columns(session.columns))
-    if robot.there.any():
+    if robot.present.any():
         _replace_cells(cells, pose_cells(reading.robot_numbers(robot), POSE), POSE)
-    if camera.there.any():
+    if camera.present.any():
         corrected = pose_cells(reading.camera_numbers(camera), MEASURED_CAM_POSE)
         _replace_cells(cells, corrected, MEASURED_CAM_POSE)
     changes = (*changes, *_change_notes(candidate))
@@ -349,7 +355,7 @@ def _change_notes(candidate: Candidate) -> tuple[str, ...]:
 
 def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
     """Refuses another reading of poses where only joint angles are recorded."""
-    if not robot.there.any() and candidate.hypothesis.robot != candidate.declared.robot:
+    if not robot.present.any() and candidate.hypothesis.robot != candidate.declared.robot:
         raise DataError(
             f"The chain closes with {candidate.words}, but the robot is known by its joint angles "
             "alone, of which that cannot be said.",
@@ -361,7 +367,7 @@ def _check_applies(candidate: Candidate, robot: PoseNumbers) -> None:
 def _is_one_log(chain: FloatArray | None, robot: PoseNumbers) -> bool:
     """Whether joint angles and poses of a row belong together, and are reordered together."""
     # Without a robot model this cannot be checked, and one log is more likely.
-    if chain is None or not robot.there.any():
+    if chain is None or not robot.present.any():
         return True
     # Other units or frames change all rows alike, so the steps between rows are compared.
     steps = [

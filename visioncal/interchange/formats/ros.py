@@ -7,8 +7,8 @@ import numpy as np
 from visioncal.core.conventions import PoseNumbers, Reading
 from visioncal.core.documents import mapping, number, read_json, read_yaml
 from visioncal.core.errors import DataError
-from visioncal.interchange.formats.finding import head
-from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
+from visioncal.interchange.formats.file_search import head
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
 
@@ -22,7 +22,7 @@ def _is_easy_handeye(path: Path) -> bool:
     )
 
 
-def _read_easy_handeye(path: Path, requested: ImportOptions) -> Foreign:
+def _read_easy_handeye(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a .samples file: a list of `robot` and `tracking` as geometry_msgs/Transform."""
     # With the camera on the base the sampler stores the robot's pose inverted, so that one solver
     # serves both (easy_handeye2, HandeyeSampler); the file itself does not say which it is.
@@ -42,7 +42,7 @@ def _read_easy_handeye(path: Path, requested: ImportOptions) -> Foreign:
         if poses.reading.inverse
         else "as they stand, as with the camera in the hand"
     )
-    return Foreign(
+    return ForeignRecording(
         name=path.stem,
         robot=poses,
         camera=requested.camera.applied_to(_numbers(camera, places, inverse=False)),
@@ -74,7 +74,7 @@ def _is_moveit(path: Path) -> bool:
     return named or nested
 
 
-def _read_moveit(path: Path, requested: ImportOptions) -> Foreign:
+def _read_moveit(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads MoveIt's samples: the effector in the world, the object in the sensor, as matrices."""
     # A list of mappings, as its panel saves them, or of pairs, as its tests have them.
     document = read_json(path) if path.suffix.lower() == ".json" else read_yaml(path)
@@ -89,7 +89,7 @@ def _read_moveit(path: Path, requested: ImportOptions) -> Foreign:
         robot.append(as_matrix(first, f"{where}: effector_wrt_world"))
         camera.append(as_matrix(second, f"{where}: object_wrt_sensor"))
         places.append(where)
-    return Foreign(
+    return ForeignRecording(
         name=path.stem,
         robot=requested.robot.applied_to(matrix_numbers(np.array(robot), places)),
         camera=requested.camera.applied_to(matrix_numbers(np.array(camera), places)),

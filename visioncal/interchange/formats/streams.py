@@ -25,7 +25,7 @@ _EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
 @dataclass(frozen=True, eq=False)
-class Paired:
+class PairedSamples:
     """A sample of slow, distinct poses from the overlap of two streams.
 
     Attributes:
@@ -68,7 +68,7 @@ def in_seconds(stamps: FloatArray) -> FloatArray:
 
 def pair_streams(
     robot_s: FloatArray, robot: FloatArray, camera_s: FloatArray, camera: FloatArray
-) -> Paired:
+) -> PairedSamples:
     """Estimates a coarse clock offset, and selects times at which the robot is slow.
 
     Args:
@@ -95,7 +95,7 @@ def pair_streams(
         )
     poses = flange.at(robot_clock_s[rows])
     chosen = slow_and_new(poses, flange.speeds(robot_clock_s[rows]))
-    return Paired(rows[chosen], poses[chosen], match)
+    return PairedSamples(rows[chosen], poses[chosen], match)
 
 
 def _check_common(robot_s: FloatArray, camera_s: FloatArray) -> None:

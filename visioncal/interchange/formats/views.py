@@ -19,8 +19,13 @@ from visioncal.core.files import is_inside
 from visioncal.core.types import FloatArray
 from visioncal.interchange.formats.columns import DOCUMENTS, ENDINGS, foreign_from, read_document
 from visioncal.interchange.formats.fields import fields_of_records, flattened
-from visioncal.interchange.formats.finding import is_image_name, kind_of, listed, number_in
-from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
+from visioncal.interchange.formats.file_search import (
+    files_in,
+    is_image_name,
+    number_in,
+    series_name,
+)
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
 from visioncal.interchange.formats.import_options import ImportOptions
 
 _LINE = re.compile(r"^[ \t]*([frt])[ \t]+(\S.*)$", re.MULTILINE)
@@ -41,10 +46,10 @@ class _Family:
 def _families(folder: Path) -> tuple[_Family, ...]:
     """Groups a folder's data files by their names without the number, the largest group first."""
     groups: dict[str, dict[int, Path]] = defaultdict(dict)
-    for file in listed(folder):
+    for file in files_in(folder):
         number = number_in(file.name)
         if file.suffix.lower() in ENDINGS and number is not None:
-            groups[kind_of(file)].setdefault(number, file)
+            groups[series_name(file)].setdefault(number, file)
     families = [_Family(name.rsplit(".", 1)[0], files) for name, files in groups.items()]
     return tuple(
         sorted(
@@ -63,7 +68,7 @@ def _view_folder(path: Path) -> Path | None:
     return next((folder for folder in folders if _families(folder)), None)
 
 
-def _read_views(path: Path, requested: ImportOptions) -> Foreign:
+def _read_views(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads a folder with one file a view, or several kinds of file a view."""
     folder = _view_folder(path)
     if folder is None:
@@ -86,7 +91,7 @@ def _read_views(path: Path, requested: ImportOptions) -> Foreign:
     fields = fields_of_records(records, places, name, folder, tuple(views))
     folders = (file for file in (folder, path, path / "images") if is_inside(file, path))
     images = next(
-        (file for file in folders if any(is_image_name(at.name) for at in listed(file))), None
+        (file for file in folders if any(is_image_name(at.name) for at in files_in(file))), None
     )
     return foreign_from(fields, requested, images=images)
 

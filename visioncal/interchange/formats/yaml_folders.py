@@ -12,8 +12,8 @@ from visioncal.core.documents import as_numbers, mapping, read_yaml
 from visioncal.core.documents.values import read_plain_text
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, FloatArray, Mount
-from visioncal.interchange.formats.finding import head, images_beside, listed, number_in
-from visioncal.interchange.formats.foreign import Foreign, ForeignFormat
+from visioncal.interchange.formats.file_search import files_in, head, images_beside, number_in
+from visioncal.interchange.formats.foreign import ForeignFormat, ForeignRecording
 from visioncal.interchange.formats.import_options import ImportOptions
 from visioncal.interchange.formats.intrinsics import read_intrinsics
 from visioncal.interchange.formats.poses import as_matrix, matrix_numbers
@@ -28,11 +28,11 @@ _ZIVID_NAME = re.compile(r"(pos|pose|robot_pose)_?[0-9]+\.ya?ml", re.IGNORECASE)
 def _zivid_files(path: Path) -> tuple[Path, ...]:
     if not path.is_dir():
         return ()
-    named = tuple(file for file in listed(path) if _ZIVID_NAME.fullmatch(file.name))
+    named = tuple(file for file in files_in(path) if _ZIVID_NAME.fullmatch(file.name))
     return named if named and re.search("FloatMatrix|PoseState", head(named[0])) else ()
 
 
-def _read_zivid(path: Path, requested: ImportOptions) -> Foreign:
+def _read_zivid(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads pos01.yaml ... (Zivid SDK, Matrix4x4; older samples, OpenCV's `PoseState`)."""
     files = _zivid_files(path)
     if not files:
@@ -42,7 +42,7 @@ def _read_zivid(path: Path, requested: ImportOptions) -> Foreign:
     views = tuple(number for number in numbers if number is not None)
     places = tuple(file.name for file in files)
     images, notes = images_beside(path, requested.images, views, places, numbered=True)
-    return Foreign(
+    return ForeignRecording(
         name=path.resolve().name,
         robot=requested.robot.applied_to(matrix_numbers(matrices, places, unit="mm")),
         images=images,
@@ -70,10 +70,10 @@ ZIVID = ForeignFormat(
 def _pose_files(path: Path, name: re.Pattern[str] = _POSE_NAME) -> tuple[Path, ...]:
     if not path.is_dir():
         return ()
-    return tuple(file for file in listed(path) if name.fullmatch(file.name))
+    return tuple(file for file in files_in(path) if name.fullmatch(file.name))
 
 
-def _read(path: Path, requested: ImportOptions) -> Foreign:
+def _read(path: Path, requested: ImportOptions) -> ForeignRecording:
     """Reads the folder; a pose is tx, ty, tz [m] and theta-u [rad] (ViSP, vpPoseVector)."""
     # Poses of the object in the camera are used only where there are no images.
     files = _pose_files(path)
@@ -89,7 +89,7 @@ def _read(path: Path, requested: ImportOptions) -> Foreign:
         else {number_in(file.name): file for file in _pose_files(path, _CAMERA_POSE_NAME)}
     )
     camera = requested.camera.applied_to(_poses([camera_files.get(view) for view in views], places))
-    return Foreign(
+    return ForeignRecording(
         name=path.resolve().name,
         robot=requested.robot.applied_to(_poses(files, places)),
         camera=camera if camera_files else None,
@@ -126,7 +126,7 @@ def _mount(path: Path, notes: list[str]) -> Mount | None:
 
 
 def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
-    cameras = [file for file in listed(path) if file.suffix.lower() == ".xml"]
+    cameras = [file for file in files_in(path) if file.suffix.lower() == ".xml"]
     if not cameras:
         return None
     lens, more = read_intrinsics(cameras[0])
@@ -136,7 +136,7 @@ def _lens(path: Path, notes: list[str]) -> dict[str, Any] | None:
 
 def _target(path: Path, notes: list[str]) -> dict[str, Any] | None:
     """Reads the target from a note beside the images, where that is complete."""
-    for file in listed(path):
+    for file in files_in(path):
         if not file.name.endswith("-data.txt"):
             continue
         text = read_plain_text(file)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from visioncal.calibration.stages.detect import look_for
+from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import figure
 from visioncal.core.types import Corners, Target
@@ -85,7 +85,9 @@ class Capture:
         """Takes the views on the disk into account."""
         for view in self.journal.views:
             image = decode_image(self.journal.image(view))
-            detected = None if isinstance(image, str) else look_for(image, self.target, view.number)
+            detected = (
+                None if isinstance(image, str) else find_corners(image, self.target, view.number)
+            )
             if detected is not None and isinstance(detected[0], Corners):
                 self.coach.add(detected[0])
             state = state_of(view)
@@ -163,11 +165,11 @@ class Capture:
         return self.prediction.after([view.number for view in self.journal.views])
 
     def _check_missed_in_a_row(self) -> None:
-        if not self.options.lost:
+        if not self.options.missed_in_a_row:
             return
-        recent = self.steps[-self.options.lost :]
+        recent = self.steps[-self.options.missed_in_a_row :]
         reasons = [step.found.reason for step in recent if isinstance(step.found, Missed)]
-        if len(reasons) < self.options.lost:
+        if len(reasons) < self.options.missed_in_a_row:
             return
         raise DataError(
             f"no view at {len(recent)} stops in a row "
@@ -180,7 +182,7 @@ class Capture:
         )
 
 
-def missed(steps: Sequence[CaptureEvent]) -> Iterator[tuple[int, str]]:
+def missed_stops(steps: Sequence[CaptureEvent]) -> Iterator[tuple[int, str]]:
     """Stops that gave no view, with the reasons."""
     for step in steps:
         if isinstance(step.found, Missed):

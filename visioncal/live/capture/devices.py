@@ -12,7 +12,7 @@ from visioncal.live.drivers.protocols import Arm, CameraDevice, DeviceSetup
 
 
 @dataclass(frozen=True)
-class ArmWish:
+class ArmSetup:
     """Options of an arm to open.
 
     Attributes:
@@ -30,12 +30,12 @@ class ArmWish:
     answers: bool = True
 
 
-ArmOpener: TypeAlias = Callable[[ArmWish], Arm]
+ArmOpener: TypeAlias = Callable[[ArmSetup], Arm]
 CameraOpener: TypeAlias = Callable[[str, DeviceSetup], CameraDevice]
 _Opener = TypeVar("_Opener")
 
 
-def open_arm(words: str, wish: ArmWish) -> Arm:
+def open_arm(words: str, wish: ArmSetup) -> Arm:
     """Opens an arm.
 
     Args:
@@ -85,13 +85,13 @@ def _needs(address: str, words: str) -> str:
 # Drivers and their client libraries are imported only when a device is opened.
 
 
-def _ur(wish: ArmWish) -> Arm:
+def _ur(wish: ArmSetup) -> Arm:
     from visioncal.live.drivers.ur import UrArm
 
     return UrArm(_needs(wish.address, "ur:HOST, as ur:192.168.0.10"), watch_only=wish.watch_only)
 
 
-def _manual(wish: ArmWish) -> Arm:
+def _manual(wish: ArmSetup) -> Arm:
     from visioncal.live.drivers.manual import ManualArm
 
     return ManualArm(wish.ask, wish.form, answers=wish.answers)

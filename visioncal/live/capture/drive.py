@@ -48,12 +48,12 @@ class JointPace:
             return float(2.0 * np.sqrt(distance / self.acceleration))
         return distance / self.speed + self.speed / self.acceleration
 
-    def way_s(self, postures: Iterable[FloatArray]) -> float:
+    def path_duration_s(self, postures: Iterable[FloatArray]) -> float:
         """Duration of a path from posture to posture [s]."""
         return sum(self.travel_s(start, end) for start, end in pairwise(postures))
 
 
-def watched(
+def wait_until_stopped(
     arm: MovingArm,
     expected_s: float,
     clock: Clock,
@@ -125,7 +125,7 @@ def _move(
     pace = JointPace.of(options)
     expected_s = pace.travel_s(joints_of(cell), goal)
     arm.start_move(goal, speed=pace.speed, acceleration=pace.acceleration)
-    watched(arm, expected_s, cell.clock, cell.state, glance)
+    wait_until_stopped(arm, expected_s, cell.clock, cell.state, glance)
     off_rad = np.abs(joints_of(cell) - goal)
     if off_rad.max() > _ARRIVED_RAD:
         joint = int(off_rad.argmax())

@@ -9,7 +9,7 @@ import numpy as np
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.drive import JointPace, watched
+from visioncal.live.capture.drive import JointPace, wait_until_stopped
 from visioncal.live.capture.live import HostClock
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.robot import Robot
@@ -135,4 +135,4 @@ class Hovering:
     def _move(self, goal: FloatArray) -> None:
         expected_s = _PACE.travel_s(self._joints(), goal)
         self.arm.start_move(goal, speed=_PACE.speed, acceleration=_PACE.acceleration)
-        watched(self.arm, expected_s, HostClock(), self.arm.state)
+        wait_until_stopped(self.arm, expected_s, HostClock(), self.arm.state)

@@ -46,8 +46,8 @@ class CaptureOptions:
         still: Limits within which arm and image count as still.
         single: Whether every frame is of another pose, as in a folder of pictures; it is then taken
             without waiting.
-        lost: Number of stops in a row without a view that ends the recording; 0 for never, where a
-            person sees it.
+        missed_in_a_row: Number of stops in a row without a view that ends the recording; 0 for
+            never, where a person sees it.
     """
 
     speed: float = PLAN_SPEED
@@ -56,7 +56,7 @@ class CaptureOptions:
     keep: Keep = "sharpest"
     still: Stillness = field(default_factory=Stillness)
     single: bool = False
-    lost: int = 3
+    missed_in_a_row: int = 3
 
     def __post_init__(self) -> None:
         if not 0.0 < self.speed <= FASTEST:

@@ -10,9 +10,9 @@ import numpy as np
 
 from visioncal.core.errors import VisioncalError
 from visioncal.live.planning.accuracy import Accuracy
-from visioncal.live.planning.information import World, worlds_of
-from visioncal.live.planning.read_back import PlanFile
-from visioncal.live.planning.recorded import so_far
+from visioncal.live.planning.information import World, predict_worlds
+from visioncal.live.planning.plan_file import PlanFile
+from visioncal.live.planning.recorded import calibrate_partially
 from visioncal.session import Session
 
 # Least number of views for a calibration.
@@ -40,7 +40,7 @@ class PlannedAccuracy:
     def of(cls, plan: PlanFile) -> "PlannedAccuracy":
         """Prepares the predictions of a plan's stops."""
         q = np.array([stop.q for stop in plan.stops])
-        (world,) = worlds_of((plan.cell,), plan.purpose, q)
+        (world,) = predict_worlds((plan.cell,), plan.purpose, q)
         return cls(tuple(stop.view for stop in plan.stops), world)
 
     def after(self, views: Sequence[int]) -> Accuracy | None:
@@ -50,7 +50,7 @@ class PlannedAccuracy:
             return None
         covariance = self.world.covariance(rows)
         place, turn = (
-            np.trace(array @ covariance) for array in (self.world.place, self.world.turn)
+            np.trace(array @ covariance) for array in (self.world.position, self.world.rotation)
         )
         return Accuracy.of(float(place), float(turn))
 
@@ -88,11 +88,11 @@ class RecordedAccuracy:
 def _session_accuracy(folder: Path) -> Accuracy | None:
     """Accuracy of the camera's pose from a session as it is now."""
     try:
-        run = so_far(Session.load(folder)).known
+        run = calibrate_partially(Session.load(folder)).known
     except VisioncalError:
         # Too few views yet; the reason is reported when the session is calibrated.
         return None
-    if run.answer is None:
+    if run.assessment_or_none is None:
         return None
-    covariance = run.answer.covariance[:6, :6]
+    covariance = run.assessment_or_none.covariance[:6, :6]
     return Accuracy.of(float(np.trace(covariance[3:, 3:])), float(np.trace(covariance[:3, :3])))

@@ -19,8 +19,8 @@ from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.predict import PlannedAccuracy
 from visioncal.live.drivers.protocols import MovingArm
-from visioncal.live.planning.path import ordered
-from visioncal.live.planning.read_back import PlanFile, Stop
+from visioncal.live.planning.path import order_stops
+from visioncal.live.planning.plan_file import PlanFile, Stop
 
 # Typical duration of a stop besides the motion to it [s].
 _STOP_S = 1.5
@@ -32,7 +32,7 @@ _ARRIVED_RAD = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Departure:
+class MotionSummary:
     """Summary of a recording before anything moves.
 
     Attributes:
@@ -48,9 +48,9 @@ class Departure:
     duration_s: float
 
 
-def departure(
+def motion_summary(
     cell: LiveCell, plan: PlanFile, done: Sequence[int], options: CaptureOptions
-) -> Departure:
+) -> MotionSummary:
     """Checks and summarises what is to be driven, without the views `done`; nothing moves.
 
     Raises:
@@ -61,12 +61,12 @@ def departure(
     _check_model(cell, plan, here)
     stops = tuple(stop for stop in plan.stops if stop.view not in done)
     if not stops:
-        return Departure((), (), 0.0, 0.0)
+        return MotionSummary((), (), 0.0, 0.0)
     first = CheckedPaths(plan).to(stops[0], here)
     postures = [here, *first, *(q for stop in stops[1:] for q in (*stop.via, stop.q))]
     turns = np.abs(np.diff(np.array([here, *first]), axis=0)).sum(axis=0)
-    duration_s = JointPace.of(options).way_s(postures) + _STOP_S * len(stops)
-    return Departure(stops, first, float(turns.max()), duration_s)
+    duration_s = JointPace.of(options).path_duration_s(postures) + _STOP_S * len(stops)
+    return MotionSummary(stops, first, float(turns.max()), duration_s)
 
 
 def record(
@@ -203,7 +203,7 @@ class CheckedPaths:
         if planned is not None and _is_at(q, planned):
             return (*stop.via, stop.q)
         self._check_limits(q)
-        route = ordered(self.plan.cell, q, stop.q[None])
+        route = order_stops(self.plan.cell, q, stop.q[None])
         if route.unreachable:
             (obstacle,) = route.unreachable.values()
             angles = ", ".join(f"{value:.0f}" for value in np.rad2deg(q))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visioncal.calibration.stages.detect import look_for
+from visioncal.calibration.stages.detect import find_corners
 from visioncal.core.errors import DriverError
 from visioncal.core.types import Corners, Image, Rejection, Target
 from visioncal.live.capture.live import LiveCell
@@ -158,7 +158,7 @@ def _select_frame(
 
 
 def _detect(still: StillFrame, target: Target, view: int, motion_px: float) -> TakenView | Missed:
-    corners, _ = look_for(grey(still.frame.image), target, view)
+    corners, _ = find_corners(grey(still.frame.image), target, view)
     if isinstance(corners, Rejection):
         return Missed(corners.reason)
     return TakenView(still.frame, still.state, corners, motion_px)

@@ -15,7 +15,7 @@ from visioncal.core.types import FloatArray
 from visioncal.live.drivers.extras import client_library
 from visioncal.live.drivers.protocols import ArmState, JointSample
 from visioncal.live.drivers.stopwatch import Stopwatch
-from visioncal.live.drivers.ur_line import Line
+from visioncal.live.drivers.ur_line import CallThread
 from visioncal.live.drivers.ur_net import (
     SCRIPT_PORT,
     Dashboard,
@@ -24,8 +24,8 @@ from visioncal.live.drivers.ur_net import (
     read_tool_offset,
     resolve,
 )
+from visioncal.live.drivers.ur_states import StateStream
 from visioncal.live.drivers.ur_status import Condition, read_condition
-from visioncal.live.drivers.ur_watch import StateStream
 
 _EXTRA = "ur"
 _RATE_HZ = 125.0
@@ -69,7 +69,7 @@ class UrArm:
         self._name, self._model = f"{condition.model} at {host}", condition.model.lower()
         self._states = StateStream(receive, self._host, condition.version)
         self._control: Any = None
-        self._line: Line | None = None
+        self._line: CallThread | None = None
         self._moves_before: int | None = None
         self._motion_timer = Stopwatch()
         self._closed = False
@@ -219,14 +219,14 @@ class UrArm:
             self._control = library.RTDEControlInterface(self._host, _RATE_HZ)
         except RuntimeError as error:
             raise self._explained_error(f"does not take the control script: {error}") from error
-        self._line = Line(self._name, self._kick_watchdog, _KICK_S)
+        self._line = CallThread(self._name, self._kick_watchdog, _KICK_S)
         offset = self._line.call(
             self._control.getTCPOffset, limit_s=_CALL_S, what="report its tool offset"
         )
         self._flange_from_tool = _matrix(offset)
         self._enable_watchdog(self._line)
 
-    def _enable_watchdog(self, line: Line) -> None:
+    def _enable_watchdog(self, line: CallThread) -> None:
         """Makes the controller stop the arm if this computer falls silent."""
         line.call(
             lambda: self._control.setWatchdog(_LEAST_HZ),
@@ -240,7 +240,7 @@ class UrArm:
             if self._states.alive and self._control.isProgramRunning():
                 self._control.kickWatchdog()
 
-    def _restart_program(self, line: Line) -> None:
+    def _restart_program(self, line: CallThread) -> None:
         """Sends the control script again after it was ended at the pendant, or in a pause."""
         read_condition(self._host).check_moves()
         line.call(self._control.reuploadScript, limit_s=_CALL_S, what="take the control script")
@@ -262,7 +262,7 @@ class UrArm:
         client = self._states.client
         return float(client.getPayload()), np.array(client.getPayloadCog())
 
-    def _control_line(self) -> Line:
+    def _control_line(self) -> CallThread:
         self._check_open()
         if self._line is None:
             raise DriverError(

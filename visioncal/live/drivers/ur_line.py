@@ -20,7 +20,7 @@ _THROWN = (RuntimeError, ValueError)
 _GLANCE_S = 0.05
 
 
-class Line:
+class CallThread:
     """Worker thread that runs calls in order, and a periodic task [s] while there are none."""
 
     def __init__(self, name: str, idle: Callable[[], None], every_s: float) -> None:

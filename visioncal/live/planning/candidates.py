@@ -10,10 +10,10 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import some_of
 from visioncal.core.types import FloatArray, IntArray, Mask, Progress
-from visioncal.live.planning.cell import PlanCell, collisions_of
-from visioncal.live.planning.visibility import Shade, sight_of
+from visioncal.live.planning.cell import PlanCell, collision_model
+from visioncal.live.planning.visibility import Occlusion, board_views
 from visioncal.robot import Robot
-from visioncal.robot.atlas import Atlas
+from visioncal.robot.capability_map import CapabilityMap
 from visioncal.robot.collision import Collisions
 from visioncal.robot.inverse import Inverse
 
@@ -131,15 +131,15 @@ class _CandidateSearch:
         self._least_share, self._distances_narrowed = _SHARES[0], False
         self._cell, self._count = cell, count
         self._rng = np.random.default_rng(seed)
-        self._sight = sight_of(cell, seed)
-        self._shade = Shade.of(cell, np.vstack([self._sight.outline, self._sight.centre]))
-        self.collisions = collisions_of(cell)
+        self._sight = board_views(cell, seed)
+        self._shade = Occlusion.of(cell, np.vstack([self._sight.outline, self._sight.centre]))
+        self.collisions = collision_model(cell)
         self._inverse = Inverse(cell.robot)
         self._unreached: list[FloatArray] = []
 
     @cached_property
-    def _atlas(self) -> Atlas:
-        return Atlas(self._cell.robot, self._inverse, self._rng)
+    def _atlas(self) -> CapabilityMap:
+        return CapabilityMap(self._cell.robot, self._inverse, self._rng)
 
     def run(self, progress: Progress | None) -> None:
         """Draws until there are enough stops, or it is clear that there are not."""

@@ -7,7 +7,7 @@ import numpy as np
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, exp, invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
-from visioncal.estimation.parts import Noise
+from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.touches import robot_noise
 from visioncal.results import Calibration
 from visioncal.robot import Robot
@@ -114,8 +114,8 @@ class PlanCell:
         covariance: (12, 12) joint covariance of both edges (rotation, translation; right
             perturbations), where recorded stops determine it; both sigmas are then typical of it.
             None where the sigmas are all that is known.
-        shown_m: Least and greatest distance at which the board has been observed [m], allowed
-            whether it fills the image there or not; None where it has not been.
+        observed_distances_m: Least and greatest distance at which the board has been observed [m],
+            allowed whether it fills the image there or not; None where it has not been.
     """
 
     mount: Mount
@@ -131,7 +131,7 @@ class PlanCell:
     limits: Limits = field(default_factory=Limits)
     boxes: tuple[Box, ...] = ()
     covariance: FloatArray | None = None
-    shown_m: tuple[float, float] | None = None
+    observed_distances_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if corner_positions(self.target)[:, 2].any():
@@ -242,7 +242,7 @@ def cell_of_calibration(
         pixel_px,
         limits,
         boxes,
-        shown_m=None if budget is None else (budget.distance_m, budget.distance_m),
+        observed_distances_m=None if budget is None else (budget.distance_m, budget.distance_m),
     )
 
 
@@ -253,7 +253,7 @@ def _noise(calibration: Calibration) -> tuple[Noise, float]:
     return replace(noise, robots=floored), calibration.noise.get("pixel_px", TYPICAL_PX)
 
 
-def collisions_of(cell: PlanCell) -> Collisions:
+def collision_model(cell: PlanCell) -> Collisions:
     """Collision model of a cell: the arm, what it carries, and obstacles.
 
     The uncertainty of the guessed camera and board is added to their clearance.
@@ -284,7 +284,7 @@ def board_size_m(target: Target) -> float:
 
 def _camera(_: Target, link: int, link_from_cam: FloatArray, unsure_m: float) -> Body:
     behind = compose(np.eye(3), np.array([0.0, 0.0, -_CAMERA_BEHIND_M]))
-    return Body("camera", link, "box", _CAMERA_M, link_from_cam @ behind, unsure_m=unsure_m)
+    return Body("camera", link, "box", _CAMERA_M, link_from_cam @ behind, uncertainty_m=unsure_m)
 
 
 def _board(target: Target, link: int, link_from_target: FloatArray, unsure_m: float) -> Body:
@@ -292,4 +292,4 @@ def _board(target: Target, link: int, link_from_target: FloatArray, unsure_m: fl
     low, high = extent_m(target)
     centre = compose(np.eye(3), np.append(0.5 * (low + high), 0.5 * _PLATE_M))
     size = np.append(high - low + 2.0 * _RIM_M, _PLATE_M)
-    return Body("board", link, "box", size, link_from_target @ centre, unsure_m=unsure_m)
+    return Body("board", link, "box", size, link_from_target @ centre, uncertainty_m=unsure_m)

@@ -107,7 +107,7 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
     # Lens and board are nuisance parameters.
     inverse = 1.0 / world.units
     inverse[12 : 12 + world.shared_count] = 0.0
-    counted = world.counted
+    counted = world.objective
     if criterion == "A":
         counted = np.diag(inverse**2) / (size - world.shared_count)
 
@@ -123,8 +123,8 @@ def reduced(world: World, criterion: Criterion) -> Reduced:
         factors @ basis,
         np.eye(len(share)) + basis.T @ recorded @ basis,
         variance(counted),
-        variance(world.place),
-        variance(world.turn),
+        variance(world.position),
+        variance(world.rotation),
         np.eye(len(share))[:, share > _LEAST_SHARE**2 * share.max(initial=0.0)],
         extremes,
         world.unestimated,
@@ -301,7 +301,7 @@ class Design:
         value: The criterion at these stops: a sigma [mm] for I, else in its own units.
         history: Accuracy predicted without any of them, and after each in the order of `rows`.
         best: Accuracy with all candidates.
-        best_look: The same if lens and board were known exactly.
+        best_known_lens_board: The same if lens and board were known exactly.
         best_exact_arm: The same without errors of the arm that a fit treats as noise.
         met: Whether the wish is met; None where there was none.
     """
@@ -311,7 +311,7 @@ class Design:
     value: float
     history: tuple[Accuracy, ...]
     best: Accuracy
-    best_look: Accuracy
+    best_known_lens_board: Accuracy
     best_exact_arm: Accuracy
     met: bool | None
 
@@ -326,7 +326,7 @@ class Design:
         return self.history[0]
 
 
-def chosen(
+def choose_stops(
     worlds: Sequence[World],
     count: int,
     *,
@@ -370,7 +370,7 @@ def shortfall(design: Design, wish: Wish, count: int) -> str:
             f"candidates together give {_accuracy_words(design.best, wish)}."
         )
     cause = "A larger board, a nearer camera or more room to move would give more."
-    if design.best_look.meets(wish):
+    if design.best_known_lens_board.meets(wish):
         cause = (
             "The uncertainty of the board's size and the lens is in the way: measure the print, "
             "and state its square_sigma_m."

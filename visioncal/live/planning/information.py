@@ -28,16 +28,16 @@ from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance_from, gram
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.solve import fisher_information
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 from visioncal.estimation.workspace import postures
 from visioncal.live.planning.cell import Box, PlanCell
 from visioncal.live.planning.purposes import Purpose
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
-from visioncal.vision.targets import FOUND_IN_PART, corner_positions
+from visioncal.vision.targets import DETECTABLE_IN_PART, corner_positions
 
 # Number of cells over which a plan is averaged: the guess, and draws from its uncertainty.
 WORLDS = 4
@@ -103,10 +103,10 @@ class World:
         factors: (k, 6, p) whitened Jacobian F of each stop; F^T F is its information.
         prior: (p, p) prior information.
         recorded: (p, p) information of the recorded stops.
-        counted: (p, p) weight W such that trace(W C) is the variance to be minimised with a
+        objective: (p, p) weight W such that trace(W C) is the variance to be minimised with a
             covariance C: of a position, as a mean over where it matters [m^2].
-        place: (p, p) the same for the position whose accuracy is reported [m^2].
-        turn: (p, p) the same for the rotation [rad^2].
+        position: (p, p) the same for the position whose accuracy is reported [m^2].
+        rotation: (p, p) the same for the rotation [rad^2].
         units: (p,) unit of each unknown where unknowns of different kinds are compared.
         lens_board_count: Number of unknowns of lens and boards; they come after the edges.
         unestimated: (k, 6, a) whitened Jacobian of each stop in parameters that a fit does not
@@ -119,9 +119,9 @@ class World:
     factors: FloatArray
     prior: FloatArray
     recorded: FloatArray
-    counted: FloatArray
-    place: FloatArray
-    turn: FloatArray
+    objective: FloatArray
+    position: FloatArray
+    rotation: FloatArray
     units: FloatArray
     shared_count: int
     unestimated: FloatArray
@@ -137,9 +137,9 @@ class World:
             self.factors[:, :, kept],
             self.prior[block],
             self.recorded[block],
-            self.counted[block],
-            self.place[block],
-            self.turn[block],
+            self.objective[block],
+            self.position[block],
+            self.rotation[block],
             self.units[kept],
             0,
             self.unestimated[:, :, of_arm],
@@ -162,7 +162,7 @@ class World:
         return np.asarray(fitted + bias @ bias.T)
 
 
-def worlds_of(
+def predict_worlds(
     cells: Sequence[PlanCell],
     purpose: Purpose,
     q: FloatArray,
@@ -204,7 +204,7 @@ def stop_factors(
         compressed = compress(stack, free.basis, free.appearance, poses[seen])
         flange = cell.robot.base_from_flange(q[seen])
         jacobian = np.concatenate([compressed.by_shared[:, :, free.columns], others], axis=2)
-        prior = Knowledge(information, np.zeros(len(information)))
+        prior = PriorInformation(information, np.zeros(len(information)))
         problem = chain(
             cell.mount,
             flange,
@@ -361,7 +361,7 @@ def _with_arm_errors(
 
 def _effect_information(problem: Problem) -> FloatArray:
     """Prior information (k, k) of a problem's effects."""
-    priors = (effect.known.information for effect in problem.effects)
+    priors = (effect.prior.information for effect in problem.effects)
     return np.asarray(block_diag(np.zeros((0, 0)), *priors))
 
 
@@ -402,7 +402,7 @@ def _predicted_corners(
     px = project(cell.camera, points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
     size = np.array(cell.camera.resolution)
     visible = np.all((px > -0.5) & (px < size - 0.5), axis=2)
-    in_part = cell.target.kind in FOUND_IN_PART or cell.target.point_tags
+    in_part = cell.target.kind in DETECTABLE_IN_PART or cell.target.point_tags
     fewest = min(_FEWEST_CORNERS, len(positions)) if in_part else len(positions)
     shows = visible.sum(axis=1) >= fewest
     view, corner = np.nonzero(visible[shows])

@@ -1,11 +1,11 @@
 """A plan of stops, or of motions, in words."""
 
 from visioncal.core.number_format import counted, figure, mm_and_deg, percent, some_of
-from visioncal.dynamics.limits import Kept
+from visioncal.dynamics.limits import MotionExtremes
+from visioncal.dynamics.plan_files import MotionPlan
 from visioncal.dynamics.sweeps import Sweeps
-from visioncal.dynamics.written import MotionPlan
 from visioncal.live.planning.accuracy import Accuracy
-from visioncal.live.planning.needed import NeedPlanned, words_of
+from visioncal.live.planning.pick_probability import NeedPlanned, words_of
 from visioncal.live.planning.plan import Plan
 
 # The board's size limits a plan if knowing it exactly would reduce the error by this factor.
@@ -29,19 +29,18 @@ def summary_of(plan: Plan) -> str:
     count, design = len(plan.stops), plan.design
     stops = counted(count, "stop")
     wanted = f"{plan.request.purpose.errors}, predicted sigma"
-    if plan.begun is None:
-        return (
-            f"{stops} from {plan.found} possible ones; {wanted}: {accuracy_words(design.predicted)}"
-        )
+    if plan.start is None:
+        accuracy = accuracy_words(design.predicted)
+        return f"{stops} from {plan.candidate_count} possible ones; {wanted}: {accuracy}"
     return (
-        f"{stops} to add, from {plan.found} possible ones; {wanted}: "
+        f"{stops} to add, from {plan.candidate_count} possible ones; {wanted}: "
         f"{accuracy_words(design.before)} before, {accuracy_words(design.predicted)} after"
     )
 
 
 def looks_note(plan: Plan) -> str:
     """States that lens or board limit a plan, so that more stops would not help; else empty."""
-    best, exact = plan.design.best, plan.design.best_look
+    best, exact = plan.design.best, plan.design.best_known_lens_board
     if best.is_open or best.mm < _LIMITED * exact.mm:
         return ""
     return (
@@ -61,10 +60,10 @@ def plan_words(plan: MotionPlan) -> tuple[str, ...]:
         "joints weighted by their greatest torques, columns of unit length; unweighted "
         f"{condition.scaled:.1f} (random: {random.scaled:.0f}), raw {condition.raw:.0f} (random: "
         f"{random.raw:.0f})",
-        f"it uses {_used(motion.kept)}",
+        f"it uses {_used(motion.extremes)}",
     ]
     if plan.sweeps is not None:
-        words += [_sweeps(plan.sweeps), f"they use {_used(plan.sweeps.kept)}"]
+        words += [_sweeps(plan.sweeps), f"they use {_used(plan.sweeps.extremes)}"]
     return tuple(words)
 
 
@@ -76,7 +75,7 @@ def plan_warnings(plan: MotionPlan) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def _used(kept: Kept) -> str:
+def _used(kept: MotionExtremes) -> str:
     shares = kept.shares
     parts = [f"{100.0 * max(values):.0f} % of the {name}" for name, values in shares.items()]
     near = ""

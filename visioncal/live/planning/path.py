@@ -7,7 +7,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import FloatArray
-from visioncal.live.planning.cell import PlanCell, collisions_of
+from visioncal.live.planning.cell import PlanCell, collision_model
 from visioncal.robot.collision import Collisions
 
 # Least gain of a reversal [rad], and the most passes over a tour.
@@ -43,7 +43,7 @@ class Detours:
             Via postures (j, n), without the ends; or, where no path was found, the index in
             `Collisions.names` of the pair of bodies that collides on the straight one.
         """
-        blocked = self._collisions.on_the_way(start, end)
+        blocked = self._collisions.path_contact(start, end)
         if blocked < 0:
             return np.empty((0, len(start)))
         detour = self._rrt_connect(start, end) if self._failed_searches < _MOST_FAILED else None
@@ -86,7 +86,7 @@ class Detours:
                 if distance <= _STEP_RAD
                 else tree.postures[place] + difference * (_STEP_RAD / distance)
             )
-            if self._collisions.on_the_way(tree.postures[place], posture) >= 0:
+            if self._collisions.path_contact(tree.postures[place], posture) >= 0:
                 break
             place = new = tree.add(posture, place)
         return new
@@ -97,7 +97,9 @@ class Detours:
         while last < len(path) - 1:
             ahead = range(len(path) - 1, last + 1, -1)
             clear = (
-                index for index in ahead if self._collisions.on_the_way(path[last], path[index]) < 0
+                index
+                for index in ahead
+                if self._collisions.path_contact(path[last], path[index]) < 0
             )
             last = next(clear, last + 1)
             kept.append(last)
@@ -147,7 +149,7 @@ class Route:
     unreachable: Mapping[int, str]
 
 
-def ordered(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:
+def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:
     """Orders stops for a short path of the joints, and finds collision-free segments.
 
     The order is that of nearest neighbours, improved by reversals (Croes 1958, 2-opt). Each segment
@@ -165,7 +167,7 @@ def ordered(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int
     Raises:
         DataError: The start violates the clearance.
     """
-    collisions = collisions_of(cell)
+    collisions = collision_model(cell)
     if start_q is not None:
         _check_start(cell, collisions, start_q)
     detours = Detours(cell, collisions, seed)

@@ -17,12 +17,18 @@ from visioncal.estimation.armmodel import block_size
 from visioncal.live.planning.accuracy import OPEN_SIGMA, Accuracy, Wish
 from visioncal.live.planning.candidates import Candidates, candidates
 from visioncal.live.planning.cell import Box, PlanCell
-from visioncal.live.planning.design import Design, chosen, shortfall
-from visioncal.live.planning.information import WORLDS, World, place_sigmas, worlds_of
-from visioncal.live.planning.needed import NeedPlanned, Picking, check_need, need_planned, words_of
-from visioncal.live.planning.path import Route, ordered
+from visioncal.live.planning.design import Design, choose_stops, shortfall
+from visioncal.live.planning.information import WORLDS, World, place_sigmas, predict_worlds
+from visioncal.live.planning.path import Route, order_stops
+from visioncal.live.planning.pick_probability import (
+    NeedPlanned,
+    Picking,
+    check_need,
+    need_planned,
+    words_of,
+)
 from visioncal.live.planning.purposes import Purpose
-from visioncal.live.planning.recorded import Begun
+from visioncal.live.planning.recorded import SessionStart
 from visioncal.robot import Robot
 
 # Most rounds in which stops without a safe path are replaced: an arm that folds far back needs up
@@ -100,8 +106,8 @@ class Plan:
     Attributes:
         design: The chosen candidates and the accuracy predicted with them.
         length_rad: Length of the path, as the sum of its segments' norms [rad].
-        begun: The session to which the stops are added; None for none.
-        found: Number of candidates.
+        start: The session to which the stops are added; None for none.
+        candidate_count: Number of candidates.
         lost: Number of tries that each limit rejected.
         in_the_way: What blocked stops that were replaced, one entry for each.
         shortfall: Why the wished accuracy, or the need, is not met, in words; empty where it is met
@@ -117,8 +123,8 @@ class Plan:
     stops: tuple[PlannedStop, ...]
     design: Design
     length_rad: float
-    begun: Begun | None
-    found: int
+    start: SessionStart | None
+    candidate_count: int
     lost: Mapping[str, int]
     in_the_way: tuple[str, ...]
     shortfall: str
@@ -132,7 +138,7 @@ def make_plan(
     cell: PlanCell,
     request: PlanRequest,
     *,
-    begun: Begun | None = None,
+    begun: SessionStart | None = None,
     progress: Progress | None = None,
 ) -> Plan:
     """Chooses stops, orders them, and states what each contributes.
@@ -154,7 +160,7 @@ def make_plan(
     stops = candidates(cell, request.candidates, request.seed, progress, least=least)
     progress("information", 0, 1)
     cells = (cell, *cell.guesses(WORLDS - 1, request.seed))
-    worlds = worlds_of(
+    worlds = predict_worlds(
         cells,
         request.purpose,
         stops.q,
@@ -203,7 +209,7 @@ class _Planning:
     request: PlanRequest
     found: Candidates
     worlds: tuple[World, ...]
-    begun: Begun | None
+    begun: SessionStart | None
 
     @property
     def recorded(self) -> int:
@@ -222,7 +228,7 @@ class _Planning:
             design = self._smallest_design(remaining)
             progress("path", attempt, _ROUNDS)
             q = self.found.q[design.rows]
-            route = ordered(self.cells[0], self.request.start_q, q, self.request.seed)
+            route = order_stops(self.cells[0], self.request.start_q, q, self.request.seed)
             if not route.unreachable:
                 return design, route, tuple(blockers)
             blockers += route.unreachable.values()
@@ -258,7 +264,7 @@ class _Planning:
         )
 
         def design_of(count: int) -> Design:
-            return chosen(worlds, count, criterion=request.criterion, wish=request.wish)
+            return choose_stops(worlds, count, criterion=request.criterion, wish=request.wish)
 
         design = design_of(request.count)
         if not len(design.rows):
@@ -288,7 +294,9 @@ class _Planning:
         numbers[list(route.order)] = first + np.arange(len(design.rows))
         names = [f"view {number}" for number in numbers]
         purpose, world = self.request.purpose, self.worlds[0]
-        contributions = tuple(helps(cell, purpose, found.q, world, design, names, begun=begun))
+        contributions = tuple(
+            stop_contributions(cell, purpose, found.q, world, design, names, begun=begun)
+        )
         q = found.q[design.rows]
         flange = cell.robot.base_from_flange(q)
         segments = route.segments
@@ -336,7 +344,7 @@ def _wish_met_error(design: Design) -> DataError:
     )
 
 
-def helps(
+def stop_contributions(
     cell: PlanCell,
     purpose: Purpose,
     q: FloatArray,
@@ -344,7 +352,7 @@ def helps(
     design: Design,
     names: Sequence[str],
     *,
-    begun: Begun | None = None,
+    begun: SessionStart | None = None,
 ) -> Iterator[str]:
     """States what each chosen stop contributes, given those before it and the recorded ones.
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from visioncal.dynamics.motion import JointMotion
-from visioncal.dynamics.written import MotionPlan
+from visioncal.dynamics.plan_files import MotionPlan
 from visioncal.live.planning.messages import accuracy_words, looks_note, plan_words, summary_of
 from visioncal.live.planning.plan import Plan, PlannedStop
 from visioncal.present.recording.arm import Obstacle
@@ -56,8 +56,8 @@ def _plan_note(plan: Plan, name: str) -> str:
         lines += ["", f"**{plan.shortfall}**"]
     elif note := looks_note(plan):
         lines += ["", note]
-    if plan.begun is not None and plan.begun.refusal:
-        lines += ["", f"So far: {plan.begun.refusal}"]
+    if plan.start is not None and plan.start.refusal:
+        lines += ["", f"So far: {plan.start.refusal}"]
     lines += [
         "",
         "The most informative first, each with what is predicted of it and all above it. Views are "

@@ -4,14 +4,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.observed_poses import ObservedPoses
 from visioncal.calibration.pipeline.run_state import RunState
-from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.calibration.stages.arms import RobotArm
-from visioncal.calibration.stages.pose_ambiguity import choose_by
-from visioncal.calibration.stages.refine import free_of
-from visioncal.calibration.stages.side import FramesSide
+from visioncal.calibration.stages.frame_model import CellFrameModel
+from visioncal.calibration.stages.pose_ambiguity import choose_nearest
+from visioncal.calibration.stages.refine import free_parameters_of_camera
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
@@ -21,8 +21,8 @@ from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.linalg import covariance_among
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import fisher_information, normal_equations
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.information import RecordedStops
@@ -61,7 +61,7 @@ class RoughEdges:
 
 
 @dataclass(frozen=True, eq=False)
-class Begun:
+class SessionStart:
     """A session to which stops are added.
 
     Attributes:
@@ -78,14 +78,16 @@ class Begun:
 
 
 @dataclass(frozen=True, eq=False)
-class SoFar:
+class PartialCalibration:
     """Run of a session as far as its stages succeed, and the reason why they end early."""
 
     known: RunState
     refusal: str = field(default="")
 
 
-def so_far(session: Session, *, progress: Progress | None = None) -> SoFar:
+def calibrate_partially(
+    session: Session, *, progress: Progress | None = None
+) -> PartialCalibration:
     """Calibrates the hand-eye level of a session as far as it goes.
 
     Raises:
@@ -98,17 +100,17 @@ def so_far(session: Session, *, progress: Progress | None = None) -> SoFar:
         try:
             run = stage.run(run)
         except DegenerateError as error:
-            return SoFar(run, error.message)
-    return SoFar(run)
+            return PartialCalibration(run, error.message)
+    return PartialCalibration(run)
 
 
-def begin(
-    partial: SoFar,
+def start_from_session(
+    partial: PartialCalibration,
     *,
     guess: RoughEdges | None = None,
     limits: Limits | None = None,
     boxes: tuple[Box, ...] = (),
-) -> Begun:
+) -> SessionStart:
     """Prepares a session as the start of a plan.
 
     In directions that the stops leave undetermined, the edges are those nearest to the guess;
@@ -129,7 +131,11 @@ def begin(
     if robot is None or not targets or run.pixel_px is None or not run.scenes:
         raise _missing_input_error(run)
     with one_blas_thread():
-        start = _start_from_guess(run, guess) if run.fit is None else _start_from_fit(run, run.fit)
+        start = (
+            _start_from_guess(run, guess)
+            if run.cell_fit_or_none is None
+            else _start_from_fit(run, run.cell_fit_or_none)
+        )
         edges, covariance = _posterior_edges(
             start.problem, start.state, start.noise, run.session.mount, guess
         )
@@ -151,10 +157,10 @@ def begin(
         boxes,
         covariance,
     )
-    cell = replace(cell, shown_m=_board_distances_m(cell, start.problem))
+    cell = replace(cell, observed_distances_m=_board_distances_m(cell, start.problem))
     first_corner = int(first_corners(targets)[start.board])
     recorded = _recorded_stops(run, start, edges, first_corner)
-    return Begun(cell, recorded, partial.refusal, start.views)
+    return SessionStart(cell, recorded, partial.refusal, start.views)
 
 
 def _board_distances_m(cell: PlanCell, problem: Problem) -> tuple[float, float]:
@@ -172,8 +178,11 @@ def _recorded_stops(
     run: RunState, start: "_RecordedStart", edges: FloatArray, first_corner: int
 ) -> RecordedStops:
     """The session's information at the plan's edges."""
-    arm, misfits = start.arm, () if run.answer is None else run.answer.misfits.values()
-    alike = [misfit.alike for misfit in misfits if misfit.alike is not None]
+    arm, misfits = (
+        start.arm,
+        () if run.assessment_or_none is None else run.assessment_or_none.residual_tests.values(),
+    )
+    alike = [misfit.neighbours for misfit in misfits if misfit.neighbours is not None]
     factors = (neighbours.factor for neighbours in alike if neighbours.is_significant)
     return RecordedStops(
         start.problem,
@@ -211,20 +220,20 @@ class _RecordedStart:
     views: tuple[int, ...]
 
 
-def _start_from_fit(run: RunState, solved: Solved) -> _RecordedStart:
+def _start_from_fit(run: RunState, solved: CellFit) -> _RecordedStart:
     """Recorded stops of a session with a fit, even if that leaves a direction undetermined."""
-    if solved.seen is None:
+    if solved.linearised_corners is None:
         raise _missing_input_error(run)
-    part, arm = solved.part, run.robot_arm
+    part, arm = solved.inlier_problem, run.robot_arm
     observed = part.observations.observed
     planned = max(dict.fromkeys(observed), key=observed.count)
     stops, first, of = np.unique(part.observations.stops, return_index=True, return_inverse=True)
-    frames = part.frames(solved.agreed.fit.state)
+    frames = part.frames(solved.inlier_fit.fit.state)
     # Errors of the arm are added again with the purpose's priors.
     bare = part.with_effects(
         [effect for effect in part.effects if effect.name != f"arm of {arm.robot}"]
     )
-    kept_stops = np.isin(np.arange(len(arm.stood)), stops)
+    kept_stops = np.isin(np.arange(len(arm.has_pose)), stops)
     camera, *boards = part.unknown
     order = [branch for branch in part.tree.branches if branch not in part.unknown]
     order += [camera, planned, *(board for board in boards if board != planned)]
@@ -235,12 +244,12 @@ def _start_from_fit(run: RunState, solved: Solved) -> _RecordedStart:
         observations=replace(part.observations, stops=of),
         effects=tuple(effect.of_stops(kept_stops) for effect in bare.effects),
     ).merged()
-    noise = solved.agreed.fit.noise
+    noise = solved.inlier_fit.fit.noise
     return _RecordedStart(
         problem,
         problem.start(frames),
         replace(noise, robots=np.maximum(noise.robots, _LEAST_NOISE.robots)),
-        free_of(solved.seen),
+        free_parameters_of_camera(solved.linearised_corners),
         arm.at(stops),
         tuple(frame_name("target", board) for board in run.session.boards).index(planned),
         tuple(run.used[index] for index in first.tolist()),
@@ -262,19 +271,21 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
     robot = robot_part(observed.arm_at(chosen).poses, run.session.mount)
     target = tuple(run.session.boards.values())[board]
     poses = [
-        choose_by(run.poses[index], pose, target)
+        choose_nearest(run.poses[index], pose, target)
         for index, pose in zip(chosen, invert(robot @ guess.x) @ guess.z, strict=True)
     ]
     ((frame, scene),) = run.scenes.items()
     problem, alone = observed.posed(poses).problem(chosen), np.ones(len(chosen), dtype=bool)
-    looks = FramesSide(problem, alone, chosen, {}).looks({frame: scene}, {frame: poses})
-    observed = replace(observed, free=free_of(looks.seen(looks.first))).posed(poses)
+    looks = CellFrameModel(problem, alone, chosen, {}).looks({frame: scene}, {frame: poses})
+    observed = replace(
+        observed, free=free_parameters_of_camera(looks.linearised(looks.first))
+    ).posed(poses)
     problem = observed.problem(chosen).merged()
     return _RecordedStart(
         problem,
         problem.start(observed.frames),
         _TYPICAL,
-        observed.free or free_of(looks.seen(looks.first)),
+        observed.free or free_parameters_of_camera(looks.linearised(looks.first)),
         observed.arm_at_stops,
         board,
         tuple(observed.first_of_stops(chosen)),
@@ -283,9 +294,13 @@ def _start_from_guess(run: RunState, guess: RoughEdges | None) -> _RecordedStart
 
 def _held_gradient(run: RunState, problem: Problem) -> FloatArray:
     """Gradient (k, 1) at held parameters of lens and boards, if any."""
-    if run.answer is None:
+    if run.assessment_or_none is None:
         return np.zeros((0, 0))
-    fitted, state, noise = run.answer.problem, run.answer.state, run.answer.noise
+    fitted, state, noise = (
+        run.assessment_or_none.problem,
+        run.assessment_or_none.state,
+        run.assessment_or_none.noise,
+    )
     gradient = normal_equations(fitted, state, noise)[1] * (fitted.counted & ~fitted.moving)
     columns = (fitted.effect_columns[effect.name] for effect in problem.effects)
     parts = [np.zeros(0), *(gradient[column.start : column.stop] for column in columns)]
@@ -294,11 +309,17 @@ def _held_gradient(run: RunState, problem: Problem) -> FloatArray:
 
 def _edge_error_root(run: RunState, start: "_RecordedStart") -> FloatArray:
     """Root (12, c) of the edges' covariance from errors of an arm without joint angles, if any."""
-    if run.answer is None or start.arm.is_modelled or "arm" not in run.answer.beside:
+    if (
+        run.assessment_or_none is None
+        or start.arm.is_modelled
+        or "arm" not in run.assessment_or_none.covariance_by_source
+    ):
         return np.zeros((12, 0))
-    columns = map(run.solved.problem.edge_columns, tuple(start.problem.unknown)[:2])
+    columns = map(run.assessment.problem.edge_columns, tuple(start.problem.unknown)[:2])
     index = np.concatenate([np.arange(column.start, column.stop) for column in columns])
-    values, vectors = np.linalg.eigh(run.answer.beside["arm"][np.ix_(index, index)])
+    values, vectors = np.linalg.eigh(
+        run.assessment_or_none.covariance_by_source["arm"][np.ix_(index, index)]
+    )
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0)))[:, values > 0.0])
 
 

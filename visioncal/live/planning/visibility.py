@@ -39,7 +39,7 @@ _RAYS, _PLANE_MARGIN = 33, 2e-3
 _FREE_SHARE, _TINY = 0.99, 1e-12
 
 
-class Window:
+class FieldOfView:
     """Field of view of a camera.
 
     A lens bends the image's sides. Points within four inner planes are in the image, points beyond
@@ -110,7 +110,7 @@ def _between(normals: FloatArray, points: FloatArray) -> Mask:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraAim:
+class BoardViews:
     """Views of a board by a camera.
 
     Attributes:
@@ -126,7 +126,7 @@ class CameraAim:
     distance_m: tuple[float, float]
     outline: FloatArray
     centre: FloatArray
-    window: Window
+    window: FieldOfView
     x: FloatArray
     z: FloatArray
 
@@ -169,7 +169,7 @@ class CameraAim:
         doubt = _MARGIN_SIGMAS * np.hypot(np.sqrt(2.0) * cell.sigma_m / distance_m, cell.sigma_rad)
         return np.asarray(cell.camera.matrix[:2].mean() * (across / distance_m + doubt))
 
-    def nearer_to(self, cam_from_target: FloatArray) -> "CameraAim":
+    def nearer_to(self, cam_from_target: FloatArray) -> "BoardViews":
         """Restricts the distances to those of (k, 4, 4) good views."""
         distance = self.distances_m(cam_from_target)
         low, high = self.distance_m
@@ -228,7 +228,7 @@ class CameraAim:
         return np.asarray(((depth >= span[0]) & (depth <= span[1])).all(axis=1))
 
 
-def sight_of(cell: PlanCell, seed: int) -> CameraAim:
+def board_views(cell: PlanCell, seed: int) -> BoardViews:
     """Prepares the views of a cell, with draws from the uncertainty of its guesses.
 
     Raises:
@@ -246,12 +246,12 @@ def sight_of(cell: PlanCell, seed: int) -> CameraAim:
         )
     drawn = cell.guesses(_GUESSES, seed)
     low, high = extent_m(cell.target)
-    return CameraAim(
+    return BoardViews(
         cell,
         cell.limits.distance_m or _distance_m(cell),
         _outline(cell.target),
         np.append(0.5 * (low + high), 0.0),
-        Window(cell.camera, cell.limits.edge_px),
+        FieldOfView(cell.camera, cell.limits.edge_px),
         np.array([plan_cell.x for plan_cell in drawn]),
         np.array([plan_cell.z for plan_cell in drawn]),
     )
@@ -260,9 +260,11 @@ def sight_of(cell: PlanCell, seed: int) -> CameraAim:
 def _distance_m(cell: PlanCell) -> tuple[float, float]:
     """Distances at which the board fills the image, or has been observed already [m]."""
     near, far = _filling_m(cell)
-    if cell.shown_m is None:
+    if cell.observed_distances_m is None:
         return near, far
-    return min(near, cell.shown_m[0] / _WIDER), max(far, _WIDER * cell.shown_m[1])
+    return min(near, cell.observed_distances_m[0] / _WIDER), max(
+        far, _WIDER * cell.observed_distances_m[1]
+    )
 
 
 def _filling_m(cell: PlanCell) -> tuple[float, float]:
@@ -291,7 +293,7 @@ def _outline(target: Target) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Shade:
+class Occlusion:
     """Occlusion of the lines of sight from the camera to points of the print.
 
     Attributes:
@@ -305,7 +307,7 @@ class Shade:
     parts: tuple[Body, ...]
 
     @classmethod
-    def of(cls, cell: PlanCell, points: FloatArray) -> "Shade":
+    def of(cls, cell: PlanCell, points: FloatArray) -> "Occlusion":
         """Prepares the bodies of a cell."""
         parts = (body for body in arm_bodies(cell.robot) if body.link < cell.robot.joint_count)
         return cls(cell, points, tuple(parts))

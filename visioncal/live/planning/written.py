@@ -54,8 +54,8 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         "cell": _cell_document(plan.cell),
         "request": _request_document(request),
     }
-    if plan.begun is not None:
-        inputs["recorded_views"] = list(plan.begun.views)
+    if plan.start is not None:
+        inputs["recorded_views"] = list(plan.start.views)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "visioncal": __version__,
@@ -65,21 +65,21 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         "purpose": request.purpose.name,
         "judged": request.purpose.errors,
         "predicted": {
-            **({} if plan.begun is None else {"before": _accuracy(design.before)}),
+            **({} if plan.start is None else {"before": _accuracy(design.before)}),
             "after": _accuracy(design.predicted),
             "all_candidates": _accuracy(design.best),
         },
         "criterion": {"name": design.criterion, "value": design.value},
     }
-    if plan.begun is not None and plan.begun.refusal:
-        document["refusal_before"] = plan.begun.refusal
+    if plan.start is not None and plan.start.refusal:
+        document["refusal_before"] = plan.start.refusal
     if design.met is not None:
         document["wish_met"] = design.met
     if plan.need is not None:
         document["need"] = {
             **_stated_values(plan.need.need),
             "probability": plan.need.probability,
-            **({} if plan.begun is None else {"probability_before": plan.need.before}),
+            **({} if plan.start is None else {"probability_before": plan.need.before}),
             "probability_of_all_candidates": plan.need.best,
         }
     if plan.shortfall:
@@ -88,7 +88,7 @@ def plan_document(plan: Plan, source: Mapping[str, str]) -> dict[str, Any]:
         "stops": [_stop_document(stop) for stop in plan.stops],
         "joints": list(plan.cell.robot.joint_names),
         "path_rad": plan.length_rad,
-        "candidates": {"found": plan.found, "lost_to": dict(plan.lost)},
+        "candidates": {"found": plan.candidate_count, "lost_to": dict(plan.lost)},
         **inputs,
     }
     if plan.in_the_way:

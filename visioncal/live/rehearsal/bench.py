@@ -151,7 +151,7 @@ class FaultInjection:
         moving = np.flatnonzero(speeds > _STOPPED_SPEED)
         return 0.0 if not len(moving) else _SAMPLING_S * float(moving[-1] + 1)
 
-    def mend(self) -> None:
+    def clear_fault(self) -> None:
         """Clears the fault, as a person would do in the cell before going on."""
         if self._fault == "link-lost":
             self._bench.restart(self.q)

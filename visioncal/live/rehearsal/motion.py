@@ -79,7 +79,7 @@ class Profile:
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class JointPath:
     """Path of the joints through postures, straight in between, without stops.
 
     Attributes:
@@ -107,13 +107,15 @@ class Way:
         return self.knots[after - 1] + slope * (place - self.distances[after - 1]), slope * speed
 
 
-def joint_way(start: FloatArray, goal: FloatArray, *, speed: float, acceleration: float) -> Way:
+def joint_path(
+    start: FloatArray, goal: FloatArray, *, speed: float, acceleration: float
+) -> JointPath:
     """Straight path of all joints between postures (n,) [rad].
 
     Speed [rad/s] and acceleration [rad/s^2] are of the joint that travels farthest.
     """
     distance = float(np.abs(goal - start).max())
-    return Way(
+    return JointPath(
         np.array([start, goal]),
         np.array([0.0, distance]),
         Profile(distance, speed, acceleration),
@@ -122,10 +124,10 @@ def joint_way(start: FloatArray, goal: FloatArray, *, speed: float, acceleration
 
 def sampled_way(
     knots: Sequence[FloatArray], distance: float, *, speed: float, acceleration: float
-) -> Way:
+) -> JointPath:
     """Path of a length [m] through evenly spaced postures (n,) [rad], at most at a speed [m/s]."""
     distances = np.linspace(0.0, distance, len(knots))
-    return Way(np.array(knots), distances, Profile(distance, speed, acceleration))
+    return JointPath(np.array(knots), distances, Profile(distance, speed, acceleration))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 
 from visioncal.core.types import FloatArray
 from visioncal.live.rehearsal.machine import Machine, flange_pose, posture, postures_to, tool_pose
-from visioncal.live.rehearsal.motion import joint_way, sampled_way
+from visioncal.live.rehearsal.motion import joint_path, sampled_way
 
 READY, DONE = 1, 2
 # Commands that repeat while they are set, and are never done.
@@ -126,7 +126,7 @@ class ControlScript:
     def _move_joints(self, goal: FloatArray, now_s: float) -> None:
         speed, acceleration = self.registers.double_in[6:8]
         q, _ = self._machine.joints(now_s)
-        self._machine.start(joint_way(q, goal, speed=speed, acceleration=acceleration), now_s)
+        self._machine.start(joint_path(q, goal, speed=speed, acceleration=acceleration), now_s)
         self._after_start(now_s)
 
     def _move_straight(self, goal: FloatArray, now_s: float) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
 from visioncal.live.rehearsal.machine import Machine
-from visioncal.live.rehearsal.motion import joint_way
+from visioncal.live.rehearsal.motion import joint_path
 
 TRUTH_PORT = 30900
 
@@ -77,7 +77,7 @@ class TruthChannel:
             q, _ = machine.joints(now_s)
             goal = np.array(request["guide"], dtype=float)
             speed, acceleration = float(request["speed"]), float(request["acceleration"])
-            machine.start(joint_way(q, goal, speed=speed, acceleration=acceleration), now_s)
+            machine.start(joint_path(q, goal, speed=speed, acceleration=acceleration), now_s)
             return {"ends": machine.ends_s}
         self._apply_fault(request["fault"], now_s)
         return {}

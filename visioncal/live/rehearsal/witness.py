@@ -13,7 +13,7 @@ from visioncal.live.capture.core import CaptureEvent
 from visioncal.live.capture.drive import JointPace
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import TakenView
-from visioncal.live.planning.read_back import PlanFile
+from visioncal.live.planning.plan_file import PlanFile
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.truth import TruthClient
 from visioncal.results import Calibration
@@ -78,7 +78,7 @@ def pace_of(
     q, motions = start_q, []
     for _, stop in zip(steps, plan.stops, strict=False):
         path = [q, *stop.via, stop.q]
-        motions.append(JointPace.of(options).way_s(path))
+        motions.append(JointPace.of(options).path_duration_s(path))
         q = stop.q
     times = [step.times for step in steps]
     motion_s, added = float(np.mean(motions)), [time.worked_s for time in times]
@@ -112,7 +112,7 @@ class EdgeCheck:
         return self.chi_square <= self.limit
 
 
-def explained(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> EdgeCheck:
+def check_edges(calibration: Calibration, transforms: Mapping[str, FloatArray]) -> EdgeCheck:
     """Tests the errors of all edges against true ones (4, 4) by name, with the joint covariance."""
     twists = np.concatenate(
         [log(invert(transforms[name]) @ edge.matrix) for name, edge in calibration.edges.items()]

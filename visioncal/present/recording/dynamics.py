@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
-from visioncal.core.files import written_beside
+from visioncal.core.files import replacing_file
 from visioncal.core.types import FloatArray
 from visioncal.dynamics import Identified, Prediction, Run
 from visioncal.present.recording import colours, paths
@@ -45,7 +45,7 @@ def write_dynamics_recording(path: Path, run: Run, blueprint: BlueprintLike | No
     """
     session = run.session
     with (
-        written_beside(path) as aside,
+        replacing_file(path) as aside,
         RecordingWriter(
             aside, session, announced=len(session.views), blueprint=blueprint, label=path
         ) as writer,

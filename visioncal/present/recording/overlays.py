@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 
 from visioncal.core.types import FloatArray
-from visioncal.present import parts
+from visioncal.present import result_parts
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.recorder import send_rows
 from visioncal.results import Calibration
@@ -45,7 +45,7 @@ class Overlay:
     ) -> "Overlay":
         """Chooses the magnification by the used views' residuals."""
         views = () if calibration is None else calibration.views
-        width = None if calibration is None else parts.image_width(calibration)
+        width = None if calibration is None else result_parts.image_width(calibration)
         if width is None:
             width = 1280 if session.resolution is None else session.resolution[0]
         used = frozenset(view.view for view in views if view.used)

@@ -10,18 +10,18 @@ import numpy.typing as npt
 import rerun as rr
 from rerun.blueprint import BlueprintLike
 
-from visioncal.core.files import written_beside
+from visioncal.core.files import replacing_file
 from visioncal.core.transforms import apply, invert
 from visioncal.core.types import Camera, FloatArray, Mount, Target
 from visioncal.dynamics.motion import JointMotion
 from visioncal.present.coverage import corners_chart, directions_chart, rotation_axes_chart
 from visioncal.present.recording import board, colours, paths
+from visioncal.present.recording.accuracy import log_map
 from visioncal.present.recording.arm import Obstacle, log_arm, log_frames, log_obstacles
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.markdown import markdown
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.scene import SMALL_FRUSTUM, frustum, log_image_plane, log_pose
-from visioncal.present.recording.workspace import log_map
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
 from visioncal.vision.camera import project
@@ -111,7 +111,7 @@ def write_preview(path: Path, preview: Preview, blueprint: BlueprintLike | None)
     Raises:
         DataError: The file cannot be written.
     """
-    with written_beside(path) as aside, Recorder(aside) as recorder:
+    with replacing_file(path) as aside, Recorder(aside) as recorder:
         stream = recorder.stream
         stream.send_recording_name(preview.name)
         recorder.lay_out(blueprint)
@@ -314,7 +314,7 @@ def write_motion_preview(
     Raises:
         DataError: The file cannot be written.
     """
-    with written_beside(path) as aside, Recorder(aside) as recorder:
+    with replacing_file(path) as aside, Recorder(aside) as recorder:
         recorder.stream.send_recording_name(preview.name)
         recorder.lay_out(blueprint)
         _log_motions(recorder.stream, preview)

@@ -12,8 +12,8 @@ from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
 from visioncal.core.files import parse_toml, sha256
 from visioncal.present.recording import codec, paths
-from visioncal.present.recording.elsewhere import ImagesElsewhere
-from visioncal.present.recording.frames import (
+from visioncal.present.recording.external_images import ExternalImages
+from visioncal.present.recording.rrd_messages import (
     CHUNK,
     MessageFrame,
     Scan,
@@ -70,7 +70,7 @@ def _images_of(path: Path, records: "_Records", complete: Sequence[int]) -> Imag
         return images
     digests = {records.image_name(index): records.rows[index].image_sha256 for index in complete}
     pictures = {name: partial(images.read, name) for name in images.places}
-    return ImagesElsewhere(
+    return ExternalImages(
         path, kept, {k: digest for k, digest in digests.items() if digest}, pictures
     )
 

@@ -11,7 +11,7 @@ import rerun as rr
 from rerun.blueprint import BlueprintLike
 
 from visioncal.present.recording import paths
-from visioncal.present.recording.frames import scan
+from visioncal.present.recording.rrd_messages import scan
 
 # Free space that one more view and the end of the file need at most.
 _ROOM_BYTES = 100_000_000

@@ -18,11 +18,11 @@ import rerun as rr
 from visioncal.core.errors import DataError
 from visioncal.core.files import sha256
 from visioncal.core.types import Corners, FloatArray
-from visioncal.present import parts
+from visioncal.present import result_parts
 from visioncal.present.recording import codec, notes, overlays, paths
-from visioncal.present.recording.frames import MessageFrame, scan
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.recorder import Recorder
+from visioncal.present.recording.rrd_messages import MessageFrame, scan
 from visioncal.present.recording.scene import SceneDrawing
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
@@ -106,7 +106,7 @@ def _draw(
     overlay = overlays.Overlay.of(session, calibration, evidence)
     scene.log_static(stream)
     if calibration is not None:
-        notes.log_static(stream, calibration, parts.stated_boards(session))
+        notes.log_static(stream, calibration, result_parts.stated_boards(session))
     seen = [evidence.get(view.number, ViewEvidence(view.number)) for view in session.views]
     scene.log_views(stream, seen)
     overlay.log_views(stream, seen)

@@ -9,21 +9,21 @@ import rerun as rr
 
 from visioncal.core.transforms import apply
 from visioncal.core.types import Camera, FloatArray, Target
-from visioncal.present import parts
-from visioncal.present.cellmap import pairs, places, sigma_words, spans
+from visioncal.present import result_parts
+from visioncal.present.network_layout import pairs, places, sigma_words, spans
 from visioncal.present.placements import target_frames
 from visioncal.present.recording import board, colours, paths
+from visioncal.present.recording.accuracy import ArmPicture, Uncertainty
 from visioncal.present.recording.arm import log_arms, placed
 from visioncal.present.recording.charts import Charts
 from visioncal.present.recording.overlays import image_frames, log_image_frames
 from visioncal.present.recording.recorder import send_rows
-from visioncal.present.recording.workspace import ArmPicture, Uncertainty
 from visioncal.results import Calibration
 from visioncal.results.evidence import ViewEvidence
 from visioncal.robot import Robot
 from visioncal.session import Session, View, frame_name
 from visioncal.session.frames import frames_of_kind
-from visioncal.session.observations import standing
+from visioncal.session.observations import robot_rows_at_stops
 from visioncal.session.table import reported_matrices
 from visioncal.vision.camera import matrix_3x3
 
@@ -71,7 +71,7 @@ def robot_states(
     poses = reported_matrices(views)
     seen = {view.view: view.base_from_flange for view in evidence.values()}
     poses |= {view: pose for view, pose in seen.items() if pose is not None}
-    (flange,) = parts.frames(calibration).robots
+    (flange,) = result_parts.frames(calibration).robots
     robot = None if calibration is None else calibration.calibrated_robot
     states = {
         view.number: RobotState(poses[view.number], view.joints_rad)
@@ -89,10 +89,10 @@ def _cell_states(
 
     A robot without a pose so far has its first one.
     """
-    rows = standing(session.declaration, session.views)
-    models = parts.calibrated_robots(calibration)
+    rows = robot_rows_at_stops(session.declaration, session.views)
+    models = result_parts.calibrated_robots(calibration)
     states: dict[str, Mapping[int, RobotState]] = {}
-    for flange, name in parts.frames(calibration).robots.items():
+    for flange, name in result_parts.frames(calibration).robots.items():
         by_view = {view: by_robot[name] for view, by_robot in rows.items() if name in by_robot}
         known = {view: _state(row, models.get(name)) for view, row in by_view.items()}
         current = next((state for state in known.values() if state is not None), None)
@@ -132,7 +132,7 @@ class SceneDrawing:
 
     session: Session
     calibration: Calibration | None
-    frames: parts.FrameHierarchy
+    frames: result_parts.FrameHierarchy
     states: Mapping[str, Mapping[int, RobotState]]
     size_m: float
     uncertainty: Uncertainty | None
@@ -144,7 +144,7 @@ class SceneDrawing:
         cls, session: Session, calibration: Calibration | None, evidence: Mapping[int, ViewEvidence]
     ) -> "SceneDrawing":
         """Collects flange poses from the evidence, or else as recorded."""
-        frames = parts.frames(calibration)
+        frames = result_parts.frames(calibration)
         states = robot_states(session, calibration, evidence)
         size_m = _size_m(frames, states)
         if calibration is None:
@@ -182,7 +182,7 @@ class SceneDrawing:
 
     def _log_things(self, stream: rr.RecordingStream, calibration: Calibration) -> None:
         """Draws image planes, boards, and the network of a cell."""
-        for frame, camera in parts.cameras(calibration).items():
+        for frame, camera in result_parts.cameras(calibration).items():
             log_image_plane(stream, camera.camera, self.size_m, frame or paths.CAM_FRAME)
         for frame, target in self._boards.items():
             sheet = board.sheet(target)
@@ -237,7 +237,7 @@ class SceneDrawing:
     @cached_property
     def _boards(self) -> Mapping[str, Target]:
         """Targets by frame, where the calibration places them."""
-        named = parts.stated_boards(self.session).items()
+        named = result_parts.stated_boards(self.session).items()
         frames = {frame_name("target", name): target for name, target in named}
         return {frame: target for frame, target in frames.items() if frame in self.frames.parents}
 
@@ -301,7 +301,7 @@ class SceneDrawing:
         # The shapes of several robots would hide each other.
         if self.calibration is None or self.calibration.cell is not None:
             return []
-        cameras = parts.cameras(self.calibration)
+        cameras = result_parts.cameras(self.calibration)
         shapes = {
             frame or paths.CAM_FRAME: frustum(camera.camera, SMALL_FRUSTUM * self.size_m)
             for frame, camera in cameras.items()
@@ -319,7 +319,9 @@ class SceneDrawing:
     ) -> None:
         """Draws a robot, or a line to its flange if its posture is unknown."""
         name = self.frames.robots[flange]
-        models = {} if self.calibration is None else parts.calibrated_robots(self.calibration)
+        models = (
+            {} if self.calibration is None else result_parts.calibrated_robots(self.calibration)
+        )
         robot, entity = models.get(name), paths.named(paths.ROBOT, name)
         arms: list[FloatArray | None] = []
         strips: list[list[FloatArray]] = []
@@ -398,7 +400,9 @@ class SceneDrawing:
         _send_strips(stream, entity, strips, rr.LineStrips3D.columns(colors=colour))
 
 
-def _size_m(frames: parts.FrameHierarchy, states: Mapping[str, Mapping[int, RobotState]]) -> float:
+def _size_m(
+    frames: result_parts.FrameHierarchy, states: Mapping[str, Mapping[int, RobotState]]
+) -> float:
     """Distance of flanges from their bases, or half the cell's extent if that is larger."""
     poses = [state.pose for by_view in states.values() for state in by_view.values()]
     distances = [float(np.linalg.norm(pose[:3, 3])) for pose in poses]

@@ -8,9 +8,9 @@ from rerun.blueprint import BlueprintLike
 
 from visioncal.core.choices import ImagesKept
 from visioncal.core.errors import DataError
-from visioncal.core.files import named_errors, sha256, written_beside
+from visioncal.core.files import named_errors, replacing_file, sha256
 from visioncal.present.recording import codec
-from visioncal.present.recording.elsewhere import ImagesElsewhere, faint_picture
+from visioncal.present.recording.external_images import ExternalImages, low_quality_jpeg
 from visioncal.present.recording.recorder import Recorder
 from visioncal.present.recording.results import log_results
 from visioncal.results import Calibration
@@ -59,7 +59,7 @@ class RecordingWriter:
         self._numbers: set[int] = set()
         self._images: dict[str, str] = {}
         store = session.images
-        self._kept = store.kept if isinstance(store, ImagesElsewhere) else images
+        self._kept = store.kept if isinstance(store, ExternalImages) else images
         with named_errors(self._label):
             if label is None:
                 path.open("xb").close()
@@ -92,7 +92,7 @@ class RecordingWriter:
         digest = "" if image is None else self._digest_of(view, image)
         shown = image
         if image is not None and self._kept != "full":
-            shown = faint_picture(image) if self._kept == "thumbnail" else None
+            shown = low_quality_jpeg(image) if self._kept == "thumbnail" else None
         self._log(view, digest, shown)
 
     def _log(self, view: View, image_sha256: str, shown: bytes | None) -> None:
@@ -132,7 +132,7 @@ class RecordingWriter:
         images = session.images
         for view in session.views:
             cells = [view.cell(column) for column in session.columns]
-            if isinstance(images, ImagesElsewhere):
+            if isinstance(images, ExternalImages):
                 checked = self._checked(cells)
                 self._log(checked, images.sha256(view.image), images.shown(view.image))
             else:
@@ -217,7 +217,7 @@ def write_recording(
         DataError: The file cannot be written, or an image of the session cannot be read.
     """
     with (
-        written_beside(path) as aside,
+        replacing_file(path) as aside,
         RecordingWriter(
             aside,
             session,

@@ -20,7 +20,7 @@ _Facts = list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
-class Signed:
+class CertificateEntries:
     """What a person adds to a certificate.
 
     Attributes:
@@ -33,7 +33,7 @@ class Signed:
 
 
 def write_certificate(
-    path: Path, calibration: Calibration, session: Session | None, signed: Signed
+    path: Path, calibration: Calibration, session: Session | None, signed: CertificateEntries
 ) -> None:
     """Writes the certificate as one HTML page that fits one sheet of A4.
 
@@ -62,7 +62,7 @@ def write_certificate(
 
 
 def _cell(
-    calibration: Calibration, session: Session | None, signed: Signed
+    calibration: Calibration, session: Session | None, signed: CertificateEntries
 ) -> Iterator[tuple[str, str]]:
     if calibration.cell is None:
         yield "Mount", calibration.mount

@@ -7,7 +7,7 @@ from markupsafe import Markup
 
 from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check
-from visioncal.calibration.verification.messages import listed_suspects, thing
+from visioncal.calibration.verification.messages import change_words, listed_suspects
 from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
@@ -26,12 +26,12 @@ _BAR, _MOST_LABELS = 0.38, 20
 def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) -> str:
     """Renders the page of a check as HTML text."""
     undone = _undone(check)
-    stops = [", ".join(map(str, views)) for views in check.seen.views]
-    before, after = _lengths(check.away), _lengths(check.left)
+    stops = [", ".join(map(str, views)) for views in check.predicted.views]
+    before, after = _lengths(check.residuals), _lengths(check.remaining)
     return template("check.html.j2").render(
         check=check,
         kind="Check of a calibration",
-        name=check.seen.known.session.name,
+        name=check.predicted.observed.session.name,
         subtitle=f"against {check.calibration.session_name}, {check.calibration.created}",
         notes=(),
         judged=verdict,
@@ -41,7 +41,7 @@ def render_check(check: Check, triggers: Sequence[Outcome], verdict: Verdict) ->
         triggers=_trigger_table(triggers),
         not_used=_reasons(
             TableRow((str(view), "not used", reason), "rejected")
-            for view, reason in sorted(check.seen.known.reasons.items())
+            for view, reason in sorted(check.predicted.observed.reasons.items())
         ),
         residuals=_residual_table(stops, before, after if undone else None),
         figure=_residuals(stops, before, after if undone else None),
@@ -93,7 +93,7 @@ def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | Non
 def _undone(check: Check) -> str:
     """Words for the change that can be undone; empty if there is none, as for mere noise."""
     change = check.named[0] if check.named else None
-    return "" if change is None or change.name == NOISE else thing(check, change)
+    return "" if change is None or change.name == NOISE else change_words(check, change)
 
 
 def _change_table(check: Check) -> Table:
@@ -104,7 +104,7 @@ def _change_table(check: Check) -> Table:
         cells = (
             f"{share:.0f} %" if share >= 1.0 else f"{share:.1g} %",
             "found" if is_found else "ruled out",
-            thing(check, suspect),
+            change_words(check, suspect),
         )
         rows.append(TableRow(cells, "left-out" if is_found else "rejected"))
     return _reasons(rows, ("share", "", "change"))

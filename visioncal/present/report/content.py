@@ -6,10 +6,10 @@ import numpy as np
 
 from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
 from visioncal.core.types import FloatArray
-from visioncal.present import parts
+from visioncal.present import result_parts
 from visioncal.present.advice import mark_of
-from visioncal.present.cellmap import weakest_frame
 from visioncal.present.facts import DEGREE, PLUS_MINUS, answering_solver, frame_words, of
+from visioncal.present.network_layout import weakest_frame
 from visioncal.present.tables import Fact, Table, TableRow
 from visioncal.results import Calibration, CameraResult, Edge, NeedMet, Verdict
 from visioncal.results.compare import intrinsics_names
@@ -157,10 +157,10 @@ def method_facts(calibration: Calibration) -> tuple[Fact, ...]:
             else "a closed form"
         )
         facts.append(Fact("solver", solver, note))
-    for name, robot in parts.robots(calibration).items():
+    for name, robot in result_parts.robots(calibration).items():
         model = str(robot.document.get("name", "given"))
         facts.append(Fact(f"robot model{of(name)}", model))
-    for name, camera in parts.cameras(calibration).items():
+    for name, camera in result_parts.cameras(calibration).items():
         width, height = camera.camera.resolution
         size = f"{camera.camera.model}, {width} \N{MULTIPLICATION SIGN} {height} px"
         facts.append(Fact(name or "camera", size))

@@ -13,7 +13,7 @@ from visioncal.dynamics import (
     Run,
     friction_at,
     judge,
-    left_for_friction,
+    measured_friction,
     stribeck_rows,
 )
 from visioncal.present import facts
@@ -171,7 +171,7 @@ def _friction_panel(
 
 def _samples(identified: Identified, prediction: Prediction, joint: int) -> FloatArray:
     """(k, 2) speed and friction torque of the samples in the fit."""
-    friction_nm = left_for_friction(identified, prediction)
+    friction_nm = measured_friction(identified, prediction)
     return np.column_stack([prediction.dq[:, joint], friction_nm[:, joint]])[
         prediction.used[:, joint]
     ]

@@ -7,8 +7,15 @@ from markupsafe import Markup
 
 from visioncal.core.number_format import counted, significant
 from visioncal.core.types import FloatArray
-from visioncal.present.cellmap import SeenPair, pairs, places, sigma_words, spans, weakest_frame
 from visioncal.present.facts import DEGREE
+from visioncal.present.network_layout import (
+    SeenPair,
+    pairs,
+    places,
+    sigma_words,
+    spans,
+    weakest_frame,
+)
 from visioncal.present.report import svg
 from visioncal.present.report.axes import Box, Panel, Scale
 from visioncal.present.report.svg import Figure

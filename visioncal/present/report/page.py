@@ -11,7 +11,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.files import write_atomically
 from visioncal.core.number_format import significant
-from visioncal.present import advice, facts, parts
+from visioncal.present import advice, facts, result_parts
 from visioncal.present.advice import named
 from visioncal.present.report import content, network
 from visioncal.present.report.templates import template
@@ -95,7 +95,7 @@ def _pictures(
     extremes = _extremes(views, seen)
     # One magnification for all pictures, so that they can be compared.
     shown = [seen[view.view] for _, view in extremes]
-    magnify = magnification(shown, parts.image_width(calibration) or 0)
+    magnify = magnification(shown, result_parts.image_width(calibration) or 0)
     pictures = None if session is None else _Pictures(session, seen)
     return {
         "used_pictures": pictures.of_used(extremes, magnify) if pictures else [],

@@ -8,13 +8,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from visioncal.core.number_format import significant
 from visioncal.core.version import __version__
-from visioncal.present import advice, arms, details, facts, parts, torques
+from visioncal.present import advice, arms, details, facts, result_parts, torques
 from visioncal.present.report import armplots, content, network, plots, sources
 
 _DEPENDENCIES = ("numpy", "scipy", "opencv-contrib-python-headless", "pin", "rerun-sdk")
 # Modules whose functions the templates call.
 _CALLED = (
-    *(parts, facts, arms, details, torques, advice),
+    *(result_parts, facts, arms, details, torques, advice),
     *(content, network, plots, armplots, sources),
 )
 

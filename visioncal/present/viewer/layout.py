@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
-from visioncal.present import parts
+from visioncal.present import result_parts
 from visioncal.present.coverage import AXES_RINGS_DEG, DIRECTIONS_RINGS_DEG
 from visioncal.present.recording import colours, paths
 from visioncal.results import Calibration, CellResult
@@ -292,7 +292,7 @@ def _disc(name: str, entity: str, rings_deg: tuple[int, ...]) -> rrb.Spatial2DVi
 
 def _eye(session: Session, calibration: Calibration | None) -> rrb.EyeControls3D | None:
     """Views the cell from the side so that it fills the view; None without known positions."""
-    frames = parts.frames(calibration)
+    frames = result_parts.frames(calibration)
     parents = {paths.CELL_FRAME, paths.BASE_FRAME}
     fixed = [
         matrix[:3, 3]

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 
-from visioncal.core.interrupts import ended_like_ctrl_c
+from visioncal.core.interrupts import signals_as_interrupts
 
 _PATIENCE_S = 5.0
 # Nothing listens at the port of the discard service.
@@ -52,7 +52,7 @@ def free_port() -> int:
 @contextmanager
 def until_interrupted() -> Iterator[None]:
     """Runs a block that Ctrl-C or SIGTERM ends without an error."""
-    with suppress(KeyboardInterrupt), ended_like_ctrl_c("SIGINT", "SIGTERM"):
+    with suppress(KeyboardInterrupt), signals_as_interrupts("SIGINT", "SIGTERM"):
         yield
 
 

@@ -22,7 +22,7 @@ from visioncal.core.transforms import (
 from visioncal.core.types import FloatArray, Mask
 from visioncal.results import Calibration
 from visioncal.results.arm import WorkspacePlace
-from visioncal.robot import Loads, Robot, bends
+from visioncal.robot import Loads, Robot, joint_deflections
 from visioncal.robot.inverse import Inverse, Posture
 from visioncal.session.choosing import ARM, Choice
 
@@ -95,7 +95,9 @@ class CalibratedArm:
         """
         if not self.compliance.any() and self.weight_moments is None:
             return q
-        return np.asarray(q - bends(self.real, q, self.compliance, loads, self.weight_moments))
+        return np.asarray(
+            q - joint_deflections(self.real, q, self.compliance, loads, self.weight_moments)
+        )
 
     def turns_deg_per_mm(self, q: FloatArray) -> FloatArray:
         """Largest joint rotation for a millimetre of the flange at constant orientation.

@@ -26,8 +26,8 @@ import numpy.typing as npt
 
 from visioncal.core.types import FloatArray, Image, IntArray, Mask, Target
 from visioncal.vision.dense.blur import DRAWN_PX, Blur, transfer
+from visioncal.vision.dense.board_rendering import Print, board_positions
 from visioncal.vision.dense.library import ONE_TORCH_THREAD, library
-from visioncal.vision.dense.shown import Print, board_places
 from visioncal.vision.finders.maps import maps_about
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def fit_corners(
         The corners in the same order; None if they are too few, do not form a board, or scatter
         more than before.
     """
-    board = board_places(target, ids)
+    board = board_positions(target, ids)
     flat = all(np.linalg.matrix_rank(array - array.mean(axis=0)) == 2 for array in (board, px))
     if len(ids) < _MIN_CORNERS or not flat:
         return None

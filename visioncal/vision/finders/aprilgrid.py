@@ -55,7 +55,7 @@ def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
     if own.sum() <= 0.5 * len(own):
         others = ", ".join(map(str, ids[~own][:5].tolist()))
         return NotFound(f"most tags seen ({others}) are none of the target's", misfit=True)
-    px, misfit = laid(target, numbers, px, own)
+    px, misfit = ordered_tags(target, numbers, px, own)
     if misfit > LAYOUT_MISFIT:
         return NotFound("the tags do not lie as the target describes them", misfit=True)
     size = f"the target's {target.columns} x {target.rows}"
@@ -67,7 +67,7 @@ def find_aprilgrid(image: Image, target: Target) -> DetectedCorners | NotFound:
     if not _has_squares(image, px, target.spacing):
         return NotFound(LACKS_SQUARES, misfit=True)
     px = refined_tags(image, px, target.spacing)
-    spacing = seen_spacing(target, numbers, px)
+    spacing = measured_spacing(target, numbers, px)
     if abs(spacing - target.spacing) > _SPACING:
         if _has_other_border(image, target, ids):
             return border
@@ -141,7 +141,9 @@ def _copies(image: Image) -> Iterator[_Copy]:
     yield _Copy(np.asarray(cv2.dilate(image, np.ones((3, 3), np.uint8)), np.uint8), 1.0, _LITTLE)
 
 
-def laid(target: Target, numbers: IntArray, px: FloatArray, own: Mask) -> tuple[FloatArray, float]:
+def ordered_tags(
+    target: Target, numbers: IntArray, px: FloatArray, own: Mask
+) -> tuple[FloatArray, float]:
     """Orders the corners of tags as on the page, and measures the layout's misfit.
 
     Args:
@@ -205,7 +207,7 @@ def refined_tags(image: Image, px: FloatArray, spacing: float) -> FloatArray:
     return np.where(strays, start, refined).reshape(px.shape).astype(float)
 
 
-def seen_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
+def measured_spacing(target: Target, numbers: IntArray, px: FloatArray) -> float:
     """Measured gap between tags [sides]; the stated one if too few tags are adjacent.
 
     Four corners of two collinear tags lie at 0, 1, 1 + s and 2 + s. Their cross-ratio (AC BD) / (BC

@@ -16,7 +16,7 @@ from visioncal.vision.finders.identify_aprilgrid import find_grid
 from visioncal.vision.finders.identify_charuco import LEAST_MARKERS, Lattice, find_lattices
 from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.identify_markers import Marker, decode_markers, genuine, holding
-from visioncal.vision.finders.imaging import check_grey, why_hard_to_see
+from visioncal.vision.finders.imaging import check_grey, poor_image_reason
 from visioncal.vision.finders.result import DetectedCorners
 from visioncal.vision.targets import DEFAULT_RELATIVE_SIGMA
 
@@ -134,7 +134,7 @@ def identify(image: Image) -> Identity:
             note = f"It is found only in the picture reduced to {small.shape[1]} pixels in width."
             square_px = identity.square_px / scale
             return replace(identity, square_px=square_px, notes=(note, *identity.notes))
-    why = why_hard_to_see(image, _MAX_BLUR_PX)
+    why = poor_image_reason(image, _MAX_BLUR_PX)
     height, width = image.shape
     raise DataError(
         f"No target is seen in this image of {width} x {height} pixels"

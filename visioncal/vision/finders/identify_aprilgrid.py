@@ -13,9 +13,9 @@ from visioncal.vision.finders.aprilgrid import (
     find_aprilgrid,
     grid_tags,
     lacks_a_line,
-    laid,
+    measured_spacing,
+    ordered_tags,
     refined_tags,
-    seen_spacing,
 )
 from visioncal.vision.finders.layout import LAYOUT_MISFIT
 from visioncal.vision.finders.result import DetectedCorners
@@ -58,8 +58,8 @@ def find_grid(image: Image) -> Grid | None:
     rows = int((ids.max() - first) // columns) + 1
     target = _target(columns, rows, first, border)
     numbers, all_tags = ids - first, np.ones(len(ids), bool)
-    quads = refined_tags(image, laid(target, numbers, px, all_tags)[0], _USUAL_SPACING)
-    target = replace(target, spacing=round(seen_spacing(target, numbers, quads), 2))
+    quads = refined_tags(image, ordered_tags(target, numbers, px, all_tags)[0], _USUAL_SPACING)
+    target = replace(target, spacing=round(measured_spacing(target, numbers, quads), 2))
     # Rows below the image are included, as ids start with 0.
     if first and not lacks_a_line(image, *_one_more(target, numbers, below=True), quads):
         target = replace(target, rows=rows + first // columns, marker_id=first % columns)
@@ -81,7 +81,7 @@ def _columns(ids: IntArray, px: FloatArray, border: int) -> tuple[int, int]:
         for columns, first in starts:
             numbers = ids - first + columns * (first > 0)
             target = _target(columns, int(numbers.max()) // columns + 1, 0, border)
-            misfits[columns, first] = laid(target, numbers, px, all_tags)[1]
+            misfits[columns, first] = ordered_tags(target, numbers, px, all_tags)[1]
         best = min(misfits, key=lambda key: misfits[key], default=(0, 0))
         if misfits.get(best, np.inf) <= LAYOUT_MISFIT:
             return best

@@ -19,8 +19,8 @@ from visioncal.vision.finders.identify_plane import (
     Lens,
     Plane,
     alternating,
-    bent_plane,
     contrasts,
+    distorted_plane,
     lens_of,
     robust_plane,
     typical_contrast,
@@ -136,7 +136,7 @@ def _lattice(image: Image, markers: Sequence[Marker], fit: _Fit) -> Lattice:
     squares = _places(np.array([marker.number for marker in fitting]), fit.columns, fit.legacy)
     on_board = (squares + 0.5)[:, None] + fit.share * _AROUND
     in_image = np.concatenate([marker.px for marker in fitting])
-    fit = replace(fit, plane=bent_plane(fit.plane, on_board.reshape(-1, 2), in_image))
+    fit = replace(fit, plane=distorted_plane(fit.plane, on_board.reshape(-1, 2), in_image))
     rows, certain = _rows(image, fit, int(squares[:, 1].max()) + 1)
     modules = modules_along(fitting[0].family)
     share, sigma = marker_share(image, fit.plane, squares, modules, fit.share)
@@ -167,7 +167,7 @@ def _fit(lens: Lens, columns: int, legacy: bool, markers: Sequence[Marker]) -> _
     if robust is None or robust[1].sum() < LEAST_MARKERS:
         return None
     plane, inliers = robust
-    plane = bent_plane(plane, places[inliers] + 0.5, centres[inliers]) if lens.bend else plane
+    plane = distorted_plane(plane, places[inliers] + 0.5, centres[inliers]) if lens.bend else plane
     corners = np.array([marker.px for marker in markers])
     offsets = plane.to_board(corners.reshape(-1, 2)).reshape(-1, 4, 2) - (places + 0.5)[:, None]
     # Projections onto an ideal marker's corners, whose squared norm is two.

@@ -10,8 +10,8 @@ from visioncal.vision.finders.identify_plane import (
     BENDS,
     Plane,
     alternating,
-    bent_plane,
     contrasts,
+    distorted_plane,
     lens_of,
     robust_plane,
     typical_contrast,
@@ -148,7 +148,7 @@ def _plane(image: Image, corners: FloatArray, px: FloatArray) -> Plane | None:
     if not candidates:
         return None
     plane, inliers = max(candidates, key=lambda pair: int(pair[1].sum()))
-    return bent_plane(plane, corners[inliers], px[inliers])
+    return distorted_plane(plane, corners[inliers], px[inliers])
 
 
 def _side_px(plane: Plane, extent: _Extent) -> float:

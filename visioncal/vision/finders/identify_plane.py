@@ -127,7 +127,7 @@ def robust_plane(
     return Plane(lens, np.asarray(homography, dtype=float)), np.ravel(mask) > 0
 
 
-def bent_plane(plane: Plane, board: FloatArray, px: FloatArray) -> Plane:
+def distorted_plane(plane: Plane, board: FloatArray, px: FloatArray) -> Plane:
     """Fits the plane with its distortion to (n, 2) inliers."""
     if len(board) < _LEAST_FOR_BEND:
         return plane

@@ -160,7 +160,7 @@ def blur_at_corners(image: Image, px: FloatArray) -> float:
     return float(np.median(_edge_sigma(image[rows[:, :, None], columns[:, None, :]])))
 
 
-def why_hard_to_see(image: Image, max_blur_px: float) -> str:
+def poor_image_reason(image: Image, max_blur_px: float) -> str:
     """Reason why a target is hard to detect: low contrast, or blur; empty if neither."""
     low, high = np.percentile(image[::4, ::4], [2, 98])
     if high - low < _LEAST_CONTRAST:

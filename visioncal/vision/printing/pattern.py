@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visioncal.core.types import FloatArray, Mask, Target
-from visioncal.vision.prints import dark_cells, dark_discs
+from visioncal.vision.print_shapes import dark_cells, dark_discs
 from visioncal.vision.targets import extent_m
 
 # Quiet zone that detectors need around squares; markers need one module.

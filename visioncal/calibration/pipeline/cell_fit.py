@@ -8,116 +8,119 @@ import numpy as np
 
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.cell import Cell, ObservationRow
-from visioncal.calibration.stages.fit_messages import found_of_looks
+from visioncal.calibration.stages.fit_messages import lens_and_board_findings
+from visioncal.calibration.stages.frame_model import CellFrameModel
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.side import FramesSide
 from visioncal.calibration.stages.turned_images import ImageTurn
 from visioncal.calibration.stages.validate import chain_rms_px
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.core.verdict import Finding
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import ConvergedFit
-from visioncal.estimation.outliers import Agreed
-from visioncal.estimation.parts import Effect, State
+from visioncal.estimation.outliers import InlierFit
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, State
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class CellFit:
     """The fit of a cell.
 
     Attributes:
         cell: The cell; its rows are the observations in the fit's order.
-        agreed: The inliers, their fit, and the frames that moved.
-        seen: Linearised corners of lenses and boards; None without images.
+        inlier_fit: The inliers, their fit, and the frames that moved.
+        linearised_corners: Linearised corners of lenses and boards; None without images.
         poses: The pose chosen for each row.
-        untied: Frames that no observation links to the rest.
+        unconnected: Frames that no observation links to the rest.
         arms: The robots' arms, as far as they were calibrated.
-        asked: The requested calibration level of the arms.
-        late: The errors of clocks, as effects.
+        level: The requested calibration level of the arms.
+        clock_effects: The errors of clocks, as effects.
         turned: How images of outliers were turned or mirrored, by view.
         solver: The solver of the edges.
     """
 
     cell: Cell
-    agreed: Agreed
-    seen: LinearisedCorners | None
+    inlier_fit: InlierFit
+    linearised_corners: LinearisedCorners | None
     poses: tuple[ViewPoses, ...]
-    untied: tuple[str, ...]
+    unconnected: tuple[str, ...]
     arms: Mapping[str, RobotArm]
-    asked: str
-    late: tuple[Effect, ...]
+    level: str
+    clock_effects: tuple[Effect, ...]
     turned: Mapping[int, ImageTurn] = field(default_factory=dict)
     solver: str = "joint"
 
     @property
-    def part(self) -> Problem:
+    def inlier_problem(self) -> Problem:
         """The problem of the inliers."""
-        return self.agreed.part
+        return self.inlier_fit.part
 
     @property
-    def side(self) -> FramesSide:
+    def frame_model(self) -> CellFrameModel:
         """The frames' side of the joint fit."""
-        agreed, views = self.agreed, [row.view for row in self.cell.rows]
-        return FramesSide(
-            agreed.problem, agreed.used, views, self.arms, self.late, agreed.fit.noise
+        agreed, views = self.inlier_fit, [row.view for row in self.cell.rows]
+        return CellFrameModel(
+            agreed.problem, agreed.used, views, self.arms, self.clock_effects, agreed.fit.noise
         )
 
     @property
     def frames(self) -> dict[str, FloatArray]:
         """Poses (4, 4) of the unknown frames in their parents."""
-        return self.agreed.problem.frames(self.agreed.fit.state)
+        return self.inlier_fit.problem.frames(self.inlier_fit.fit.state)
 
-    def posed(self) -> Self:
+    def with_arm_poses(self) -> Self:
         """Replaces the robots' poses by those of their arms."""
-        problem, arms = self.agreed.problem, self.arms.items()
+        problem, arms = self.inlier_fit.problem, self.arms.items()
         poses = {**problem.poses, **{name: arm.poses for name, arm in arms}}
-        return replace(self, agreed=replace(self.agreed, problem=replace(problem, poses=poses)))
+        inlier_fit = replace(self.inlier_fit, problem=replace(problem, poses=poses))
+        return replace(self, inlier_fit=inlier_fit)
 
-    def settled(self, side: FramesSide, fitted: ConvergedFit) -> Self:
+    def with_joint_fit(self, side: CellFrameModel, fitted: ConvergedFit) -> Self:
         """Takes over a joint fit of lenses, boards and frames."""
-        agreed = replace(self.agreed, problem=side.whole(fitted.seen), fit=fitted.fit)
-        return replace(self, agreed=agreed, seen=fitted.seen, arms=side.arms)
+        problem = side.full_problem(fitted.linearised)
+        inlier_fit = replace(self.inlier_fit, problem=problem, fit=fitted.fit)
+        corners, arms = fitted.linearised, side.arms
+        return replace(self, inlier_fit=inlier_fit, linearised_corners=corners, arms=arms)
 
-    def found_of_looks(self, covariance: FloatArray) -> Iterator[Finding]:
+    def camera_findings(self, covariance: FloatArray) -> Iterator[Finding]:
         """Findings on lenses and boards; see `stages.fit_messages`."""
-        if self.seen is not None:
-            fitted = ConvergedFit(self.seen, self.part, self.agreed.fit)
+        if self.linearised_corners is not None:
+            fitted = ConvergedFit(self.linearised_corners, self.inlier_problem, self.inlier_fit.fit)
             arms, stated = self.arms.values(), None
             if any(arm.model is not None for arm in arms):
-                stated = self.part
+                stated = self.inlier_problem
                 for arm in arms:
                     stated = arm.without_errors(stated)
-            yield from found_of_looks(self.side, fitted, covariance, stated)
+            yield from lens_and_board_findings(self.frame_model, fitted, covariance, stated)
 
     @property
-    def shown_px(self) -> dict[str, float]:
+    def residual_px(self) -> dict[str, float]:
         """Standard deviation of corner residuals of each camera, per axis [px]."""
-        if self.seen is None:
+        if self.linearised_corners is None:
             return {}
-        looks, sigmas_px = self.seen.looks, {}
+        looks, sigmas_px = self.linearised_corners.camera_parameters, {}
         for (camera, problem), corners in zip(
-            looks.problems.items(), self.seen.compressed, strict=True
+            looks.problems.items(), self.linearised_corners.compressed, strict=True
         ):
-            moving = np.flatnonzero(np.isin(looks.places(camera), self.seen.moving))
+            moving = np.flatnonzero(np.isin(looks.places(camera), self.linearised_corners.moving))
             unknowns = problem.unknowns(corners, moving)
             sigmas_px[camera] = problem.stack.shown_px(corners.residuals, unknowns)
         return sigmas_px
 
     @property
-    def looks(self) -> CameraParameters | None:
+    def camera_parameters(self) -> CameraParameters | None:
         """Estimated lenses and boards; None without images."""
-        return self.looks_at(self.agreed.fit.state)
+        return self.camera_parameters_at(self.inlier_fit.fit.state)
 
-    def looks_at(self, state: State) -> CameraParameters | None:
+    def camera_parameters_at(self, state: State) -> CameraParameters | None:
         """Lenses and boards at a state; None without images."""
-        if self.seen is None:
+        if self.linearised_corners is None:
             return None
-        free = self.seen.free
-        values = self.agreed.problem.values_of(LENSES, state)[: len(free)]
-        return self.seen.looks.with_values(free, values)
+        free = self.linearised_corners.free
+        values = self.inlier_fit.problem.values_of(LENSES, state)[: len(free)]
+        return self.linearised_corners.camera_parameters.with_values(free, values)
 
-    def chain_px(self, rows: IntArray, state: State) -> FloatArray:
+    def reprojection_px(self, rows: IntArray, state: State) -> FloatArray:
         """Reprojection errors (m,) [px] of some observations through the chain; NaN for none.
 
         Args:
@@ -125,7 +128,7 @@ class Solved:
             state: The unknowns of this fit, or of one to a subset of the observations.
         """
         chosen = np.isin(np.arange(len(self.cell.rows)), rows)
-        poses = self.agreed.problem.subset(chosen).predicted(state)
+        poses = self.inlier_fit.problem.subset(chosen).predicted(state)
         cell_rows = [self.cell.rows[index] for index in rows]
         return self.pixels(cell_rows, [self.poses[index] for index in rows], poses, state)
 
@@ -137,7 +140,7 @@ class Solved:
         state: State,
     ) -> FloatArray:
         """Reprojection errors (m,) [px] of views, given (m, 4, 4) poses of their targets."""
-        looks = self.looks_at(state)
+        looks = self.camera_parameters_at(state)
         if looks is None:
             return np.full(len(rows), np.nan)
         lenses = {problem: looks.camera(problem) for problem in looks.problems}
@@ -147,17 +150,20 @@ class Solved:
     @property
     def lens_columns(self) -> slice:
         """The problem's columns of lenses and boards, and of lens errors beyond their models."""
-        return self.agreed.problem.effect_columns.get(LENSES, slice(0, 0))
+        return self.inlier_fit.problem.effect_columns.get(LENSES, slice(0, 0))
 
     @property
     def field_columns(self) -> IntArray:
         """The problem's columns of lens errors beyond their models."""
-        columns, free = self.lens_columns, 0 if self.seen is None else len(self.seen.free)
+        columns, free = (
+            self.lens_columns,
+            0 if self.linearised_corners is None else len(self.linearised_corners.free),
+        )
         return np.arange(columns.start + free, columns.stop)
 
     def columns_of(self, indices: IntArray) -> IntArray:
         """The problem's columns of free values of lenses and boards, given their indices."""
-        free = np.zeros(0) if self.seen is None else self.seen.free
+        free = np.zeros(0) if self.linearised_corners is None else self.linearised_corners.free
         return np.asarray(self.lens_columns.start + np.searchsorted(free, indices))
 
 

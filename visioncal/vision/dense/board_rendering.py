@@ -105,7 +105,7 @@ def _nearest(lines: "Tensor", positions: "Tensor", sigma: "Tensor") -> "tuple[Te
     return index, torch.special.ndtr((positions - lines[index]) / sigma)
 
 
-def board_places(target: Target, ids: IntArray) -> FloatArray:
+def board_positions(target: Target, ids: IntArray) -> FloatArray:
     """(n, 2) corner positions on the board [squares]."""
     return np.asarray(corner_positions(target)[ids, :2] / target.square_m)
 
@@ -115,17 +115,17 @@ class DenseImage:
     """A rendered image and its difference from the actual one.
 
     Attributes:
-        drawn: (h, w) the rendered board within the image.
-        rest: (h, w) image less rendering, magnified by `MAGNIFIED` about `MIDDLE`.
-        rest_rms: Rms difference on the board [grey levels].
+        rendered: (h, w) the rendered board within the image.
+        difference: (h, w) image less rendering, magnified by `MAGNIFIED` about `MIDDLE`.
+        difference_rms: Rms difference on the board [grey levels].
     """
 
-    drawn: Image
-    rest: Image
-    rest_rms: float
+    rendered: Image
+    difference: Image
+    difference_rms: float
 
 
-def explain(
+def render_board(
     image: Image,
     target: Target,
     ids: IntArray,
@@ -151,7 +151,7 @@ def explain(
     """
     if len(ids) < _FEWEST or not np.isfinite(px).all():
         return None
-    torch, printed, board = library("torch"), Print.of(target), board_places(target, ids)
+    torch, printed, board = library("torch"), Print.of(target), board_positions(target, ids)
     with ONE_TORCH_THREAD.held(), torch.inference_mode(), suppress(np.linalg.LinAlgError):
         on_board = map_of_all(board, normalise(camera, px))
         low, high = _region(px, board, image)

@@ -16,7 +16,7 @@ _FAINT_QUALITY = 15
 
 
 @dataclass(frozen=True, eq=False)
-class ImagesElsewhere(ImageStore):
+class ExternalImages(ImageStore):
     """Images of a session whose recording was written without them.
 
     Attributes:
@@ -58,7 +58,7 @@ class ImagesElsewhere(ImageStore):
         return f"is not in {self.path.name}, which was written with --images {self.kept}"
 
 
-def faint_picture(image: bytes) -> bytes | None:
+def low_quality_jpeg(image: bytes) -> bytes | None:
     """Low-quality JPEG at an image's size; None if the bytes are no image."""
     pixels = decode_image(image, colour=True)
     if isinstance(pixels, str):

@@ -9,7 +9,7 @@ import numpy as np
 
 from visioncal.core.transforms import exp, inverse_right_jacobian, log
 from visioncal.core.types import FloatArray, IntArray, Mask
-from visioncal.estimation.variance import Knowledge
+from visioncal.estimation.variance import PriorInformation
 
 # Variances of undetermined directions of a pose are larger [rad^2].
 _UNDETERMINED_VARIANCE = 0.05
@@ -91,28 +91,28 @@ class Effect:
     Attributes:
         name: Its name, as `lens and board` or `arm a`.
         values: (k,) linearisation point.
-        known: Prior, as information (k, k) and half its gradient (k,) at these values.
+        prior: Prior, as information (k, k) and half its gradient (k,) at these values.
         held: (k,) mask of the values that are held, and count in the covariance.
         by_sensor: (n, 6, k) right Jacobian of the measured poses; None for zero.
         flange_jacobian: By robot, (s, 6, k) right Jacobian of its flange at each stop.
-        concerned: (n,) the observations to which `flange_jacobian` applies; None for all.
+        rows_concerned: (n,) the observations to which `flange_jacobian` applies; None for all.
         random: Number of the last values that are random coefficients, which no stop determines.
     """
 
     name: str
     values: FloatArray
-    known: Knowledge
+    prior: PriorInformation
     held: Mask
     by_sensor: FloatArray | None = None
     flange_jacobian: Mapping[str, FloatArray] = field(default_factory=dict)
-    concerned: Mask | None = None
+    rows_concerned: Mask | None = None
     random: int = 0
 
     @classmethod
     def free(
         cls,
         name: str,
-        known: Knowledge,
+        known: PriorInformation,
         by_sensor: FloatArray | None = None,
         flange_jacobian: Mapping[str, FloatArray] = MappingProxyType({}),
     ) -> "Effect":
@@ -129,11 +129,11 @@ class Effect:
     def determined(self) -> "Effect":
         """The effect without its random coefficients."""
         kept = len(self) - self.random
-        information = self.known.information[:kept, :kept]
+        information = self.prior.information[:kept, :kept]
         return replace(
             self,
             values=self.values[:kept],
-            known=Knowledge(information, self.known.gradient[:kept]),
+            prior=PriorInformation(information, self.prior.gradient[:kept]),
             held=self.held[:kept],
             by_sensor=None if self.by_sensor is None else self.by_sensor[:, :, :kept],
             random=0,
@@ -144,7 +144,7 @@ class Effect:
         return replace(
             self,
             by_sensor=None if self.by_sensor is None else self.by_sensor[rows],
-            concerned=None if self.concerned is None else self.concerned[rows],
+            rows_concerned=None if self.rows_concerned is None else self.rows_concerned[rows],
         )
 
     def carried(self, by: FloatArray) -> "Effect":
@@ -161,7 +161,11 @@ class Effect:
         if robot not in self.flange_jacobian:
             return np.zeros((len(stops), 6, len(self)))
         jacobian = self.flange_jacobian[robot][stops]
-        return jacobian if self.concerned is None else jacobian * self.concerned[:, None, None]
+        return (
+            jacobian
+            if self.rows_concerned is None
+            else jacobian * self.rows_concerned[:, None, None]
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,7 +137,7 @@ def sole_static_view(cell: Cell, frame: str) -> StandingTie | None:
     """
     tree = cell.tree
     moving = [row for row in cell.rows if any(step.robot for step in tree.path(row.seer, row.seen))]
-    connected = replace(cell, rows=tuple(moving)).tied()
+    connected = replace(cell, rows=tuple(moving)).connected_frames()
     pairs = {
         (row.seer, row.seen)
         for row in cell.rows
@@ -161,7 +161,7 @@ def connection_advice(cell: Cell, frame: str) -> str:
     carried = [name for name in tree.branches if frame in tree.above(name)]
     cameras = [name for name in carried if name.startswith("cam")]
     boards = [name for name in carried if name.startswith("target")]
-    others = [name for name in cell.tied() if name not in carried]
+    others = [name for name in cell.connected_frames() if name not in carried]
     seeing = [other for other in others if other.startswith("cam")]
     lying = [other for other in others if other.startswith("target")]
     ways = []

@@ -23,10 +23,10 @@ from visioncal.estimation.slight_steps import (
     Slip,
     differs_elsewhere,
     evidence_gain,
+    find_slight_move,
     leaves_noise,
     log_gain,
     resized_board,
-    slight_move,
     slipped_joint,
 )
 from visioncal.estimation.solve import Solution
@@ -45,20 +45,20 @@ class ResidualTest:
     """Deviations of the residuals of one robot's stops from noise.
 
     Attributes:
-        alike: Correlation of neighbouring stops; None for an arm whose joints are not known, as
-            its covariance includes that.
-        moved: Drift of its base or of what it observes; None where noise explains it.
+        neighbours: Correlation of neighbouring stops; None for an arm whose joints are not known,
+            as its covariance includes that.
+        drift: Drift of its base or of what it observes; None where noise explains it.
         step: Sudden change that explains more than a drift; None without one.
         rival: Another step that explains about as much; None without one.
     """
 
-    alike: Neighbours | None
-    moved: Drift | None
+    neighbours: Neighbours | None
+    drift: Drift | None
     step: Step | None = None
     rival: Step | None = None
 
 
-def misfits(
+def residual_tests(
     problem: Problem,
     fit: Solution,
     errors: Mapping[str, ArmErrors],
@@ -106,10 +106,10 @@ def _slight_move(problem: Problem, fit: Solution) -> Move | None:
     # A push shifts positions alone, and dominates their noise: with few views, no test by the noise
     # of all residuals finds it.
     frames = tuple(problem.unknown)
-    push = slight_move(problem, fit, frames, kinds=2)
+    push = find_slight_move(problem, fit, frames, kinds=2)
     if push is None:
         return None
-    if (move := slight_move(problem, fit, frames)) is not None:
+    if (move := find_slight_move(problem, fit, frames)) is not None:
         return move
     gain, *_ = evidence_gain(problem, fit, push)
     return push if gain - _search_penalty(problem) > _CLEARLY else None
@@ -160,7 +160,7 @@ def _beside_errors(
             yield replace(step, mahalanobis_sq=gain)
 
 
-def doubts(
+def residual_findings(
     found: ResidualTest,
     arm: ArmErrors | None,
     cell: Cell,
@@ -177,7 +177,7 @@ def doubts(
         joint: Function that gives the joint of a slip in words.
         calibrated: Whether the arm was calibrated.
     """
-    alike, moved = found.alike, found.moved
+    alike, moved = found.neighbours, found.drift
     if arm is not None and arm.is_significant and not calibrated and arm.of_links:
         size = mm_and_deg(1e3 * LEVER_M * arm.sigma, float(np.rad2deg(arm.sigma)))
         yield Finding(
@@ -193,8 +193,8 @@ def doubts(
             until_mm=0.0,
             mahalanobis_sq=arm.gain,
         )
-    if arm is not None and arm.is_significant and arm.look is not None:
-        yield _arm_errors_finding(arm, *(np.sqrt(3.0) * arm.look).tolist())
+    if arm is not None and arm.is_significant and arm.fit_sigmas is not None:
+        yield _arm_errors_finding(arm, *(np.sqrt(3.0) * arm.fit_sigmas).tolist())
     if found.step is not None:
         yield _step_finding(found.step, found.rival, cell, joint)
     if moved is not None:
@@ -236,7 +236,7 @@ def _step_finding(
     return Finding(
         kind,
         f"{_step_words(step, cell, joint)}; the result is between {between}.{instead}",
-        cell.or_apart(do, step.stop),
+        cell.or_separately(do, step.stop),
         mahalanobis_sq=step.mahalanobis_sq,
     )
 
@@ -249,20 +249,20 @@ def _step_words(step: Step, cell: Cell, joint: Callable[[Slip], str]) -> str:
         )
         sign = "+" if reads_deg > 0.0 else "-"
         return (
-            f"The offset of {joint(step)} steps: {cell.from_when(step.stop)}, it reads "
+            f"The offset of {joint(step)} steps: {cell.start_words(step.stop)}, it reads "
             f"{sign}{figure(abs(reads_deg))} deg (sigma {figure(sigma_deg)}) from what it read "
             "before, as where an encoder slipped or a zero was lost"
         )
     thing = _THINGS.get(step.frame, step.frame)
     if isinstance(step, Resized):
         return (
-            f"{thing} is another one: {cell.from_when(step.stop)}, it is "
+            f"{thing} is another one: {cell.start_words(step.stop)}, it is "
             f"{figure(100.0 * abs(step.share))} % {'larger' if step.share > 0.0 else 'smaller'} "
             f"(sigma {figure(100.0 * step.sigma)} %) than before, by the robot's motion"
         )
     shift_mm, turn_deg = pose_difference(np.eye(4), step.change)
     return (
-        f"{thing} moved at once: {cell.from_when(step.stop)}, it is "
+        f"{thing} moved at once: {cell.start_words(step.stop)}, it is "
         f"{mm_and_deg(shift_mm, turn_deg)} from where it was"
     )
 
@@ -274,8 +274,10 @@ def _size(shift_m: float, turn_rad: float) -> str:
 def _arm_errors_finding(arm: ArmErrors, turn_rad: float, shift_m: float) -> Finding:
     """Finding on an arm whose joints are not known, with the rms error of a look [rad, m]."""
     away = ""
-    if arm.away is not None:
-        actual, predicted = (_size(float(shift), float(turn)) for turn, shift in arm.away)
+    if arm.far_posture_errors is not None:
+        actual, predicted = (
+            _size(float(shift), float(turn)) for turn, shift in arm.far_posture_errors
+        )
         away = f", at postures away from them by {actual} (left out in turn; predicted {predicted})"
     return Finding(
         "arm_errors",

@@ -13,7 +13,7 @@ from visioncal.core.types import FloatArray
 from visioncal.core.version import __version__
 from visioncal.dynamics.excitation import Excitation
 from visioncal.dynamics.fourier import Series
-from visioncal.dynamics.limits import CHECK_HZ, Allowed, Kept
+from visioncal.dynamics.limits import CHECK_HZ, MotionExtremes, MotionLimits
 from visioncal.dynamics.motion import JointMotion
 from visioncal.dynamics.sweeps import REST_S, Stroke, Sweeps
 from visioncal.robot import Robot, has_ur_axes
@@ -30,7 +30,7 @@ _LOOKAHEAD_S, _GAIN = 0.1, 300
 class MotionPlan:
     """Motions planned to identify an arm's dynamics; `sweeps` is None where not requested."""
 
-    allowed: Allowed
+    allowed: MotionLimits
     excitation: Excitation
     sweeps: Sweeps | None
 
@@ -104,7 +104,7 @@ def _excitation(excitation: Excitation) -> dict[str, Any]:
         "condition_random": vars(excitation.random),
         "base_parameters": list(excitation.base.names),
         "weights": excitation.weights.tolist(),
-        "kept": _kept(excitation.kept) | {"rate_hz": CHECK_HZ},
+        "kept": _kept(excitation.extremes) | {"rate_hz": CHECK_HZ},
         "search": search,
     }
 
@@ -114,7 +114,7 @@ def _sweeps(sweeps: Sweeps) -> dict[str, Any]:
     document: dict[str, Any] = {
         "duration_s": begins[-1],
         "home_rad": sweeps.home.tolist(),
-        "kept": _kept(sweeps.kept),
+        "kept": _kept(sweeps.extremes),
         "strokes": [
             {
                 "joint": stroke.joint + 1,
@@ -134,7 +134,7 @@ def _sweeps(sweeps: Sweeps) -> dict[str, Any]:
     return document
 
 
-def _kept(kept: Kept) -> dict[str, Any]:
+def _kept(kept: MotionExtremes) -> dict[str, Any]:
     """Extremes of a motion, and the shares of the limits that they use."""
     document: dict[str, Any] = {
         "lowest_rad": kept.lowest.tolist(),
@@ -154,7 +154,7 @@ def _kept(kept: Kept) -> dict[str, Any]:
     return document
 
 
-def _limits(allowed: Allowed) -> dict[str, Any]:
+def _limits(allowed: MotionLimits) -> dict[str, Any]:
     """The limits, margins included."""
     share = allowed.share
     document: dict[str, Any] = {

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visioncal.calibration.stages.kinematics import Kinematics
+from visioncal.calibration.stages.kinematics import SelectedArmLevel
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Mask
@@ -41,7 +41,7 @@ class PredictedAccuracy:
     session_m: float
 
 
-def carries_over(arm: ArmData, kinematics: Kinematics) -> CarriesOver:
+def carries_over(arm: ArmData, kinematics: SelectedArmLevel) -> CarriesOver:
     """Computes where a calibrated arm is more accurate than the nominal one."""
     with one_blas_thread():
         predicted = _predicted_accuracy(arm, kinematics)
@@ -62,7 +62,7 @@ def carries_over(arm: ArmData, kinematics: Kinematics) -> CarriesOver:
     )
 
 
-def functions_of(arm: ArmData, kinematics: Kinematics) -> JointFunctions | None:
+def functions_of(arm: ArmData, kinematics: SelectedArmLevel) -> JointFunctions | None:
     """Tables of an arm's joint error functions; None where none were found."""
     functions = kinematics.functions
     if functions is None:
@@ -79,7 +79,7 @@ def functions_of(arm: ArmData, kinematics: Kinematics) -> JointFunctions | None:
     )
 
 
-def _predicted_accuracy(arm: ArmData, kinematics: Kinematics) -> PredictedAccuracy:
+def _predicted_accuracy(arm: ArmData, kinematics: SelectedArmLevel) -> PredictedAccuracy:
     q = postures(arm.model.robot)
     jacobian = arm.place_jacobian(q)[1]
     noise = np.repeat(arm.noise.robots[arm.problem.robots.index(arm.robot)], 3) ** 2

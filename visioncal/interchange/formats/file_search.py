@@ -20,12 +20,12 @@ def number_in(name: str) -> int | None:
     return int(digits[-1]) if digits and len(digits[-1]) < 19 else None
 
 
-def kind_of(path: Path) -> str:
+def series_name(path: Path) -> str:
     """A file's name without its last number: equal for files of one series."""
     return re.sub(r"[0-9]+([^0-9]*)$", r"\1", path.stem).strip("_-. ") + path.suffix.lower()
 
 
-def listed(folder: Path) -> tuple[Path, ...]:
+def files_in(folder: Path) -> tuple[Path, ...]:
     """Files of a folder in natural order; empty where it cannot be listed.
 
     Links that lead out of it are left out.
@@ -40,7 +40,7 @@ def listed(folder: Path) -> tuple[Path, ...]:
 
 def _images_in(folder: Path) -> tuple[Path, ...]:
     """Images of a folder in natural order."""
-    images = tuple(path for path in listed(folder) if is_image_name(path.name))
+    images = tuple(path for path in files_in(folder) if is_image_name(path.name))
     if not images:
         is_folder = folder.is_dir()
         raise DataError(
@@ -112,7 +112,7 @@ def _images_by_name(names: Sequence[str | None], folder: Path) -> list[Path | No
         match = by_name.get(plain)
         if match is None and is_unique and number is not None:
             match = by_number.get(number)
-        paths.append(match or below(folder, plain))
+        paths.append(match or path_inside(folder, plain))
     return paths
 
 
@@ -123,7 +123,7 @@ def is_image_name(name: str) -> bool:
 
 def _beside(base: Path, name: str) -> Path:
     """Path of a named image, as the name says or in the folder `images` beside the source."""
-    path = below(base, name)
+    path = path_inside(base, name)
     inner = base / "images" / path.name
     return inner if not path.exists() and is_inside(inner, base) and inner.exists() else path
 
@@ -144,7 +144,7 @@ def _images_of(
     """
     images = _images_in(folder)
     by_number = _unique_numbers(images)
-    kinds = Counter(kind_of(path) for path in images if number_in(path.name) in set(views))
+    kinds = Counter(series_name(path) for path in images if number_in(path.name) in set(views))
     if numbered and kinds and len(by_number) < len(images):
         usual = [name for name, count in kinds.items() if count == max(kinds.values())]
         if len(usual) > 1:
@@ -154,7 +154,7 @@ def _images_of(
                 culprits=usual,
                 next_step="Put those of one kind into a folder, and name it with --images.",
             )
-        images = tuple(path for path in images if kind_of(path) in usual)
+        images = tuple(path for path in images if series_name(path) in usual)
         by_number = _unique_numbers(images)
     if numbered and len(by_number) == len(images) and by_number.keys() & set(views):
         return tuple(by_number.get(view) for view in views), ()
@@ -190,7 +190,7 @@ def images_beside(
     Raises:
         DataError: `chosen` has no images, or not as many as there are rows.
     """
-    beside = any(is_image_name(path.name) for path in listed(folder))
+    beside = any(is_image_name(path.name) for path in files_in(folder))
     if chosen is None and not beside:
         return (), ()
     return _images_of(chosen or folder, views, labels, numbered=numbered)
@@ -202,7 +202,7 @@ def _unique_numbers(paths: Sequence[Path]) -> dict[int, Path]:
     return {number: path for number, path in numbers if number is not None and counts[number] == 1}
 
 
-def below(base: Path, name: str) -> Path:
+def path_inside(base: Path, name: str) -> Path:
     """Path of a file that a document names, relative to the document's folder.
 
     Raises:

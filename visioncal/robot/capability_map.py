@@ -18,7 +18,7 @@ _PROBES, _NEIGHBOURS = 1000, 6
 _TURN_SHARE = 0.5
 
 
-class Atlas:
+class CapabilityMap:
     """Capability map of an arm: random postures, indexed by their flange poses.
 
     Postures that differ by the first and last joint alone are equivalent, since these turn the pose

@@ -7,13 +7,13 @@ import numpy as np
 
 from visioncal.calibration.guess import Candidate, guess_reading
 from visioncal.calibration.guess.changed_rows import changed_rows
-from visioncal.calibration.guess.given import FEWEST_ROWS, Recording, closes
+from visioncal.calibration.guess.recording import FEWEST_ROWS, Recording, closes
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
 from visioncal.calibration.pipeline.guess_inputs import (
     camera_numbers,
     camera_pose_choices,
     chain_poses,
-    guess_seen,
+    guess_from_camera_poses,
     numbers_in,
     places_of,
     robot_numbers,
@@ -90,13 +90,13 @@ _BESIDE_JOINTS = Remedy(
 )
 
 
-def reading_hint(run: RunState) -> Finding | None:
+def misread_pose_finding(run: RunState) -> Finding | None:
     """Finding on the reading of the poses that closes the chain, if any; after the stage `pnp`."""
     hint = _constant_rotations(run) or _changed_midway(run)
     if hint is not None:
         return hint
     try:
-        guess = guess_seen(run)
+        guess = guess_from_camera_poses(run)
     except VisioncalError:
         # Too little to guess from; the calibration's own error says so.
         return None
@@ -143,7 +143,7 @@ def session_is_mirrored(session: Session) -> bool:
 def _constant_rotations(run: RunState) -> Finding | None:
     """Finding that the robot's rotations were not recorded: they are constant, the camera's not."""
     robot, camera = robot_numbers(run), camera_numbers(run)
-    both = robot.there & camera.there
+    both = robot.present & camera.present
     if both.sum() < FEWEST_ROWS:
         return None
     of_robot, of_camera = robot.poses()[both], camera.poses()[both]
@@ -192,7 +192,7 @@ def _changed_midway(run: RunState) -> Finding | None:
 def _constant_positions(run: RunState) -> Finding | None:
     """Finding that the robot's positions are constant, where that does not fit the camera."""
     robot = robot_numbers(run)
-    positions = robot.poses()[robot.there, :3, 3]
+    positions = robot.poses()[robot.present, :3, 3]
     is_one = len(positions) >= FEWEST_ROWS and np.ptp(positions, axis=0).max() < _STILL_M
     words = (
         "All rows have one position of the robot, and that does not explain what the camera sees: "
@@ -211,7 +211,7 @@ def _unpaired(run: RunState) -> Finding | None:
     """Finding that rows do not belong to their images: shuffled rows fit about as well."""
     # Robot and camera rotate by the same angle between two views, whatever the unknown frames.
     robot, camera = robot_numbers(run), camera_numbers(run)
-    both = robot.there & camera.there
+    both = robot.present & camera.present
     if both.sum() < _FEWEST_SHUFFLED:
         return None
     by_robot = _pairwise_angles(robot_part(robot.poses()[both], run.session.mount))
@@ -231,7 +231,7 @@ def _unpaired(run: RunState) -> Finding | None:
         "The robot's poses are not those of the images: of all pairs of views, robot and camera "
         f"turn alike in {percent(share)}, and in {percent(by_chance)} if rows are shuffled."
     )
-    is_reported = numbers_in(run.session, POSE).there.any()
+    is_reported = numbers_in(run.session, POSE).present.any()
     return Finding(_MISREAD, words, _UNPAIRED if is_reported else _UNPAIRED_JOINTS)
 
 
@@ -243,7 +243,7 @@ def _pairwise_angles(poses: FloatArray) -> FloatArray:
 def _poses_contradicting_joints(run: RunState, declared: Candidate) -> Finding | None:
     """Finding that the reported poses are wrong where the joint angles fit the camera."""
     session = run.session
-    if session.robot_document is None or not numbers_in(session, POSE).there.any():
+    if session.robot_document is None or not numbers_in(session, POSE).present.any():
         return None
     arm = Robot.from_document(session.robot_document)
     chain, matched = chain_poses(session, arm), match_joints(session.views, arm)
@@ -268,7 +268,7 @@ def misreadings(run: RunState) -> Iterator[Finding]:
     """Findings on misread poses, where chains do not close as declared; after the stage `pnp`."""
     if run.mount is None:
         yield from _misreadings_in_cell(run)
-    elif not closes(_recording(run)) and (hint := reading_hint(run)) is not None:
+    elif not closes(_recording(run)) and (hint := misread_pose_finding(run)) is not None:
         yield hint
 
 
@@ -348,5 +348,5 @@ def may_be_misread(run: RunState) -> bool:
     verdict, findings = run.verdict, run.findings
     if verdict is None or findings is None or verdict.status == "good":
         return False
-    has_outliers = not run.fitted.agreed.used.all()
+    has_outliers = not run.cell_fit.inlier_fit.used.all()
     return has_outliers or is_scattered(findings) or run.robot is not None

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
-from visioncal.present import parts
+from visioncal.present import result_parts
 from visioncal.present.placements import placement
 from visioncal.present.recording import colours, paths
 from visioncal.present.recording.notes import log_scalars
@@ -50,17 +50,17 @@ class ArmPicture:
     """Drawing of a calibrated arm.
 
     Attributes:
-        found: Result of its calibration.
+        result: Result of its calibration.
         robot: Calibrated model.
-        off_m: By view, (k, 3) origins of the calibrated arm's joints and flange in the base, and
-            the deviations of the nominal arm's origins [m].
+        deviations_m: By view, (k, 3) origins of the calibrated arm's joints and flange in the base,
+            and the deviations of the nominal arm's origins [m].
         factor: Magnification of the nominal arm's deviations.
         size_m: Size of the cell [m].
     """
 
-    found: ArmResult
+    result: ArmResult
     robot: Robot
-    off_m: Mapping[int, tuple[FloatArray, FloatArray]]
+    deviations_m: Mapping[int, tuple[FloatArray, FloatArray]]
     factor: int
     size_m: float
 
@@ -89,8 +89,8 @@ class ArmPicture:
         """Draws the map with its legend, and the style of the plots."""
         frame = rr.CoordinateFrame(paths.BASE_FRAME)
         stream.log(paths.magnified_arm(self.factor), frame, static=True)
-        if self.found.workspace_map:
-            log_map(stream, self.found.map_places_m, self.found.map_sigmas_mm, self.size_m)
+        if self.result.workspace_map:
+            log_map(stream, self.result.map_places_m, self.result.map_sigmas_mm, self.size_m)
         for plot in (paths.UNSEEN_MM, paths.UNSEEN_DEG):
             for held in (False, True):
                 for name, label, colour in (
@@ -107,7 +107,7 @@ class ArmPicture:
 
     def log_views(self, stream: rr.RecordingStream, rows: Mapping[int, int]) -> None:
         """Draws the nominal arm in each view, by row, and plots the residuals of both arms."""
-        drawn = [self.off_m[view] for view in rows if view in self.off_m]
+        drawn = [self.deviations_m[view] for view in rows if view in self.deviations_m]
         strips = [
             np.vstack([np.zeros(3), origins + self.factor * deviations])
             for origins, deviations in drawn
@@ -117,9 +117,12 @@ class ArmPicture:
         stream.log(entity, style, static=True)
         lines = rr.LineStrips3D.columns(strips=strips)
         send_rows(
-            stream, entity, rows.values(), lines.partition([view in self.off_m for view in rows])
+            stream,
+            entity,
+            rows.values(),
+            lines.partition([view in self.deviations_m for view in rows]),
         )
-        for held, views in ((False, self.found.left_out), (True, self.found.holdout)):
+        for held, views in ((False, self.result.left_out), (True, self.result.holdout)):
             _log_unseen(
                 stream,
                 {rows[view.view]: view for view in views if view.view in rows},
@@ -243,7 +246,7 @@ class Uncertainty:
             for view, seen in evidence.items()
             if view in frames and (placed := placement(calibration, seen, frames[view])) is not None
         }
-        final_frames = parts.frames(calibration).matrices
+        final_frames = result_parts.frames(calibration).matrices
         edges = {
             name: edge
             for name, edge in calibration.placed.items()

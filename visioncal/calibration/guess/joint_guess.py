@@ -12,13 +12,13 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from visioncal.calibration.guess.fit import Fit, distances, is_about_one_axis, robust_fit
-from visioncal.calibration.guess.given import SCORE_FLOOR, STANDS_OUT
-from visioncal.calibration.guess.joints import (
+from visioncal.calibration.guess.joint_readings import (
     JointReading,
     declared_reading,
     joint_readings,
     with_zero,
 )
+from visioncal.calibration.guess.recording import SCORE_FLOOR, STANDS_OUT
 from visioncal.calibration.guess.search import thinned
 from visioncal.core.number_format import mm_and_deg
 from visioncal.core.threads import one_blas_thread

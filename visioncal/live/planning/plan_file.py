@@ -12,7 +12,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.files import DocumentTable, read_text
 from visioncal.core.types import MOUNTS, Camera, CameraKind, FloatArray, Mount, Target
 from visioncal.estimation.chain import edge_names
-from visioncal.estimation.parts import Noise
+from visioncal.estimation.problem_parts import Noise
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.purposes import Purpose, purpose_of
 from visioncal.live.planning.written import SCHEMA

@@ -10,7 +10,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean, some_of
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray
-from visioncal.estimation.parts import Noise
+from visioncal.estimation.problem_parts import Noise
 from visioncal.frames.touches import TouchRows, check_lengths, flange_poses, refuse_copies
 from visioncal.results import Calibration, Edge, Frame, Verdict
 from visioncal.robot import Robot

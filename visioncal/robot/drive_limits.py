@@ -14,7 +14,7 @@ RATE_KEYS = ("velocity_rad_s", "acceleration_rad_s2", "torque_nm")
 
 
 @dataclass(frozen=True, eq=False)
-class Rates:
+class DriveLimits:
     """Limits of an arm's drives; inf where unknown, in m/s, m/s^2 and N for prismatic joints.
 
     Attributes:
@@ -28,7 +28,7 @@ class Rates:
     torque: FloatArray
 
     @classmethod
-    def of_rows(cls, rows: Sequence[DocumentTable]) -> "Rates":
+    def of_rows(cls, rows: Sequence[DocumentTable]) -> "DriveLimits":
         """Reads the limits from a table of joints.
 
         Raises:

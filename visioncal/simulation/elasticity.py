@@ -79,7 +79,7 @@ class Payload:
 
 
 @dataclass(frozen=True, eq=False)
-class Giving:
+class JointElasticity:
     """Compliance and backlash of an arm.
 
     Attributes:
@@ -93,9 +93,9 @@ class Giving:
     backlash: FloatArray
 
 
-def sagging(
+def loaded_joints(
     arm: DhArm,
-    giving: Giving,
+    giving: JointElasticity,
     joints: FloatArray,
     payloads: Sequence[Payload] = (),
     approach: FloatArray | None = None,
@@ -123,9 +123,9 @@ def sagging(
     return np.asarray(sagged)
 
 
-def giving_of(
+def elasticity_of(
     arm: DhArm, compliance: Sequence[float], mass_share: float, backlash: Sequence[float]
-) -> Giving:
+) -> JointElasticity:
     """Compliance and backlash of an arm; empty sequences stand for none.
 
     Raises:
@@ -135,7 +135,7 @@ def giving_of(
     for name, values in (("compliance", compliance), ("backlash", backlash)):
         if len(values) not in (0, count):
             raise DataError(f"simulation: {len(values)} values of {name} for {count} joints.")
-    return Giving(
+    return JointElasticity(
         np.array(compliance) if compliance else np.zeros(count),
         mass_share,
         np.array(backlash) if backlash else np.zeros(count),
@@ -143,7 +143,7 @@ def giving_of(
 
 
 def load_torques(
-    arm: DhArm, giving: Giving, joints: FloatArray, payloads: Sequence[Payload]
+    arm: DhArm, giving: JointElasticity, joints: FloatArray, payloads: Sequence[Payload]
 ) -> FloatArray:
     """(m, n) torques of weight and force on the joints [N m]: moments about the axes."""
     frames = link_frames(arm, joints)
@@ -222,8 +222,8 @@ class ArmOptions(ArmErrors):
         `q` are (k, n) encoder angles [rad]. Without payloads there are none; without sides of
         approach (k,), the arm is in the middle of its backlash.
         """
-        giving = giving_of(arm, self.compliance_rad_per_nm, self.mass_share, self.backlash_rad)
-        return forward(arm, sagging(arm, giving, q, payloads, approach))
+        giving = elasticity_of(arm, self.compliance_rad_per_nm, self.mass_share, self.backlash_rad)
+        return forward(arm, loaded_joints(arm, giving, q, payloads, approach))
 
     def jitter(self, stops: int, rng: np.random.Generator) -> FloatArray:
         """(stops, 4, 4) repeatability errors of the flange, in its own frame."""

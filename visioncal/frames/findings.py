@@ -42,7 +42,7 @@ def outlier_findings(
 
     `names` and `reasons` are (n,); `again` is the remedy, as a sentence.
     """
-    for at in np.flatnonzero(~inliers.agrees).tolist():
+    for at in np.flatnonzero(~inliers.mask).tolist():
         renamed = reasons[at].endswith(RENAMED)
         words = f"{names[at]} was left out: {reasons[at]}{'' if renamed else '.'}"
         yield Finding("left_out", words, Remedy(_RENAME if renamed else again, AGAIN))

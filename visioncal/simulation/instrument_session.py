@@ -10,12 +10,12 @@ from visioncal.core.types import FloatArray
 from visioncal.session import MemoryImages, Session
 from visioncal.session.columns import POSE, pose_row
 from visioncal.simulation.arms import DhArm, arm_named, forward
-from visioncal.simulation.sag import ArmOptions
+from visioncal.simulation.elasticity import ArmOptions
 from visioncal.simulation.truth import write_truth
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracked(ArmOptions):
+class InstrumentOptions(ArmOptions):
     """Options of a simulated session with an instrument.
 
     Attributes:
@@ -40,7 +40,7 @@ THREE = ((0.03, -0.02, 0.12), (0.10, 0.05, 0.08), (-0.08, 0.06, 0.10))
 
 
 @dataclass(frozen=True, eq=False)
-class Shop:
+class InstrumentRecord:
     """Ground truth and readings.
 
     Attributes:
@@ -54,7 +54,7 @@ class Shop:
         rows: Readings: stop, point, and (4, 4) pose in the instrument's frame.
     """
 
-    options: Tracked
+    options: InstrumentOptions
     arm: DhArm
     true_arm: DhArm
     base_from_instrument: FloatArray
@@ -63,7 +63,7 @@ class Shop:
     rows: tuple[tuple[int, int, FloatArray], ...]
 
 
-def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
+def tracked(options: InstrumentOptions, joints: FloatArray | None = None) -> InstrumentRecord:
     """Moves the arm over its workspace, or to (s, n) joint angles [rad], and reads the points."""
     rng = np.random.default_rng([7, options.seed])
     arm = arm_named(options.robot)
@@ -72,7 +72,7 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
     rotation = exp(np.array([[0.5, 1.0, -0.3, 0, 0, 0]]))[0, :3, :3] if options.poses else np.eye(3)
     z = compose(rotation, np.array(options.points[0]))
     if joints is None:
-        joints = above(arm, options.stops, rng)
+        joints = random_postures(arm, options.stops, rng)
     count = len(joints)
     loads, approach = options.loads(count), options.approach(count)
     flange = options.flange_at(true_arm, joints, loads, approach) @ options.jitter(count, rng)
@@ -84,10 +84,10 @@ def tracked(options: Tracked, joints: FloatArray | None = None) -> Shop:
             noise = exp(np.r_[rng.normal(size=3) * options.sigma_rad, 0, 0, 0][None])[0, :3, :3]
             place_read = true[:3, 3] + options.sigma_m * rng.normal(size=3)
             rows.append((stop, point, compose(true[:3, :3] @ noise, place_read)))
-    return Shop(options, arm, true_arm, x, z, joints, tuple(rows))
+    return InstrumentRecord(options, arm, true_arm, x, z, joints, tuple(rows))
 
 
-def above(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatArray:
+def random_postures(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatArray:
     """Random postures over the workspace, above the table [rad]."""
     kept: list[FloatArray] = []
     while len(kept) < stops:
@@ -98,7 +98,7 @@ def above(arm: DhArm, stops: int, rng: np.random.Generator) -> FloatArray:
 
 
 def session_of(
-    shop: Shop, *, joints: bool = True, poses: bool = False, **document: object
+    shop: InstrumentRecord, *, joints: bool = True, poses: bool = False, **document: object
 ) -> Session:
     """The session in memory, with joint angles or the nominal arm's poses.
 
@@ -130,7 +130,7 @@ def session_of(
     return Session.assemble(facts | document, list(rows[0]), cells, MemoryImages({}))
 
 
-def write_tracked(shop: Shop, folder: Path | str) -> Path:
+def write_tracked(shop: InstrumentRecord, folder: Path | str) -> Path:
     """Writes a session's folder, and the truth in `<folder>.truth.json` beside it.
 
     Raises:

@@ -14,6 +14,7 @@ from visioncal.core.files import DocumentTable, find_described, parse_toml, read
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Camera, Target
 from visioncal.session.document import NAME
+from visioncal.simulation.elasticity import Payload
 from visioncal.simulation.layout import (
     CELL,
     BoardAt,
@@ -27,7 +28,6 @@ from visioncal.simulation.layout import (
 )
 from visioncal.simulation.optics import CAMERAS
 from visioncal.simulation.options import TARGETS
-from visioncal.simulation.sag import Payload
 
 Thing: TypeAlias = (
     RobotAt | CameraAt | BoardAt | InstrumentAt | PointAt | Moved | Swept | Payload | NetworkOptions

@@ -20,8 +20,8 @@ from visioncal.dynamics import (
     drive_gains,
     estimate_payload,
 )
-from visioncal.dynamics.run import conditioned_streams, current_streams, of_one_arm, robot_of
-from visioncal.robot import Inertias, matrices
+from visioncal.dynamics.run import conditioned_streams, current_streams, robot_of, select_arm
+from visioncal.robot import Inertias, symmetric_matrices
 from visioncal.session import Session
 
 
@@ -56,11 +56,11 @@ def print_gains(options: GainsOptions) -> None:
         DataError: The body is invalid, or the sessions cannot be read or have no currents.
     """
     body = _body(options)
-    without = of_one_arm(Session.load(options.session), options.named)
+    without = select_arm(Session.load(options.session), options.named)
     robot = robot_of(without)
     empty = current_streams(without, robot, options.cutoff_hz)
     full = current_streams(
-        of_one_arm(Session.load(options.loaded), options.named),
+        select_arm(Session.load(options.loaded), options.named),
         robot,
         options.cutoff_hz or empty[0].cutoff_hz,
     )
@@ -116,7 +116,9 @@ def _ur_words(payload: Payload) -> str:
 def _body(options: GainsOptions) -> FloatArray:
     """(10,) the body's inertial parameters in the flange's frame."""
     centre = 1e-3 * np.array(numbers_in(options.com_mm, "--com-mm", "x,y,z"))
-    about = matrices(np.array(numbers_in(options.inertia, "--inertia", "xx,xy,yy,xz,yz,zz")))
+    about = symmetric_matrices(
+        np.array(numbers_in(options.inertia, "--inertia", "xx,xy,yy,xz,yz,zz"))
+    )
     body = Inertias.of_bodies(np.array([options.mass_kg]), centre[None], about[None])
     if not (options.mass_kg > 0.0 and body.consistent):
         raise DataError(

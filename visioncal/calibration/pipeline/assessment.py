@@ -12,6 +12,7 @@ from visioncal.calibration.pipeline.arm_results import (
     with_errors_beside_step,
 )
 from visioncal.calibration.pipeline.budget import budget_mm, left_out, middles_of
+from visioncal.calibration.pipeline.cell_fit import CellFit
 from visioncal.calibration.pipeline.fault_messages import (
     PoseFault,
     Version,
@@ -22,43 +23,42 @@ from visioncal.calibration.pipeline.fault_messages import (
     versions,
 )
 from visioncal.calibration.pipeline.lens_fields import LensErrors, lens_errors
-from visioncal.calibration.pipeline.solved import Solved
 from visioncal.calibration.pipeline.starting import problem_of, sensors_of, targets_of
-from visioncal.calibration.stages.arms import ArmFound
+from visioncal.calibration.stages.arms import IdentifiedArm
 from visioncal.calibration.stages.cell import Cell, ObservationRow
-from visioncal.calibration.stages.clock_offset import ClockOffset, FoundDelay
+from visioncal.calibration.stages.clock_offset import ClockOffset, DelayEstimate
 from visioncal.calibration.stages.clock_sweep import ClockPair
 from visioncal.calibration.stages.clocks import clock_effects
-from visioncal.calibration.stages.diagnose import ResidualTest, misfits
 from visioncal.calibration.stages.kinematics import unseen_views
 from visioncal.calibration.stages.observed import Observed
 from visioncal.calibration.stages.pnp import ViewPoses
-from visioncal.calibration.stages.pose_ambiguity import choose_by, chosen
-from visioncal.calibration.stages.validate import HeldOut, apart
+from visioncal.calibration.stages.pose_ambiguity import choose_nearest, with_candidate
+from visioncal.calibration.stages.residual_findings import ResidualTest, residual_tests
+from visioncal.calibration.stages.validate import HeldOutResiduals, pose_residuals
 from visioncal.core.choices import Convention
 from visioncal.core.types import FloatArray
 from visioncal.estimation.chain import scatter
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.intervals import noise_intervals
-from visioncal.estimation.parts import Noise, State
 from visioncal.estimation.poses import fit_poses
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.solve import Solution, covariance_of, fit_problem
 from visioncal.results import HELD_BACK, Edge, Moved, ViewResult
 from visioncal.results.arm import UnseenView
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class FitAssessment:
     """A fit with its covariance and diagnosis.
 
     Attributes:
-        solved: The fit.
+        cell_fit: The fit.
         problem: The problem of its inliers.
         covariance: (p, p) of its unknowns, from noise and all other sources.
-        beside: (p, p) covariances from sources other than noise, by source.
+        covariance_by_source: (p, p) covariances from sources other than noise, by source.
         lenses: Lens errors beyond the camera models, by camera.
-        misfits: Tests of the residuals of each robot's stops.
+        residual_tests: Tests of the residuals of each robot's stops.
         arms: Results on the arms, by robot.
         held_out: Residuals of observations that were left out of the fit in turn.
         moved: Frames that moved, in the order of time.
@@ -67,14 +67,14 @@ class Answer:
         sigmas: Estimated standard deviations, by frame or robot and by name.
     """
 
-    solved: Solved
+    cell_fit: CellFit
     problem: Problem
     covariance: FloatArray
-    beside: Mapping[str, FloatArray]
+    covariance_by_source: Mapping[str, FloatArray]
     lenses: Mapping[str, LensErrors]
-    misfits: Mapping[str, ResidualTest]
-    arms: Mapping[str, ArmFound]
-    held_out: HeldOut
+    residual_tests: Mapping[str, ResidualTest]
+    arms: Mapping[str, IdentifiedArm]
+    held_out: HeldOutResiduals
     moved: tuple[Moved, ...]
     faults: tuple[PoseFault, ...]
     views: tuple[ViewResult, ...]
@@ -83,7 +83,7 @@ class Answer:
     @property
     def fit(self) -> Solution:
         """Estimated unknowns and noise."""
-        return self.solved.agreed.fit
+        return self.cell_fit.inlier_fit.fit
 
     @property
     def state(self) -> State:
@@ -98,7 +98,7 @@ class Answer:
     @cached_property
     def versions(self) -> dict[str, Version]:
         """All unknown frames over time, by their names in the problem."""
-        return versions(self.solved)
+        return versions(self.cell_fit)
 
     @cached_property
     def edges(self) -> dict[str, Edge]:
@@ -134,7 +134,7 @@ class Answer:
             delays=tuple(self._fitted_delay(pair, delay) for delay in clock.delays),
         )
 
-    def _fitted_delay(self, pair: ClockPair, delay: FoundDelay) -> FoundDelay:
+    def _fitted_delay(self, pair: ClockPair, delay: DelayEstimate) -> DelayEstimate:
         correction = self._fitted_time(pair.delay(delay.of))
         if correction is None:
             return delay
@@ -152,7 +152,7 @@ class Answer:
     @cached_property
     def budget_mm(self) -> dict[str, dict[str, float]]:
         """Standard deviations of each frame's position in its parent, by source [mm]."""
-        budget = budget_mm(self.solved, self.beside)
+        budget = budget_mm(self.cell_fit, self.covariance_by_source)
         return {self.versions[key].name: sigmas for key, sigmas in budget.items()}
 
     @cached_property
@@ -161,9 +161,9 @@ class Answer:
         return noise_intervals(self.problem, self.state, self.noise)
 
 
-def answer_of(
-    cell: Cell, observed: Observed, solved: Solved, convention: Convention | None
-) -> Answer:
+def assess_fit(
+    cell: Cell, observed: Observed, solved: CellFit, convention: Convention | None
+) -> FitAssessment:
     """Examines a fit.
 
     Args:
@@ -172,7 +172,7 @@ def answer_of(
         solved: The fit of its connected part.
         convention: Joint table convention of calibrated arms' parameters.
     """
-    part, fit = solved.part, solved.agreed.fit
+    part, fit = solved.inlier_problem, solved.inlier_fit.fit
     # A closed form is no minimum, which would pass for a misfit.
     is_fit = solved.solver == "joint"
     converged = fit if is_fit else fit_problem(part, fit.state)
@@ -180,12 +180,12 @@ def answer_of(
         name: arm.errors for name, arm in solved.arms.items() if not arm.is_modelled and arm.errors
     }
     offsets = joint_offsets(solved.arms)
-    tests = misfits(part, converged, errors, offsets)
+    tests = residual_tests(part, converged, errors, offsets)
     solved = replace(solved, arms=with_errors_beside_step(solved.arms, part, fit, tests))
     beside = covariance_from_other_sources(part, fit, solved.arms, tests, offsets, is_fit=is_fit)
     covariance = sum(beside.values(), covariance_of(part, fit))
     faults, held_out, middles = pose_faults(solved), left_out(solved), middles_of(solved.cell)
-    return Answer(
+    return FitAssessment(
         solved,
         part,
         covariance,
@@ -193,7 +193,7 @@ def answer_of(
         lens_errors(solved),
         tests,
         {
-            name: arm.found(part, fit, covariance, middles, convention)
+            name: arm.identified(part, fit, covariance, middles, convention)
             for name, arm in solved.arms.items()
         },
         held_out,
@@ -204,9 +204,9 @@ def answer_of(
     )
 
 
-def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
+def _sigmas(solved: CellFit) -> dict[str, dict[str, float]]:
     """Estimated standard deviations of robots by name, and of cameras and instruments by frame."""
-    fit, problem = solved.agreed.fit, solved.agreed.problem
+    fit, problem = solved.inlier_fit.fit, solved.inlier_fit.problem
     results = {
         robot: {
             "translation_mm": 1e3 * float(sigma_m),
@@ -214,8 +214,12 @@ def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
         }
         for robot, (sigma_rad, sigma_m) in zip(problem.robots, fit.noise.robots, strict=True)
     }
-    if solved.seen is not None:
-        pairs = zip(solved.seen.looks.problems, solved.seen.sigmas_px, strict=True)
+    if solved.linearised_corners is not None:
+        pairs = zip(
+            solved.linearised_corners.camera_parameters.problems,
+            solved.linearised_corners.sigmas_px,
+            strict=True,
+        )
         results |= {frame: {"pixel_px": sigma} for frame, sigma in pairs}
     sensors = dict.fromkeys(
         (*sensors_of(solved.cell, solved.poses), *(row.seer for row in solved.cell.rows))
@@ -226,15 +230,19 @@ def _sigmas(solved: Solved) -> dict[str, dict[str, float]]:
 
 
 def _views(
-    observed: Observed, cell: Cell, solved: Solved, held_out: HeldOut, faults: Sequence[PoseFault]
+    observed: Observed,
+    cell: Cell,
+    solved: CellFit,
+    held_out: HeldOutResiduals,
+    faults: Sequence[PoseFault],
 ) -> tuple[ViewResult, ...]:
     """Result of each observation, in the order of the session's rows."""
-    rows, used = solved.cell.rows, solved.agreed.used
+    rows, used = solved.cell.rows, solved.inlier_fit.used
     residuals_mm_deg, why = _residuals(solved), reasons(solved, faults)
-    rms_px = solved.chain_px(np.arange(len(rows)), solved.agreed.fit.state)
+    rms_px = solved.reprojection_px(np.arange(len(rows)), solved.inlier_fit.fit.state)
     left_out_residuals = np.full((len(rows), 3), np.nan)
     left_out_residuals[used] = np.stack(
-        [1e3 * held_out.away_m, np.rad2deg(held_out.away_rad), held_out.rms_px], axis=1
+        [1e3 * held_out.residual_m, np.rad2deg(held_out.residual_rad), held_out.rms_px], axis=1
     )
     results = {}
     for at, row in enumerate(rows):
@@ -276,14 +284,14 @@ def _finite_or_none(figures: FloatArray) -> list[float | None]:
     return [value if np.isfinite(value) else None for value in figures.tolist()]
 
 
-def _residuals(solved: Solved) -> FloatArray:
+def _residuals(solved: CellFit) -> FloatArray:
     """(n, 2) residuals of the observations [mm], [deg]."""
     # Of one camera and one robot it is the distance of the target, as each view places it, from its
     # mean over the inliers; of a whole cell, from what the rest predicts.
     if solved.cell.mount is None:
         return residuals(solved)
-    problem = solved.agreed.problem
-    away_m, away_rad = scatter(problem, solved.part, solved.agreed.fit.state)
+    problem = solved.inlier_fit.problem
+    away_m, away_rad = scatter(problem, solved.inlier_problem, solved.inlier_fit.fit.state)
     oriented = problem.observations.has_rotation
     return np.stack([1e3 * away_m, np.where(oriented, np.rad2deg(away_rad), np.nan)], axis=1)
 
@@ -303,9 +311,9 @@ class Held:
     problem: Problem
 
 
-def held_back(solved: Solved, observed: Observed) -> Held | None:
+def held_back(solved: CellFit, observed: Observed) -> Held | None:
     """Held-back observations that can be compared with the fit; None for none."""
-    cell, state, frames = solved.cell, solved.agreed.fit.state, solved.cell.tree.branches.keys()
+    cell, state, frames = solved.cell, solved.inlier_fit.fit.state, solved.cell.tree.branches.keys()
     rows = [
         row for row in cell.held if row.view in observed.poses and {row.seer, row.seen} <= frames
     ]
@@ -313,15 +321,15 @@ def held_back(solved: Solved, observed: Observed) -> Held | None:
         return None
     solved = replace(solved, cell=replace(cell, rows=tuple(rows)))
     views = [observed.poses[row.view] for row in rows]
-    predicted = _problem(solved, observed, [chosen(view, 0, None) for view in views]).predicted(
-        state
-    )
+    predicted = _problem(
+        solved, observed, [with_candidate(view, 0, None) for view in views]
+    ).predicted(state)
     targets = targets_of(cell)
     views = [
-        choose_by(view, pose, targets.get(row.seen))
+        choose_nearest(view, pose, targets.get(row.seen))
         for view, pose, row in zip(views, predicted, rows, strict=True)
     ]
-    looks = solved.looks
+    looks = solved.camera_parameters
     for at, (view, row) in enumerate(zip(views, rows, strict=True)):
         if looks is not None and view.corners is not None and row.seer in looks.problems:
             stack, camera = CornerStack.of({view.view: view.corners}, looks.points), row.seer
@@ -330,17 +338,17 @@ def held_back(solved: Solved, observed: Observed) -> Held | None:
     return Held(tuple(rows), tuple(views), _problem(solved, observed, views))
 
 
-def held_back_results(solved: Solved, observed: Observed) -> dict[int, ViewResult]:
+def held_back_results(solved: CellFit, observed: Observed) -> dict[int, ViewResult]:
     """Results of the held-back observations, by view: residuals from what the fit predicts."""
     held = held_back(solved, observed)
     if held is None:
         return {}
-    state, problem = solved.agreed.fit.state, held.problem
-    away_m, away_rad = apart(problem, state)
+    state, problem = solved.inlier_fit.fit.state, held.problem
+    away_m, away_rad = pose_residuals(problem, state)
     if solved.cell.mount is not None:
-        fitted = set(solved.part.observations.observed)
+        fitted = set(solved.inlier_problem.observations.observed)
         is_fitted = np.array([name in fitted for name in problem.observations.observed])
-        from_mean = scatter(problem.subset(is_fitted), solved.part, state)
+        from_mean = scatter(problem.subset(is_fitted), solved.inlier_problem, state)
         away_m[is_fitted] = from_mean[0]
         away_rad[is_fitted] = np.where(np.isnan(away_rad[is_fitted]), np.nan, from_mean[1])
     rms_px = solved.pixels(held.rows, held.views, problem.predicted(state), state)
@@ -356,18 +364,18 @@ def held_back_results(solved: Solved, observed: Observed) -> dict[int, ViewResul
     return results
 
 
-def held_back_by_arm(solved: Solved, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
+def held_back_by_arm(solved: CellFit, observed: Observed, robot: str) -> tuple[UnseenView, ...]:
     """Residuals of held-back views by the nominal arm with its own fit, and by the calibrated."""
     arm, held = solved.arms[robot], held_back(solved, observed)
     if held is None or arm.kinematics is None:
         return ()
     nominal = arm.without_errors(held.problem)
-    nominal = arm.stated(nominal) or nominal
+    nominal = arm.with_nominal_zero(nominal) or nominal
     before, after = (
-        np.stack(apart(problem, _state_in(problem, state))[::-1], axis=1)
+        np.stack(pose_residuals(problem, _state_in(problem, state))[::-1], axis=1)
         for problem, state in (
             (nominal, arm.kinematics.nominal.fit.state),
-            (held.problem, solved.agreed.fit.state),
+            (held.problem, solved.inlier_fit.fit.state),
         )
     )
     views = [row.view for row in held.rows]
@@ -384,18 +392,20 @@ def _state_in(problem: Problem, state: State) -> State:
     return State(state.edges, np.concatenate([*values, state.values[len(state.values) - behind :]]))
 
 
-def _problem(solved: Solved, observed: Observed, views: Sequence[ViewPoses]) -> Problem:
+def _problem(solved: CellFit, observed: Observed, views: Sequence[ViewPoses]) -> Problem:
     """The problem of a cell's rows, with the unknowns of the fit."""
-    fitted = solved.agreed.problem
+    fitted = solved.inlier_fit.problem
     problem = replace(problem_of(solved.cell, views), tree=fitted.tree, poses=fitted.poses)
     observations, none = problem.observations, np.zeros(len(problem), dtype=bool)
-    for move in solved.agreed.moves:
+    for move in solved.inlier_fit.moves:
         later = observations.stops >= move.stop
         observations = observations.renamed(move.frame, move.twin, later)
     clock_errors = {effect.name: effect for effect in clock_effects(solved.cell, observed.clocks)}
     effects = [
         clock_errors.get(effect.name)
-        or replace(effect, by_sensor=None, concerned=None if effect.concerned is None else none)
+        or replace(
+            effect, by_sensor=None, rows_concerned=None if effect.rows_concerned is None else none
+        )
         for effect in fitted.effects
     ]
     problem = replace(problem, observations=observations, points=fitted.points)

@@ -36,7 +36,7 @@ def without_unit(name: str) -> tuple[str, str]:
     return (match[1], (match[2] or match[3]).lower()) if match and match[1] else (name, "")
 
 
-def worded_poses(fields: Fields, whose: str, taken: Collection[str]) -> tuple[str, ...]:
+def pose_fields_by_words(fields: Fields, whose: str, taken: Collection[str]) -> tuple[str, ...]:
     """Finds the fields of the robot's or the camera's poses by the words of their names.
 
     Returns:

@@ -14,11 +14,11 @@ from visioncal.core.types import Image, Target
 from visioncal.core.verdict import EMPTY_ROWS, LEAST_NEED_MM, MISSING, Finding, Remedy
 from visioncal.session import Session, View
 from visioncal.session.images import FolderImages
-from visioncal.session.kinds import is_read, is_seen
+from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.finders.identify import Identity, identify
 from visioncal.vision.finders.identify_text import describe
-from visioncal.vision.finders.imaging import blur_of_edges, decode_image, why_hard_to_see
+from visioncal.vision.finders.imaging import blur_of_edges, decode_image, poor_image_reason
 from visioncal.vision.targets import board_words, load_target, marker_cells, target_names
 
 # Names that are listed, and images that are searched for any board.
@@ -95,7 +95,9 @@ def _missing_images(session: Session) -> Iterator[Finding]:
 def _empty_rows(session: Session) -> Iterator[Finding]:
     """Reports rows of one camera and one robot that observe nothing, where others do."""
     # In a whole cell, a row may state only where a robot was.
-    observes = [is_seen(view) or is_read(view) for view in session.views]
+    observes = [
+        is_camera_observation(view) or is_instrument_reading(view) for view in session.views
+    ]
     if is_whole_cell(session) or all(observes) or not any(observes):
         return
     empty = [view for view, seen in zip(session.views, observes, strict=True) if not seen]
@@ -202,7 +204,7 @@ def other_board(session: Session, unseen: Sequence[View]) -> Finding | None:
         image = decode_image(session.images.read(view.image))
         if isinstance(image, str):
             continue
-        why = why_hard_to_see(image, MAX_BLUR_PX)
+        why = poor_image_reason(image, MAX_BLUR_PX)
         if why:
             unreadable = unreadable or _blurred_finding(view, why, existing)
             continue

@@ -6,22 +6,22 @@ from typing import Self
 
 import numpy as np
 
-from visioncal.calibration.stages.arms import RobotArm, effects_of
+from visioncal.calibration.stages.arms import RobotArm, arm_effects
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.types import Corners, FloatArray, IntArray, Mask
 from visioncal.estimation.arm import ArmErrors, misfit_covariance
 from visioncal.estimation.effects.lenses import CameraParameters, LinearisedCorners
 from visioncal.estimation.joint import ConvergedFit
-from visioncal.estimation.parts import Effect, Noise, State
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
 from visioncal.estimation.solve import fit_problem, fitted_covariance, robot_likelihood
 
 
 @dataclass(frozen=True, eq=False)
-class FramesSide:
-    """Part of the joint fit beside corners, lenses and boards; see `joint.Side`.
+class CellFrameModel:
+    """Part of the joint fit beside corners, lenses and boards; see `joint.FrameModel`.
 
     Attributes:
         observed: All n observations.
@@ -30,7 +30,8 @@ class FramesSide:
         arms: The robots' arms, with the errors that were found.
         effects: All effects but lenses, boards and arms.
         noise: Its levels to start from; None for those from above.
-        freely: Whether all errors that were found are free, rather than only the estimated ones.
+        frees_all_errors: Whether all errors that were found are free, rather than only the
+            estimated ones.
     """
 
     observed: Problem
@@ -39,7 +40,7 @@ class FramesSide:
     arms: Mapping[str, RobotArm]
     effects: Sequence[Effect] = ()
     noise: Noise | None = None
-    freely: bool = False
+    frees_all_errors: bool = False
 
     @property
     def errors(self) -> tuple[ArmErrors, ...]:
@@ -49,7 +50,7 @@ class FramesSide:
     @property
     def has_errors(self) -> bool:
         """Whether errors of an arm are free."""
-        return any(arm.frees_errors(freely=self.freely) for arm in self.arms.values())
+        return any(arm.has_free_errors(freely=self.frees_all_errors) for arm in self.arms.values())
 
     @property
     def has_links(self) -> bool:
@@ -58,25 +59,29 @@ class FramesSide:
 
     def problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of the inliers, repeated ones sharing an error."""
-        return replace(self.whole(seen), with_repeats=True).subset(self.used)
+        return replace(self.full_problem(seen), with_repeats=True).subset(self.used)
 
     def rows(self, seen: LinearisedCorners) -> IntArray:
-        """(n,) the corners' view of each observation of `problem`, by index; see `joint.Side`."""
+        """(n,) index of the corners' view of each observation of `problem`; see `FrameModel`."""
         return self._all_rows(seen)[self.used]
 
     def _all_rows(self, seen: LinearisedCorners) -> IntArray:
         places = {view: at for at, view in enumerate(seen.views)}
         return np.array([places.get(view, -1) for view in self.views], dtype=np.int64)
 
-    def whole(self, seen: LinearisedCorners) -> Problem:
+    def full_problem(self, seen: LinearisedCorners) -> Problem:
         """The problem of all observations, with the poses by current lenses and boards."""
         problem, rows = self.observed, self._all_rows(seen)
         has_corners, stated = rows >= 0, problem.observations
         measured, covariance = stated.measured.copy(), stated.covariance.copy()
-        measured[has_corners] = seen.looks.poses[rows[has_corners]]
+        measured[has_corners] = seen.camera_parameters.poses[rows[has_corners]]
         covariance[has_corners] = seen.covariance[rows[has_corners]]
         observations = replace(stated, measured=measured, covariance=covariance)
-        effects = [seen.effect(rows), *self.effects, *effects_of(self.arms, freely=self.freely)]
+        effects = [
+            seen.effect(rows),
+            *self.effects,
+            *arm_effects(self.arms, freely=self.frees_all_errors),
+        ]
         return replace(problem, observations=observations).with_effects(effects)
 
     def with_errors(self, fitted: ConvergedFit) -> Self:
@@ -85,7 +90,7 @@ class FramesSide:
         likelihood = robot_likelihood(problem, fit.state, fit.noise)
         arms = {
             name: arm
-            if arm.frees_errors(freely=self.freely)
+            if arm.has_free_errors(freely=self.frees_all_errors)
             else arm.with_errors(likelihood, problem.robots.index(name))
             for name, arm in self.arms.items()
         }
@@ -104,7 +109,7 @@ class FramesSide:
         problem, arms = fitted.problem, self.arms_without_joints
         for arm in arms.values():
             problem = arm.without_errors(problem)
-        values, free = problem.start_values.copy(), len(fitted.seen.free)
+        values, free = problem.start_values.copy(), len(fitted.linearised.free)
         values[:free] = fitted.fit.state.values[:free]
         fit = fit_problem(problem, State(fitted.fit.state.edges, values))
         covariance = fitted_covariance(problem, fit.state, fit.noise)
@@ -116,7 +121,7 @@ class FramesSide:
 
     def freed(self, *, freely: bool) -> Self:
         """Frees all errors of the arms that were found, or only the estimated ones."""
-        return replace(self, freely=freely)
+        return replace(self, frees_all_errors=freely)
 
     def looks(
         self, scenes: Mapping[str, Scene], views: Mapping[str, Sequence[ViewPoses]]

@@ -69,7 +69,7 @@ class Recording:
 
     def common_rows(self) -> IntArray:
         """The rows with a pose of both sides."""
-        return np.flatnonzero(self.robot.there & self.camera.there)
+        return np.flatnonzero(self.robot.present & self.camera.present)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from visioncal.session import Stream as Recorded
 from visioncal.session import frame_name
 from visioncal.session.columns import POSE
 from visioncal.simulation.arms import DhArm, forward
-from visioncal.simulation.boards import Sheet, corners_m, found_in_part
+from visioncal.simulation.boards import Sheet, corners_m, detectable_in_part
 from visioncal.simulation.cell import SimulatedCell, SimulatedSight
 from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.imaging import EDGE_PX, detected
@@ -39,13 +39,13 @@ class Passage:
 
     Attributes:
         options: Options of the sweep.
-        way: Joint path (k, n) [rad] over k times [s], with continuous acceleration.
+        path: Joint path (k, n) [rad] over k times [s], with continuous acceleration.
         robot_s: Times of the controller's reports, by its own clock [s].
         taken_s: Times of the frames' middle rows, by that clock [s].
     """
 
     options: SweepOptions
-    way: CubicSpline
+    path: CubicSpline
     robot_s: FloatArray
     taken_s: FloatArray
 
@@ -65,7 +65,7 @@ class Passage:
 
     def reported(self, arm: DhArm, rng: np.random.Generator) -> Recorded:
         """The controller's stream, from the nominal arm and noisy encoders."""
-        joints = self.way(self.robot_s)
+        joints = self.path(self.robot_s)
         joints = joints + self.options.encoder_sigma_rad * rng.standard_normal(joints.shape)
         poses = forward(arm, joints)
         quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
@@ -92,7 +92,7 @@ class Passage:
         corners, optics = corners_m(sheet), camera.camera
         delays_s = np.zeros(len(corners))
         for _ in range(_ROUNDS if self.options.readout_s else 1):
-            points = apply_each(before(self.way(taken_s + delays_s)), corners)
+            points = apply_each(before(self.path(taken_s + delays_s)), corners)
             px = project(optics, points)
             delays_s = self.options.readout_s * (px[:, 1] / (optics.resolution[1] - 1) - 0.5)
         ids = np.flatnonzero(sees(optics, points, EDGE_PX)).astype(np.int64)
@@ -131,7 +131,7 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
     passage = Passage.through(robot.joints[: swept.stops], swept)
     recorded = passage.reported(robot.arm, rng)
     camera, board = cell.camera(swept.camera), cell.board(swept.target)
-    min_corners = _FEWEST_OF_CELL if found_in_part(board.target) else len(corners_m(board))
+    min_corners = _FEWEST_OF_CELL if detectable_in_part(board.target) else len(corners_m(board))
     seen_from = pushed.seen_from(swept.robot, swept.camera, swept.target)
     used_views = [sight.view for sight in cell.sights] + [reading.view for reading in cell.readings]
     first_view = 1 + max([*used_views, *(row[0] for row in cell.pose_rows)], default=-1)
@@ -143,7 +143,7 @@ def with_sweep(cell: SimulatedCell, swept: Swept, pushed: SimulatedCell) -> Simu
     for taken_s in passage.taken_s.tolist():
         seen = partial(before, robot.options.jitter(1, rng))
         exact = passage.frame(taken_s, seen, camera, board, first_view + len(sights))
-        middle = seen(passage.way([taken_s]))[0]
+        middle = seen(passage.path([taken_s]))[0]
         if len(exact.ids) < min_corners or middle[2, 2] < _FACING:
             continue
         corners = detected(board, exact, options.pixel_sigma_px, rng)

@@ -15,7 +15,7 @@ from visioncal.simulation.boards import centre_m
 from visioncal.simulation.draws import RandomStream
 from visioncal.simulation.layout import CELL, MIDDLE_M, BoardAt, CameraAt, NetworkOptions, RobotAt
 from visioncal.simulation.poses import Viewpoints, filling_m, looking_at
-from visioncal.simulation.reach import home_posture, reached
+from visioncal.simulation.reach import home_posture, reachable_postures
 
 # Minimum height of links over their own base [m].
 _LEAST_HEIGHT_M = 0.02
@@ -197,7 +197,7 @@ def _aimed_postures(
             stops = stops[: len(views)]
             goals = _flanges(robot, aim, placed, flanges, stops, views[: len(stops)])
             starts = np.tile(homes[index], (len(stops), 1))
-            moved, good = reached(arm, goals, starts, _LEAST_HEIGHT_M)
+            moved, good = reachable_postures(arm, goals, starts, _LEAST_HEIGHT_M)
             joints[stops[good]] = moved[good]
             pending[stops[good]] = False
         if not pending.any():

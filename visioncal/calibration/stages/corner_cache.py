@@ -42,7 +42,7 @@ class Searched:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptCorners:
+class CornerCache:
     """Cached searches by the digests of what was searched.
 
     Attributes:
@@ -59,7 +59,7 @@ class KeptCorners:
     _lock: Lock = field(default_factory=Lock)
 
     @classmethod
-    def beside(cls, session: Session, *, grows: bool) -> "KeptCorners":
+    def beside(cls, session: Session, *, grows: bool) -> "CornerCache":
         """Reads a session's cache; empty for one without a folder."""
         if not isinstance(session.images, FolderImages):
             return cls(None, grows, {})
