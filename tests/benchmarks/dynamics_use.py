@@ -122,10 +122,10 @@ def text(found: list[dict[str, np.ndarray]]) -> str:
         for name in ("payload", "gains", "collision", "fed")
     )
     lines = [
-        f"{len(found)} simulated UR10e whose masses and inertias are 20 % off from the maker's, "
-        "3 % of noise in the torques, 20 s of a multi-sine at random to identify the arm, and the "
-        "same with a payload 88 mm off the flange's origin. Squares: of errors over their own "
-        "sigmas, which should be 1.",
+        f"{len(found)} simulated UR10e whose masses and inertias differ by 20 % from the "
+        "maker's, 3 % of noise in the torques, 20 s of a random multi-sine to identify the "
+        "arm, and the same with a payload 88 mm from the flange's origin. Squares: squared "
+        "errors over their stated variance, which should be 1.",
         "",
         "| payload [kg] | mass off by [g], median / worst | centre off by [mm] | squares, mass | "
         "centre |",
