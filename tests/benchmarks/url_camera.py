@@ -86,8 +86,8 @@ def main() -> None:
     ]
     text = (
         f"Pictures of {SIZE[0]} x {SIZE[1]} as JPEG, {RATE_HZ:g} a second over HTTP on the "
-        "loopback, each with its number in it, requested after pauses without requests. The age "
-        "is the time from the drawing of a picture, before encoding, to its stamp; more "
+        "loopback, each with its number in it, requested after pauses without requests. The age is "
+        "the time from drawing a picture, before encoding, to its stamp; more "
         "than one frame is too old.\n\n"
     )
     table = "\n".join(lines)
