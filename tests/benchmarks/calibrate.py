@@ -181,7 +181,7 @@ def main() -> None:
                 "command / OpenCV", "API / OpenCV", "command / OpenCV, wall",
                 "API / OpenCV, wall"]  # fmt: skip
         text += f"\n\n{table(head, rows)}"
-        text += "\n\nProcessor time of what is typed first:\n\n"
+        text += "\n\nProcessor time of the first commands:\n\n"
         text += table(["", "s", "over import typer"], started())
         text += "\n\nProcessor time of a small session, 20 views of 1280 x 800:\n\n"
         text += table(["calibrate", "s"], small(folder))
