@@ -127,7 +127,7 @@ def main() -> None:
     first = list(dict.fromkeys(row.group for row in rows if row.score > 0.0))
     said = [
         f"Of {len(rows)} sessions {counts[0]} have results and {counts[1]} rows a reason.",
-        f"Equal to `calibrate`'s to the bit: {same} of {len(sample)} that were compared.",
+        f"Bitwise equal to the results of `calibrate`: {same} of {len(sample)} compared.",
         f"First on the page: {', '.join(first)} (the loose camera is robot_{LOOSE % robots:02d},",
         f"the other model robot_{OTHER % robots:02d}). Load average meanwhile: ",
         f"{os.getloadavg()[2]:.0f}, on {os.cpu_count()} cores.",

@@ -172,16 +172,16 @@ def main() -> None:
         rows = [row for kind in first(kinds) for row in rows_of(*kind, folder)]
         text = (
             f"{VIEWS} views of 2448 x 2048 of a 9 x 6 ChArUco board, median of {REPEATS} "
-            "interleaved runs, processor time of all threads together. The command is started "
-            "anew and writes report and recording; the API is warm and writes nothing; OpenCV "
-            "reads and detects, no more. "
+            "interleaved runs, processor time of all threads together. The command includes "
+            "process start, report and recording; the API is warm and writes nothing; "
+            "OpenCV only reads and detects. "
             f"Load average meanwhile: {os.getloadavg()[2]:.0f} on {os.cpu_count()} cores."
         )
         head = ["files", "level", "threads", "command [s]", "API [s]", "OpenCV detection [s]",
                 "command / OpenCV", "API / OpenCV", "command / OpenCV, wall",
                 "API / OpenCV, wall"]  # fmt: skip
         text += f"\n\n{table(head, rows)}"
-        text += "\n\nProcessor time of what is typed first:\n\n"
+        text += "\n\nProcessor time of the first commands:\n\n"
         text += table(["", "s", "over import typer"], started())
         text += "\n\nProcessor time of a small session, 20 views of 1280 x 800:\n\n"
         text += table(["calibrate", "s"], small(folder))

@@ -139,10 +139,11 @@ def times_of_views(folder: Path) -> str:
     repeats = CONTROLLER.repeatability_rad
     return (
         f"{len(steps)} planned views took {took_s:.0f} s: {moved_s:.0f} s on the way, "
-        f"{settled_s:.0f} s settling, and {rest_s:.2f} s a view for all else (allowed "
+        f"{settled_s:.0f} s settling, and {rest_s:.2f} s a view for everything else (limit "
         f"{ALLOWED_S}; frames, finding, writing: {np.median(worked):.2f} median, "
-        f"{worked.max():.2f} at most). The told pose is {1e3 * max(compared.off_m):.3f} mm at most "
-        f"from where the flange was at the exposure; each joint repeats to {repeats:g} rad."
+        f"{worked.max():.2f} at most). The recorded pose differs by at most "
+        f"{1e3 * max(compared.off_m):.3f} mm from the flange's pose at the exposure; each joint "
+        f"repeats to {repeats:g} rad."
     )
 
 
@@ -167,8 +168,8 @@ def losses_of_kills(folder: Path) -> str:
     killed = sum(not end.done for end in ends)
     return (
         f"{killed} kills at random moments of one recording of {stops} views, resumed each time: "
-        "every view that was acknowledged was in the session after every kill, and all were there "
-        "in the end."
+        "after every kill the session contained every acknowledged view, and in the end all "
+        "views."
     )
 
 

@@ -107,10 +107,11 @@ def main(sweeps: int) -> None:
             "camera's place [mm]", "chi2 / 6", "refused")  # fmt: skip
     table = "\n".join(["| " + " | ".join(head) + " |", "| --- " * len(head) + "|", *rows])
     text = f"""Simulated UR10e cells, {sweeps} sweeps a row: 12 postures, 1.7 s from one to the
-next (5 postures in 7 s), without a rest; 30 frames a second whose poses have the noise of corners
-of 0.1 px, and the robot's poses at 125 Hz. The clocks differ by up to a second, drawn anew each
-time. Errors are of `clock.camera_minus_robot_s` against the truth; its sigma is a median. The
-camera's place is that of its transform (median), and chi2 / 6 is 1 where its covariance is right.
+next (5 postures in 7 s), without stopping; 30 frames a second whose poses have the noise of
+corners of 0.1 px, and the robot's poses at 125 Hz. The clocks differ by up to a second, at random
+in each sweep. Errors are of `clock.camera_minus_robot_s` against the truth; its sigma is a median.
+The camera's position error is a median, and chi2 / 6 is 1 if the covariance of its transform is
+right.
 
 {table}
 """

@@ -37,13 +37,12 @@ FAR_MM, FAR_MRAD = 50.0, 1e3 * np.radians(5.0)
 
 ACCURACY_HEAD = f"""\
 Median error of X over {SEEDS} seeds, ours against OpenCV's method of the same name
-(`calibrateHandEye`; `calibrateRobotWorldHandEye` for shah and li). A failure is no answer, or one
-that is more than {FAR_MM:.0f} mm or 5 degrees off; a median of mostly failures is `inf`.
+(`calibrateHandEye`; `calibrateRobotWorldHandEye` for shah and li). A failure is no result, or an
+error of more than {FAR_MM:.0f} mm or 5 degrees; a median of mostly failures is `inf`.
 The worlds are in `tests/support/worlds.py`. Unless their name says otherwise they have 20 views,
-tilts and rolls up to 40 degrees, and a camera that is mounted eye-in-hand and errs by 0.2 mm and
-0.3 mrad. A coarse robot errs by 0.3 mm and 0.5 mrad, a precise one by 0.03 mm and 0.05 mrad; the
-robot is precise in the world with noisy depth and in those with small tilts, and coarse in all
-others.
+tilts and rolls up to 40 degrees, and an eye-in-hand camera with noise of 0.2 mm and 0.3 mrad. A
+coarse robot has noise of 0.3 mm and 0.5 mrad, a precise one of 0.03 mm and 0.05 mrad; the robot is
+precise in the world with noisy depth and in those with small tilts, and coarse in all others.
 
 | world | solver | ours mrad | OpenCV mrad | ratio | ours mm | OpenCV mm | ratio | our failures \
 | OpenCV's |

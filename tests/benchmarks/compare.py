@@ -100,12 +100,13 @@ def main() -> None:
     lines = [head, ["---"] * 3 + ["---:"] * 5, *rows]
     table = "\n".join("| " + " | ".join(row) + " |" for row in lines)
     text = (
-        f"Of {PAIRS} pairs of calibrations of 20 views, corner noise 0.05 px. Unchanged pairs "
-        "are to be told apart in 5 % at most. Then the camera of the second is moved: shifted by "
+        f"Of {PAIRS} pairs of calibrations of 20 views, corner noise 0.05 px. At most 5 % of "
+        "unchanged pairs may be reported as changed. Then the camera of the second "
+        "calibration is moved: shifted by "
         f"{SIGMAS:g} times the `sigma_mm` of the difference (the root of its covariance's trace) "
-        "to a random side; by the same along the direction that is known worst; turned by "
-        f"{SIGMAS:g} times its `sigma_deg`. The last column counts random shifts that were found "
-        f"in the camera's edge and not in the board's.\n\n{table}\n"
+        "in a random direction; by the same in the worst-determined direction; rotated by "
+        f"{SIGMAS:g} times its `sigma_deg`. The last column counts random shifts that were "
+        f"attributed to the camera's transform and not to the board's.\n\n{table}\n"
     )
     print(text)
     write_section("Telling a change from noise", "python tests/benchmarks/compare.py", text)

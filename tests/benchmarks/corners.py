@@ -298,22 +298,24 @@ def main() -> None:
             f"**{target.kind}**; in {missing} rows more OpenCV finds no board.\n\n{table(found)}"
         )
     text = (
-        f"{PICTURES} pictures a row, tilted by 25 deg in a lens that bends by 2 % unless the row "
-        "says otherwise. Px are rms of a coordinate, `shared` rms of what all corners of a picture "
-        "have in common, outliers those more than "
-        f"{OUTLIER_PX} px off: OpenCV's (the best peer's) first. The aim for checkerboards is a "
-        "ratio of 0.65 at most, for ChArUco boards of 1. Of AprilGrids `squares` are tags, and of "
-        "circles distances of rows; an AprilGrid's corners are those of the tags that are read, of "
+        f"{PICTURES} pictures a row, tilted by 25 deg, with a lens distortion of 2 %, unless the "
+        "row states otherwise. Px are rms of a coordinate, `shared` is the rms of the "
+        "common error of a picture's corners, outliers are errors of more than "
+        f"{OUTLIER_PX} px: OpenCV's (the best peer's) first. The aim for checkerboards is a "
+        "ratio of 0.65 at most, for ChArUco boards of 1. For AprilGrids `squares` are tags, for "
+        "circles distances of rows; an AprilGrid's corners are those of the detected tags, "
+        "of "
         f"{4 * APRILGRID.columns * APRILGRID.rows} in a picture. NEES is the template's squared "
-        "error over the variance that it states.\n\n" + "\n\n".join(parts)
+        "error over its stated variance.\n\n" + "\n\n".join(parts)
     )
     print(text, flush=True)
     text += f"\n\nImages of 2448 x 2048 px, median processor time of one thread:\n\n{speed()}\n"
     if DATA.is_dir():
         text += (
-            "\nImages that others recorded: root mean square of a coordinate's residuals with a "
-            "lens of each set of corners, and the\namplitude of their wave of two pixels' length, "
-            f"which colour mosaics and sharpening leave:\n\n{of_others()}\n"
+            "\nImages from other sources: root mean square of a coordinate's residuals, with a "
+            "lens estimated from each set of corners, and the amplitude of their component "
+            "with a period of two pixels, which colour mosaics and sharpening cause:"
+            f"\n\n{of_others()}\n"
         )
     write_section("Corners", "PYTHONPATH=tests python tests/benchmarks/corners.py", text)
 

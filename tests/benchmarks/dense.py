@@ -228,8 +228,8 @@ def main() -> None:
         )
         print(parts[-1])
     text = (
-        f"{PICTURES} pictures a row, as in the section on corners less the largest squares; px "
-        "are rms of a coordinate, OpenCV's the best of its detector and three windows of "
+        f"{PICTURES} pictures a row, as in the section on corners, without the largest squares; "
+        "px are rms of a coordinate, OpenCV's the best of its detector and three windows of "
         "`cornerSubPix`. The aim is a ratio of 0.5 at most in all rows and of 0.35 in the "
         "median.\n\n"
         + "\n\n".join(parts)

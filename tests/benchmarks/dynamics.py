@@ -271,10 +271,10 @@ A real Franka Panda (Gaz et al. 2019: one exciting motion of 21 s at 1 kHz), tra
 {3}
 """
 WORLD_TEXT = """
-{worlds} simulated UR5e, whose masses and inertias are off by a fifth from the
-published ones, with Coulomb, viscous, offset and Stribeck friction and rotors; 3 % of torque noise,
-1e-5 rad of noise of the angles; one motion of `visioncal dynamics plan` of 20 s and a slow sweep of
-60 s, at 500 Hz. The fresh motion is a random multi-sine.
+{worlds} simulated UR5e, whose masses and inertias differ by a fifth from the published ones, with
+Coulomb, viscous, offset and Stribeck friction and rotors; 3 % of torque noise, 1e-5 rad of angle
+noise; one motion of `visioncal dynamics plan` of 20 s and a slow sweep of 60 s, at 500 Hz. The
+fresh motion is a random multi-sine.
 
 | what | came to |
 | --- | ---: |

@@ -122,10 +122,10 @@ def text(found: list[dict[str, np.ndarray]]) -> str:
         for name in ("payload", "gains", "collision", "fed")
     )
     lines = [
-        f"{len(found)} simulated UR10e whose masses and inertias are 20 % off from the maker's, "
-        "3 % of noise in the torques, 20 s of a multi-sine at random to identify the arm, and the "
-        "same with a payload 88 mm off the flange's origin. Squares: of errors over their own "
-        "sigmas, which should be 1.",
+        f"{len(found)} simulated UR10e whose masses and inertias differ by 20 % from the "
+        "maker's, 3 % of noise in the torques, 20 s of a random multi-sine to identify the "
+        "arm, and the same with a payload 88 mm from the flange's origin. Squares: squared "
+        "errors over their stated variance, which should be 1.",
         "",
         "| payload [kg] | mass off by [g], median / worst | centre off by [mm] | squares, mass | "
         "centre |",
@@ -140,11 +140,12 @@ def text(found: list[dict[str, np.ndarray]]) -> str:
     limits, soon = collision[:, :6], collision[:, 6]
     lines += [
         "",
-        f"- Drive gains by a known {PAYLOADS_KG[-1]:g} kg, currents recorded: off by "
+        f"- Drive gains from a known {PAYLOADS_KG[-1]:g} kg, currents recorded: errors of "
         f"{np.median(gains):.2f} % in the median, {gains.max():.2f} % at worst.",
-        f"- Torques fed forward on another motion, links as bodies: {np.median(fed[:, 0]):.2f} % "
-        f"of their range off in the median of joints ({fed[:, 0].max():.2f} % at worst); with the "
-        f"maker's inertias and the same friction {np.median(fed[:, 1]):.1f} % "
+        f"- Feed-forward torques of another motion, links as bodies: errors of "
+        f"{np.median(fed[:, 0]):.2f} % of their range in the median of joints "
+        f"({fed[:, 0].max():.2f} % at worst); with the maker's inertias and the same friction "
+        f"{np.median(fed[:, 1]):.1f} % "
         f"({fed[:, 1].max():.0f} %).",
         f"- Collisions, an observer of {GAIN_PER_S:g}/s while all joints move: without one the "
         f"residuals stay under "

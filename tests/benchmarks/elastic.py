@@ -162,13 +162,14 @@ def main(worlds: int, processes: int | None) -> None:
         (
             f"{worlds} worlds a row; 100 views, 5 MP, 0.1 px, a robot that repeats to 0.03 mm",
             "and 0.05 mrad; stiffness 6 to 20 kN m/rad (UR10e) or 400 to 1500 kN m/rad (1.8 m),",
-            "own weight alone. Medians; shares of the error of the edges alone. Springs: those",
-            "that are told; their sigma over its bound (median), error over sigma (root mean",
-            "square), and how many are within two sigmas. Dirty: as in the table of calibrated",
-            "arms, with its Cramer-Rao bound (the share's median), and our error over the bound",
-            "(root mean squares over all worlds). There the board's size is known to 0.02 %, and",
-            "an arm whose links are off by 0.5 mm knows no better: what that leaves grows with the",
-            "distance from the board, and no estimator gets below it. The last rows are of the",
+            "own weight alone. Medians; shares of the error with the transforms alone estimated.",
+            "Springs: the identified ones; their sigma over its bound (median), error over",
+            "sigma (root mean square), and the share within two sigmas. Dirty: as in the",
+            "table of calibrated arms, with its Cramer-Rao bound (the share's median), and",
+            "our error over the bound (root mean squares over all worlds). There the",
+            "board's size is known to 0.02 %, and an arm with link errors of 0.5 mm does",
+            "not determine it better: the remaining error grows with the distance from the",
+            "board, for any estimator. The last rows are of the",
             "same worlds with a board whose size is known to 0.001 %.\n",
             "| arm | camera | cell | edges alone [mm] | rigid arm | with springs "
             "| 90 % of worlds under | bound | error / bound | sigma / bound | error / sigma "

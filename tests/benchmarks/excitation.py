@@ -89,9 +89,9 @@ def main() -> None:
         "of the seeds. Weighted: rows divided by the joints' greatest torques, columns of unit "
         "length; plain: rows as they are, columns of unit length; links alone: plain, without the "
         "columns of friction; raw: rows and columns as they are. Random motions stay within the "
-        "limits of joints and drives (plain, median of 20). Shares of what is allowed, which is "
-        "90 % of the greatest speeds and accelerations, and torques with a margin of 1.2, at "
-        "1 kHz; beyond: samples at 1 kHz whose differences are beyond the data sheet.",
+        "limits of joints and drives (plain, median of 20). Shares of the limits: 90 % of the "
+        "greatest speeds and accelerations, and torques with a margin of 1.2, at 1 kHz; "
+        "beyond: samples at 1 kHz whose differences exceed the data sheet.",
         "",
         "| robot | base | weighted | plain | links alone | raw | random | range % | speed % | "
         "acceleration % | torque % | beyond | nearest mm | starts | s |",

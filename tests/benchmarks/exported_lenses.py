@@ -108,15 +108,16 @@ def main(seeds: int) -> None:
     """Prints the table and keeps it."""
     text = "\n".join(
         [
-            f"RMS of rays [px], medians of {seeds}: by matrix and coefficients of the fit, by",
-            "those of exports, by lens and field; and what an export says that it leaves.",
+            f"RMS of rays [px], medians of {seeds}: with matrix and coefficients of the fit,",
+            "with those of exports, with lens and field; and the remaining error that an",
+            "export states.",
             "",
             "| world | lens | fit | exported | lens and field | said |",
             "| --- | --- | ---: | ---: | ---: | ---: |",
             *(row(*pair, seeds) for pair in first(ROWS)),
             "",
-            "Eight later stops where nothing has changed: squared distance from the prediction",
-            "over its mean, and how often `verify` fails, without the field and with it.",
+            "Eight later stops without a change: squared distance from the prediction over its",
+            "mean, and how often `verify` fails, without and with the field.",
             "",
             "| world | mount | lens | without | fails | with | fails |",
             "| --- | --- | --- | ---: | ---: | ---: | ---: |",

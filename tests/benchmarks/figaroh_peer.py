@@ -259,21 +259,21 @@ def main(worlds: int) -> None:
     write_section("An arm calibrated from poses, against figaroh", command, text)
 
 
-TEXT = """{worlds} worlds each: a UR10e off by 0.5 mm and 1 mrad in every parameter, 60 views, 5 MP,
-0.1 px, a robot that repeats to 0.03 mm and 0.05 mrad. Both get the same joint angles and the same
-measured poses of the board, whose lens and size are exact. The error is that of the camera's place
-in the target at postures all over the workspace. Times are of one thread's processor, the least of
-three runs (one of `map_cv` and of `visioncal calibrate`).
+TEXT = """{worlds} worlds each: a UR10e with errors of 0.5 mm and 1 mrad in every parameter, 60
+views, 5 MP, 0.1 px, a robot that repeats to 0.03 mm and 0.05 mrad. Both get the same joint angles
+and the same measured poses of the board, whose lens and size are exact. The error is that of the
+camera's position in the target's frame at postures all over the workspace. Times are processor
+times of one thread, the least of three runs (one of `map_cv` and of `visioncal calibrate`).
 
 figaroh 1.0.2: a `BaseCalibration` whose `cost_function` is `calc_updated_fkm`,
 `_compute_logmap_residuals` (in the body) and `apply_measurement_weighting`, `full_params`, one
 marker of six components, base and tip unknown; the time is that of `initialize` and `solve`. Its
-world is what stands still, its marker what is on the flange. `structural` has the weights of its
-UR10 example (1 for m, 0.5 for rad). `map` is told the true noise and the true sizes of the arm's
-errors, as is visioncal's fit; `map_cv` finds the sizes by cross-validation, as visioncal's fit does
-by restricted likelihood. `visioncal calibrate` has no counterpart there: it also compares levels,
-looks for wrong views, and gives the covariance, intervals, held-out errors, other solvers' answers
-and a verdict.
+world is the fixed one of camera and board, its marker the one on the flange. `structural`
+has the weights of its UR10 example (1 for m, 0.5 for rad). `map` gets the true noise and the true
+sizes of the arm's errors, like visioncal's fit; `map_cv` estimates the sizes by cross-validation,
+visioncal's fit by restricted likelihood. `visioncal calibrate` has no counterpart in figaroh: it
+also compares levels, detects wrong views, and gives the covariance, intervals, held-out errors, the
+results of other solvers and a verdict.
 
 """
 

@@ -89,11 +89,11 @@ def main() -> None:
     text = "\n".join(
         [
             f"{len(found)} sessions of 15 rendered views, each with one mistake of the first hour: "
-            f"{named} are named by the first sentence of `calibrate`, and {good} are `good` once "
-            "what it says is typed, by a program that does what a reader would. Blur and "
-            "poor motion need a new recording; poses of the tool are a note alone. Files that are "
-            "merely another program's (semicolons, decimal commas, byte-order marks, empty rows) "
-            "are read as they are.",
+            f"{named} are named by the first sentence of `calibrate`, and {good} are `good` "
+            "after its commands are typed, by a program that follows the messages. Blur "
+            "and poor motion need a new recording; poses of the tool only give a note. "
+            "Files in the style of other programs (semicolons, decimal commas, byte-order "
+            "marks, empty rows) are read unchanged.",
             "",
             *rows,
         ]

@@ -233,13 +233,13 @@ def main() -> None:
     with one_blas_thread():
         text = "\n".join(
             (
-                f"{SEEDS} parts of 40 cm a row; root mean square over all of them. Where the "
-                "noise's level is estimated from few residuals, the squared error over the "
-                "covariance (NEES) is six times an F variable, whose mean is above 6.\n",
+                f"{SEEDS} parts of 40 cm a row; root mean square over all of them. If the noise "
+                "level is estimated from few residuals, the squared error over the "
+                "covariance (NEES) is six times an F variable, with a mean above 6.\n",
                 *accuracy(),
                 "",
-                "Wrong points and wrong orders, with an even noise of 0.1 mm that nobody tells the "
-                "fit:\n",
+                "Wrong points and wrong orders, with uniform noise of 0.1 mm that is unknown to "
+                "the fit:\n",
                 *mistakes(),
             )
         )

@@ -104,8 +104,8 @@ def main() -> None:
             sys.exit("There is no report.")
     load = f"{os.getloadavg()[0]:.0f}"
     text = [
-        f"Own pictures and a table to a report in {len(rows)} commands, the last two of which the "
-        f"refusal of the fourth prints (load average {load}, on 4 cores):",
+        f"From your own pictures and a table to a report in {len(rows)} commands; the refusal of "
+        f"the fourth prints the last two (load average {load}, on 4 cores):",
         "",
         "| typed | exit status | s |",
         "| --- | ---: | ---: |",

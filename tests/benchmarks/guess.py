@@ -109,16 +109,18 @@ def main() -> None:
         count, most = accused(world)
         sound.append([world, str(count), f"{most:.2f}" if most else "none came near"])
     text = (
-        f"Sessions, of {PLANTED} each, in which the planted mistake was named (in brackets: in "
-        "which another one was). Both mounts, three arms, lens given or estimated, three levels of "
+        f"Sessions, of {PLANTED} each, in which the simulated mistake was named (in brackets: "
+        "another one was named). Both mounts, three arms, lens given or estimated, three levels of "
         f"noise.\n\n{table(rows)}\n\n"
-        f"Sound sessions, {SOUND} of each world. The last column is the score of the declared "
-        "reading over that of the best other; from 3 on another reading stands out.\n\n"
+        f"Correct sessions, {SOUND} of each world. The last column is the score of the declared "
+        "convention over that of the best other; from 3 on, another convention is "
+        "reported.\n\n"
         f"{table(sound)}\n\n"
-        "What is not named: two rows exchanged of which one belonged to a wrong view anyway, or "
-        "that leave no majority of sound views; angles taken in another order where turns are so "
-        "small that orders hardly differ; and nearly anything where the views turn about one axis, "
-        "which is said: there, wrong readings close the chain better than the right one.\n"
+        "Not named: two exchanged rows if one belongs to a wrong view anyway, or if no majority "
+        "of correct views remains; a wrong order of angles if the rotations are so small "
+        "that the orders hardly differ; and nearly any mistake if the views rotate about "
+        "one axis, which is reported: wrong conventions then close the chain better than "
+        "the right one.\n"
     )
     print(text, f"{time.perf_counter() - started:.0f} s")
     command = "PYTHONPATH=tests python tests/benchmarks/guess.py"

@@ -363,7 +363,7 @@ def real_table() -> str:
     millimetres, degrees = real_folds(path, few(20, 1))
     return (
         f"`ric_charuco_eye_to_hand`, 20 times 5-fold over 15 views, everything but the corners "
-        f"fitted anew in each fold: {millimetres:.2f} mm and {degrees:.3f} deg."
+        f"estimated again in each fold: {millimetres:.2f} mm and {degrees:.3f} deg."
     )
 
 
@@ -382,18 +382,18 @@ def main(seeds: int, few: int) -> None:
     with Pool() as pool:
         refused = int(sum(pool.map(healthy, range(healthy_sets), chunksize=4)))
         text = f"""Simulated UR10e cells, 20 views of a 9 x 6 ChArUco board of 30 mm squares,
-cameras of 2448 x 2048 (5 MP) and 1280 x 800 (1.0 MP). A good robot errs by 0.03 mm and 0.05 mrad a
-stop, a coarse one by 0.3 mm and 0.5 mrad. Errors are of the camera's transform, root mean square;
-the bound is Cramer and Rao's with the board as stated. The squared error over the stated covariance
-of both edges, per degree of freedom, is 1 where the covariance is right; the board's scale is exact
-here and counts as known to 0.1 %, which makes it 11/12. OpenCV's best is the best of seven
-methods for each figure, from poses by solvePnP or calibrateCamera.
+cameras of 2448 x 2048 (5 MP) and 1280 x 800 (1.0 MP). A good robot has noise of 0.03 mm and 0.05
+mrad per stop, a coarse one of 0.3 mm and 0.5 mrad. Errors are root mean squares of the camera's
+transform; the bound is the Cramer-Rao bound with the stated board. The squared error over the
+stated covariance of both transforms, per degree of freedom, is 1 if the covariance is right; the
+board's scale is exact here but has a prior sigma of 0.1 %, so 11/12 is expected. OpenCV's best is
+the best of seven methods for each figure, with poses from solvePnP or calibrateCamera.
 
 {seeds} seeds a row:
 
 {bound_table(pool, seeds)}
 
-Views whose reported pose is off by 5 to 30 mm and 1 to 5 degrees, {few} seeds a row:
+Views with errors of 5 to 30 mm and 1 to 5 degrees in the reported pose, {few} seeds a row:
 
 {wrong_table(pool, few)}
 

@@ -130,12 +130,12 @@ def simulated(worlds: int) -> str:
         f"| {name} | {frames_row(item, worlds)} | {arm_row(item, worlds)} |"
         for name, item in first(tuple(KINDS.items()))
     ]
-    text = f"""A UR10e of which 30 stops are read, by an instrument of 20 um (50 urad where a
-    probe's rotation is read); the arm repeats to 0.03 mm and 0.03 mrad. {worlds} worlds a row.
-    Right arm: both frames against the Cramer-Rao bound at the true noise, and their squared errors
-    over the stated covariance (1 is right). Wrong arm (0.5 mm and 1 mrad in every parameter): the
-    first point's place at postures all over the workspace, root mean square; the bound is that of
-    all links' errors without any prior."""
+    text = f"""30 stops of a UR10e are read by an instrument of 20 um (50 urad for a probe's
+    rotation); the arm repeats to 0.03 mm and 0.03 mrad. {worlds} worlds a row.
+    Exact arm: both frames against the Cramer-Rao bound at the true noise, and their squared
+    errors over the stated covariance (1 is right). Inexact arm (0.5 mm and 1 mrad in every
+    parameter): error of the first point's position at postures all over the workspace, root mean
+    square; the bound has all link errors as unknowns, without a prior."""
     head = (
         "| read | frames: error / bound | squared error / covariance "
         "| wrong arm, frames alone [mm] | calibrated, all over [mm] | error / bound "
@@ -158,20 +158,20 @@ def example_a(worlds: int) -> str:
         taken.append(known.robot_arm.kinematics.level)
     stated, metres, millimetres, scaled = np.median(conditions, axis=0)
     text = f"""A 6R arm of 1.8 m (generic-6r-1800), one reflector on its flange, 30 random stops
-    read by a laser tracker of 20 um, no other noise; {worlds} worlds. Where the tracker stands and
-    the reflector sits is unknown, too. Errors of {size * 0.5:.2f} mm and {size:.2f} mrad in every
-    parameter put the nominal arm {np.median(before):.2f} mm off at its stops (rms, frames fitted).
-    Calibrated, fresh postures all over the workspace are predicted to {np.median(held):.3f} mm
-    (rms, median of the worlds; the worst {np.max(held):.3f} mm); {taken.count("geometry")} of
-    {worlds} take the geometry. Where such a fit stops at 0.31 mm, fifteen times the noise of the
-    tracker, the arm does what the model does not have."""
+    read by a laser tracker of 20 um, no other noise; {worlds} worlds. The poses of tracker and
+    reflector are unknown, too. Errors of {size * 0.5:.2f} mm and {size:.2f} mrad in every
+    parameter give the nominal arm errors of {np.median(before):.2f} mm at its stops (rms, frames
+    fitted). After calibration, new postures all over the workspace are predicted to
+    {np.median(held):.3f} mm (rms, median of the worlds; the worst {np.max(held):.3f} mm);
+    {taken.count("geometry")} of {worlds} choose the level geometry. If such a fit ends at 0.31 mm,
+    fifteen times the noise of the tracker, the arm has errors that are not in the model."""
     parameters = """Condition numbers of the identification by 28 parameters (24 of the table, 4 of
-    Hayati's), tracker and reflector known, over the 23 combinations that are told:"""
-    explained = """The five combinations that are not told at all have no condition in any units: a
-    finite number for all 28, like the 8e5 that is quoted of this example, is the rounding or the
-    damping of a solver. The rest depends on the units: in millimetres and radians an angle counts
-    a thousand times as much as a length, and its square a million times. The result depends on none
-    of it, since the fit scales its columns; the last row alone says something of the stops."""
+    Hayati's), tracker and reflector known, over the 23 identifiable combinations:"""
+    explained = """The five unidentifiable combinations have no finite condition number in any
+    units: a finite number for all 28, like the 8e5 quoted for this example, comes from rounding or
+    from a solver's damping. The others depend on the units: in millimetres and radians an angle has
+    a thousand times the weight of a length, and its square a million times. The result does not
+    depend on them, since the fit scales its columns; only the last row describes the stops."""
     rows = (
         ("mm, mrad, places in mm (as m, rad, m)", metres),
         ("mm, rad, places in mm", millimetres),
@@ -265,10 +265,10 @@ def irb120() -> str:
             f"| {name} test set, {len(q)} stops | {before.mean():.2f} | {rest.mean():.3f} "
             f"| {everything.mean():.3f} |"
         )
-    text = f"""**ABB IRB 120** (Wu et al. 2015): three points at 36 stops, by a measuring arm that
-    is taken as of 0.06 mm. {told(known)} The test sets have another tool: its point is the mean of
-    what their first five configurations say, and nothing else is fitted to them. Mean distances
-    [mm]:"""
+    text = f"""**ABB IRB 120** (Wu et al. 2015): three points at 36 stops, by a measuring arm with
+    an assumed sigma of 0.06 mm. {told(known)} The test sets have another tool: its point is the
+    mean of the estimates from their first five configurations, and nothing else is fitted to them.
+    Mean distances [mm]:"""
     head = "| | nominal arm, all | calibrated, the other configurations | calibrated, all |"
     return "\n".join((prose(text), "", head, "| --- | --- | --- | --- |", *lines))
 
@@ -301,10 +301,10 @@ def rokae() -> str:
     ]
     found = known.findings.rms
     return prose(
-        f"""**ROKAE-type arm**: 30 poses by a laser that is taken as of 0.02 mm and 0.1 mrad.
+        f"""**ROKAE-type arm**: 30 poses by a laser with assumed sigmas of 0.02 mm and 0.1 mrad.
         {told(known)} In sample {found.mm:.3f} mm and {found.deg:.3f} deg rms
         ({levels[0].rms_mm:.3f} mm with the geometry alone); in ten folds, with the level chosen
-        anew, {rms(folds[:, 0]):.3f} mm and {rms(folds[:, 1]):.3f} deg rms, in the median
+        in each, {rms(folds[:, 0]):.3f} mm and {rms(folds[:, 1]):.3f} deg rms, in the median
         {np.median(folds[:, 0]):.3f} mm."""
     )
 
@@ -314,9 +314,10 @@ def talos() -> str:
     known = known_of(thirdparty.talos(DATA))
     folds = cross_validated(lambda held: thirdparty.talos(DATA, held), 61)[:, 0]
     return prose(
-        f"""**TALOS**: 61 contacts of the left hand, moved by torso and arm (nine joints), taken as
-        of 0.3 mm. {told(known)} In ten folds, with the level chosen anew, {np.median(folds):.2f} mm
-        in the median, {folds.mean():.2f} mm in the mean, {folds.max():.2f} mm at most."""
+        f"""**TALOS**: 61 contacts of the left hand, moved by torso and arm (nine joints), with an
+        assumed sigma of 0.3 mm. {told(known)} In ten folds, with the level chosen in each,
+        {np.median(folds):.2f} mm in the median, {folds.mean():.2f} mm in the mean,
+        {folds.max():.2f} mm at most."""
     )
 
 

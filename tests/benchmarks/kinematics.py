@@ -167,7 +167,8 @@ def main(worlds: int) -> None:
         (
             f"{worlds} worlds a row; 5 MP, 0.1 px, a robot that repeats to 0.03 mm and 0.05 mrad,",
             "one board of 9 x 6 squares of 30 mm, as stated. Views are random in distance, tilt,",
-            "roll and branch of the arm; the last rows' are near one another, as one teaches them.",
+            "roll and branch of the arm; those of the last rows are near one another, as",
+            "in manual teaching.",
             "Medians; the whole error over the bound is a root mean square over all worlds, as is",
             "that over the predicted sigma; the time is of all behind detection.\n",
             "| arm | camera | views | edges alone [mm] | calibrated [mm] | share "
@@ -175,11 +176,11 @@ def main(worlds: int) -> None:
             "| error / predicted sigma | geometry taken | seconds |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
             *ideal,
-            "\nWith eccentric joints (0.15 mrad), gears that ripple (0.03 mrad), a board bent by",
-            "0.3 mm whose size is known to 0.02 %, and intrinsics that are off by 0.1 px:",
-            "shares of the error of the edges alone. Without the blocks: flat board, lens as",
-            "stated, no eccentricity, noise levels estimated; corners alone: the same unknowns,",
-            "with the stops taken for exact.\n",
+            "\nWith eccentric joints (0.15 mrad), gear ripple (0.03 mrad), a board bent by 0.3",
+            "mm whose size is known to 0.02 %, and intrinsics with errors of 0.1 px:",
+            "shares of the error with the transforms alone estimated. Without the blocks:",
+            "flat board, given lens, no eccentricity, noise levels estimated; corners alone: the",
+            "same unknowns, with the stops taken for exact.\n",
             "| arm | camera | views | edges alone [mm] | all blocks | 90 % of worlds under "
             "| without the blocks | corners alone |",
             "| --- | --- | --- | --- | --- | --- | --- | --- |",

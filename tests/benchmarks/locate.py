@@ -128,17 +128,17 @@ def main(cells: int) -> None:
                 rows.append((row.words, way, str(len(picks)), *figures(picks),
                              str(len(kept) - len(found))))  # fmt: skip
     share = 100 * np.mean([item.in_region for item in everything])
-    text = f"""Simulated UR10e cells of 20 views and {PICKS} picks each, at a new stop, with the
-noise of robot and pixels drawn anew. A good robot errs by 0.03 mm and 0.05 mrad a stop, a coarse
-one by 0.3 mm and 0.5 mrad. Planes are tilted against the view by 30 degrees or so, and half of them
-are known to 0.2 mm only; targets are a 9 x 6 ChArUco board of 30 mm squares and a marker of
-60 mm, both printed to 0.02 % of their size; the board of the calibration is known to 0.1 %, and
-differs by as much from what is stated. The region is the 95 % ellipsoid, the ball is that of
+    text = f"""Simulated UR10e cells of 20 views and {PICKS} picks each, at a new stop, with new
+noise of robot and pixels. A good robot has noise of 0.03 mm and 0.05 mrad per stop, a coarse one of
+0.3 mm and 0.5 mrad. Planes are tilted by about 30 degrees against the viewing direction, and half
+of them are known to 0.2 mm only; targets are a 9 x 6 ChArUco board of 30 mm squares and a marker of
+60 mm, both printed to 0.02 % of their size; the calibration's board has a stated sigma of 0.1 % and
+a true scale error of that size. The region is the 95 % ellipsoid, the ball is that of
 `radius95_mm`; errors, radii and times are medians.
 
 {table(head, rows)}
 
-Of all {len(everything)} picks the region holds {share:.1f} %.
+Of all {len(everything)} picks, the region contains {share:.1f} %.
 """
     print(text)
     write_section("Picks", "PYTHONPATH=tests python tests/benchmarks/locate.py", text)

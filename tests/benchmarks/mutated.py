@@ -95,10 +95,11 @@ def main() -> None:
                 f"{statuses[statuse]} with exit status {statuse}" for statuse in sorted(statuses)
             )
             + f"; {len(wrong)} with a traceback, another status, an earlier output that changed, "
-            "an unclear refusal, JSON that is none, or beyond the limits of "
+            "an unclear refusal, invalid JSON, or beyond the limits of "
             f"{LONGEST_S:.0f} s and {MOST_BYTES / 1024**3:.0f} GiB. The slowest took "
             f"{slowest:.1f} s, the largest process had {largest / 1e6:.0f} MB, all libraries "
-            "included. A cell has how often a command ended with a status, by what was broken.",
+            "included. A cell of the table counts the exit statuses of a command, by the kind of "
+            "broken input.",
             "",
             *by_command(mutants),
             "",

@@ -204,12 +204,12 @@ def main(cells: int) -> None:
     with Pool(2) as pool:
         kept = pool.map(of_one_cell, range(cells), chunksize=2)
     found = [outcome for outcome in kept if outcome is not None]
-    text = f"""{cells} simulated UR10e cells of 8 to 30 views, both mounts; robots that err by 0.02
-to 0.4 mm and 0.01 to 1.2 mrad a stop; corners with 0.05 to 0.3 px of noise, the lens given
-or estimated, or poses; tilts from 0.1 to 0.7 rad; the board known to 0.1 %. Of each, {PICKS} picks
-with new noise: a look, as one of the views looked, at a thing that is seen without noise, and a
-motion there. {cells - len(found)} sessions were refused. The standard error is in brackets (picks
-of one cell share its calibration).
+    text = f"""{cells} simulated UR10e cells of 8 to 30 views, both mounts; robots with noise of
+0.02 to 0.4 mm and 0.01 to 1.2 mrad a stop; corners with 0.05 to 0.3 px of noise, the lens given or
+estimated, or poses; tilts from 0.1 to 0.7 rad; the board known to 0.1 %. Of each, {PICKS} picks
+with new noise: an observation, from the pose of one of the views, of an object without image noise,
+and a motion there. {cells - len(found)} sessions were refused. The standard error is in brackets
+(picks of one cell share its calibration).
 
 {table(("stated", "cells", "mean stated", "picks that land", "difference"), in_bins(found))}
 

@@ -180,9 +180,9 @@ def report(cells: Sequence[Clean], faults: Sequence[Faulty], four_s: float) -> s
             "| ---: | ---: | ---: | ---: |",
             f"| {over[0]:.2f} | {over[1]:.2f} | {nees[0]:.2f} | {nees[1]:.2f} |",
             "",
-            f"{len(faults)} such cells in which one board is moved and one camera bumped on the "
-            "way, the images of",
-            "two rows are exchanged and six are of other stops:",
+            f"{len(faults)} such cells in which one board moves and one camera is bumped during",
+            "the recording, the images of two rows are exchanged and six images are from",
+            "other stops:",
             "",
             "| named | cells |",
             "| --- | ---: |",
@@ -193,8 +193,8 @@ def report(cells: Sequence[Clean], faults: Sequence[Faulty], four_s: float) -> s
             f"| all six images of other stops | {share([fault.strays == 6 for fault in faults])} |",
             f"| nothing besides | {share([fault.false == 0 for fault in faults])} |",
             "",
-            f"Base b is off by {rms[0]:.3f} mm (root mean square), in the same cells without "
-            f"faults by {rms[1]:.3f} mm.",
+            f"The error of base b is {rms[0]:.3f} mm (root mean square), in the same cells "
+            f"without faults {rms[1]:.3f} mm.",
             "",
             f"Four cameras at 40 stops, corners found: {four_s:.2f} s; a clean cell above: "
             f"{np.median([cell.taken_s for cell in cells]):.2f} s.",

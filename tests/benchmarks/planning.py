@@ -273,15 +273,16 @@ def main(worlds: int) -> None:
         ]
     text = "\n".join(
         (
-            f"Stops of a UR5e chosen from {CANDIDATES} feasible ones, and as many drawn from them;",
+            f"Stops of a UR5e chosen from {CANDIDATES} feasible ones, and the same number drawn "
+            "at random;",
             f"one board, {worlds} worlds a row, each with {DRAWS} draws of arm and noise. Planned",
-            f"over {SAMPLE} cells, from guesses that are off by {1e2 * GUESS_M:.0f} cm and",
+            f"over {SAMPLE} cells, from guesses with errors of {1e2 * GUESS_M:.0f} cm and",
             f"{np.rad2deg(GUESS_RAD):.1f} deg (one sigma per axis).",
-            "Kinematics: an arm whose links are off by 0.5 mm and 1 mrad, seen by 5 MP; errors of",
-            "what it carries all over its workspace. Hand-eye: a right arm, 1 MP; errors of the",
-            "camera's edge. Errors are root mean squares over the worlds; expected is the sigma in",
-            "the true cell: where the least ratio is over 1, random stops never were expected",
-            "better.\n",
+            "Kinematics: an arm with link errors of 0.5 mm and 1 mrad, a camera of 5 MP; errors",
+            "of the carried frame all over the workspace. Hand-eye: an exact arm, 1 MP;",
+            "errors of the camera's transform. Errors are root mean squares over the",
+            "worlds; expected is the sigma in the true cell: a least ratio over 1 means",
+            "that random stops were never expected to be better.\n",
             "| purpose | camera | stops | planned [mm] | random [mm] | ratio | ratio of means "
             "| ratio of rotations | planned, expected [mm] | random | ratio | least ratio |",
             "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
@@ -297,8 +298,8 @@ def main(worlds: int) -> None:
             "| arm | eye-in-hand, fair guess | bad guess | eye-to-hand, fair guess | bad guess |",
             "| --- | --- | --- | --- | --- |",
             *(search_row(name) for name in first(ARMS)),
-            "\nOf 20 planned stops, those that see the whole board [%] where both guesses are off",
-            f"by {1e2 * BAD_M:.0f} cm and {np.rad2deg(BAD_RAD):.0f} deg, and are said to be:\n",
+            "\nOf 20 planned stops, those that see the whole board [%] if both guesses have",
+            f"errors of {1e2 * BAD_M:.0f} cm and {np.rad2deg(BAD_RAD):.0f} deg, as stated:\n",
             "| arm | eye-in-hand, mean | worst world | eye-to-hand, mean | worst world |",
             "| --- | --- | --- | --- | --- |",
             *seen,

@@ -63,9 +63,9 @@ def main() -> None:
     print(table)
     if not WORDS:
         text = f"""Sigmas are those of the camera and of the board or, by an instrument, of its
-base and probe. Views are left out one by one, the rest of the answer being fitted anew; Park's
-solution (of the same views, their poses by the fitted lens and board) is beside it by the residuals
-of the views that it was fitted to. No truth is known.
+base and probe. Views are left out one by one, and the others fitted again; for Park's solution
+(from the same views, with poses from the fitted lens and board) the residuals are those of the
+views in its fit. The true values are unknown.
 
 {table}
 """

@@ -87,9 +87,9 @@ def main() -> None:
         lines.append(f"| {what} | {statistics.median(values):.2f} | {max(values):.2f} |")
     text = (
         f"{VIEWS} views of 2448 x 2048 as JPEG, {size / VIEWS / 1e6:.2f} MB each, already encoded; "
-        f"{REPEATS} interleaved turns. Every recorded view is flushed; the file is fsynced once, "
-        "and the files of the plain side each. Reading checks the SHA-256 of every image. The aim "
-        f"is {LIMIT_MS:g} ms a view beyond encoding for what is recorded.\n\n"
+        f"{REPEATS} interleaved turns. Every recorded view is flushed; the recording is fsynced "
+        "once, each plain file separately. Reading checks the SHA-256 of every image. The aim "
+        f"is {LIMIT_MS:g} ms per recorded view, without encoding.\n\n"
     )
     table = "\n".join(lines)
     print(text + table)

@@ -128,9 +128,11 @@ def faults(folder: Path) -> str:
         )
     lines += [wrong_banner(), disk_full(folder)]
     return (
-        f"{FAULT_STOPS} planned views; the fault comes after the second, while the arm moves, or, "
-        "of the camera, at the stop. A covered lens is told at each stop, and ends the recording "
-        "at the third; all others are told at once.\n\n" + "\n".join(lines) + "\n"
+        f"{FAULT_STOPS} planned views; the fault comes after the second, while the arm moves, "
+        "or, for the camera, at the stop. A covered lens is reported at each stop, and "
+        "ends the recording at the third; all others are reported at once.\n\n"
+        + "\n".join(lines)
+        + "\n"
     )
 
 
@@ -199,9 +201,11 @@ def knocks(folder: Path) -> str:
         finally:
             hand.end()
     return (
-        f"{hand.count} knocks of {1e3 * KNOCK_RAD:g} mrad in every joint, up to 1.5 s apart, while "
-        f"the arm stood at {len(steps)} stops. {len(witness.away_mm)} views were accepted; where "
-        f"each was taken, the flange was within {max(witness.away_mm, default=np.nan):.3f} mm of "
+        f"{hand.count} knocks of {1e3 * KNOCK_RAD:g} mrad in every joint, up to 1.5 s apart, "
+        "while the "
+        f"arm was at rest at {len(steps)} stops. {len(witness.away_mm)} views were "
+        "accepted; at each of them, the flange was within "
+        f"{max(witness.away_mm, default=np.nan):.3f} mm of "
         "what was recorded "
         "(a UR5e repeats to 0.03 mm).\n"
     )
@@ -217,7 +221,7 @@ def kills(folder: Path) -> str:
     killed = [end for end in ends if not end.done]
     moments = ", ".join(f"{item.after_s:.1f} s ({item.acknowledged})" for item in killed)
     return (
-        f"{len(killed)} recordings killed with SIGKILL, at random moments after they had begun "
+        f"{len(killed)} recordings killed with SIGKILL, at random moments after their start "
         f"(views acknowledged by then): {moments}. After each the session opened with every "
         f"acknowledged view; the last --resume completed all {KILL_STOPS}. No view was lost.\n"
     )

@@ -22,7 +22,8 @@ WORDS = tuple(argument for argument in sys.argv[1:] if argument != _OPTION)
 _Any = TypeVar("_Any")
 _HEAD = """# What the benchmarks measured
 
-Each section is written by the command that it names; run that command to renew it.
+Each section between `begin` and `end` marks is written by the command that it names; run that
+command to update it.
 """
 
 

@@ -126,11 +126,11 @@ def main(sweeps: int) -> None:
             "in sigmas")  # fmt: skip
     table = "\n".join(["| " + " | ".join(head) + " |", "| --- " * len(head) + "|", *rows])
     text = f"""Simulated UR10e cells, {sweeps} sweeps a row: 8 postures, 1.7 s from one to the next,
-without a rest; 30 frames a second with corners of 0.1 px, each at the time of its row, and the
+without stopping; 30 frames a second with corners of 0.1 px, each at the time of its row, and the
 robot's poses at 125 Hz; the clocks are 37 ms apart. Errors are of `clock.shutter.readout_s` against
-the truth; its sigma is a median. The camera's place is that of its transform (medians), and
-chi2 / 6 is 1 where its covariance tells its errors. The last two columns say how far it is off
-where the rows are ignored (in {IGNORED} sweeps), and how many sigmas of the answer that does not.
+the truth; its sigma is a median. The camera's position error and its sigma are medians, and chi2
+/ 6 is 1 if the covariance of its transform is right. The last two columns are the error if the row
+times are ignored (in {IGNORED} sweeps), and that error in sigmas of the result with row times.
 
 {table}
 """

@@ -130,13 +130,14 @@ def main() -> None:
         text = "\n".join(
             (
                 f"{SEEDS} seeds a row; flange tilted by up to 45 degrees, contact noise 0.1 mm per "
-                "axis; the robot's noise, where there is any, is 0.03 mm and 0.05 mrad per axis. "
-                "RMS errors; the bound is the Cramer-Rao bound by code of its own; the linear fit "
-                "is the plain least squares over the touches of kind `point`. The squared error "
-                "over its covariance is one where the covariance is right and the noise known; "
-                "with a noise estimated at f degrees of freedom it is f / (f - 2): 1.09 for ten "
+                "axis; the robot's noise, if any, is 0.03 mm and 0.05 mrad per axis. "
+                "RMS errors; the Cramer-Rao bound is computed by independent code; the linear "
+                "fit is plain least squares over the touches of kind `point`. The squared "
+                "error over its covariance is one if the covariance is right and the noise "
+                "known; with noise estimated with f degrees of freedom, f / (f - 2) is "
+                "expected: 1.09 for ten "
                 "touches of a point, 1.08 with four of the axes, 1.5 for four touches. It is "
-                "of the sets that lost none.\n",
+                "computed from the sets that lost no touch.\n",
                 "| touches | tip [mm] | over its bound | linear fit over bound | rotation [deg] | "
                 "over its bound | squared error over covariance | sets that lost a sound touch |",
                 "| --- | --- | --- | --- | --- | --- | --- | --- |",

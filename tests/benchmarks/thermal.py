@@ -49,8 +49,8 @@ def main() -> None:
     text = "\n".join(
         [
             f"{worlds} worlds: root mean squares over 60 postures of the workspace, from minute "
-            "100 to the fifth hour. *Share* is what is left over the drift, *surprise* what is "
-            "left over its predicted sigma.",
+            "100 to the fifth hour. *Share* is the remaining error over the drift, *surprise* "
+            "the remaining error over its predicted sigma.",
             "",
             "| arm | measured | drift [mm] | left [mm] | share | worst | surprise | s |",
             "| --- | --- | --- | --- | --- | --- | --- | --- |",

@@ -86,9 +86,9 @@ def main() -> None:
     ]
     text = (
         f"Pictures of {SIZE[0]} x {SIZE[1]} as JPEG, {RATE_HZ:g} a second over HTTP on the "
-        "loopback, each with its number in it, asked for after pauses in which nobody asks. The "
-        "age is from when the camera drew a picture, before encoding it, to its stamp; more than "
-        "one frame is too old.\n\n"
+        "loopback, each with its number in it, requested after pauses without requests. The age is "
+        "the time from drawing a picture, before encoding, to its stamp; more "
+        "than one frame is too old.\n\n"
     )
     table = "\n".join(lines)
     print(text + table)

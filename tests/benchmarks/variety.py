@@ -147,16 +147,16 @@ libraries: {sum(warned.values())}.
 
 {ends(walks)}
 
-`calibrate` and the look at the recording's layout run in all cells, the others in a part. A check
-that said no is a `verify` of the same world, which is a false alarm.
+`calibrate` and the check of the recording's layout run in all cells, the others in some. A "no"
+from `verify` is a false alarm, since the world has not changed.
 
 {errors(walks)}
 
-chi2 is that of all free transforms together under their joint covariance, and sigmas are those of a
-normal number as unlikely. A checkerboard's frame is taken as it fits best. Corners that are not as
-finders like are those of checkerboards with squares under 32 px and of ChArUco boards whose markers
-come within 4.5 px of the corners or fill more than 0.7 of the square: there OpenCV's corners are
-biased, in whole views together, and no covariance expects that.
+chi2 is computed for all free transforms together with their joint covariance, and converted to the
+sigmas of a normal variable of equal probability. Of a checkerboard's symmetric frames, the best
+fit is used. Corners are not "as finders like" on checkerboards with squares under 32 px and on
+ChArUco boards whose markers come within 4.5 px of the corners or fill more than 0.7 of the
+square: there OpenCV's corners have a common bias in whole views, which no covariance includes.
 
 What the cells were:
 

@@ -122,9 +122,10 @@ def main(checks: int) -> None:
     text = "\n".join(
         (
             f"{CELLS * each} checks a row, of {CELLS} UR5e calibrated from 60 views each; 5 MP,",
-            "0.1 px, a robot that repeats to 0.03 mm and 0.05 mrad, five stops anywhere that show",
-            "the board. Nothing as stated, with the camera on the flange: eccentric joints (0.15",
-            "mrad), gears that ripple (0.03 mrad), a board bent by 0.3 mm and 0.02 % too large,",
+            "0.1 px, a robot that repeats to 0.03 mm and 0.05 mrad, five stops anywhere with the",
+            "board in view. Nothing as stated, with the camera on the flange: eccentric",
+            "joints (0.15 mrad), gear ripple (0.03 mrad), a board bent by 0.3 mm and 0.02 % too "
+            "large,",
             "intrinsics 0.1 px off.\n",
             "| cell | change | named right | named right and alone | failed | CPU seconds each |",
             "| --- | --- | --- | --- | --- | --- |",

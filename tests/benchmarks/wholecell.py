@@ -185,13 +185,13 @@ def report(cells: Sequence[Outcome], taken_s: float) -> str:
             "|---|---:|",
             *(f"| {name} | {value} |" for name, value in rows),
             "",
-            "The other boards are as large as stated, which is known to 0.1 % only: the sigma of "
-            "the size counts that, and these cells have no need of it.",
+            "The other boards have exactly the stated size, but a prior sigma of 0.1 %: the "
+            "sigma of the size includes it, so it is too large in these cells.",
             "",
-            f"The frames' places are off by {away:.3f} mm (median, per axis). The height is taken "
+            f"The frames' position error is {away:.3f} mm (median, per axis). The height is used "
             f"in {sum(cell.prior_used for cell in cells)} of {len(cells)}; verdicts: {verdicts}. "
-            f"In {sum(cell.moved > 0 for cell in cells)} a frame is said to have moved that did "
-            f"not. One cell takes {taken_s:.1f} s of one core.",
+            f"In {sum(cell.moved > 0 for cell in cells)} a frame is falsely reported as moved. "
+            f"One cell takes {taken_s:.1f} s of one core.",
         ]
     )
 

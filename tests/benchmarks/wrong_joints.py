@@ -117,13 +117,14 @@ def main(count: int) -> None:
             for mapping in pool.map(partial(looked_at, arm), range(count), 1)
         ]
     text = (
-        f"Sessions, of {count} each, in which the planted slip was named. Both mounts, three arms, "
-        "10 to 40 views, corners of 0.1 px. Without poses, the camera is what tells.\n\n"
+        f"Sessions, of {count} each, in which the simulated mistake was named. Both mounts, "
+        "three arms, 10 to 40 views, corner noise of 0.1 px. Without poses, only the "
+        "camera reveals the mistake.\n\n"
         f"{counted(found, tuple(SLIPS), 'slip', [USUAL])}\n\n"
-        "By the camera alone a UR10 that stands for a UR10e leaves two or three times what the "
-        "arm's own errors leave: too little to accuse anybody. The levels of the arm's calibration "
-        "take it up.\n\n"
-        f"Sound sessions, {count} of each kind, that were accused of anything.\n\n"
+        "With the camera alone, a UR10 declared as a UR10e leaves residuals two or three times "
+        "those of the arm's own errors: too little for a finding. The arm's calibration "
+        "estimates the difference.\n\n"
+        f"Correct sessions, {count} of each kind, with a false finding.\n\n"
         f"{counted(found, tuple(SOUND), 'sound session', list(ARMS))}\n"
     )
     print(text, f"{time.perf_counter() - started:.0f} s")
