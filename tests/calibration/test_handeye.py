@@ -1,5 +1,6 @@
 """Both unknown edges: the fit, its covariance, and the motions that are refused."""
 
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -332,6 +333,19 @@ def test_small_tilts_are_refused_at_a_typical_noise():
         )
         with pytest.raises(DegenerateError, match=r"predicted sigma of .* at a typical noise"):
             solved(data)
+
+
+def test_the_geometry_of_the_stops_decides_and_not_how_little_noise_the_data_show():
+    x, z = some_edges(2)
+    motion, messages = one_axis(12, 2, np.deg2rad(0.3)), set()
+    for share in (1e-3, 0.1, 1.0):
+        noise = Noise.of_robot(share * np.deg2rad(0.05), share * 1e-4)
+        with pytest.raises(DegenerateError, match="at a typical noise") as refused:
+            solved(made_up(motion, x, z, noise))
+        figure = re.search(r"predicted sigma of ([\d.]+) mm", str(refused.value))
+        messages.add(float(figure[1]))
+    # The poses at which it is predicted differ by the noise itself.
+    assert max(messages) < 1.1 * min(messages)
 
 
 def test_weak_motion_is_answered_and_its_direction_told():

@@ -12,6 +12,7 @@ from visioncal.core.number_format import figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import edge_names, robot_part
+from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.linalg import covariance_among, spectrum
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
@@ -85,7 +86,8 @@ def check_observability(
 ) -> None:
     """Refuses motion that leaves a direction undetermined.
 
-    The motion is judged by its geometry, at a noise of at most `TYPICAL_NOISE` and `TYPICAL_PX`.
+    The motion is judged by its geometry, at `TYPICAL_NOISE` and `TYPICAL_PX`, whatever noise these
+    data show; lens and board, or points, at a corner noise of at most `TYPICAL_PX`.
 
     Args:
         problem: The used views.
@@ -147,11 +149,12 @@ def check_determined(
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
-    problem, noise = _at_typical_noise(problem, noise, pixel_px)
-    frames, placed = problem.with_effects(()), State(state.edges, np.zeros(0))
-    _refuse_null(frames, placed, noise, scene)
-    _refuse_vague(frames, placed, noise, scene)
+    typical, typical_noise = _at_typical_noise(problem, noise, pixel_px)
+    frames, placed = typical.with_effects(()), State(state.edges, np.zeros(0))
+    _refuse_null(frames, placed, typical_noise, scene)
+    _refuse_vague(frames, placed, typical_noise, scene)
     if looks and problem.effects:
+        problem, noise = _at_typical_noise(problem, noise, pixel_px, keeps_less=True)
         cause, advice = scene.undetermined
         first = problem.effects[0].determined
         _refuse_vague(
@@ -163,10 +166,11 @@ def check_determined(
 
 
 def _at_typical_noise(
-    problem: Problem, noise: Noise, pixel_px: Mapping[str, float]
+    problem: Problem, noise: Noise, pixel_px: Mapping[str, float], *, keeps_less: bool = False
 ) -> tuple[Problem, Noise]:
-    """The same observations at a typical noise, where the data show a larger one."""
-    shares = {name: min(1.0, TYPICAL_PX / px) for name, px in pixel_px.items()}
+    """The same observations at a typical noise, or at the data's where that is less and kept."""
+    most = 1.0 if keeps_less else np.inf
+    shares = {name: min(most, TYPICAL_PX / floored_sigma_px(px)) for name, px in pixel_px.items()}
     seen, least = problem.observations, min(shares.values(), default=1.0)
     scale = np.array([shares.get(observer, 1.0) for observer in seen.observers])[:, None, None]
     typical = replace(
@@ -179,7 +183,9 @@ def _at_typical_noise(
             for effect in problem.effects
         ),
     )
-    robots = np.minimum(noise.robots, TYPICAL_NOISE.robots)
+    robots = np.broadcast_to(TYPICAL_NOISE.robots, noise.robots.shape)
+    if keeps_less:
+        robots = np.minimum(noise.robots, robots)
     return typical, Noise(robots, np.minimum(noise.sensors, 1.0))
 
 
