@@ -406,7 +406,7 @@ Boards that differ from their description, {few} seeds a row (5 MP, 0.1 px, good
 {board_table(pool, few)}
 
 Of {healthy_sets} sets (8 to 30 views, tilts up to 3 to 45 degrees, both mounts, three arms),
-{refused} are refused: few views with the smallest tilts, which predict over 5 mm at a typical noise.
+{refused} are refused: few views with the smallest tilts, over 5 mm at a typical noise.
 
 {real_table()}
 """
