@@ -11,6 +11,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.vision.targets import corner_positions
 
 # Largest homography residual as a share of the corners' spread. Wrong numbers leave 0.7 to 1.1;
@@ -22,6 +23,8 @@ _FEWEST = 6
 _BORDER_PX = 2.0
 # Share of the views from which on targets count as seen from behind.
 _MOST_FROM_BEHIND = 0.5
+# Share from which on their corners are numbered so in all views: single ones may be wrong.
+_ALL_FROM_BEHIND = 0.9
 # Largest number of corners in a row that is tried; a sheet of paper holds fewer.
 _MOST_A_ROW = 100
 # Columns of a drawing minus corners in a row, by the kinds whose numbers go row by row.
@@ -118,6 +121,47 @@ def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, i
         "px.",
         culprits=["session.toml: resolution", *(f"view {corners.view}" for corners in outside)],
         next_step=f"In [camera] of session.toml, write resolution = [{height}, {width}].",
+    )
+
+
+def numbering_finding(views: Sequence[Corners], target: Target, name: str = "") -> Finding | None:
+    """Finding that a board's corners are numbered as if it was seen from behind.
+
+    Corners of mirrored images look the same; only the robot's motion tells them apart.
+
+    Args:
+        views: The corners of each view of the target.
+        target: The target.
+        name: Name of the target in the session, where it has several.
+    """
+    # The z axis of a rig may point either way.
+    if target.kind == "points" or not views:
+        return None
+    if np.mean([_is_from_behind(corners, target) for corners in views]) < _ALL_FROM_BEHIND:
+        return None
+    order, step = ": counterclockwise", "Number them clockwise from the marker's upper left"
+    if target.kind in _EXTRA_COLUMNS:
+        extra = _EXTRA_COLUMNS[target.kind]
+        columns, rows = target.columns - extra, target.rows - extra
+        order = ": rows from the bottom up, or column by column"
+        step = (
+            "Number them row by row from corner 0, which is at the upper left of the print (where "
+            f"rows were counted from the bottom, point p becomes {columns} * ({rows - 1} - p // "
+            f"{columns}) + p % {columns}"
+        )
+        # Column by column, the corners of other boards do not lie as drawn.
+        by_column = f"; where column by column, {columns} * (p % {rows}) + p // {rows}"
+        step = f"{step}{by_column if columns == rows else ''})"
+    elif target.kind != "marker":
+        order, step = "", "Number them as they are printed"
+    whose = f"target {name}" if name else "the board"
+    return Finding(
+        "corner_numbers",
+        f"corners.csv numbers the corners of {whose} as if it was seen from behind{order}. The "
+        "camera's pose holds, but the board's frame is turned over: its z axis points at the "
+        "camera.",
+        Remedy(f"{step}, and calibrate again.", CALIBRATE),
+        tuple(corners.view for corners in views),
     )
 
 
