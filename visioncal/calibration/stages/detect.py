@@ -27,6 +27,7 @@ from visioncal.vision.finders import DetectedCorners, NotFound, find_target, fit
 from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
 from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
+from visioncal.vision.finders.identify import identify
 from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image, poor_image_reason
 from visioncal.vision.targets import corner_positions, point_numbers
@@ -155,7 +156,7 @@ def detect(
 
 
 def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
-    """Whether images clearly show a checkerboard of another size than the declared one."""
+    """Whether images clearly show another board than the declared checkerboard."""
     # A thorough search for an absent board takes seconds an image, and is skipped where all images
     # of a sample show another board.
     target = session.boards[name]
@@ -171,10 +172,21 @@ def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
             return False
         seen = find_squares(image)
         if seen is None or not seen.found or seen.cut:
-            return False
-        if {seen.columns, seen.rows} == {target.columns, target.rows}:
+            if not _shows_markers_alone(image, target):
+                return False
+        elif {seen.columns, seen.rows} == {target.columns, target.rows}:
             return False
     return bool(sample)
+
+
+def _shows_markers_alone(image: Image, target: Target) -> bool:
+    """Whether an image shows a board with markers, and not the declared one beside it."""
+    try:
+        identity = identify(image)
+    except DataError:
+        return False
+    is_marked = identity.kind in ("charuco", "aprilgrid") and identity.corners_seen > 0
+    return is_marked and isinstance(find_target(image, target), NotFound)
 
 
 @contextmanager
