@@ -4,6 +4,7 @@ A view of a flat board is a homography, apart from noise, the lens and single ou
 under a tenth of the corners' spread. Numbers of another board leave nearly all of it.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 
 import cv2
@@ -121,6 +122,46 @@ def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, i
         "px.",
         culprits=["session.toml: resolution", *(f"view {corners.view}" for corners in outside)],
         next_step=f"In [camera] of session.toml, write resolution = [{height}, {width}].",
+    )
+
+
+def check_extent(
+    views: Sequence[Corners],
+    resolution: tuple[int, int],
+    image: tuple[int, int] | None,
+) -> None:
+    """Refuses a stated resolution that is smaller than the images in which corners were found.
+
+    Args:
+        views: The corners of each view.
+        resolution: Stated width and height of the image [px].
+        image: Width and height of one of these images [px]; None without.
+
+    Raises:
+        DataError: In most views, corners lie to the right of the image or below it.
+    """
+    last = np.array(resolution) - 1.0 + _BORDER_PX
+    outside = [corners for corners in views if (corners.px > last).any()]
+    if 2 * len(outside) <= len(views):
+        return
+    width, height = resolution
+    u_px, v_px = np.max([corners.px.max(axis=0) for corners in views], axis=0).tolist()
+    least = [math.ceil(u_px + 0.5), math.ceil(v_px + 0.5)]
+    size = f"{least} or more, the size of the images in which the corners were found"
+    if image is not None:
+        size = str(list(image))
+    step = (
+        f"In [camera] of session.toml, write resolution = {size}; matrix and distortion, where "
+        "stated, must be of that size."
+    )
+    if image == resolution:
+        step = "The images have the stated size: find the corners anew, in these images."
+    raise DataError(
+        f"session.toml: resolution = [{width}, {height}] is smaller than the images in which the "
+        f"corners of corners.csv were found: they reach u = {u_px:.1f} and v = {v_px:.1f} px, and "
+        f"those of {len(outside)} of {len(views)} views lie outside the stated image.",
+        culprits=["session.toml: resolution", *(f"view {corners.view}" for corners in outside)],
+        next_step=step,
     )
 
 

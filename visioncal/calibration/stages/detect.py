@@ -14,7 +14,12 @@ import cv2
 import numpy as np
 
 from visioncal.calibration.stages.corner_cache import CornerCache, Searched
-from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS, check_axes, check_numbers
+from visioncal.calibration.stages.corner_numbers import (
+    OTHER_NUMBERS,
+    check_axes,
+    check_extent,
+    check_numbers,
+)
 from visioncal.calibration.stages.image_size import other_size_step
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
@@ -136,6 +141,11 @@ def detect(
     check_axes(
         [(session.corners[view.number], session.boards[session.board_of(view)]) for view in given],
         resolution,
+    )
+    check_extent(
+        [session.corners[view.number] for view in given],
+        resolution,
+        _size_of_first(session, given),
     )
     imported = {view.number: _imported(session, view, resolution) for view in given}
     for name, target in session.boards.items():
@@ -419,6 +429,14 @@ def _sample(session: Session, views: Sequence[View], name: str) -> dict[int, Cor
         if len(sample) == _LAYOUT_SAMPLE:
             break
     return sample
+
+
+def _size_of_first(session: Session, views: Sequence[View]) -> tuple[int, int] | None:
+    """Width and height of the first image of some views; None without one."""
+    for view in views:
+        if view.image and session.images.exists(view.image):
+            return claimed_size(session.images.read(view.image))
+    return None
 
 
 def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, int] | None:
