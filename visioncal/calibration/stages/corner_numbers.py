@@ -129,6 +129,7 @@ def check_extent(
     views: Sequence[Corners],
     resolution: tuple[int, int],
     image: tuple[int, int] | None,
+    cameras: Iterable[tuple[int, int]] = (),
 ) -> None:
     """Refuses a stated resolution that is smaller than the images in which corners were found.
 
@@ -136,16 +137,20 @@ def check_extent(
         views: The corners of each view.
         resolution: Stated width and height of the image [px].
         image: Width and height of one of these images [px]; None without.
+        cameras: Stated width and height of the images of all cameras [px].
 
     Raises:
-        DataError: In most views, corners lie to the right of the image or below it.
+        DataError: In most views, corners lie to the right of the image or below it, and they do not
+            fit another camera's images, with which this one's may be exchanged.
     """
     last = np.array(resolution) - 1.0 + _BORDER_PX
     outside = [corners for corners in views if (corners.px > last).any()]
     if 2 * len(outside) <= len(views):
         return
-    width, height = resolution
-    u_px, v_px = np.max([corners.px.max(axis=0) for corners in views], axis=0).tolist()
+    extent = np.max([corners.px.max(axis=0) for corners in views], axis=0)
+    if any((extent <= np.array(size) - 1.0 + _BORDER_PX).all() for size in cameras):
+        return
+    (width, height), (u_px, v_px) = resolution, extent.tolist()
     least = [math.ceil(u_px + 0.5), math.ceil(v_px + 0.5)]
     size = f"{least} or more, the size of the images in which the corners were found"
     if image is not None:

@@ -146,6 +146,7 @@ def detect(
         [session.corners[view.number] for view in given],
         resolution,
         _size_of_first(session, given),
+        [camera.size for camera in session.cameras.values() if camera.size is not None],
     )
     imported = {view.number: _imported(session, view, resolution) for view in given}
     for name, target in session.boards.items():
