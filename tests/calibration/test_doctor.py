@@ -17,6 +17,7 @@ from support.typed_fixes import mended
 import visioncal
 from visioncal.calibration.pipeline import checkup
 from visioncal.calibration.pipeline.checkup import to_document
+from visioncal.calibration.stages import detect
 from visioncal.calibration.stages.image_size import other_images, scaled_matrix, turned_lens
 from visioncal.core.errors import DataError
 from visioncal.core.types import Camera
@@ -24,6 +25,7 @@ from visioncal.interchange.formats import load_for_rereading
 from visioncal.session import Session
 from visioncal.simulation import BOARDS
 from visioncal.vision.camera import project
+from visioncal.vision.finders import find_target
 from visioncal.vision.finders.board import FINDERS
 
 # Of each kind of finding one: what its first sentence is about, and the kind.
@@ -298,3 +300,23 @@ def test_a_turned_image_has_the_lens_that_its_rays_have(clockwise):
     seen, turned = ((799 - v, u), (-y, x, z)) if clockwise else ((v, 1279 - u), (y, -x, z))
     found = project(turned_lens(lens, clockwise=clockwise), np.stack(turned, axis=1))
     np.testing.assert_allclose(found, np.stack(seen, axis=1), atol=1e-9)
+
+
+def test_a_few_images_decide_that_a_board_with_markers_is_another(monkeypatch):
+    thorough = []
+
+    def counted(image, target, *, quick=False):
+        thorough.append(not quick)
+        return find_target(image, target, quick=quick)
+
+    monkeypatch.setattr(detect, "find_target", counted)
+    image, _ = photograph(charuco(9, 6), Shot(square_px=28))
+    image = np.pad(image, 20, mode="edge")
+    images = [np.roll(image, shift, axis=1) for shift in range(9)]
+    session = Session.from_arrays(images, np.tile(np.eye(4), (9, 1, 1)), checkerboard(9, 6))
+    found = visioncal.doctor(session).findings[0]
+    assert found.kind == "other_board"
+    assert "a ChArUco board of 9 x 6 squares" in found.words
+    # A thorough search for what is not there takes seconds in large images.
+    assert sum(thorough) == 3
+    assert len(thorough) > len(images)

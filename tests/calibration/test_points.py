@@ -684,7 +684,7 @@ def test_a_lens_that_cannot_be_the_cameras_is_not_used_and_comes_first(drawn):
 
 def test_corners_of_larger_images_than_stated_name_the_resolution(drawn):
     state(drawn, "resolution", [320, 240])
-    with pytest.raises(DataError, match=r"resolution in \[camera\] is not that of the images"):
+    with pytest.raises(DataError, match=r"resolution = \[320, 240\] is smaller than the images"):
         calibrate(drawn)
 
 

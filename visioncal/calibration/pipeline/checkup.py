@@ -7,7 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from visioncal.calibration.pipeline.exchanged_names import exchanged_names
-from visioncal.calibration.pipeline.misread_poses import misread_pose_finding, misreadings
+from visioncal.calibration.pipeline.misread_poses import (
+    misread_pose_finding,
+    misreadings,
+    turned_boards,
+)
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.running import initial_state
 from visioncal.calibration.pipeline.solving import first_inliers
@@ -139,8 +143,10 @@ def _findings(run: RunState, error: VisioncalError | None) -> Iterator[Finding]:
     hint = misread_pose_finding(run) if error is None and run.mount is not None else None
     if hint is not None:
         yield hint
+    readings = [*misreadings(run)] if error is None and run.mount is None else []
+    if error is None and hint is None and not readings:
+        yield from turned_boards(run)
     if run.mount is None:
-        readings = [*misreadings(run)] if error is None else []
         names = None if readings else exchanged_names(run)
         yield from readings if names is None else [names]
     if error is not None and cause is None:

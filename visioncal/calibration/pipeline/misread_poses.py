@@ -22,6 +22,7 @@ from visioncal.calibration.pipeline.guess_inputs import (
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cameras import COUNTED_BACKWARDS
+from visioncal.calibration.stages.corner_numbers import numbering_finding
 from visioncal.calibration.stages.doubts import is_scattered
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
@@ -270,6 +271,23 @@ def misreadings(run: RunState) -> Iterator[Finding]:
         yield from _misreadings_in_cell(run)
     elif not closes(_recording(run)) and (hint := misread_pose_finding(run)) is not None:
         yield hint
+
+
+def turned_boards(run: RunState) -> Iterator[Finding]:
+    """Findings on boards whose numbering turns their frames over; where nothing is misread.
+
+    The chain closes nevertheless, unlike that of mirrored images.
+    """
+    session = run.session
+    for name, target in session.boards.items():
+        corners = [
+            session.corners[view.number]
+            for view in session.views
+            if view.has_corners and view.number in run.poses and session.board_of(view) == name
+        ]
+        found = numbering_finding(corners, target, name if len(session.boards) > 1 else "")
+        if found is not None and (run.mount is None or closes(_recording(run))):
+            yield found
 
 
 def _misreadings_in_cell(run: RunState) -> Iterator[Finding]:

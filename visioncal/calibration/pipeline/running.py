@@ -15,6 +15,7 @@ from visioncal.calibration.pipeline.misread_poses import (
     may_be_misread,
     misread_pose_finding,
     misreadings,
+    turned_boards,
 )
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.calibration.pipeline.run_state import RunState
@@ -152,6 +153,8 @@ def run_stages(state: RunState) -> RunState:
             if stage.name == "joints":
                 located = state
                 hint = next(misreadings(state), None)
+                if hint is None:
+                    state = state.noting((), turned_boards(state))
                 # Where only some rows are exchanged, the others can still be fitted.
                 state = replace(state, is_misread=hint is not None and not hint.views)
         return _with_other_board(_with_reading(state, located, hint))

@@ -68,6 +68,7 @@ EVIDENCE: Mapping[str, Evidence] = {
     "shared_image": Evidence(_FACT),
     "repeated_views": Evidence(_FACT),
     "other_board": Evidence(_FACT),
+    "corner_numbers": Evidence(_FACT),
     "rig_points": Evidence(_FACT),
     "other_lens": Evidence(_FACT),
     "prior": Evidence(2.7e-3),

@@ -4,6 +4,7 @@ A view of a flat board is a homography, apart from noise, the lens and single ou
 under a tenth of the corners' spread. Numbers of another board leave nearly all of it.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 
 from visioncal.core.errors import DataError
 from visioncal.core.types import Corners, FloatArray, Target
+from visioncal.core.verdict import CALIBRATE, Finding, Remedy
 from visioncal.vision.targets import corner_positions
 
 # Largest homography residual as a share of the corners' spread. Wrong numbers leave 0.7 to 1.1;
@@ -22,6 +24,8 @@ _FEWEST = 6
 _BORDER_PX = 2.0
 # Share of the views from which on targets count as seen from behind.
 _MOST_FROM_BEHIND = 0.5
+# Share from which on their corners are numbered so in all views: single ones may be wrong.
+_ALL_FROM_BEHIND = 0.9
 # Largest number of corners in a row that is tried; a sheet of paper holds fewer.
 _MOST_A_ROW = 100
 # Columns of a drawing minus corners in a row, by the kinds whose numbers go row by row.
@@ -118,6 +122,92 @@ def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, i
         "px.",
         culprits=["session.toml: resolution", *(f"view {corners.view}" for corners in outside)],
         next_step=f"In [camera] of session.toml, write resolution = [{height}, {width}].",
+    )
+
+
+def check_extent(
+    views: Sequence[Corners],
+    resolution: tuple[int, int],
+    image: tuple[int, int] | None,
+    cameras: Iterable[tuple[int, int]] = (),
+) -> None:
+    """Refuses a stated resolution that is smaller than the images in which corners were found.
+
+    Args:
+        views: The corners of each view.
+        resolution: Stated width and height of the image [px].
+        image: Width and height of one of these images [px]; None without.
+        cameras: Stated width and height of the images of all cameras [px].
+
+    Raises:
+        DataError: In most views, corners lie to the right of the image or below it, and they do not
+            fit another camera's images, with which this one's may be exchanged.
+    """
+    last = np.array(resolution) - 1.0 + _BORDER_PX
+    outside = [corners for corners in views if (corners.px > last).any()]
+    if 2 * len(outside) <= len(views):
+        return
+    extent = np.max([corners.px.max(axis=0) for corners in views], axis=0)
+    if any((extent <= np.array(size) - 1.0 + _BORDER_PX).all() for size in cameras):
+        return
+    (width, height), (u_px, v_px) = resolution, extent.tolist()
+    least = [math.ceil(u_px + 0.5), math.ceil(v_px + 0.5)]
+    size = f"{least} or more, the size of the images in which the corners were found"
+    if image is not None:
+        size = str(list(image))
+    step = (
+        f"In [camera] of session.toml, write resolution = {size}; matrix and distortion, where "
+        "stated, must be of that size."
+    )
+    if image == resolution:
+        step = "The images have the stated size: find the corners anew, in these images."
+    raise DataError(
+        f"session.toml: resolution = [{width}, {height}] is smaller than the images in which the "
+        f"corners of corners.csv were found: they reach u = {u_px:.1f} and v = {v_px:.1f} px, and "
+        f"those of {len(outside)} of {len(views)} views lie outside the stated image.",
+        culprits=["session.toml: resolution", *(f"view {corners.view}" for corners in outside)],
+        next_step=step,
+    )
+
+
+def numbering_finding(views: Sequence[Corners], target: Target, name: str = "") -> Finding | None:
+    """Finding that a board's corners are numbered as if it was seen from behind.
+
+    Corners of mirrored images look the same; only the robot's motion tells them apart.
+
+    Args:
+        views: The corners of each view of the target.
+        target: The target.
+        name: Name of the target in the session, where it has several.
+    """
+    # The z axis of a rig may point either way.
+    if target.kind == "points" or not views:
+        return None
+    if np.mean([_is_from_behind(corners, target) for corners in views]) < _ALL_FROM_BEHIND:
+        return None
+    order, step = ": counterclockwise", "Number them clockwise from the marker's upper left"
+    if target.kind in _EXTRA_COLUMNS:
+        extra = _EXTRA_COLUMNS[target.kind]
+        columns, rows = target.columns - extra, target.rows - extra
+        order = ": rows from the bottom up, or column by column"
+        step = (
+            "Number them row by row from corner 0, which is at the upper left of the print (where "
+            f"rows were counted from the bottom, point p becomes {columns} * ({rows - 1} - p // "
+            f"{columns}) + p % {columns}"
+        )
+        # Column by column, the corners of other boards do not lie as drawn.
+        by_column = f"; where column by column, {columns} * (p % {rows}) + p // {rows}"
+        step = f"{step}{by_column if columns == rows else ''})"
+    elif target.kind != "marker":
+        order, step = "", "Number them as they are printed"
+    whose = f"target {name}" if name else "the board"
+    return Finding(
+        "corner_numbers",
+        f"corners.csv numbers the corners of {whose} as if it was seen from behind{order}. The "
+        "camera's pose holds, but the board's frame is turned over: its z axis points at the "
+        "camera.",
+        Remedy(f"{step}, and calibrate again.", CALIBRATE),
+        tuple(corners.view for corners in views),
     )
 
 

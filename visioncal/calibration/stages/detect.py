@@ -14,7 +14,12 @@ import cv2
 import numpy as np
 
 from visioncal.calibration.stages.corner_cache import CornerCache, Searched
-from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS, check_axes, check_numbers
+from visioncal.calibration.stages.corner_numbers import (
+    OTHER_NUMBERS,
+    check_axes,
+    check_extent,
+    check_numbers,
+)
 from visioncal.calibration.stages.image_size import other_size_step
 from visioncal.core.errors import DataError
 from visioncal.core.limits import MAX_BLUR_PX
@@ -27,6 +32,7 @@ from visioncal.vision.finders import DetectedCorners, NotFound, find_target, fit
 from visioncal.vision.finders.aprilgrid import LACKS_SQUARES, free_tags_step
 from visioncal.vision.finders.checkerboard import MOST_PIXELS as MOST_CHECKERBOARD_PIXELS
 from visioncal.vision.finders.headers import MOST_PIXELS, claimed_size
+from visioncal.vision.finders.identify import identify
 from visioncal.vision.finders.identify_checkerboard import find_squares
 from visioncal.vision.finders.imaging import blur_at_corners, decode_image, poor_image_reason
 from visioncal.vision.targets import corner_positions, point_numbers
@@ -136,6 +142,12 @@ def detect(
         [(session.corners[view.number], session.boards[session.board_of(view)]) for view in given],
         resolution,
     )
+    check_extent(
+        [session.corners[view.number] for view in given],
+        resolution,
+        _size_of_first(session, given),
+        [camera.size for camera in session.cameras.values() if camera.size is not None],
+    )
     imported = {view.number: _imported(session, view, resolution) for view in given}
     for name, target in session.boards.items():
         mine = [imported[view.number] for view in given if session.board_of(view) == name]
@@ -155,7 +167,7 @@ def detect(
 
 
 def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
-    """Whether images clearly show a checkerboard of another size than the declared one."""
+    """Whether images clearly show another board than the declared checkerboard."""
     # A thorough search for an absent board takes seconds an image, and is skipped where all images
     # of a sample show another board.
     target = session.boards[name]
@@ -171,10 +183,21 @@ def _shows_another(session: Session, name: str, views: Sequence[View]) -> bool:
             return False
         seen = find_squares(image)
         if seen is None or not seen.found or seen.cut:
-            return False
-        if {seen.columns, seen.rows} == {target.columns, target.rows}:
+            if not _shows_markers_alone(image, target):
+                return False
+        elif {seen.columns, seen.rows} == {target.columns, target.rows}:
             return False
     return bool(sample)
+
+
+def _shows_markers_alone(image: Image, target: Target) -> bool:
+    """Whether an image shows a board with markers, and not the declared one beside it."""
+    try:
+        identity = identify(image)
+    except DataError:
+        return False
+    is_marked = identity.kind in ("charuco", "aprilgrid") and identity.corners_seen > 0
+    return is_marked and isinstance(find_target(image, target), NotFound)
 
 
 @contextmanager
@@ -407,6 +430,14 @@ def _sample(session: Session, views: Sequence[View], name: str) -> dict[int, Cor
         if len(sample) == _LAYOUT_SAMPLE:
             break
     return sample
+
+
+def _size_of_first(session: Session, views: Sequence[View]) -> tuple[int, int] | None:
+    """Width and height of the first image of some views; None without one."""
+    for view in views:
+        if view.image and session.images.exists(view.image):
+            return claimed_size(session.images.read(view.image))
+    return None
 
 
 def _stated_resolution(session: Session, views: Sequence[View]) -> tuple[int, int] | None:

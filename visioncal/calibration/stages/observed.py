@@ -239,11 +239,11 @@ def nothing_seen(observed: Observed) -> DataError:
     outside = [view for view in observed.lost_views if "lies far outside the image" in view]
     if 2 * len(outside) > len(observed.lost_views):
         return DataError(
-            f"session {observed.session.name!r}: the corners lie outside the image: resolution in "
-            "[camera] is not that of the images in which they were found.",
+            f"session {observed.session.name!r}: the corners lie outside the image: their pixels "
+            "are not counted from its upper left corner.",
             culprits=outside,
-            next_step="In session.toml, give the resolution of these images, with the matrix that "
-            "belongs to it.",
+            next_step="In corners.csv, u_px counts to the right and v_px down, from the centre of "
+            "the upper left pixel of the whole image.",
         )
     return DataError(
         f"session {observed.session.name!r}: no view shows the target.",

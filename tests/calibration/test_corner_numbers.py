@@ -1,0 +1,120 @@
+"""Corners of another detector, numbered or counted otherwise than the drawing of the target."""
+
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import visioncal
+from visioncal.core.errors import DataError
+from visioncal.core.types import Target
+from visioncal.session import Session
+from visioncal.simulation import CellOptions, simulate
+from visioncal.vision.targets import load_target
+
+SQUARE = Target("board", "charuco", 6, 6, 0.03, 1e-6, marker_m=0.022, dictionary="DICT_5X5_100")
+
+
+def bottom_up(ids, columns, rows):
+    return columns * (rows - 1 - ids // columns) + ids % columns
+
+
+def by_column(ids, columns, rows):
+    return rows * (ids % columns) + ids // columns
+
+
+def renumbered(order, target, mount="eye-in-hand"):
+    """A sound cell, and its session with the corners numbered in another order."""
+    cell = simulate(CellOptions(mount=mount, views=16, seed=3, target=target))
+    inset = 1 if target.kind == "charuco" else 0
+    columns, rows = target.columns - inset, target.rows - inset
+    seen = [(order(view.ids, columns, rows), view.px) for view in cell.corners]
+    session = Session.from_corners(
+        seen, cell.robot.base_from_flange, target, cell.stated[""].resolution, mount=mount
+    )
+    return cell, session
+
+
+@pytest.mark.parametrize(
+    ("order", "target", "mount", "step"),
+    [
+        (
+            bottom_up,
+            load_target("checkerboard_9x6_25mm"),
+            "eye-to-hand",
+            "point p becomes 9 * (5 - p // 9) + p % 9), and calibrate again.",
+        ),
+        (by_column, SQUARE, "eye-in-hand", "where column by column, 5 * (p % 5) + p // 5), and"),
+    ],
+)
+def test_numbers_that_turn_the_board_over_are_named(order, target, mount, step):
+    cell, session = renumbered(order, target, mount)
+    found = visioncal.calibrate(session)
+    assert found.verdict.status == "check"
+    cause = found.verdict.causes[0]
+    assert cause.kind == "corner_numbers"
+    assert cause.words.startswith("corners.csv numbers the corners of the board as if it was seen")
+    assert step in str(cause.do)
+    # The board's z axis points at the camera, and the camera is where it is.
+    board = "base_from_target" if mount == "eye-in-hand" else "flange_from_target"
+    assert found.edges[board].matrix[:3, 2] @ cell.transforms[board][:3, 2] < -0.99
+    (camera,) = set(cell.transforms) - {board}
+    assert np.linalg.norm((found.edges[camera].matrix - cell.transforms[camera])[:3, 3]) < 1e-3
+    assert [finding.kind for finding in visioncal.doctor(session).findings] == ["corner_numbers"]
+
+
+def test_a_marker_numbered_counterclockwise_is_named():
+    marker = replace(load_target("aruco_4x4_50_id0_120mm"), square_sigma_m=1e-6)
+    _, session = renumbered(lambda ids, *_: ids[::-1], marker)
+    causes = visioncal.calibrate(session).verdict.causes
+    assert "from behind: counterclockwise." in causes[0].words
+
+
+def test_numbers_as_drawn_are_not_accused():
+    for order in (lambda ids, *_: ids, lambda ids, columns, rows: columns * rows - 1 - ids):
+        _, session = renumbered(order, load_target("checkerboard_9x6_25mm"))
+        assert visioncal.calibrate(session).verdict.status == "good"
+        assert visioncal.doctor(session).is_sound
+
+
+@pytest.mark.parametrize(
+    ("image", "step"),
+    [
+        (None, r"write resolution = \[\d+, \d+\] or more, the size of the images in which"),
+        ((800, 1280), r"write resolution = \[1280, 800\];"),
+        ((400, 640), "find the corners anew, in these images"),
+    ],
+    ids=["no image", "another size", "the stated size"],
+)
+def test_a_resolution_that_most_corners_exceed_is_named(tmp_path, image, step):
+    cell = simulate(CellOptions(views=12, seed=3))
+    assert cell.stated[""].resolution == (1280, 800)
+    seen = [(view.ids, view.px) for view in cell.corners]
+    flange, target = cell.robot.base_from_flange, cell.options.target
+    Session.from_corners(seen, flange, target, (640, 400), mount="eye-in-hand").save(tmp_path)
+    if image is not None:
+        cv2.imwrite(str(tmp_path / "000.png"), np.zeros(image, np.uint8))
+        head, *rows = (tmp_path / "views.csv").read_text("utf-8").splitlines()
+        lines = [f"{head},image", *(f"{row},000.png" for row in rows)]
+        (tmp_path / "views.csv").write_text("\n".join(lines) + "\n", "utf-8")
+    session = Session.load(tmp_path)
+    with pytest.raises(DataError) as refused:
+        visioncal.calibrate(session)
+    highest = np.max([view.px.max(axis=0) for view in cell.corners], axis=0)
+    said = refused.value.message
+    assert "session.toml: resolution = [640, 400] is smaller than the images" in said
+    assert f"they reach u = {highest[0]:.1f} and v = {highest[1]:.1f} px" in said
+    assert re.search(step, refused.value.next_step)
+    (found,) = (item for item in visioncal.doctor(session).findings if item.words == said)
+    assert found.do.words == refused.value.next_step
+
+
+def test_corners_left_of_the_image_are_not_of_larger_images():
+    cell = simulate(CellOptions(views=12, seed=3))
+    seen = [(view.ids, view.px - [1280, 0]) for view in cell.corners]
+    flange, target = cell.robot.base_from_flange, cell.options.target
+    session = Session.from_corners(seen, flange, target, (1280, 800), mount="eye-in-hand")
+    with pytest.raises(DataError, match="not counted from its upper left corner"):
+        visioncal.calibrate(session)
