@@ -9,6 +9,7 @@ from support.marks import slow
 
 from visioncal.calibration.pipeline.running import view_evidence
 from visioncal.calibration.pipeline.steps import STAGES
+from visioncal.calibration.stages.cause_ranking import REFINE_LENS
 from visioncal.calibration.stages.observed import nothing_seen
 from visioncal.core.errors import DataError
 from visioncal.core.types import MOUNTS, Camera, Target
@@ -16,6 +17,12 @@ from visioncal.estimation.closed_form import SOLVERS
 from visioncal.simulation import CellOptions, fine_camera, fisheye_camera, simulate, wide_camera
 
 FINE = CellOptions(camera=fine_camera(), pixel_sigma_px=0.1)
+# Simulated boards have exactly their size.
+MARKER = replace(
+    FINE,
+    target=Target("tag", "marker", 1, 1, 0.12, 1e-6, dictionary="DICT_5X5_100", marker_id=3),
+    pixel_sigma_px=0.03,
+)
 # Its corners look the same after half a turn, and at small tilts its mirrored pose fits as well.
 AMBIGUOUS = replace(
     FINE,
@@ -72,6 +79,70 @@ def test_a_matrix_known_to_a_pixel_is_counted_as_such(mode):
         surprises.append(mahalanobis_sq(cell, known))
     # Mean of 8 chi-square of 12 over 12: sigma 0.14; four sigma, and held values err a bit more.
     assert 0.4 < np.mean(surprises) < 1.8
+
+
+@pytest.mark.parametrize("mode", ["auto", slow("refine")])
+def test_a_rough_matrix_is_refined_within_its_prior_by_views_of_one_marker(mode):
+    rng, sigma_px, nees = np.random.default_rng(3), 6.0, []
+    for seed in range(10):
+        cell = simulate(replace(MARKER, seed=seed))
+        # Of the stated sigma, but without the rare draws beyond three sigmas, which are named.
+        off_px = sigma_px * rng.uniform(-(3**0.5), 3**0.5, 4)
+        session = with_camera(cell, off_px, matrix_sigma_px=sigma_px, intrinsics=mode)
+        known = calibrated(cell, session=session)
+        nees.append(mahalanobis_sq(cell, known))
+        # The corners' noise does not absorb the lens's error, and nothing is accused for it.
+        (noise_px,) = known.cell_fit.linearised_corners.sigmas_px
+        assert noise_px == pytest.approx(0.03, rel=0.5)
+        assert known.verdict.status == "good", known.verdict.reasons
+        assert not any("was not done" in finding.words for finding in known.verdict.findings)
+    # Mean of 10 chi-square of 12 over 12: sigma 0.13.
+    assert 0.6 < np.mean(nees) < 1.5
+
+
+def test_a_matrix_off_by_many_of_its_sigmas_is_refined_without_its_prior_and_named():
+    nees = []
+    for seed in range(4):
+        cell = simulate(replace(MARKER, seed=seed))
+        session = with_camera(cell, (9.0, -9.0, 6.0, -9.0), matrix_sigma_px=0.6)
+        known = calibrated(cell, session=session)
+        nees.append(mahalanobis_sq(cell, known))
+        assert "lens" in [cause.kind for cause in known.verdict.causes]
+    # Mean of 4 chi-square of 12 over 12: sigma 0.2.
+    assert np.mean(nees) == pytest.approx(1.0, abs=0.8)
+
+
+@pytest.mark.parametrize(
+    ("table", "is_refused"),
+    [
+        ({}, False),
+        ({"matrix_sigma_px": 6.0, "intrinsics": "hold"}, False),
+        ({"intrinsics": "refine"}, True),
+    ],
+    ids=["no prior", "held", "refined without a prior"],
+)
+def test_a_matrix_without_a_prior_is_held_on_views_of_one_marker(table, is_refused):
+    cell = simulate(MARKER)
+    known = calibrated(cell, session=with_camera(cell, **table))
+    fitted = known.cell_fit
+    assert not np.isin(
+        fitted.camera_parameters.lens_of("cam"), fitted.linearised_corners.moving
+    ).any()
+    refused = [finding for finding in known.verdict.findings if "was not done" in finding.words]
+    assert len(refused) == is_refused
+    assert all("matrix_sigma_px" in finding.do.words for finding in refused)
+
+
+def test_an_uncertain_result_of_a_held_lens_names_the_lens_and_not_the_board():
+    cell = simulate(replace(MARKER, pixel_sigma_px=0.2))
+    off_px = (9.0, -9.0, 9.0, 9.0)
+    session = with_camera(cell, off_px, matrix_sigma_px=9.0, intrinsics="hold")
+    known = calibrated(cell, session=session)
+    budget = known.accuracy_at_work.budget_mm
+    assert np.hypot(budget["intrinsics"], budget["held_values"]) > 0.8 * budget["total"]
+    (weak,) = (finding for finding in known.verdict.findings if finding.kind == "weak_motion")
+    assert "most of that is the lens's" in weak.words
+    assert weak.do is REFINE_LENS
 
 
 @pytest.mark.parametrize("given", [slow(True), False], ids=["lens given", "lens estimated"])

@@ -12,7 +12,12 @@ from support.cells import calibrated, showing
 from support.sound_findings import SOUND, changed, directions, left_out
 
 from visioncal.calibration.pipeline import calibrate
-from visioncal.calibration.stages.cause_ranking import MEASURE_BOARD, NO_JOINTS, with_misread
+from visioncal.calibration.stages.cause_ranking import (
+    MEASURE_BOARD,
+    NO_JOINTS,
+    REFINE_LENS,
+    with_misread,
+)
 from visioncal.calibration.stages.findings import PointAccuracy
 from visioncal.calibration.stages.fit_messages import scale_finding
 from visioncal.calibration.stages.judge import judge
@@ -194,8 +199,19 @@ def test_errors_that_are_too_large_come_from_their_sources(need) -> None:
     budget = {"pixels": 0.05, "board": 0.02, "held values": 0.1, "total": 0.12}
     of_board = replace(found, places=(PointAccuracy("A point", budget, 0.2),))
     assert judge(of_board).causes[1].do is MEASURE_BOARD
-    of_lens = replace(of_board, places=(PointAccuracy("A point", {**budget, "lens": 0.05}, 0.2),))
-    assert "Add views" in judge(of_lens).causes[1].do.words
+    # Nor do they where a lens is held that is known less than the board.
+    of_lens = replace(
+        changed(of_board, holds_lens=True, has_lens_sigma=True),
+        places=(PointAccuracy("A point", {**budget, "intrinsics": 0.05}, 0.2),),
+    )
+    assert judge(of_lens).causes[1].do is REFINE_LENS
+    assert judge(changed(of_lens, holds_lens=False)).causes[1].do is MEASURE_BOARD
+    # What is not stated is not refined within its sigma.
+    assert "Add views" in judge(changed(of_lens, has_lens_sigma=False)).causes[1].do.words
+    less_known_board = replace(
+        of_lens, places=(PointAccuracy("A point", {**budget, "intrinsics": 0.01}, 0.2),)
+    )
+    assert judge(less_known_board).causes[1].do is MEASURE_BOARD
     # What can be had without them is no cause of a doubt about something else.
     met = replace(found, need=None, worst=directions(1e-4), warnings=(DRIFT,))
     assert ids(judge(met)) == ["moved_slowly"]

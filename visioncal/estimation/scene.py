@@ -180,6 +180,16 @@ class CornerProblem:
         residuals = 2 * len(self.stack.px) - 6 * len(self.stack.views)
         return residuals >= _SPARE * (len(self.lens) + len(BOARD_NAMES) * len(self.printed))
 
+    @property
+    def is_refined_by_prior(self) -> bool:
+        """Whether a given matrix is refined within its stated sigma, by corners too few to test it.
+
+        The robot's motion determines it, too. Without a stated sigma it is held.
+        """
+        scene = self.scene
+        is_stated = scene.matrix_sigma_px is not None and not scene.estimated
+        return is_stated and scene.mode != "hold" and not self.has_spare_corners
+
     def unknowns(self, compressed: Compressed, moving: IntArray) -> int:
         """Number of unknowns that the corners have determined, including the poses.
 
@@ -204,6 +214,8 @@ class CornerProblem:
             return np.union1d(self.lens, self.points)
         if self.scene.mode == "refine" and self.has_spare_corners:
             return np.concatenate([self.lens, np.union1d(self.shape, self.points)])
+        if self.is_refined_by_prior:
+            return np.concatenate([self.lens[:4], self.points])
         return self.points
 
     @property

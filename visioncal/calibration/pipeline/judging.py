@@ -307,7 +307,7 @@ def _sensors(
 ) -> list[Sensor]:
     seers = dict.fromkeys(view.seer for view in views)
     not_needed = run.spared.keys() | run.held_back
-    sensors = []
+    seen, sensors = run.cell_fit.linearised_corners, []
     for seer in seers:
         seer_views = [view for view in views if view.seer == seer]
         unused = (view for view in seer_views if not view.used and view.view not in not_needed)
@@ -322,6 +322,8 @@ def _sensors(
                 levels.get("level", 1.0),
                 sum(view.view in run.spared for view in seer_views),
                 seer if len(seers) > 1 else "",
+                seen is not None and seen.holds_lens(seer),
+                seer in run.scenes and run.scenes[seer].matrix_sigma_px is not None,
             )
         )
     return sensors

@@ -125,8 +125,16 @@ _SIGMAS, _LIKELIER = ("weak_motion", "place", "workspace"), 0.5
 TILTED = Remedy("Add views tilted by 30 to 45 degrees.")
 MEASURE_BOARD = Remedy(
     "Measure the board with a caliper over its whole width, and state square_m, the side of one "
-    "square, and square_sigma_m, how well it is known, of the target: more views tell neither."
+    "square (of a marker size_m, its side), and square_sigma_m, how well it is known, of the "
+    "target: more views tell neither."
 )
+
+# Remedy for a given lens that is held and not known better.
+REFINE_LENS = Remedy(
+    'In [camera], set intrinsics = "refine", best with more views and a board of many corners, or '
+    "state a smaller matrix_sigma_px where fx, fy, cx, cy are known better."
+)
+_STATED_BETTER = (MEASURE_BOARD, REFINE_LENS)
 
 # Remedy for errors of an arm whose joints are not known.
 NO_JOINTS = Remedy(
@@ -228,7 +236,9 @@ def _with_weak_motion(found: Sequence[Finding], more: Remedy | None) -> Sequence
     """Findings with weak motion as the cause, and its remedy, of an uncertain calibration."""
     weak = next((finding for finding in found if finding.kind == "weak_motion"), None)
     source = next((finding for finding in found if finding.kind == "calibration"), None)
-    if weak is None or source is None or source.probability < 0.5 or more in (None, MEASURE_BOARD):
+    if weak is None or source is None or source.probability < 0.5:
+        return found
+    if more is None or more in _STATED_BETTER:
         return found
     return [
         replace(weak, probability=source.probability),

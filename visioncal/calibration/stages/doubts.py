@@ -10,6 +10,7 @@ from visioncal.calibration.stages.cause_ranking import (
     MEASURE_BOARD,
     MOVED_AT_ONCE,
     NO_JOINTS,
+    REFINE_LENS,
     add_views_remedy,
     run_evidence,
 )
@@ -129,25 +130,51 @@ def _is_of_arm(findings: Findings) -> bool:
 
 def _is_of_board(findings: Findings) -> bool:
     """Whether most uncertainty comes from the stated size of boards, which no view reduces."""
-    # Held values may include a lens.
-    names = {name.partition(" of ")[0] for place in findings.places for name in place.budget_mm}
-    held = () if "lens" in names else ("held values",)
+    held = () if _has_uncertain_held_lens(findings) else ("held values",)
     return _is_mostly_of(findings, "board", *held)
 
 
+def _is_of_lens(findings: Findings) -> bool:
+    """Whether most uncertainty comes from lenses that are held although their sigma is stated."""
+    return (
+        any(sensor.holds_lens and sensor.has_lens_sigma for sensor in findings.sensors)
+        and _has_uncertain_held_lens(findings)
+        and _is_mostly_of(findings, "intrinsics", "held values")
+    )
+
+
+def _has_uncertain_held_lens(findings: Findings) -> bool:
+    """Whether held values are lenses rather than boards, of which the budget has less."""
+    return any(sensor.holds_lens for sensor in findings.sensors) and (
+        _variance_of(findings, "intrinsics") > _variance_of(findings, "board")
+    )
+
+
 def _is_mostly_of(findings: Findings, *sources: str) -> bool:
-    of_sources = total = 0.0
-    for place in findings.places:
-        for name, mm in place.budget_mm.items():
-            of_sources += mm**2 * name.startswith(sources)
-            total += mm**2 * (name == "total")
-    return of_sources > 0.5 * total
+    return _variance_of(findings, *sources) > 0.5 * _variance_of(findings, "total")
+
+
+def _variance_of(findings: Findings, *sources: str) -> float:
+    """Sum of the variances of sources over the points of interest [mm^2]."""
+    return sum(
+        mm**2
+        for place in findings.places
+        for name, mm in place.budget_mm.items()
+        if name.startswith(sources)
+    )
+
+
+def _better_stated(findings: Findings) -> Remedy | None:
+    """Remedy for a held board or lens that causes most uncertainty; None for other causes."""
+    if _is_of_board(findings):
+        return MEASURE_BOARD
+    return REFINE_LENS if _is_of_lens(findings) else None
 
 
 def remedy_for_uncertainty(findings: Findings) -> Remedy | None:
     """Remedy that makes a result less uncertain; None where a finding on the arm has it."""
-    if _is_of_board(findings):
-        return MEASURE_BOARD
+    if stated := _better_stated(findings):
+        return stated
     if any(warning.do is NO_JOINTS for warning in findings.warnings):
         return None
     words = "Add views from other poses of the robot."
@@ -352,14 +379,16 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
             weak.append(f"{direction.words} ({figure(sigma)} {unit})")
             is_fatal |= bool(sigma > bad)
     if weak:
-        of_arm, of_board = _is_of_arm(findings), _is_of_board(findings)
+        of_arm, stated = _is_of_arm(findings), _better_stated(findings)
         least = f"{limits.sigma_mm[0]:g} mm and {limits.sigma_deg[0]:g} deg"
         known = f"known to {', '.join(weak)} (sigma; doubt begins at {least}): most of that"
         words = (
             f"As mounts, {known} is the arm's, and is the same in every recording."
             if of_arm
             else f"Frames are {known} is the board's, as well as its size is stated."
-            if of_board
+            if stated is MEASURE_BOARD
+            else f"Frames are {known} is the lens's, which is held and known too little."
+            if stated is REFINE_LENS
             else f"Weakly determined, with their sigmas: {', '.join(weak)}; doubt begins at "
             f"{least}. The cause: {findings.tie.words}."
             if findings.tie
@@ -370,7 +399,7 @@ def _sigma_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
         yield Finding(
             "weak_motion",
             words,
-            NO_JOINTS if of_arm else MEASURE_BOARD if of_board else step,
+            NO_JOINTS if of_arm else stated or step,
             is_fatal=is_fatal,
             until_mm=0.0,
         )
@@ -401,7 +430,7 @@ def _budget_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fi
         + ", ".join(f"{figure(mm)} mm from the {name}" for name, mm in parts[:_LISTED_PARTS])
         + "."
         + (f" Over {limits.sigma_mm[0]:g} mm are also {', '.join(others)}." if others else ""),
-        MEASURE_BOARD if _is_of_board(findings) else None,
+        _better_stated(findings),
         is_fatal=budget["total"] > limits.sigma_mm[1],
         until_mm=0.0,
     )

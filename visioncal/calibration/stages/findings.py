@@ -54,6 +54,8 @@ class Sensor:
         level: Ratio of the scatter of its poses to their predicted noise.
         spared: Number of redundant views that were not needed.
         name: Its frame; empty for a single sensor.
+        holds_lens: Whether its lens is held and counts in the covariance.
+        has_lens_sigma: Whether the session states how well its matrix is known.
     """
 
     used: int
@@ -63,6 +65,8 @@ class Sensor:
     level: float = 1.0
     spared: int = 0
     name: str = ""
+    holds_lens: bool = False
+    has_lens_sigma: bool = False
 
 
 @dataclass(frozen=True)

@@ -233,13 +233,17 @@ def _rig_size_findings(target: Target, measured: MeasuredScale) -> Iterator[Find
 def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
     looks = fitted.camera_parameters
     problem, lens = looks.problems[camera], looks.lens_of(camera)
-    if problem.scene.mode == "refine" and not problem.has_spare_corners:
+    free = np.intersect1d(lens, fitted.moving)
+    if problem.scene.mode == "refine" and not len(free):
         words = (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
             f"{len(problem.stack.views)} views leave too little to judge by."
         )
-        yield Finding("remark", words, Remedy("Show a board with more corners, or more views."))
-    free = np.intersect1d(lens, fitted.moving)
+        step = (
+            "Show a board with more corners, or more views, or state matrix_sigma_px, how well fx, "
+            "fy, cx, cy are known."
+        )
+        yield Finding("remark", words, Remedy(step))
     if not problem.scene.estimated and len(free) and _has_changed(fitted, free):
         is_exact = problem.scene.matrix_sigma_px is None
         steps = (looks.values - looks.stated)[lens[:4]]

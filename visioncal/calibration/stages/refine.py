@@ -117,7 +117,7 @@ def _fit_with_own_weights(
     # of any arm's shape decide which values are free, but are not estimated. Their sigma is that
     # under the stated lenses and boards: a board whose size changes with the arm hides a part of
     # it.
-    stated = fit_jointly(looks, side, looks.first, frames)
+    stated = _with_refined_matrices(side, fit_jointly(looks, side, looks.first, frames))
     if not looks.levels:
         levels = lens_levels(side, _with_measured_sizes(side, stated))
         stated = refit_jointly(
@@ -153,6 +153,14 @@ def _fit_with_own_weights(
             before=fitted.linearised,
         )
     return fitted, new_side
+
+
+def _with_refined_matrices(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
+    """The fit without those stated priors of matrices that it contradicts by many sigmas."""
+    problems = fitted.camera_parameters.problems.items()
+    refined = [name for name, problem in problems if problem.is_refined_by_prior]
+    freed = _without_contradicted_priors(side, fitted, refined)
+    return freed if freed is fitted or _is_determined(freed, fitted) else fitted
 
 
 def _with_measured_sizes(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
@@ -362,14 +370,26 @@ def _fit_freed(side: FrameModel, moving: IntArray, fitted: ConvergedFit) -> Conv
     """Fits with more values free, without priors of lenses that they contradict."""
     wider = refit_jointly(fitted, side, moving)
     looks = wider.camera_parameters
+    return _without_contradicted_priors(
+        side,
+        wider,
+        [name for name in looks.problems if np.isin(looks.lens_of(name), moving).all()],
+    )
+
+
+def _without_contradicted_priors(
+    side: FrameModel, fitted: ConvergedFit, cameras: Sequence[str]
+) -> ConvergedFit:
+    """Fits without the priors of those cameras' free lenses that contradict them."""
+    looks, moving = fitted.camera_parameters, fitted.moving
     wrong = [
-        looks.lens_of(problem)
-        for problem in looks.problems
-        if np.isin(looks.lens_of(problem), moving).all() and contradicted_lens(wider, problem)
+        np.intersect1d(looks.lens_of(name), moving)
+        for name in cameras
+        if contradicted_lens(fitted, name)
     ]
     if not wrong:
-        return wider
-    return refit_jointly(wider, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
+        return fitted
+    return refit_jointly(fitted, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
 
 
 def _with_freed_scales(side: CellFrameModel, fitted: ConvergedFit) -> ConvergedFit:

@@ -316,6 +316,14 @@ class LinearisedCorners:
         """(f,) which of them stay where they are."""
         return ~np.isin(self.free, self.moving)
 
+    def holds_lens(self, name: str) -> bool:
+        """Whether a camera has a lens that is uncertain, and stays where it is."""
+        looks = self.camera_parameters
+        if name not in looks.lenses:
+            return False
+        lens = looks.lens_of(name)
+        return bool(np.isin(lens, self.free).any() and not np.isin(lens, self.moving).any())
+
     @property
     def known(self) -> PriorInformation:
         """What is known of the free values without any robot."""
