@@ -3,6 +3,7 @@
 import difflib
 import math
 from collections.abc import Iterable, Sequence
+from decimal import ROUND_CEILING, Decimal
 
 # Least figures in sentences, and in tables [mm, deg or px]: smaller ones do not matter.
 _LEAST, _SMALLEST = 1e-3, 1e-4
@@ -19,6 +20,15 @@ def figure(value: float) -> str:
     decimals = max(1 - exponent, 0)
     text = f"{value:.{decimals}f}"
     return text.rstrip("0").rstrip(".") if decimals else text
+
+
+def rounded_up(value: float) -> float:
+    """Rounds a non-negative limit up to the digits that `figure` and `significant` show."""
+    if value == 0.0 or not math.isfinite(value):
+        return value
+    exponent = int(f"{value:.1e}".partition("e")[2])
+    step = Decimal(1).scaleb(min(exponent - 1, 0))
+    return float(Decimal(repr(float(value))).quantize(step, ROUND_CEILING))
 
 
 def mm_and_deg(mm: float, deg: float) -> str:
