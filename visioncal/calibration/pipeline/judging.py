@@ -153,7 +153,8 @@ def _unconnected(run: RunState) -> Iterator[Finding]:
     for frame in run.cell_fit.unconnected:
         if run.mount is not None and frame.startswith("target"):
             words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
-            yield Finding("unseen_target", words)
+            step = Remedy("Add views that show it, or delete it from session.toml.")
+            yield Finding("unseen_target", words, step)
         else:
             step = Remedy(connection_advice(run.cell, frame))
             yield Finding("untied", f"{frame} is tied to nothing.", step)

@@ -194,6 +194,7 @@ def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
             "remark",
             f"The {len(target.points_m)} points of target {target.name} were taken for exact: "
             f"their sigma_m counts for up to {MOST_LOOSE}.",
+            Remedy(f"Leave points out, down to {MOST_LOOSE}, so that their sigma_m counts."),
         )
         return
     sigmas = np.array(target.point_sigmas_m)
