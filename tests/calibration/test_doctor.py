@@ -298,3 +298,12 @@ def test_a_turned_image_has_the_lens_that_its_rays_have(clockwise):
     seen, turned = ((799 - v, u), (-y, x, z)) if clockwise else ((v, 1279 - u), (y, -x, z))
     found = project(turned_lens(lens, clockwise=clockwise), np.stack(turned, axis=1))
     np.testing.assert_allclose(found, np.stack(seen, axis=1), atol=1e-9)
+
+
+def test_a_session_of_one_view_is_described_in_the_singular(sound, tmp_path):
+    one = tmp_path / "one"
+    shutil.copytree(sound, one)
+    lines = (one / "views.csv").read_text().splitlines(keepends=True)
+    (one / "views.csv").write_text("".join(lines[:2]))
+    seen = visioncal.doctor(one).seen
+    assert {"1 view", "1 pose of the robot"} <= {*seen}

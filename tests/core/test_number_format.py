@@ -2,7 +2,7 @@
 
 import pytest
 
-from visioncal.core.number_format import figure, rounded_up, significant
+from visioncal.core.number_format import counted, figure, rounded_up, significant
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,13 @@ from visioncal.core.number_format import figure, rounded_up, significant
 def test_a_limit_is_rounded_up_to_the_digits_shown(limit, shown):
     assert figure(rounded_up(limit)) == shown
     assert float(significant(rounded_up(limit))) == float(shown) >= limit
+
+
+def test_a_count_of_one_is_singular():
+    verbs = ("shows", "show")
+    assert [counted(count, "view", verbs) for count in (0, 1, 3)] == [
+        "0 views show",
+        "1 view shows",
+        "3 views show",
+    ]
+    assert counted(1, "pose") == "1 pose"

@@ -85,9 +85,11 @@ def significant(value: float | None, digits: int = 2) -> str:
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
 
 
-def counted(count: int, thing: str) -> str:
-    """A count with its noun: `1 stop`, `3 stops`."""
-    return f"{count} {thing}{'' if count == 1 else 's'}"
+def counted(count: int, thing: str, verbs: tuple[str, str] | None = None) -> str:
+    """A count with its noun, and its verb of (singular, plural): `1 stop`, `3 stops show`."""
+    is_one = count == 1
+    words = f"{count} {thing}{'' if is_one else 's'}"
+    return words if verbs is None else f"{words} {verbs[0] if is_one else verbs[1]}"
 
 
 def listed(words: Sequence[str]) -> str:

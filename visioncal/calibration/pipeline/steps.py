@@ -27,6 +27,7 @@ from visioncal.calibration.stages.readings import (
 )
 from visioncal.calibration.stages.robots import check_joints, check_read_joints, read_robots
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import STREAMS, Session
@@ -85,8 +86,9 @@ def _not_used(run: RunState) -> Iterator[Finding]:
     if readings and session.mount != "instrument":
         yield Finding(
             "unused",
-            f"{readings} rows have an instrument's readings (meas_ columns), which were not used: "
-            "where images or measured poses (cft_ columns) are there, these are.",
+            f"{counted(readings, 'row', ('has', 'have'))} an instrument's readings (meas_ "
+            "columns), which were not used: where images or measured poses (cft_ columns) are "
+            "there, these are.",
             Remedy("Calibrate the arm by the instrument with a session of the readings alone."),
         )
 

@@ -35,6 +35,7 @@ from visioncal.calibration.stages.motion import (
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.clock import (
@@ -390,10 +391,12 @@ def _undetermined(
         return _at_offset(sweep, views, clock, [warning], [])
     if resting.sum() < FEWEST_VIEWS:
         raise undetermined_error(sweep.motion, views, resting, why)
+    moving = int((~resting).sum())
     warning = Finding(
         "clock",
-        f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
-        f"between the clocks is not known: {reason}.",
+        f"{counted(moving, 'view', ('that was', 'that were'))} taken in motion "
+        f"{'is' if moving == 1 else 'are'} left out, as the offset between the clocks is not "
+        f"known: {reason}.",
         _SHOW_OFFSET,
     )
     kept = [view for view, is_still in zip(views, resting, strict=True) if is_still]

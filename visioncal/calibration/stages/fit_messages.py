@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.image_size import other_images
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
@@ -237,7 +237,8 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
     if problem.scene.mode == "refine" and not problem.has_spare_corners:
         words = (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
-            f"{len(problem.stack.views)} views leave too little to judge by."
+            f"{counted(len(problem.stack.views), 'view', ('leaves', 'leave'))} too little to judge "
+            "by."
         )
         yield Finding("remark", words, Remedy("Show a board with more corners, or more views."))
     free = np.intersect1d(lens, fitted.moving)
