@@ -320,3 +320,12 @@ def test_a_few_images_decide_that_a_board_with_markers_is_another(monkeypatch):
     # A thorough search for what is not there takes seconds in large images.
     assert sum(thorough) == 3
     assert len(thorough) > len(images)
+
+
+def test_a_session_of_one_view_is_described_in_the_singular(sound, tmp_path):
+    one = tmp_path / "one"
+    shutil.copytree(sound, one)
+    lines = (one / "views.csv").read_text().splitlines(keepends=True)
+    (one / "views.csv").write_text("".join(lines[:2]))
+    seen = visioncal.doctor(one).seen
+    assert {"1 view", "1 pose of the robot"} <= {*seen}

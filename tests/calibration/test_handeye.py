@@ -285,10 +285,11 @@ def test_noise_of_a_translation_makes_no_offset_worth_measuring(mount):
         assert "measure that offset" not in caught.value.next_step
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_fewer_than_three_views_are_refused(count):
+@pytest.mark.parametrize("stops", ["0 usable stops", "1 usable stop", "2 usable stops"])
+def test_fewer_than_three_views_are_refused(stops):
     x, z = some_edges()
-    with pytest.raises(DegenerateError, match=f"{count} usable stops of the robot, at least 3"):
+    count = int(stops[0])
+    with pytest.raises(DegenerateError, match=f"{stops} of the robot, at least 3"):
         solved(made_up(some_motion(count), x, z))
 
 

@@ -151,9 +151,10 @@ def test_parts_of_the_image_that_were_never_visited_are_named():
     assert "into the upper left, upper right, lower left and lower right of" in empty.do.words
 
 
-def test_two_views_are_too_few():
-    cell = cell_with(wide_camera(), 6, views=2)
-    with pytest.raises(DataError, match="2 views show the target, and at least 3"):
+@pytest.mark.parametrize(("views", "words"), [(1, "1 view shows"), (2, "2 views show")])
+def test_two_views_are_too_few(views, words):
+    cell = cell_with(wide_camera(), 6, views=views)
+    with pytest.raises(DataError, match=f"{words} the target, and at least 3"):
         estimate(cell)
 
 

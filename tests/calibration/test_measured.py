@@ -236,6 +236,8 @@ def test_what_cannot_be_used_is_said():
         "and base_from_target" in reason
         for reason in other.verdict.reasons
     )
+    (unused,) = (cause for cause in other.verdict.causes if cause.kind == "unused")
+    assert unused.do.words.endswith("or delete [prior.base_from_cam] from session.toml.")
     closed = calibrate(scara_with_tilt({"flange_from_cam": prior}), solver="park")
     assert any(
         "was not used: the closed form park cannot" in reason for reason in closed.verdict.reasons

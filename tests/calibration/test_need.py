@@ -18,9 +18,10 @@ from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Need
-from visioncal.core.verdict import EMPTY_IMAGE, Finding, remarks
+from visioncal.core.verdict import EMPTY_IMAGE, GOOD_FOR, Finding, remarks
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian, pose_basis
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
+from visioncal.present.report.content import need_facts
 from visioncal.results import Calibration, NeedMet, Picker, Rms, to_document
 from visioncal.simulation import CellOptions, simulate
 
@@ -287,6 +288,16 @@ def test_limits_give_way_to_the_need_and_what_is_unexplained_does_not(changes, g
     assert f"good for tasks of {good_from_mm:g}" in plain.reasons[-1] or not good_from_mm
     assert judge(replace(found, need=Need(plain.good_for_mm))).status == "good"
     assert judge(replace(found, need=Need(0.9 * plain.good_for_mm))).status == "check"
+
+
+@pytest.mark.parametrize("sigma_mm", [0.1, 0.101, 0.102, 0.104])
+def test_a_result_is_good_for_the_need_that_it_prints(sigma_mm: float) -> None:
+    found = replace(SOUND, picks=(of_size(sigma_mm),))
+    plain = judge(found)
+    (words,) = (finding.words for finding in plain.findings if finding.kind == GOOD_FOR)
+    (fact,) = need_facts(None, plain)
+    for shown in (words.partition("tasks of ")[2], fact.value):
+        assert judge(replace(found, need=Need(float(shown.split()[0])))).status == "good"
 
 
 def test_a_part_of_the_image_without_corners_is_a_hint_where_a_need_is_met() -> None:

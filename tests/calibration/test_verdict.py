@@ -75,6 +75,7 @@ def test_sound_findings_are_good_and_say_how_good():
         ({"noise_deg": 0.029}, "check", "0.029 deg from stop to stop"),
         ({"stops": 8}, "check", "Only 8 stops are used"),
         ({"stops": 4, "views": views(4)}, "bad", "Only 4 views are used"),
+        ({"stops": 1, "views": views(1)}, "bad", "Only 1 view is used"),
         ({"lost": LOST}, "check", "10 of 30 views are not used; the first: view 30, blurred"),
         ({"lost": LOST * 4}, "bad", "40 of 60 views"),
         ({"pixel_px": 1.0}, "check", "Corners deviate by 1 px"),

@@ -351,7 +351,7 @@ def test_order_of_views_does_not_matter(solver: Solver, seed: int):
 @all_solvers
 def test_one_view_is_refused(solver: Solver):
     problem = simulate(PRECISE, 0)
-    with pytest.raises(DegenerateError, match="1 views were given") as caught:
+    with pytest.raises(DegenerateError, match="1 view was given") as caught:
         solver(problem.robot[:1], problem.camera[:1])
     assert "tilted" in caught.value.next_step
 

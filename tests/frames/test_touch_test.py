@@ -13,7 +13,7 @@ from support.pages import Page
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
-from visioncal.frames.touch_test import evaluate_gaps, touch_points
+from visioncal.frames.touch_test import evaluate_gaps, touch_points, touch_test_finding
 from visioncal.interchange.merge_results import rewrite_result
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm
@@ -59,6 +59,16 @@ def test_the_tip_comes_as_near_as_predicted(proved):
     assert not evaluate_gaps(points, [5.0] * 5).passed
     with pytest.raises(DataError, match="5 of 0 mm and more"):
         evaluate_gaps(points, [0.1])
+
+
+@pytest.mark.parametrize(("ratio", "passed"), [(1.2, True), (2.0, False), (200.0, False)])
+def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(proved, ratio, passed):
+    folder, look, _ = proved
+    points = touch_points(Session.load(look), Calibration.load(folder / "out"))
+    gaps_mm = [0.1, 0.1, 0.1, ratio * points[3].radius95_mm, 0.1]
+    test = evaluate_gaps(points, gaps_mm)
+    assert test.passed == passed
+    assert (f"The gap at {points[3].name} (" in touch_test_finding(test).words) != passed
 
 
 @pytest.mark.usefixtures("patient")

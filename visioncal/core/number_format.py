@@ -3,6 +3,7 @@
 import difflib
 import math
 from collections.abc import Iterable, Sequence
+from decimal import ROUND_CEILING, Decimal
 
 # Least figures in sentences, and in tables [mm, deg or px]: smaller ones do not matter.
 _LEAST, _SMALLEST = 1e-3, 1e-4
@@ -19,6 +20,15 @@ def figure(value: float) -> str:
     decimals = max(1 - exponent, 0)
     text = f"{value:.{decimals}f}"
     return text.rstrip("0").rstrip(".") if decimals else text
+
+
+def rounded_up(value: float) -> float:
+    """Rounds a non-negative limit up to the digits that `figure` and `significant` show."""
+    if value == 0.0 or not math.isfinite(value):
+        return value
+    exponent = int(f"{value:.1e}".partition("e")[2])
+    step = Decimal(1).scaleb(min(exponent - 1, 0))
+    return float(Decimal(repr(float(value))).quantize(step, ROUND_CEILING))
 
 
 def mm_and_deg(mm: float, deg: float) -> str:
@@ -75,9 +85,11 @@ def significant(value: float | None, digits: int = 2) -> str:
     return f"{value:.{max(digits - 1 - exponent, 0)}f}"
 
 
-def counted(count: int, thing: str) -> str:
-    """A count with its noun: `1 stop`, `3 stops`."""
-    return f"{count} {thing}{'' if count == 1 else 's'}"
+def counted(count: int, thing: str, verbs: tuple[str, str] | None = None) -> str:
+    """A count with its noun, and its verb of (singular, plural): `1 stop`, `3 stops show`."""
+    is_one = count == 1
+    words = f"{count} {thing}{'' if is_one else 's'}"
+    return words if verbs is None else f"{words} {verbs[0] if is_one else verbs[1]}"
 
 
 def listed(words: Sequence[str]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.errors import DegenerateError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import edge_names, robot_part
@@ -239,7 +239,7 @@ def _scene(problem: Problem, mount: Mount) -> CellWords:
     """Wording of messages about one camera and one robot."""
     stops = np.unique(problem.observations.stops)
     flange = problem.poses[problem.robots[0]][stops]
-    views, names = f"{len(stops)} used views", _names(problem, mount)
+    views, names = counted(len(stops), "used view"), _names(problem, mount)
     further = tuple(names)[2:]
 
     def motion(frame: str) -> str:
@@ -309,7 +309,7 @@ def refuse_too_few(problem: Problem, mount: Mount, views: int = 1) -> None:
         axis = _main_axis(_turns(robot_part(flange, mount)))
         culprit += f" along the {_frame(mount)}'s {axis_words(axis)}"
         cause = f"two views share that axis of rotation, and {cause}"
-    found = f"{len(stops)} usable stops of the robot"
+    found = f"{counted(len(stops), 'usable stop')} of the robot"
     if len(stops) == 1 < views:
         found = f"all {views} used views are from one pose of the robot"
     raise DegenerateError(
@@ -456,7 +456,7 @@ def too_little_motion(base_from_flange: FloatArray, mount: Mount) -> tuple[str, 
     robot = robot_part(base_from_flange, mount)
     if turns_about_two_axes(robot):
         return "", ""
-    views = f"{len(robot)} views with poses"
+    views = f"{counted(len(robot), 'view')} with poses"
     words = motion_words(robot, base_from_flange, views, f"the {_frame(mount)}")
     return f"{title(mount)}: {words}.", _advice(mount)
 

@@ -30,6 +30,7 @@ from visioncal.calibration.guess.result import Candidate, Guess
 from visioncal.calibration.guess.search import search
 from visioncal.core.conventions import ROTATION_FORMS, PoseNumbers
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import counted
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.transforms import invert, pose_difference, rotation_angle
 from visioncal.core.types import MOUNTS, FloatArray, Mount
@@ -191,8 +192,8 @@ def _check(recording: Recording) -> None:
     robot, camera = recording.robot, recording.camera
     if len(robot) != len(camera):
         raise DataError(
-            f"guess: {len(robot)} poses of the robot and {len(camera)} of the camera cannot be "
-            "paired row by row.",
+            f"guess: {counted(len(robot), 'pose')} of the robot and {len(camera)} of the camera "
+            "cannot be paired row by row.",
             next_step="Give both the same rows, empty where a pose is missing.",
         )
     for numbers in (robot, camera):
@@ -208,7 +209,8 @@ def _check(recording: Recording) -> None:
     common = len(recording.common_rows())
     if common < FEWEST_ROWS:
         raise DegenerateError(
-            f"guess: {common} rows have a pose of the robot and one of the camera; "
+            f"guess: {counted(common, 'row', ('has', 'have'))} a pose of the robot and one of the "
+            f"camera; "
             f"{FEWEST_ROWS} or more are needed to distinguish readings.",
             next_step="Add views, tilted about different axes.",
         )

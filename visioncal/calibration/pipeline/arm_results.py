@@ -14,7 +14,7 @@ from visioncal.calibration.stages.reported_poses import RobotReport
 from visioncal.calibration.stages.residual_findings import ResidualTest
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import NOTE, Finding, remarks
+from visioncal.core.verdict import NOTE, Finding, Remedy, remarks
 from visioncal.estimation.arm import covariance_of_size, misfit_covariance
 from visioncal.estimation.intervals import expected_levels
 from visioncal.estimation.null_space import joint_words
@@ -156,10 +156,12 @@ def _findings_on(
         yield Finding(
             "level",
             "It stays as it reports itself: its errors take joint angles and a known model.",
+            Remedy("Record joint angles, and name the arm as [robot] model in session.toml."),
         )
     elif arm.thermal is None and level == thermal.LEVEL:
         words = "No data show how it drifts with its temperature: that stays in its noise."
-        yield Finding("level", words)
+        step = Remedy("Record the joints' temperatures or currents in a stream, from a cold start.")
+        yield Finding("level", words, step)
     if arm.kinematics is not None:
         yield from doubts(arm.kinematics)
     if test is not None:

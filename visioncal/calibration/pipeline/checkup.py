@@ -25,7 +25,7 @@ from visioncal.calibration.stages.observed import CameraObservations, by_reason
 from visioncal.core.arguments import typed
 from visioncal.core.errors import VisioncalError
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg, some_of
+from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.summaries import html_card
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, Mask, Mount, Progress
@@ -252,11 +252,14 @@ def _motion(run: RunState, mount: Mount) -> Iterator[Finding]:
         )
     used, (enough, _) = int(inliers.used.sum()), CalibrationLimits().stops
     if used < enough:
-        do = f"Add {enough - used} views or more, tilted by 20 to 40 degrees about different axes."
+        do = (
+            f"Add {counted(enough - used, 'view')} or more, tilted by 20 to 40 degrees about "
+            "different axes."
+        )
         yield Finding(
             "few_stops",
-            f"Only {used} views can be used; {enough} or more give a result something to be "
-            "checked with.",
+            f"Only {counted(used, 'view')} can be used; {enough} or more give a result something "
+            "to be checked with.",
             Remedy(do),
         )
     rad, metres = inliers.fit.noise.robots[0].tolist()
@@ -314,22 +317,23 @@ def _coverage(run: RunState) -> Iterator[Finding]:
 def _contents(run: RunState) -> Iterator[str]:
     """The contents of the session, in a few words each."""
     session = run.session
-    yield f"{len(session.views)} views"
+    yield counted(len(session.views), "view")
     images = [view.image for view in session.views if view.image]
     if images:
         there = sum(session.images.exists(image) for image in images)
-        yield f"{there} of {len(images)} images"
+        yield f"{there} of {counted(len(images), 'image')}"
     for look in run.cameras.values():
         blur = [corners.blur_px for corners in look.corners.values() if corners.blur_px > 0.0]
         size = "" if look.resolution is None else " of {} x {} px".format(*look.resolution)
         edges = f", edges {np.median(blur):.1f} px wide" if blur else ""
-        yield f"the board in {len(look.corners)} {'images' if images else 'views'}{size}{edges}"
+        seen = counted(len(look.corners), "image" if images else "view")
+        yield f"the board in {seen}{size}{edges}"
         yield from _unseen_rows(session, look)
     for robot, reported in run.robots.items():
         # Rows of one stop share a pose.
         if poses := {pose.tobytes() for pose in reported.base_from_flange.values()}:
             whose = f"robot {robot}" if len(run.robots) > 1 else "the robot"
-            yield f"{len(poses)} poses of {whose}"
+            yield f"{counted(len(poses), 'pose')} of {whose}"
     if session.streams:
         yield f"streams {some_of(list(session.streams))}"
 

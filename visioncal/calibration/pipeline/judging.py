@@ -34,7 +34,7 @@ from visioncal.calibration.stages.findings import (
 from visioncal.calibration.stages.need import PickInputs, predict_picks
 from visioncal.calibration.stages.priors import prior_findings
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg, some_of
+from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
 from visioncal.core.types import FloatArray, Rejection
 from visioncal.core.verdict import NOTE, Finding, Remedy
@@ -153,7 +153,8 @@ def _unconnected(run: RunState) -> Iterator[Finding]:
     for frame in run.cell_fit.unconnected:
         if run.mount is not None and frame.startswith("target"):
             words = f"No usable view shows {frame.replace('_', ' ', 1)}: it has no place."
-            yield Finding("unseen_target", words)
+            step = Remedy("Add views that show it, or delete it from session.toml.")
+            yield Finding("unseen_target", words, step)
         else:
             step = Remedy(connection_advice(run.cell, frame))
             yield Finding("untied", f"{frame} is tied to nothing.", step)
@@ -486,4 +487,5 @@ def _determining_views(cell: Cell, frame: str) -> str:
     rows += [row for row in cell.rows if frame in cell.tree.above(row.seen)]
     counts = Counter(f"{row.seer} of {row.seen}" for row in rows)
     fewest = sorted(counts.items(), key=lambda pair: pair[1])
-    return f"It rests on {some_of([f'{count} views by {key}' for key, count in fewest], 4)}."
+    words = [f"{counted(count, 'view')} by {key}" for key, count in fewest]
+    return f"It rests on {some_of(words, 4)}."

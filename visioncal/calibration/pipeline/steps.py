@@ -27,6 +27,7 @@ from visioncal.calibration.stages.readings import (
 )
 from visioncal.calibration.stages.robots import check_joints, check_read_joints, read_robots
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.core.types import Rejection
 from visioncal.core.verdict import Finding, Remedy
 from visioncal.session import STREAMS, Session
@@ -74,18 +75,21 @@ def _not_used(run: RunState) -> Iterator[Finding]:
     for edge in session.declaration.prior:
         if run.solver != "joint":
             reason = f"the closed form {run.solver} cannot"
+            step = "Calibrate without --solver, which solves jointly."
         elif edge not in names and not session.declaration.has_names:
             reason = f"what is unknown of this session is {' and '.join(names)}"
+            step = f"State the prior of one of these, or delete [prior.{edge}] from session.toml."
         else:
             continue
-        yield Finding("unused", f"[prior.{edge}] was not used: {reason}.")
+        yield Finding("unused", f"[prior.{edge}] was not used: {reason}.", Remedy(step))
     readings = sum(view.reading_m is not None for view in session.views)
     if readings and session.mount != "instrument":
         yield Finding(
             "unused",
-            f"{readings} rows have an instrument's readings (meas_ columns), which were not used: "
-            "where images or measured poses (cft_ columns) are there, these are. A session with "
-            "the readings alone calibrates the arm by the instrument.",
+            f"{counted(readings, 'row', ('has', 'have'))} an instrument's readings (meas_ "
+            "columns), which were not used: where images or measured poses (cft_ columns) are "
+            "there, these are.",
+            Remedy("Calibrate the arm by the instrument with a session of the readings alone."),
         )
 
 
@@ -95,8 +99,8 @@ def _suspicious(warning: str) -> Finding:
         return Finding("misread_joints", warning, Remedy(_MODEL_STEP))
     file, _, rest = warning.partition(": ")
     is_unknown = any(words in warning for words in _UNKNOWN_NAMES)
-    step = Remedy(f"In {file}, correct or delete {rest.partition(' ')[0]}.") if is_unknown else None
-    return Finding("remark", warning, step)
+    place = rest.partition(" ")[0] if is_unknown else "what this names"
+    return Finding("remark", warning, Remedy(f"In {file}, correct or delete {place}."))
 
 
 def _without_times(session: Session) -> str:

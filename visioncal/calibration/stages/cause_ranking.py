@@ -9,7 +9,8 @@ The probability depends on the kind of finding:
   disagree explains at most the squared ratio of both.
 - Error sources that are too large with nothing wrong: by their share of a pick's mean squared
   error.
-- Facts, such as an unconnected frame: probability one. Remarks without a test are no causes.
+- Facts, such as an unconnected frame: probability one. Remarks without a test, and sigmas beyond
+  their limits, are facts that are causes only where there is no other.
 """
 
 import math
@@ -205,7 +206,7 @@ def rank_causes(
     findings = _with_probabilities(doubts, left_out_mm)
     if met is None and (deciding := _deciding(findings)) is not None:
         rest = (finding for finding in findings if finding is not deciding)
-        return (replace(deciding, probability=1.0 - _FACT), *rest)
+        return (_as_fact(deciding, more), *rest)
     unmet = met is not None and met.probability < NeedLimits.probability[0]
     too_large = met is None and any(
         pick.good_for_mm > CalibrationLimits.sigma_mm[0] for pick in picks
@@ -220,16 +221,37 @@ def rank_causes(
         # Badly measured rotations inflate all apparent errors of the robot.
         known |= {*_OF_ROBOT} if "measured_turns" in known else set()
         findings += [source for source in _sources(picks, met, more) if source.kind not in known]
-    return tuple(_with_weak_motion(_with_misread_joints(findings), more))
+    return tuple(_with_facts(_with_weak_motion(_with_misread_joints(findings), more), more))
 
 
 def _deciding(found: Sequence[Finding]) -> Finding | None:
     """The sigma that alone makes a result bad: far beyond its limit, with no likely mistake."""
-    sigmas = [finding for finding in found if finding.kind in _SIGMAS]
     likelier = any(finding.probability >= _LIKELIER for finding in found)
-    if likelier or not any(finding.is_fatal for finding in sigmas):
+    if likelier or not any(finding.is_fatal for finding in found if finding.kind in _SIGMAS):
         return None
-    return min(sigmas, key=lambda finding: _SIGMAS.index(finding.kind))
+    return _first_sigma(found)
+
+
+def _first_sigma(found: Sequence[Finding]) -> Finding | None:
+    """The sigma beyond its limit that precedes the others, as it explains them."""
+    sigmas = [finding for finding in found if finding.kind in _SIGMAS]
+    return min(sigmas, key=lambda finding: _SIGMAS.index(finding.kind), default=None)
+
+
+def _as_fact(found: Finding, more: Remedy | None) -> Finding:
+    """A finding as a cause with the probability of a fact."""
+    return replace(found, probability=1.0 - _FACT, do=found.do or more)
+
+
+def _with_facts(found: Sequence[Finding], more: Remedy | None) -> Sequence[Finding]:
+    """Findings with the facts among them as causes, where there is no other cause."""
+    if any(finding.probability for finding in found):
+        return found
+    sigma = _first_sigma(found)
+    return [
+        _as_fact(finding, more) if finding is sigma or finding.kind not in _SIGMAS else finding
+        for finding in found
+    ]
 
 
 def _with_weak_motion(found: Sequence[Finding], more: Remedy | None) -> Sequence[Finding]:

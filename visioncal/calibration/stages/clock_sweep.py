@@ -35,8 +35,9 @@ from visioncal.calibration.stages.motion import (
 )
 from visioncal.calibration.stages.pnp import ViewPoses
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.core.types import Camera, FloatArray, IntArray, Mask, Mount, Rejection
-from visioncal.core.verdict import Finding
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.clock import (
     ClockChange,
     ClockFit,
@@ -56,6 +57,9 @@ from visioncal.session import View
 
 # Assumed sigma of a stated offset [s].
 _STATED_SIGMA_S = 1e-3
+_SHOW_OFFSET = Remedy(
+    "Take the views at rest, or record a sweep that turns fast enough to show the clocks' offset."
+)
 _SPARED = "not needed: slower views stand for it, at the same places"
 _NO_TIME = "no pose of the robot: neither a pose nor a time is there"
 _BEYOND = "no pose of the robot: it was taken before or after the robot's stream"
@@ -381,15 +385,19 @@ def _undetermined(
             "clock",
             f"[clock] camera_minus_robot_s is taken as stated, {1e3 * stated_s:+.4g} ms, to "
             f"{1e3 * _STATED_SIGMA_S:g} ms, although views were taken in motion: {reason}.",
+            _SHOW_OFFSET,
         )
         clock = replace(clock, method="stated", sigma_s=_STATED_SIGMA_S)
         return _at_offset(sweep, views, clock, [warning], [])
     if resting.sum() < FEWEST_VIEWS:
         raise undetermined_error(sweep.motion, views, resting, why)
+    moving = int((~resting).sum())
     warning = Finding(
         "clock",
-        f"{int((~resting).sum())} views that were taken in motion are left out, as the offset "
-        f"between the clocks is not known: {reason}.",
+        f"{counted(moving, 'view', ('that was', 'that were'))} taken in motion "
+        f"{'is' if moving == 1 else 'are'} left out, as the offset between the clocks is not "
+        f"known: {reason}.",
+        _SHOW_OFFSET,
     )
     kept = [view for view, is_still in zip(views, resting, strict=True) if is_still]
     clocked = _at_offset(sweep, kept, clock, [warning], [])

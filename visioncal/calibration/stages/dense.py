@@ -66,8 +66,9 @@ class Dense:
             )
         if focus:
             view, worst = max(focus.items(), key=lambda pair: pair[1].width_px)
+            are = "is" if len(focus) == 1 else "are"
             words.append(
-                f"{len(focus)} of {len(self.fits)} images are out of focus, with edges up to "
+                f"{len(focus)} of {len(self.fits)} images {are} out of focus, with edges up to "
                 f"{worst.width_px:.1f} px wide as a sigma (view {view}): set the focus to the "
                 "distance of the board, or close the aperture."
             )

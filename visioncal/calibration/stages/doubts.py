@@ -16,7 +16,7 @@ from visioncal.calibration.stages.cause_ranking import (
 )
 from visioncal.calibration.stages.findings import Findings, JudgedArm, JudgedPair, Sensor
 from visioncal.core.limits import CalibrationLimits
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import counted, figure, mm_and_deg
 from visioncal.core.types import Mount
 from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Remedy, look_at, or_alone
 from visioncal.results import Rms, ViewResult
@@ -441,8 +441,11 @@ def _stop_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Find
     check, bad = limits.stops
     for arm in findings.arms:
         if arm.stops < check:
-            counted = f"{used} views" if arm.stops == used else f"{arm.stops} stops"
-            words = f"Only {counted} are used; {check} or more are needed to check the result."
+            thing, verbs = "view" if arm.stops == used else "stop", ("is", "are")
+            words = (
+                f"Only {counted(arm.stops, thing, verbs)} used; {check} or more are needed to "
+                "check the result."
+            )
             step, is_fatal = _tilted(findings), arm.stops < bad
             kind = "too_few_stops" if is_fatal else "few_stops"
             finding = Finding(kind, words, step, is_fatal=is_fatal, until_mm=0.0)
@@ -458,11 +461,13 @@ def _lost_doubts(sensor: Sensor, limits: CalibrationLimits) -> Iterator[Finding]
         others = [rejection for rejection in lost if rejection.view not in disagree]
         if disagree:
             count = len(disagree) if others else "all"
-            details = f"; {count} of them disagree with the others"
+            verb = "disagrees" if count == 1 else "disagree"
+            details = f"; {count} of them {verb} with the others"
         if others:
             details += f"; the first{' but for these' if disagree else ''}: view {others[0].view}, "
             details += others[0].reason
-        words = f"{len(lost)} of {total} views are not used{details}."
+        are = "is" if len(lost) == 1 else "are"
+        words = f"{len(lost)} of {total} views {are} not used{details}."
         advice = "Correct the first of them and those like it, or repeat what is missing."
         step = Remedy(advice, look_at(others[0].view)) if others else None
         views, is_fatal = tuple(rejection.view for rejection in lost), share > limits.lost_share[1]

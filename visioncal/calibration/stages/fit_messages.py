@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from visioncal.calibration.stages.image_size import other_images
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.types import Camera, FloatArray, IntArray, Target
 from visioncal.core.verdict import CALIBRATE, NOTE, Finding, Remedy
@@ -194,6 +194,7 @@ def _point_findings(target: Target, moved_m: FloatArray) -> Iterator[Finding]:
             "remark",
             f"The {len(target.points_m)} points of target {target.name} were taken for exact: "
             f"their sigma_m counts for up to {MOST_LOOSE}.",
+            Remedy(f"Leave points out, down to {MOST_LOOSE}, so that their sigma_m counts."),
         )
         return
     sigmas = np.array(target.point_sigmas_m)
@@ -237,7 +238,8 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
     if problem.scene.mode == "refine" and not len(free):
         words = (
             f'intrinsics = "refine" was not done: {len(problem.stack.px)} corners in '
-            f"{len(problem.stack.views)} views leave too little to judge by."
+            f"{counted(len(problem.stack.views), 'view', ('leaves', 'leave'))} too little to judge "
+            "by."
         )
         step = (
             "Show a board with more corners, or more views, or state matrix_sigma_px, how well fx, "

@@ -103,7 +103,8 @@ def _empty_rows(session: Session) -> Iterator[Finding]:
     empty = [view for view, seen in zip(session.views, observes, strict=True) if not seen]
     views, last = tuple(view.number for view in empty), len(observes) - len(empty) - 1
     named, these = some_of([*map(str, views)], _LISTED), "these rows" if views[1:] else "this row"
-    words = f"{len(views)} of {len(observes)} rows of views.csv observe nothing: view {named}"
+    verb = "observe" if views[1:] else "observes"
+    words = f"{len(views)} of {len(observes)} rows of views.csv {verb} nothing: view {named}"
     step = Remedy(f"In views.csv, fill in column image of {these}, or delete {these}.")
     if any(view.has_corners for view in session.views):
         words = f"{words}; without an image, a view needs rows in corners.csv"

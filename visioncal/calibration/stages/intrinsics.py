@@ -8,7 +8,7 @@ import numpy as np
 
 from visioncal.calibration.stages.cause_ranking import TILTED
 from visioncal.core.errors import ConvergenceError, DataError, DegenerateError
-from visioncal.core.number_format import listed
+from visioncal.core.number_format import counted, listed
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import Camera, CameraKind, Corners, FloatArray, Rejection, Target
 from visioncal.core.verdict import EMPTY_IMAGE, Finding, Remedy
@@ -78,8 +78,8 @@ def estimate_intrinsics(
     """
     if len(corners) < _FEWEST_VIEWS:
         raise DataError(
-            f"intrinsics: {len(corners)} views show the target, and at least {_FEWEST_VIEWS} are "
-            "needed.",
+            f"intrinsics: {counted(len(corners), 'view', ('shows', 'show'))} the target, and at "
+            f"least {_FEWEST_VIEWS} are needed.",
             culprits=["views"],
             next_step="Add views, or give matrix and distortion in [camera].",
         )

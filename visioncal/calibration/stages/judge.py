@@ -14,7 +14,7 @@ from visioncal.calibration.stages.doubts import (
 from visioncal.calibration.stages.findings import Findings
 from visioncal.calibration.stages.need import Picks, need_met
 from visioncal.core.limits import NeedLimits
-from visioncal.core.number_format import figure, percent
+from visioncal.core.number_format import figure, percent, rounded_up
 from visioncal.core.verdict import (
     AGREEMENT,
     EMPTY_IMAGE,
@@ -96,7 +96,7 @@ def _good_for(
     worst = max(findings.picks, key=lambda pick: pick.good_for_mm)
     sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
     words = (
-        f"It {verb} good for tasks of {figure(good_for_mm)} mm and more at "
+        f"It {verb} good for tasks of {figure(rounded_up(good_for_mm))} mm and more at "
         f"{figure(worst.distance_m)} m from the {sensor}."
     )
     return (Finding(GOOD_FOR, words),)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.errors import DataError
+from visioncal.core.number_format import counted
 from visioncal.core.transforms import invert, rotation_angle
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.trajectory import Samples, Trajectory
@@ -93,7 +94,8 @@ def motion_of(session: Session, robot: Robot | None, name: str) -> RobotMotion:
         return RobotMotion(name, flange, joints, reported=False)
     needed = "a known [robot] model" if robot is None else f"{robot.joint_count} joints a sample"
     raise DataError(
-        f"streams/{name}.csv: it has {len(reported_s)} poses and {len(joints_s)} rows of "
+        f"streams/{name}.csv: it has {counted(len(reported_s), 'pose')} and "
+        f"{counted(len(joints_s), 'row')} of "
         f"{q.shape[1]} joint angles; two poses or more are needed, or {needed}.",
         culprits=[f"streams/{name}.csv"],
         next_step="Fill in x_m to qw, or q1_rad ... and [robot] model.",

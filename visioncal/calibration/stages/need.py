@@ -30,7 +30,7 @@ import numpy as np
 from visioncal.calibration.stages.arms import RobotArm
 from visioncal.calibration.stages.validate import HeldOutResiduals
 from visioncal.core.limits import NeedLimits
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import adjoint, apply_each, invert, skew
 from visioncal.core.types import FloatArray, IntArray, Need
@@ -110,9 +110,9 @@ class Picks:
 
     def stays_within(self, need: Need | None) -> str:
         """The limits that 95 % of picks are within, in the units of a need."""
-        within = [f"{figure(self.good_for_deg)} deg"] if need and need.deg else []
+        within = [f"{figure(rounded_up(self.good_for_deg))} deg"] if need and need.deg else []
         if need is None or need.mm or not within:
-            within.insert(0, f"{figure(self.good_for_mm)} mm")
+            within.insert(0, f"{figure(rounded_up(self.good_for_mm))} mm")
         return " and ".join(within)
 
 

@@ -13,7 +13,7 @@ from visioncal.calibration.stages.observed import CameraObservations
 from visioncal.calibration.stages.pose_ambiguity import choose_nearest
 from visioncal.calibration.verification.calibration_prior import CalibrationPrior
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import counted, figure
 from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import Corners, FloatArray, IntArray, Progress, Rejection, Target
 from visioncal.estimation.arm import ArmErrors
@@ -201,9 +201,10 @@ def _with_arm(observed: ObservedPoses, prior: CalibrationPrior) -> ObservedPoses
         return observed
     if observed.robot_arm.joints_rad is None:
         missing = [view.number for view in observed.session.views if view.joints_rad is None]
+        without = f"{counted(len(missing), 'view', ('has', 'have'))} no joint angles."
         raise DataError(
             f"session {observed.session.name!r}: the calibration is of an arm by its joints, and "
-            + (f"{len(missing)} views have no joint angles." if missing else "its joints differ."),
+            + (without if missing else "its joints differ."),
             culprits=[f"views.csv: view {index}" for index in missing],
             next_step="Record q1_rad ... with every view.",
         )

@@ -17,6 +17,7 @@ from typing import TypeAlias
 import numpy as np
 
 from visioncal.core.errors import DataError, DegenerateError
+from visioncal.core.number_format import counted
 from visioncal.core.types import FloatArray
 
 FEWEST_VIEWS = 2
@@ -66,8 +67,9 @@ def _checked(robot: FloatArray, camera: FloatArray) -> tuple[FloatArray, FloatAr
         )
     if robot.shape[-3] < FEWEST_VIEWS:
         raise DegenerateError(
-            f"hand-eye: {robot.shape[-3]} views were given; a relative motion needs at least "
-            f"{FEWEST_VIEWS}, and a full solution 3 with two different rotation axes.",
+            f"hand-eye: {counted(robot.shape[-3], 'view', ('was', 'were'))} given; a relative "
+            f"motion needs at least {FEWEST_VIEWS}, and a full solution 3 with two different "
+            "rotation axes.",
             next_step="Add views that are tilted about different axes.",
         )
     if not (np.isfinite(robot).all() and np.isfinite(camera).all()):

@@ -4,7 +4,14 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from visioncal.core.number_format import decimals_for, fixed, matched, percent, significant
+from visioncal.core.number_format import (
+    decimals_for,
+    fixed,
+    matched,
+    percent,
+    rounded_up,
+    significant,
+)
 from visioncal.core.types import FloatArray
 from visioncal.present import result_parts
 from visioncal.present.advice import mark_of
@@ -139,7 +146,11 @@ def need_facts(need: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
         facts.append(Fact(f"picks within {words}", percent(need.probability)))
     if verdict.good_for_mm is not None:
         facts.append(
-            Fact("good for tasks of", f"{significant(verdict.good_for_mm)} mm", "and more")
+            Fact(
+                "good for tasks of",
+                f"{significant(rounded_up(verdict.good_for_mm))} mm",
+                "and more",
+            )
         )
     return tuple(facts)
 
