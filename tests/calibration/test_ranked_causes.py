@@ -307,6 +307,8 @@ def test_the_cause_its_cost_and_what_to_do_come_first() -> None:
         "Possibly (20 %): The lens is another.",
     )
     assert verdict.rest == ("It is odd.", DRIFT.words, "Held back.")
+    sure = replace(found[2], probability=0.6)
+    assert Verdict("bad", (found[4], sure)).top[1] == "Also likely (60 %): The lens is another."
     assert verdict.next_steps == (EXCHANGED.do, Remedy("Add views."), Remedy("Leave it out."))
     assert Verdict.of("good", "Fine.").top == ("Fine.",)
 

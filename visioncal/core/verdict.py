@@ -16,8 +16,8 @@ from visioncal.core.summaries import html_card
 VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 
 # Number of findings, and of steps, that are shown first; least probability of causes among them,
-# and of causes with steps.
-_SHOWN, _LEAST_LIKELY, _LIKELY = 3, 0.05, 0.2
+# of causes with steps, and of causes that are likely beside the first.
+_SHOWN, _LEAST_LIKELY, _LIKELY, _EVEN = 3, 0.05, 0.2, 0.5
 # Kinds of findings that are not doubts.
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 # Missing images, images of another size than the camera's, and empty rows: no doubts about the
@@ -228,7 +228,8 @@ class Verdict:
 
     def _line(self, finding: Finding) -> str:
         likely = f"({percent(finding.probability)})"
-        how = "Most likely" if finding in self.causes[:1] else "Possibly"
+        how = "Also likely" if finding.probability >= _EVEN else "Possibly"
+        how = "Most likely" if finding in self.causes[:1] else how
         is_likely = finding.probability >= _LEAST_LIKELY and finding.kind not in SOURCES
         begin = f"{how} {likely}: " if is_likely else ""
         return f"{begin}{finding.words} {finding.without_it}".strip()
