@@ -127,7 +127,7 @@ class ConvergedFit:
 
 
 def fit_jointly(
-    looks: CameraParameters,
+    optics: CameraParameters,
     side: FrameModel,
     moving: IntArray,
     frames: Mapping[str, FloatArray],
@@ -137,7 +137,7 @@ def fit_jointly(
     """Linearises and fits in turn, until the values stay where they are.
 
     Args:
-        looks: Corners, lenses and boards to start from.
+        optics: Corners, lenses and boards to start from.
         side: What is known of the frames.
         moving: Places of the values that the fit moves.
         frames: Where to start.
@@ -148,7 +148,7 @@ def fit_jointly(
         ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
     """
     with diverging():
-        return _settled(side, _fitted(side, looks.linearised(moving, before), frames, others))
+        return _settled(side, _fitted(side, optics.linearised(moving, before), frames, others))
 
 
 @contextmanager
@@ -173,11 +173,11 @@ def diverging() -> Iterator[None]:
 
 
 def refit_jointly(
-    fitted: ConvergedFit, side: FrameModel, moving: IntArray, looks: CameraParameters | None = None
+    fitted: ConvergedFit, side: FrameModel, moving: IntArray, optics: CameraParameters | None = None
 ) -> ConvergedFit:
     """Settles once more from an answer, with other values free, or by other priors."""
     return fit_jointly(
-        looks or fitted.camera_parameters,
+        optics or fitted.camera_parameters,
         side,
         moving,
         fitted.frames,
@@ -205,9 +205,13 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
     # Far from the answer, as where a lens was stated for images of another size, the whole step
     # leads to lenses that see nothing.
     limits = [_FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
-    looks, free, change = fitted.linearised.camera_parameters, fitted.linearised.free, fitted.change
+    optics, free, change = (
+        fitted.linearised.camera_parameters,
+        fitted.linearised.free,
+        fitted.change,
+    )
     for _ in range(_HALVINGS):
-        there = looks.with_values(free, looks.values[free] + change)
+        there = optics.with_values(free, optics.values[free] + change)
         change = change / 2
         if there.has_lenses:
             seen = there.linearised(fitted.moving)
@@ -259,9 +263,9 @@ class MeasuredScale:
 
 def measured_scale(side: FrameModel, fitted: ConvergedFit, board: int = 0) -> MeasuredScale:
     """Measures a board's size by the robots' motion; its sigma is infinite where that cannot."""
-    looks = fitted.linearised.camera_parameters
-    (place,) = looks.scale_of(board)
-    stated, known = looks.stated_scale_sigma(board), float(looks.prior_sigma[place] ** -2.0)
+    optics = fitted.linearised.camera_parameters
+    (place,) = optics.scale_of(board)
+    stated, known = optics.stated_scale_sigma(board), float(optics.prior_sigma[place] ** -2.0)
     step, covariance = Scores.of(side, fitted).asked_for(np.array([place]), fitted.moving)
     # What was stated is taken away again: without it the rest may leave the size open.
     measured = 1.0 / float(covariance[0, 0]) - known
@@ -356,9 +360,9 @@ def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
 
 def contradicted_lens(fitted: ConvergedFit, camera: str) -> bool:
     """Whether given intrinsics are farther off than what they are known to explains."""
-    looks = fitted.camera_parameters
-    away = (looks.values - looks.stated)[looks.lenses[camera]]
-    return contradicts(away, lens_prior(looks.problems[camera].scene))
+    optics = fitted.camera_parameters
+    away = (optics.values - optics.stated)[optics.lenses[camera]]
+    return contradicts(away, lens_prior(optics.problems[camera].scene))
 
 
 def contradicts(away: FloatArray, prior_sigma: FloatArray) -> bool:

@@ -398,12 +398,12 @@ def _rows(
     noise: Noise,
     camera: str,
 ) -> _Rows:
-    looks, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
-    of_camera = looks.rows(camera)
-    mine, poses = looks.problems[camera], looks.poses[of_camera]
+    optics, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
+    of_camera = optics.rows(camera)
+    mine, poses = optics.problems[camera], optics.poses[of_camera]
     shape = mine.basis[mine.stack.ids]
-    stack = mine.stack.with_points(mine.stack.points + shape @ looks.values[looks.boards])
-    stack, lens = replace(stack, zooms=None), looks.camera(camera)
+    stack = mine.stack.with_points(mine.stack.points + shape @ optics.values[optics.boards])
+    stack, lens = replace(stack, zooms=None), optics.camera(camera)
     now = reproject(stack, lens, poses)
     focus = zooms(stack, lens)
     breath = distances(stack, poses)[stack.view_of][:, None] * focus
@@ -416,7 +416,9 @@ def _rows(
     here = np.flatnonzero((rows >= of_camera.start) & (rows < of_camera.stop))
     linear, (of, members) = problem.linear(state), problem.units
     jacobian = linear.jacobian_of(here)
-    places = problem.effect_columns[LENSES].start + np.searchsorted(seen.free, looks.places(camera))
+    places = problem.effect_columns[LENSES].start + np.searchsorted(
+        seen.free, optics.places(camera)
+    )
     others = np.ones(len(problem), dtype=bool)
     others[here] = False
     known, gradient = normal_equations(problem, state, noise, among=others)

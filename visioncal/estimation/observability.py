@@ -82,7 +82,7 @@ def check_observability(
     mount: Mount,
     pixel_px: Mapping[str, float] = MappingProxyType({}),
     *,
-    looks: bool = False,
+    with_first_effect: bool = False,
 ) -> None:
     """Refuses motion that leaves a direction undetermined.
 
@@ -95,12 +95,15 @@ def check_observability(
         noise: Of the residuals.
         mount: Mounting of the camera.
         pixel_px: By camera, the corner noise behind its poses' covariance [px].
-        looks: Whether the first effect has to be determined, too: lens and board, or points.
+        with_first_effect: Whether the first effect has to be determined, too: lens and board, or
+            points.
 
     Raises:
         DegenerateError: A direction is numerically null, or its predicted sigma is over the limit.
     """
-    check_determined(problem, state, noise, _scene(problem, mount), pixel_px, looks=looks)
+    check_determined(
+        problem, state, noise, _scene(problem, mount), pixel_px, with_first_effect=with_first_effect
+    )
 
 
 def refuse_open_motion(problem: Problem, state: State, noise: Noise, mount: Mount) -> None:
@@ -140,7 +143,7 @@ def check_determined(
     scene: CellWords,
     pixel_px: Mapping[str, float] = MappingProxyType({}),
     *,
-    looks: bool = False,
+    with_first_effect: bool = False,
 ) -> None:
     """Refuses motion that leaves a direction of an unknown frame undetermined.
 
@@ -153,7 +156,7 @@ def check_determined(
     frames, placed = typical.with_effects(()), State(state.edges, np.zeros(0))
     _refuse_null(frames, placed, typical_noise, scene)
     _refuse_vague(frames, placed, typical_noise, scene)
-    if looks and problem.effects:
+    if with_first_effect and problem.effects:
         problem, noise = _at_typical_noise(problem, noise, pixel_px, keeps_less=True)
         cause, advice = scene.undetermined
         first = problem.effects[0].determined

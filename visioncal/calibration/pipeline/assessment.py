@@ -329,11 +329,11 @@ def held_back(solved: CellFit, observed: Observed) -> Held | None:
         choose_nearest(view, pose, targets.get(row.seen))
         for view, pose, row in zip(views, predicted, rows, strict=True)
     ]
-    looks = solved.camera_parameters
+    optics = solved.camera_parameters
     for at, (view, row) in enumerate(zip(views, rows, strict=True)):
-        if looks is not None and view.corners is not None and row.seer in looks.problems:
-            stack, camera = CornerStack.of({view.view: view.corners}, looks.points), row.seer
-            poses = fit_poses(stack, looks.camera(camera), view.cam_from_target).cam_from_target
+        if optics is not None and view.corners is not None and row.seer in optics.problems:
+            stack, camera = CornerStack.of({view.view: view.corners}, optics.points), row.seer
+            poses = fit_poses(stack, optics.camera(camera), view.cam_from_target).cam_from_target
             views[at] = replace(view, cam_from_target=poses)
     return Held(tuple(rows), tuple(views), _problem(solved, observed, views))
 

@@ -177,10 +177,10 @@ def columns_of_boards(solved: CellFit) -> IntArray:
 
 def middle_jacobians(solved: CellFit) -> dict[str, FloatArray]:
     """(3, b) Jacobians of targets' middles with respect to `columns_of_boards` [m], by frame."""
-    seen, looks = solved.linearised_corners, solved.camera_parameters
-    if seen is None or looks is None:
+    seen, optics = solved.linearised_corners, solved.camera_parameters
+    if seen is None or optics is None:
         return {}
-    plates, boards = solved.cell.session.plates, looks.boards
+    plates, boards = solved.cell.session.plates, optics.boards
     free, jacobians = within(seen.free, boards), {}
     slices = shape_slices(tuple(plates.values()), boards.start)
     for (name, target), values in zip(plates.items(), slices, strict=True):
@@ -192,18 +192,18 @@ def middle_jacobians(solved: CellFit) -> dict[str, FloatArray]:
 
 def _appearance_columns(solved: CellFit) -> dict[str, IntArray]:
     """The problem's columns of the free values of each lens and board."""
-    seen, looks = solved.linearised_corners, solved.camera_parameters
-    if seen is None or looks is None:
+    seen, optics = solved.linearised_corners, solved.camera_parameters
+    if seen is None or optics is None:
         return {}
     boards, is_pair = solved.cell.session.boards, solved.cell.mount is not None
     slices = {
         "intrinsics" if is_pair else f"intrinsics of {name}": lens
-        for name, lens in looks.lenses.items()
+        for name, lens in optics.lenses.items()
     }
     if is_pair:
-        slices["board"] = looks.boards
+        slices["board"] = optics.boards
         boards = {}
-    board_slices = shape_slices(tuple(boards.values()), looks.boards.start)
+    board_slices = shape_slices(tuple(boards.values()), optics.boards.start)
     for name, values in zip(boards, board_slices, strict=True):
         slices[f"board {name}".strip()] = values
     free = {name: within(seen.free, values) for name, values in slices.items()}

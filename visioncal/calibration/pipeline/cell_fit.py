@@ -98,11 +98,11 @@ class CellFit:
         """Standard deviation of corner residuals of each camera, per axis [px]."""
         if self.linearised_corners is None:
             return {}
-        looks, sigmas_px = self.linearised_corners.camera_parameters, {}
+        optics, sigmas_px = self.linearised_corners.camera_parameters, {}
         for (camera, problem), corners in zip(
-            looks.problems.items(), self.linearised_corners.compressed, strict=True
+            optics.problems.items(), self.linearised_corners.compressed, strict=True
         ):
-            moving = np.flatnonzero(np.isin(looks.places(camera), self.linearised_corners.moving))
+            moving = np.flatnonzero(np.isin(optics.places(camera), self.linearised_corners.moving))
             unknowns = problem.unknowns(corners, moving)
             sigmas_px[camera] = problem.stack.shown_px(corners.residuals, unknowns)
         return sigmas_px
@@ -140,12 +140,12 @@ class CellFit:
         state: State,
     ) -> FloatArray:
         """Reprojection errors (m,) [px] of views, given (m, 4, 4) poses of their targets."""
-        looks = self.camera_parameters_at(state)
-        if looks is None:
+        optics = self.camera_parameters_at(state)
+        if optics is None:
             return np.full(len(rows), np.nan)
-        lenses = {problem: looks.camera(problem) for problem in looks.problems}
+        lenses = {problem: optics.camera(problem) for problem in optics.problems}
         cameras = [lenses.get(row.seer) for row in rows]
-        return chain_rms_px([view.corners for view in views], poses, cameras, looks.points)
+        return chain_rms_px([view.corners for view in views], poses, cameras, optics.points)
 
     @property
     def lens_columns(self) -> slice:

@@ -381,14 +381,16 @@ def check_answer(run: RunState) -> None:
     inliers, cell = run.cell_fit.inlier_fit, run.cell_fit.cell
     part, fit = run.cell_fit.inlier_problem, inliers.fit
     seen = run.cell_fit.linearised_corners
-    looks = seen is not None and any(scene.estimated for scene in run.scenes.values())
+    is_estimated = seen is not None and any(scene.estimated for scene in run.scenes.values())
     pixel_px = (
         {}
         if seen is None
         else dict(zip(seen.camera_parameters.problems, seen.sigmas_px, strict=True))
     )
     if run.mount is not None:
-        check_observability(part, fit.state, fit.noise, run.mount, pixel_px, looks=looks)
+        check_observability(
+            part, fit.state, fit.noise, run.mount, pixel_px, with_first_effect=is_estimated
+        )
         return
     names = {name: _names(part.tree, name) for name in part.unknown}
     outliers = inliers.problem.subset(~inliers.used)
@@ -426,7 +428,7 @@ def check_answer(run: RunState) -> None:
         )
 
     scene = CellWords("cell", names, motion, advice)
-    check_determined(part, fit.state, fit.noise, scene, pixel_px, looks=looks)
+    check_determined(part, fit.state, fit.noise, scene, pixel_px, with_first_effect=is_estimated)
 
 
 def _names(tree: Tree, frame: str) -> tuple[str, str]:

@@ -65,12 +65,12 @@ def lens_errors(solved: CellFit) -> dict[str, LensErrors]:
     }
 
 
-def _is_of_lens(looks: CameraParameters, camera: str) -> bool:
+def _is_of_lens(optics: CameraParameters, camera: str) -> bool:
     """Compares mean residuals by cells of the image with those by corners of the board."""
-    problem = looks.problems[camera]
+    problem = optics.problems[camera]
     if problem.levels is None or problem.levels.gains[0] < SIGNIFICANT:
         return False
-    without = replace(looks, problems={**looks.problems, camera: problem.without_levels()})
+    without = replace(optics, problems={**optics.problems, camera: problem.without_levels()})
     residuals = without.compressed(camera).residuals
     stack, shares = problem.stack, problem.shares[problem.stack.view_of]
     by_cell = lens_field(stack.px, residuals, problem.scene.camera.resolution, shares)
@@ -92,11 +92,11 @@ def lens_field_of(
     seen = solved.linearised_corners
     if seen is None:
         return None
-    looks, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
-    levels, noise_px = looks.problems[camera].levels, floored_sigma_px(seen.sigmas_px[which])
+    optics, which = seen.camera_parameters, list(seen.camera_parameters.problems).index(camera)
+    levels, noise_px = optics.problems[camera].levels, floored_sigma_px(seen.sigmas_px[which])
     if levels is None or not (levels.field or levels.breathing or levels.jitter):
         return None
-    lens, places = looks.lens_of(camera), looks.places(camera)
+    lens, places = optics.lens_of(camera), optics.places(camera)
     mean, jacobian, root = np.zeros(0), np.zeros((0, len(covariance))), np.zeros((0, 0))
     if (coefficients := seen.compressed[which].coefficients) is not None:
         # Coefficients depend on lens and boards, and on those directions of themselves that also
@@ -107,7 +107,7 @@ def lens_field_of(
         jacobian[:, shared] = coefficients.slope[:, is_free]
         jacobian[:, beyond] = coefficients.moving_roots
         values = solved.inlier_fit.problem.values_of(LENSES, solved.inlier_fit.fit.state)
-        change = values[: len(seen.free)] - looks.values[seen.free]
+        change = values[: len(seen.free)] - optics.values[seen.free]
         fitted = values[beyond - solved.lens_columns.start]
         mean = (
             coefficients.mean + coefficients.slope[:, is_free] @ change[np.isin(seen.free, places)]
@@ -115,7 +115,7 @@ def lens_field_of(
         mean = (mean + coefficients.moving_roots @ fitted) / noise_px
         rest = coefficients.rest @ coefficients.rest.T
         own = jacobian @ covariance @ jacobian.T / noise_px**2 + rest
-        root = _root(own, looks.camera(camera), levels)
+        root = _root(own, optics.camera(camera), levels)
     with_lens, free = np.zeros((len(mean), len(lens))), np.isin(lens, seen.free)
     with_lens[:, free] = jacobian @ covariance[:, solved.columns_of(lens[free])] / noise_px
     return LensField(
@@ -158,23 +158,23 @@ def _root(covariance: FloatArray, camera: Camera, levels: LensLevels) -> FloatAr
 
 def lens_changes(solved: CellFit) -> Iterator[Finding]:
     """Lenses that were zoomed, refocused or hit during the session, by the corners alone."""
-    seen, looks = solved.linearised_corners, solved.camera_parameters
-    if seen is None or looks is None:
+    seen, optics = solved.linearised_corners, solved.camera_parameters
+    if seen is None or optics is None:
         return
     stations = {row.view: row.station for row in solved.cell.rows}
-    for which, (name, problem) in enumerate(looks.problems.items()):
+    for which, (name, problem) in enumerate(optics.problems.items()):
         views = problem.stack.views
         # Images for the intrinsics alone have no time.
         timed = np.array([view in stations for view in views])
         stack = replace(problem.stack, zooms=None)
-        stack = stack.with_points(looks.points[stack.ids]).keep(timed[stack.view_of])
+        stack = stack.with_points(optics.points[stack.ids]).keep(timed[stack.view_of])
         order = np.argsort([stations[view] for view in stack.views], kind="stable")
         poses = seen.compressed[which].cam_from_target[timed]
-        step = lens_step(stack, looks.camera(name), poses, order)
+        step = lens_step(stack, optics.camera(name), poses, order)
         if step is None:
             continue
         first = stations[stack.views[int(order[step.first])]]
-        of = "The lens" if len(looks.problems) == 1 else f"The lens of {name}"
+        of = "The lens" if len(optics.problems) == 1 else f"The lens of {name}"
         yield Finding(
             LENS_CHANGED,
             f"{of} changed: {solved.cell.start_words(first)}, {_step_words(step)}, by the corners "

@@ -318,10 +318,10 @@ def _written_jacobian(run: RunState) -> FloatArray:
     ]
     nothing, arm = slice(0, 0), f"arm of {run.robot_arm.robot}"
     errors, seen = problem.effect_columns.get(arm, nothing), run.cell_fit.linearised_corners
-    looks = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
+    optics = run.cell_fit.columns_of(np.zeros(0, dtype=np.int64) if seen is None else seen.free)
     of_errors, model = rows[errors], run.robot_arm.model
     kept = slice(None) if model is None else model.is_kept
-    return np.concatenate([rows[:12], rows[looks], *further, of_errors[kept]])
+    return np.concatenate([rows[:12], rows[optics], *further, of_errors[kept]])
 
 
 def cell_of(run: RunState) -> CellResult:
@@ -419,7 +419,7 @@ def cameras_of(run: RunState) -> dict[str, CameraResult]:
         run.assessment.covariance,
         6 * len(run.assessment.edges),
     )
-    seen, looks = solved.linearised_corners, solved.camera_parameters
+    seen, optics = solved.linearised_corners, solved.camera_parameters
     # Measured poses need no camera, but later use of the result may.
     cameras = {
         frame: CameraResult(camera, estimated=False)
@@ -427,19 +427,19 @@ def cameras_of(run: RunState) -> dict[str, CameraResult]:
         if (frame := frame_name("camera", name)) in solved.cell.tree.branches
         and (camera := table.stated) is not None
     }
-    if seen is None or looks is None:
+    if seen is None or optics is None:
         return cameras | dict(run.lenses)
     for name, scene in run.scenes.items():
-        lens = looks.lens_of(name)
+        lens = optics.lens_of(name)
         free = np.isin(lens, seen.free)
         estimated = scene.estimated or bool(np.isin(lens, seen.moving).any())
-        result = CameraResult(looks.camera(name), estimated)
+        result = CameraResult(optics.camera(name), estimated)
         if free.any():
             columns = solved.columns_of(lens[free])
             own, cross = np.zeros((len(lens),) * 2), np.zeros((len(lens), edges))
             own[np.ix_(free, free)] = covariance[np.ix_(columns, columns)]
             cross[free] = covariance[columns, :edges]
-            result = CameraResult(looks.camera(name), estimated, own, cross)
+            result = CameraResult(optics.camera(name), estimated, own, cross)
         cameras[name] = replace(result, field=lens_field_of(solved, name, covariance, edges))
     return cameras
 
@@ -451,9 +451,9 @@ def fit_section(run: RunState) -> CellJointFit:
         run.assessment.covariance,
         6 * len(run.assessment.edges),
     )
-    seen, looks = solved.linearised_corners, solved.camera_parameters
+    seen, optics = solved.linearised_corners, solved.camera_parameters
     arms, of_arms = _calibrated_arms(run)
-    if seen is None or looks is None:
+    if seen is None or optics is None:
         columns = [*range(edges), *of_arms]
         return CellJointFit(
             cameras={}, targets={}, arms=arms, covariance=covariance[np.ix_(columns, columns)]
@@ -462,7 +462,7 @@ def fit_section(run: RunState) -> CellJointFit:
     return CellJointFit(
         cameras={
             object_name(name, "camera"): _relative_indices(seen.free, at)
-            for name, at in looks.lenses.items()
+            for name, at in optics.lenses.items()
         },
         targets={
             name: _relative_indices(seen.free, shape) for name, shape in _shape_slices(run).items()
@@ -487,18 +487,20 @@ def _calibrated_arms(run: RunState) -> tuple[dict[str, FittedArm], list[int]]:
 def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResult]]:
     """The estimated shapes of boards and rigs, by name; exact rigs are left out."""
     solved, covariance = run.cell_fit, run.assessment.covariance
-    seen, looks = solved.linearised_corners, solved.camera_parameters
+    seen, optics = solved.linearised_corners, solved.camera_parameters
     boards, rigs = dict[str, BoardResult](), dict[str, RigResult]()
-    if seen is None or looks is None:
+    if seen is None or optics is None:
         return boards, rigs
-    all_sigmas = np.zeros(len(looks.values))
+    all_sigmas = np.zeros(len(optics.values))
     all_sigmas[seen.free] = np.sqrt(np.diag(covariance))[solved.columns_of(seen.free)]
-    shapes = zip(_shape_slices(run).items(), run.session.boards.items(), looks.corners, strict=True)
+    shapes = zip(
+        _shape_slices(run).items(), run.session.boards.items(), optics.corners, strict=True
+    )
     for (name, shape), (plate, target), corners in shapes:
         if frame_name("target", plate) not in solved.inlier_problem.tree.branches:
             continue
         values, sigmas, free = (
-            looks.values[shape],
+            optics.values[shape],
             all_sigmas[shape],
             _relative_indices(seen.free, shape),
         )
@@ -516,12 +518,12 @@ def shapes_of(run: RunState) -> tuple[dict[str, BoardResult], dict[str, RigResul
 
 def _shape_slices(run: RunState) -> dict[str, slice]:
     """The slice of each target's shape in the values of lenses and boards, by name."""
-    looks = run.cell_fit.camera_parameters
-    if looks is None:
+    optics = run.cell_fit.camera_parameters
+    if optics is None:
         return {}
     targets = tuple(run.session.boards.values())
     names = tuple(name or "target" for name in run.session.plates) or ("target",)
-    return dict(zip(names, shape_slices(targets, looks.boards.start), strict=True))
+    return dict(zip(names, shape_slices(targets, optics.boards.start), strict=True))
 
 
 def _relative_indices(indices: IntArray, part: slice) -> tuple[int, ...]:

@@ -238,18 +238,18 @@ def _fit_with_inliers(start: CellFit, observed: Observed, sizes: Mapping[str, fl
 
 def _turned_images(solved: CellFit) -> dict[int, ImageTurn]:
     """How images of outliers were turned or mirrored, by view."""
-    inliers, looks = solved.inlier_fit, solved.camera_parameters
+    inliers, optics = solved.inlier_fit, solved.camera_parameters
     problem, state = inliers.problem, inliers.fit.state
-    if looks is None or inliers.used.all():
+    if optics is None or inliers.used.all():
         return {}
     typical_px = float(np.nanmedian(solved.reprojection_px(np.flatnonzero(inliers.used), state)))
     predicted, turns = problem.predicted(state), {}
     for row in np.flatnonzero(~inliers.used).tolist():
         seer, view = solved.cell.rows[row].seer, solved.poses[row]
-        if view.corners is None or seer not in looks.problems:
+        if view.corners is None or seer not in optics.problems:
             continue
-        camera = looks.camera(seer)
-        predicted_px = predict_corners(camera, predicted[row], looks.corners[view.board])
+        camera = optics.camera(seer)
+        predicted_px = predict_corners(camera, predicted[row], optics.corners[view.board])
         how = find_image_turn(view.corners.px, predicted_px, camera.resolution, typical_px)
         if how is not None:
             turns[view.view] = how
@@ -270,19 +270,19 @@ def _fit_lenses_and_frames(
     if observed.scenes and not solved.inlier_fit.problem.is_combined:
         side, frames = solved.frame_model, solved.frames
         views = _views_by_camera(observed, solved.poses)
-        looks = side.looks(observed.scenes, views).with_levels(levels)
+        optics = side.looks(observed.scenes, views).with_levels(levels)
         if observed.is_misread:
-            return solved.with_joint_fit(side, settle_looks(looks, side, looks.first, frames))
+            return solved.with_joint_fit(side, settle_looks(optics, side, optics.first, frames))
         try:
-            fitted, side = refine_jointly(side, looks, frames)
+            fitted, side = refine_jointly(side, optics, frames)
         except ConvergenceError:
             names = next(iter(observed.scenes.values())).names
             targets = [frame_name("target", name) for name in names]
-            size_errors = {index: sizes.get(targets[index], 0.0) for index in looks.printed}
+            size_errors = {index: sizes.get(targets[index], 0.0) for index in optics.printed}
             far = {board: size for board, size in size_errors.items() if abs(size) > _FAR_SIZE}
             if not far:
                 raise
-            fitted, side = refine_jointly(side, looks.with_sizes(far), frames)
+            fitted, side = refine_jointly(side, optics.with_sizes(far), frames)
         return solved.with_joint_fit(side, fitted)
     solved = replace(solved, linearised_corners=None)
     if drifts := tuple(arm_effects(solved.arms)):
@@ -341,8 +341,8 @@ def _converge_arms(solved: CellFit) -> CellFit:
                 corners.camera_parameters, side, corners.moving, solved.frames, None, corners
             )
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
-                looks = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
-                fitted = settle_looks(looks, side, fitted.moving, fitted.frames, fitted.others)
+                optics = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
+                fitted = settle_looks(optics, side, fitted.moving, fitted.frames, fitted.others)
             solved = solved.with_joint_fit(side, fitted)
         problem, state = solved.inlier_fit.problem, solved.inlier_fit.fit.state
         moved = {name: arm.relinearised(problem, state) for name, arm in solved.arms.items()}

@@ -55,19 +55,19 @@ def lens_and_board_findings(
         covariance: (p, p) covariance of its unknowns, including other errors than noise.
         stated: The same observations with nominal arms; None where none was calibrated.
     """
-    looks = fitted.camera_parameters
-    cameras = zip(looks.problems.items(), fitted.linearised.compressed, strict=True)
+    optics = fitted.camera_parameters
+    cameras = zip(optics.problems.items(), fitted.linearised.compressed, strict=True)
     for (camera, problem), compressed in cameras:
-        moving = np.flatnonzero(np.isin(looks.places(camera), fitted.moving))
+        moving = np.flatnonzero(np.isin(optics.places(camera), fitted.moving))
         noise = _noise_findings(
             problem.stack, compressed.residuals, problem.unknowns(compressed, moving)
         )
         of = "" if camera == ONLY_CAMERA else camera
         yield from (finding.of(of) for finding in (*noise, *_lens_findings(fitted, camera)))
-    scene = next(iter(looks.problems.values())).scene
+    scene = next(iter(optics.problems.values())).scene
     for board, target in enumerate(scene.targets):
-        if board not in looks.printed:
-            yield from _point_findings(target, looks.moved_points(board))
+        if board not in optics.printed:
+            yield from _point_findings(target, optics.moved_points(board))
             frame = frame_name("target", scene.names[board])
             measured = measured_rig(side, fitted, frame, board)
             if stated is not None:
@@ -75,15 +75,15 @@ def lens_and_board_findings(
             yield from _rig_size_findings(target, measured)
             continue
         called = f"board {scene.names[board]}".strip()
-        if _is_free(fitted, looks.scale_of(board)):
-            (place,) = looks.scale_of(board)
+        if _is_free(fitted, optics.scale_of(board)):
+            (place,) = optics.scale_of(board)
             at = fitted.columns.start + int(np.searchsorted(fitted.linearised.free, place))
             measured = measured_scale(side, fitted, board)
             written = replace(
-                measured, scale=float(looks.values[place]), sigma=float(covariance[at, at] ** 0.5)
+                measured, scale=float(optics.values[place]), sigma=float(covariance[at, at] ** 0.5)
             )
             yield scale_finding(called, target, measured, written)
-        if _has_changed(fitted, looks.shape_of(board)):
+        if _has_changed(fitted, optics.shape_of(board)):
             yield _shape_finding(fitted, board, called)
 
 
@@ -153,29 +153,29 @@ def scale_finding(
 
 def _shape_finding(fitted: ConvergedFit, board: int, called: str) -> Finding:
     """Finding on a bent, stretched or sheared board; a note within the accuracy of printing."""
-    looks = fitted.camera_parameters
-    shape = looks.shape_of(board)
+    optics = fitted.camera_parameters
+    shape = optics.shape_of(board)
     aspect, *bends, shear = shape
-    drawn = looks.with_values(shape, np.zeros(len(shape))).corners[board]
-    largest_m = float(np.linalg.norm(looks.corners[board] - drawn, axis=1).max())
+    drawn = optics.with_values(shape, np.zeros(len(shape))).corners[board]
+    largest_m = float(np.linalg.norm(optics.corners[board] - drawn, axis=1).max())
     if largest_m < _LEAST_BEND_M:
         return Finding(
             NOTE, f"The {called} is within {figure(1e3 * largest_m)} mm of its drawing, size aside."
         )
     parts, steps = [], []
     if _has_changed(fitted, np.array([aspect])):
-        longer = float(looks.values[aspect])
+        longer = float(optics.values[aspect])
         far, near = ("y", "x") if longer > 0 else ("x", "y")
         parts.append(
             f"longer along its {far} than along its {near}, by {figure(100 * abs(longer))} %"
         )
     if _has_changed(fitted, np.array([shear])):
-        corner_deg = 90.0 - np.rad2deg(float(looks.values[shear]))
+        corner_deg = 90.0 - np.rad2deg(float(optics.values[shear]))
         parts.append(f"sheared: its rows and columns meet at {corner_deg:.3f} deg")
     if parts:
         steps.append("Print it anew on another printer.")
     if _has_changed(fitted, np.array(bends)) or not parts:
-        depth = figure(1e3 * float(np.ptp(looks.corners[board][:, 2])))
+        depth = figure(1e3 * float(np.ptp(optics.corners[board][:, 2])))
         parts.insert(0, f"not flat: its corners lie within {depth} mm of depth")
         steps.insert(0, "Put the board on a stiff, flat plate, and record again.")
     return Finding(
@@ -232,8 +232,8 @@ def _rig_size_findings(target: Target, measured: MeasuredScale) -> Iterator[Find
 
 
 def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
-    looks = fitted.camera_parameters
-    problem, lens = looks.problems[camera], looks.lens_of(camera)
+    optics = fitted.camera_parameters
+    problem, lens = optics.problems[camera], optics.lens_of(camera)
     free = np.intersect1d(lens, fitted.moving)
     if problem.scene.mode == "refine" and not len(free):
         words = (
@@ -248,13 +248,13 @@ def _lens_findings(fitted: ConvergedFit, camera: str) -> Iterator[Finding]:
         yield Finding("remark", words, Remedy(step))
     if not problem.scene.estimated and len(free) and _has_changed(fitted, free):
         is_exact = problem.scene.matrix_sigma_px is None
-        steps = (looks.values - looks.stated)[lens[:4]]
-        words, do = other_images(problem.scene.camera, looks.values[lens[:4]])
+        steps = (optics.values - optics.stated)[lens[:4]]
+        words, do = other_images(problem.scene.camera, optics.values[lens[:4]])
         if words:
             yield Finding("lens", f"{words} It was refined.", Remedy(do, CALIBRATE))
         else:
             is_wrong = is_exact or contradicted_lens(fitted, camera)
-            moved_px = _largest_shift_px(problem, looks.camera(camera))
+            moved_px = _largest_shift_px(problem, optics.camera(camera))
             yield _refined_lens_finding(steps, is_doubtful=is_wrong and moved_px > _LEAST_MOVE_PX)
     if problem.contested:
         at = np.arange(fitted.problem.size)[fitted.columns]

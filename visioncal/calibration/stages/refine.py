@@ -61,19 +61,19 @@ def free_parameters_of_camera(seen: LinearisedCorners) -> LensBoardParameters:
 
 
 def refine_jointly(
-    side: CellFrameModel, looks: CameraParameters, frames: Mapping[str, FloatArray]
+    side: CellFrameModel, optics: CameraParameters, frames: Mapping[str, FloatArray]
 ) -> tuple[ConvergedFit, CellFrameModel]:
     """Fits lenses, boards and frames to all corners together; see `free_supported_values`.
 
     With these fitted, the residuals determine the noise of each view, and all is fitted once more
-    with that. `looks` has stated lenses and boards, `frames` the initial poses of unknown frames.
+    with that. `optics` has stated lenses and boards, `frames` the initial poses of unknown frames.
 
     Returns:
         The fit, and the side with the errors of its arms.
     """
     try:
         with diverging():
-            fitted, new_side = _fit_with_levels(side, looks, frames, is_plain=False)
+            fitted, new_side = _fit_with_levels(side, optics, frames, is_plain=False)
         levels = fitted.camera_parameters.levels
         sigmas = zip(fitted.camera_parameters.problems, fitted.linearised.sigmas_px, strict=True)
         if not any(name in levels and are_beyond(levels[name], value) for name, value in sigmas):
@@ -82,34 +82,34 @@ def refine_jointly(
         pass
     # A field of many pixels is wrong: poses diverge with it. The lens models are then used without
     # fields.
-    no_levels = dict.fromkeys(looks.problems, LensLevels())
+    no_levels = dict.fromkeys(optics.problems, LensLevels())
     with diverging():
-        return _fit_with_levels(side, looks.with_levels(no_levels), frames, is_plain=True)
+        return _fit_with_levels(side, optics.with_levels(no_levels), frames, is_plain=True)
 
 
 def _fit_with_levels(
     side: CellFrameModel,
-    looks: CameraParameters,
+    optics: CameraParameters,
     frames: Mapping[str, FloatArray],
     *,
     is_plain: bool,
 ) -> tuple[ConvergedFit, CellFrameModel]:
-    levels = looks.levels
-    fitted, side = _fit_with_own_weights(side, looks, frames)
-    looks = fitted.camera_parameters.weighed(fitted.linearised)
+    levels = optics.levels
+    fitted, side = _fit_with_own_weights(side, optics, frames)
+    optics = fitted.camera_parameters.weighed(fitted.linearised)
     stacks = {name: problem.stack for name, problem in fitted.camera_parameters.problems.items()}
-    if any(problem.stack is not stacks[name] for name, problem in looks.problems.items()):
-        fitted = refit_jointly(fitted, side, fitted.moving, looks)
-    elif np.array_equal(fitted.moving, looks.first) and not (levels or side.has_errors):
+    if any(problem.stack is not stacks[name] for name, problem in optics.problems.items()):
+        fitted = refit_jointly(fitted, side, fitted.moving, optics)
+    elif np.array_equal(fitted.moving, optics.first) and not (levels or side.has_errors):
         return fitted, side
     if is_plain:
         return fitted, side
-    looks = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
-    return refit_jointly(fitted, side, fitted.moving, looks), side
+    optics = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
+    return refit_jointly(fitted, side, fitted.moving, optics), side
 
 
 def _fit_with_own_weights(
-    side: CellFrameModel, looks: CameraParameters, frames: Mapping[str, FloatArray]
+    side: CellFrameModel, optics: CameraParameters, frames: Mapping[str, FloatArray]
 ) -> tuple[ConvergedFit, CellFrameModel]:
     """Fits all with the corners' own weights."""
     # Errors of an arm are estimated once lenses and boards are fitted. Before, they may have looked
@@ -117,8 +117,8 @@ def _fit_with_own_weights(
     # of any arm's shape decide which values are free, but are not estimated. Their sigma is that
     # under the stated lenses and boards: a board whose size changes with the arm hides a part of
     # it.
-    stated = _with_refined_matrices(side, fit_jointly(looks, side, looks.first, frames))
-    if not looks.levels:
+    stated = _with_refined_matrices(side, fit_jointly(optics, side, optics.first, frames))
+    if not optics.levels:
         levels = lens_levels(side, _with_measured_sizes(side, stated))
         stated = refit_jointly(
             stated, side, stated.moving, stated.camera_parameters.with_levels(levels)
@@ -165,13 +165,13 @@ def _with_refined_matrices(side: FrameModel, fitted: ConvergedFit) -> ConvergedF
 
 def _with_measured_sizes(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     """The fit with board sizes by the motion, where these differ much from the stated ones."""
-    looks = fitted.camera_parameters
-    scales = np.array([_measured_size(side, fitted, index).scale for index in looks.printed])
+    optics = fitted.camera_parameters
+    scales = np.array([_measured_size(side, fitted, index).scale for index in optics.printed])
     if not np.any(np.abs(scales) > _NONLINEAR):
         return fitted
-    sizes = np.concatenate([looks.scale_of(index) for index in looks.printed])
-    looks = looks.without_prior(sizes.tolist()).with_values(sizes, scales)
-    return refit_jointly(fitted, side, np.union1d(fitted.moving, sizes), looks)
+    sizes = np.concatenate([optics.scale_of(index) for index in optics.printed])
+    optics = optics.without_prior(sizes.tolist()).with_values(sizes, scales)
+    return refit_jointly(fitted, side, np.union1d(fitted.moving, sizes), optics)
 
 
 def lens_levels(side: FrameModel, fitted: ConvergedFit) -> dict[str, LensLevels]:
@@ -186,24 +186,24 @@ def lens_levels(side: FrameModel, fitted: ConvergedFit) -> dict[str, LensLevels]
         fitted = refit_jointly(
             fitted, side, fitted.moving, fitted.camera_parameters.with_levels(no_breathing)
         )
-    looks = fitted.linearised.camera_parameters
+    optics = fitted.linearised.camera_parameters
     # The board's size is left to the motion: a wrong one would look like breathing, and so would a
     # focal length.
-    doubted = {name: item for name, item in looks.problems.items() if len(item.doubted)}
-    looks = looks.doubting(
+    doubted = {name: item for name, item in optics.problems.items() if len(item.doubted)}
+    optics = optics.doubting(
         {name: (lens_prior(item.scene), item.doubted[:0]) for name, item in doubted.items()}
     )
-    sizes = [looks.scale_of(index) for index in looks.printed]
-    unsized = looks.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
-    seen = fitted.linearised.freed(np.arange(len(looks.values)), unsized)
+    sizes = [optics.scale_of(index) for index in optics.printed]
+    unsized = optics.without_prior(np.concatenate([np.zeros(0), *sizes]).tolist())
+    seen = fitted.linearised.freed(np.arange(len(optics.values)), unsized)
     # Priors may be wrong, which is tested later; without them, frames may be undetermined.
     problem = side.problem(seen)
     problem = replace(problem, priors=with_loose_positions(problem.priors))
-    values = np.append(looks.values, np.zeros(seen.by_field.shape[2]))
+    values = np.append(optics.values, np.zeros(seen.by_field.shape[2]))
     state = State(fitted.fit.state.edges, np.concatenate([values, fitted.others]))
     return {
         name: estimate_levels(seen, problem, side.rows(seen), state, fitted.fit.noise, name)
-        for name in looks.problems
+        for name in optics.problems
     }
 
 
@@ -215,27 +215,27 @@ def _with_lens_priors(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     prior each, whose sigma is estimated by restricted likelihood (REML). They are freed where the
     data determine them better than the prior, and count in the covariance where not.
     """
-    looks, moving = fitted.camera_parameters, [fitted.moving]
+    optics, moving = fitted.camera_parameters, [fitted.moving]
     # A size error within the board's sigma looks like another focal length.
     scales = np.array(
-        [value for board in looks.printed for value in looks.scale_of(board)], dtype=int
+        [value for board in optics.printed for value in optics.scale_of(board)], dtype=int
     )
     held = [
         name
-        for name, problem in looks.problems.items()
+        for name, problem in optics.problems.items()
         if not problem.scene.estimated
         and problem.scene.matrix_sigma_px is None
         and problem.scene.mode == "auto"
         and problem.has_spare_corners
-        and not np.isin(looks.lens_of(name), fitted.moving).any()
+        and not np.isin(optics.lens_of(name), fitted.moving).any()
     ]
     if not held:
         return fitted
     scores = Scores.of(side, fitted)
     doubts = {}
     for name in held:
-        problem, lens = looks.problems[name], looks.lens_of(name)
-        focal_px, sigma = looks.values[lens[:2]], lens_prior(problem.scene)
+        problem, lens = optics.problems[name], optics.lens_of(name)
+        focal_px, sigma = optics.values[lens[:2]], lens_prior(problem.scene)
         step, covariance = scores.asked_for(np.append(lens[:4], scales), fitted.moving)
         step, covariance = step[:4], covariance[:4, :4]
         # Both focal lengths have one factor: their ratio is determined well, and not in doubt.
@@ -256,7 +256,7 @@ def _with_lens_priors(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
     if not any(len(places) for _, places in doubts.values()):
         return fitted
     free = np.unique(np.concatenate(moving))
-    return _with_contested_lenses(side, refit_jointly(fitted, side, free, looks.doubting(doubts)))
+    return _with_contested_lenses(side, refit_jointly(fitted, side, free, optics.doubting(doubts)))
 
 
 def _still_significant(
@@ -268,9 +268,9 @@ def _still_significant(
     refit = fit_jointly(
         fitted.camera_parameters, side, fitted.moving, fitted.frames, before=fitted.linearised
     )
-    looks = fitted.camera_parameters
-    groups = [looks.shape_of(index) for index in looks.printed] + [
-        looks.lens_of(problem) for problem in looks.problems
+    optics = fitted.camera_parameters
+    groups = [optics.shape_of(index) for index in optics.printed] + [
+        optics.lens_of(problem) for problem in optics.problems
     ]
     kept = [
         array
@@ -281,7 +281,7 @@ def _still_significant(
     ]
     sizes, refit = _significant_sizes(side, refit)
     places = np.concatenate([stated.moving, *kept, *sizes])
-    without_prior = places[np.isinf(looks.prior_sigma[places])]
+    without_prior = places[np.isinf(optics.prior_sigma[places])]
     restated = stated.camera_parameters.without_prior(without_prior.tolist())
     restated = restated.with_values(places, refit.camera_parameters.values[places])
     return fit_jointly(restated, side, np.unique(places), fitted.frames)
@@ -291,18 +291,20 @@ def _significant_sizes(side: FrameModel, fit: ConvergedFit) -> tuple[list[IntArr
     """The board scales that still differ from the stated ones, and the fit with these free."""
     # An error common to all boards looks like one of the arms' links, and with all free together
     # none is significant: the least significant one is reset, and the others are measured again.
-    looks = fit.camera_parameters
-    boards = [board for board in looks.printed if np.isin(looks.scale_of(board), fit.moving).all()]
+    optics = fit.camera_parameters
+    boards = [
+        board for board in optics.printed if np.isin(optics.scale_of(board), fit.moving).all()
+    ]
     while boards:
         measured = [measured_scale(side, fit, board) for board in boards]
         least = min(measured, key=lambda value: abs(value.scale) / value.sigma)
         if least.is_another:
             break
         boards.remove(least.board)
-        place = looks.scale_of(least.board)
-        restated = fit.camera_parameters.with_values(place, looks.stated[place])
+        place = optics.scale_of(least.board)
+        restated = fit.camera_parameters.with_values(place, optics.stated[place])
         fit = refit_jointly(fit, side, np.setdiff1d(fit.moving, place), restated)
-    return [looks.scale_of(index) for index in boards], fit
+    return [optics.scale_of(index) for index in boards], fit
 
 
 def _measured_size(side: FrameModel, fitted: ConvergedFit, board: int) -> MeasuredScale:
@@ -311,14 +313,14 @@ def _measured_size(side: FrameModel, fitted: ConvergedFit, board: int) -> Measur
     # disagree by millimetres, because a board's size is wrong, their lines of sight do, too, and
     # restrain a size that is linear about the views' poses. The costs of fits with other sizes do
     # not have this bias.
-    linear, looks = measured_scale(side, fitted, board), fitted.camera_parameters
-    noise, place = fitted.fit.noise, looks.scale_of(board)
+    linear, optics = measured_scale(side, fitted, board), fitted.camera_parameters
+    noise, place = fitted.fit.noise, optics.scale_of(board)
     if linear.is_another or not any(robot[1] > _ROUGH_M for robot in noise.robots):
         return linear
 
     def refit(scale: float) -> ConvergedFit:
-        value = looks.values[place] + scale
-        return refit_jointly(fitted, side, fitted.moving, looks.with_values(place, value))
+        value = optics.values[place] + scale
+        return refit_jointly(fitted, side, fitted.moving, optics.with_values(place, value))
 
     below, centre, above = (
         equations_and_cost(item.problem, item.fit.state, noise)[2]
@@ -369,11 +371,11 @@ def _with_contested_lenses(side: FrameModel, fitted: ConvergedFit) -> ConvergedF
 def _fit_freed(side: FrameModel, moving: IntArray, fitted: ConvergedFit) -> ConvergedFit:
     """Fits with more values free, without priors of lenses that they contradict."""
     wider = refit_jointly(fitted, side, moving)
-    looks = wider.camera_parameters
+    optics = wider.camera_parameters
     return _without_contradicted_priors(
         side,
         wider,
-        [name for name in looks.problems if np.isin(looks.lens_of(name), moving).all()],
+        [name for name in optics.problems if np.isin(optics.lens_of(name), moving).all()],
     )
 
 
@@ -381,15 +383,15 @@ def _without_contradicted_priors(
     side: FrameModel, fitted: ConvergedFit, cameras: Sequence[str]
 ) -> ConvergedFit:
     """Fits without the priors of those cameras' free lenses that contradict them."""
-    looks, moving = fitted.camera_parameters, fitted.moving
+    optics, moving = fitted.camera_parameters, fitted.moving
     wrong = [
-        np.intersect1d(looks.lens_of(name), moving)
+        np.intersect1d(optics.lens_of(name), moving)
         for name in cameras
         if contradicted_lens(fitted, name)
     ]
     if not wrong:
         return fitted
-    return refit_jointly(fitted, side, moving, looks.without_prior(np.concatenate(wrong).tolist()))
+    return refit_jointly(fitted, side, moving, optics.without_prior(np.concatenate(wrong).tolist()))
 
 
 def _with_freed_scales(side: CellFrameModel, fitted: ConvergedFit) -> ConvergedFit:
@@ -420,16 +422,16 @@ def _with_freed_scales(side: CellFrameModel, fitted: ConvergedFit) -> ConvergedF
 def _with_scale(side: CellFrameModel, fitted: ConvergedFit, size: MeasuredScale) -> ConvergedFit:
     """The fit with the scale of a board free, from its measured value."""
     place = fitted.camera_parameters.scale_of(size.board)
-    looks = fitted.camera_parameters.with_values(place, np.array([size.scale]))
+    optics = fitted.camera_parameters.with_values(place, np.array([size.scale]))
     if size.contradicts:
-        looks = looks.without_prior(place.tolist())
-    return refit_jointly(fitted, side, np.union1d(fitted.moving, place), looks)
+        optics = optics.without_prior(place.tolist())
+    return refit_jointly(fitted, side, np.union1d(fitted.moving, place), optics)
 
 
 def _most_wrong_size(side: CellFrameModel, fitted: ConvergedFit) -> MeasuredScale | None:
     """The held board scale that differs most significantly from the stated one, or None."""
-    looks = fitted.camera_parameters
-    held = [index for index in looks.printed if looks.scale_of(index)[0] not in fitted.moving]
+    optics = fitted.camera_parameters
+    held = [index for index in optics.printed if optics.scale_of(index)[0] not in fitted.moving]
     measured = [_measured_size(side, fitted, board) for board in held]
     wrong = [size for size in measured if _is_wrong(side, size)]
     return max(wrong, key=lambda value: abs(value.scale) / value.sigma, default=None)
@@ -448,15 +450,15 @@ def _is_clear(
     Such errors depend on the posture and look like a size, whose sigma by white noise is far too
     small.
     """
-    looks = resized.camera_parameters
-    (place,) = looks.scale_of(size.board)
+    optics = resized.camera_parameters
+    (place,) = optics.scale_of(size.board)
     column = resized.columns.start + int(np.searchsorted(resized.linearised.free, place))
     # Removes the prior's information.
-    prior_information = looks.prior_sigma[place] ** -2.0
+    prior_information = optics.prior_sigma[place] ** -2.0
     information = 1.0 / covariance[column, column] - prior_information
     if information <= 0.0:
         return False
-    scale, sigma = looks.values[place] * (1.0 + prior_information / information), information**-0.5
+    scale, sigma = optics.values[place] * (1.0 + prior_information / information), information**-0.5
     tested = replace(size, scale=float(scale), sigma=max(float(sigma), size.sigma))
     return _is_wrong(side, tested)
 
@@ -471,9 +473,9 @@ def _is_determined(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
 
 def _largest_sigmas(fitted: ConvergedFit) -> FloatArray:
     """(2 e,) the largest sigma of each unknown frame's rotation [rad] and position [m]."""
-    looks, fit = [effect.determined for effect in fitted.problem.effects[:1]], fitted.fit
-    problem = fitted.problem.with_effects(looks)
-    values = fit.state.values[: sum(map(len, looks))]
+    optics, fit = [effect.determined for effect in fitted.problem.effects[:1]], fitted.fit
+    problem = fitted.problem.with_effects(optics)
+    values = fit.state.values[: sum(map(len, optics))]
     covariance = covariance_of(problem, replace(fit, state=State(fit.state.edges, values)))
     places = np.arange(6 * len(problem.unknown)).reshape(-1, 3)
     return np.sqrt([np.linalg.eigvalsh(covariance[np.ix_(place, place)])[-1] for place in places])
@@ -481,14 +483,14 @@ def _largest_sigmas(fitted: ConvergedFit) -> FloatArray:
 
 def _contested_cameras(side: FrameModel, fitted: ConvergedFit) -> list[str]:
     """Cameras with held intrinsics that the corners contradict."""
-    looks, moving = fitted.camera_parameters, fitted.moving
+    optics, moving = fitted.camera_parameters, fitted.moving
     held = [
-        problem for problem in looks.problems if not np.isin(looks.lens_of(problem), moving).all()
+        problem for problem in optics.problems if not np.isin(optics.lens_of(problem), moving).all()
     ]
-    if not held or not looks.has_spare_corners:
+    if not held or not optics.has_spare_corners:
         return []
-    bent = np.union1d(moving, looks.shape)
-    lenses = {name: looks.lens_of(name) for name in held}
+    bent = np.union1d(moving, optics.shape)
+    lenses = {name: optics.lens_of(name) for name in held}
     scores = Scores.of(side, fitted)
     least = scores.gain(bent)
     return [
@@ -518,13 +520,13 @@ def recompute_poses(
 
 def _shape_sets(side: FrameModel, fitted: ConvergedFit) -> Iterator[IntArray]:
     """Sets of values to free: the bends, with given intrinsics or without, where significant."""
-    looks, moving = fitted.camera_parameters, fitted.moving
-    if not looks.has_spare_corners:
+    optics, moving = fitted.camera_parameters, fitted.moving
+    if not optics.has_spare_corners:
         return
-    bent = np.union1d(moving, looks.shape)
+    bent = np.union1d(moving, optics.shape)
     stated = {
-        name: np.setdiff1d(looks.lens_of(name), bent)
-        for name, problem in looks.problems.items()
+        name: np.setdiff1d(optics.lens_of(name), bent)
+        for name, problem in optics.problems.items()
         if problem.scene.mode != "hold"
     }
     scores = Scores.of(side, fitted)
@@ -548,11 +550,11 @@ def _shape_sets(side: FrameModel, fitted: ConvergedFit) -> Iterator[IntArray]:
 def _predicts_worse(wider: ConvergedFit, fitted: ConvergedFit) -> bool:
     """Whether held-out views are predicted worse, in position and in rotation."""
     # Intrinsics with a stated sigma are free to move within that in any case.
-    looks = wider.camera_parameters
+    optics = wider.camera_parameters
     freed = [
         problem.scene
-        for name, problem in looks.problems.items()
-        if np.isin(looks.lens_of(name), np.setdiff1d(wider.moving, fitted.moving)).all()
+        for name, problem in optics.problems.items()
+        if np.isin(optics.lens_of(name), np.setdiff1d(wider.moving, fitted.moving)).all()
     ]
     if freed and all(scene.matrix_sigma_px is not None for scene in freed):
         return False

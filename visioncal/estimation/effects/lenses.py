@@ -255,8 +255,8 @@ class CameraParameters:
             sigmas.append(sigma)
         poses = np.concatenate([compressed.cam_from_target for compressed in found])
         corners = PriorInformation(information, gradient)
-        looks = replace(self, poses=poses)
-        return LinearisedCorners(looks, np.sort(moving), tuple(found), tuple(sigmas), corners)
+        optics = replace(self, poses=poses)
+        return LinearisedCorners(optics, np.sort(moving), tuple(found), tuple(sigmas), corners)
 
     def compressed(self, name: str) -> Compressed:
         """What one camera's corners say, linearised at its poses."""
@@ -318,39 +318,41 @@ class LinearisedCorners:
 
     def holds_lens(self, name: str) -> bool:
         """Whether a camera has a lens that is uncertain, and stays where it is."""
-        looks = self.camera_parameters
-        if name not in looks.lenses:
+        optics = self.camera_parameters
+        if name not in optics.lenses:
             return False
-        lens = looks.lens_of(name)
+        lens = optics.lens_of(name)
         return bool(np.isin(lens, self.free).any() and not np.isin(lens, self.moving).any())
 
     @property
     def known(self) -> PriorInformation:
         """What is known of the free values without any robot."""
-        looks, free = self.camera_parameters, self.free
-        prior = 1.0 / looks.prior_sigma[free] ** 2
+        optics, free = self.camera_parameters, self.free
+        prior = 1.0 / optics.prior_sigma[free] ** 2
         return PriorInformation(
             self.corners.information[np.ix_(free, free)] + np.diag(prior),
-            self.corners.gradient[free] + prior * (looks.values - looks.stated)[free],
+            self.corners.gradient[free] + prior * (optics.values - optics.stated)[free],
         )
 
-    def freed(self, moving: IntArray, looks: CameraParameters | None = None) -> "LinearisedCorners":
+    def freed(
+        self, moving: IntArray, optics: CameraParameters | None = None
+    ) -> "LinearisedCorners":
         """The same with other values moving, or with other priors."""
         return replace(
-            self, moving=np.sort(moving), camera_parameters=looks or self.camera_parameters
+            self, moving=np.sort(moving), camera_parameters=optics or self.camera_parameters
         )
 
-    def still(self, looks: CameraParameters, name: str) -> Compressed | None:
+    def still(self, optics: CameraParameters, name: str) -> Compressed | None:
         """What one camera's corners say, if other parameters have it alike; else None."""
-        mine, there = self.camera_parameters.problems[name], looks.problems[name]
-        places = looks.places(name)
+        mine, there = self.camera_parameters.problems[name], optics.problems[name]
+        places = optics.places(name)
         is_alike = (
             there.stack is mine.stack
             and there.levels == mine.levels
-            and looks.poses is self.camera_parameters.poses
-            and np.array_equal(looks.values[places], self.camera_parameters.values[places])
+            and optics.poses is self.camera_parameters.poses
+            and np.array_equal(optics.values[places], self.camera_parameters.values[places])
         )
-        return self.compressed[list(looks.problems).index(name)] if is_alike else None
+        return self.compressed[list(optics.problems).index(name)] if is_alike else None
 
     @property
     def covariance(self) -> FloatArray:

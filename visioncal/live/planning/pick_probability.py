@@ -48,7 +48,7 @@ class Picking:
 
         Args:
             rows: (m,) the candidates.
-            without: What is taken as exact: `looks` (lens and board), `arm` (posture-dependent
+            without: What is taken as exact: `optics` (lens and board), `arm` (posture-dependent
                 errors) or `noise` (of the robot at observation and pick).
         """
         turn_rad = np.inf if self.need.deg is None else float(np.deg2rad(self.need.deg))
