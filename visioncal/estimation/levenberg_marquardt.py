@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt, for any problem that can linearise itself."""
+"""Levenberg-Marquardt minimisation of any problem that can linearise itself."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,31 +8,32 @@ import numpy as np
 
 State = TypeVar("State")
 
-# Far more than a healthy problem takes: flat valleys of rational lenses take two hundred.
+# Well-posed problems take far fewer; flat valleys of rational lens models take two hundred.
 ITERATIONS = 400
 START_DAMPING, _LEAST_DAMPING, _WORST_DAMPING = 1e-4, 1e-12, 1e9
-# A step that promised less than this, and went up, is the last: in units of the noise that is a
-# hundredth of a sigma. Where the next promise is this much less, it leads on all the same.
+# The iteration ends at a step that raises the cost with a smaller predicted decrease (a hundredth
+# of a sigma). That step is still accepted if the next predicted decrease is smaller by the second
+# factor.
 _LITTLE, _LEADS = 1e-4, 1e-2
-# A step is not taken at rest that promises so much less than what is rest: the linearisation at the
-# answer is then at hand.
+# At convergence, a step whose predicted decrease is below this share of the tolerance is skipped,
+# so that the problem is already linearised at the returned state.
 _NOTHING = 0.1
-# Least change of the damping after a step, and that after one which kept its promise to this share:
-# the problem is as good as linear.
+# Smallest damping factor after a step, and that after a step with at least this gain ratio, where
+# the problem is practically linear.
 _LEAST_CHANGE, _LINEAR_CHANGE, _LINEAR = 0.1, 1e-3, 0.99
-# Near the answer, where directions that are hardly determined would need many damped steps.
+# Near the solution, where poorly determined directions would need many damped steps.
 NEAR_DAMPING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised(Generic[State]):
-    """A problem at one state: its cost, and where a damped step leads to.
+    """A problem linearised at one state.
 
     Attributes:
-        state: The state.
+        state: The linearisation point.
         cost: The squared error there.
-        step: Where a step of some damping leads to.
-        fall: By how much the cost then falls, to first order; None where that is not known.
+        step: Maps a damping to the state after the damped step.
+        fall: Maps a damping to the predicted decrease of the cost; None if not known.
     """
 
     state: State
@@ -51,48 +52,48 @@ def levenberg_marquardt(
     """Minimises a sum of squares (Levenberg 1944; Marquardt 1963).
 
     Args:
-        start: Where to begin.
-        linearise: Gives the cost at a state and the way on.
-        settled: Decrease of the cost under which the state has come to rest, relative to the
-            cost and one: in units of the noise, less than one is no difference.
-        damping: Of the first step.
-        most: So many steps.
+        start: Initial state.
+        linearise: Linearises the problem at a state.
+        settled: Decrease of the cost, relative to the cost plus one, below which the iteration
+            has converged: costs in units of the noise differ insignificantly by less than one.
+        damping: Damping of the first step.
+        most: Maximum number of steps.
 
     Returns:
-        The state of the least cost, and whether it came to rest there.
+        The state of least cost, and whether the iteration converged.
     """
     now = linearise(start)
     for _ in range(most):
-        promised = now.fall(damping) if now.fall is not None else np.inf
-        little = settled * (abs(now.cost) + 1.0)
-        if 0.0 <= promised <= little:
-            return now.state if promised <= _NOTHING * little else now.step(damping), True
-        then = linearise(now.step(damping))
-        if then.cost <= now.cost:
-            fell = now.cost - then.cost
-            damping = max(damping * _change(fell, promised), _LEAST_DAMPING)
-            now = then
-            if fell <= little:
+        predicted = now.fall(damping) if now.fall is not None else np.inf
+        tolerance = settled * (abs(now.cost) + 1.0)
+        if 0.0 <= predicted <= tolerance:
+            return now.state if predicted <= _NOTHING * tolerance else now.step(damping), True
+        trial = linearise(now.step(damping))
+        if trial.cost <= now.cost:
+            decrease = now.cost - trial.cost
+            damping = max(damping * _change(decrease, predicted), _LEAST_DAMPING)
+            now = trial
+            if decrease <= tolerance:
                 return now.state, True
         else:
-            # What is left is rounding, curvature that Gauss and Newton leave out, or an error of
-            # the derivatives.
-            if promised <= _LITTLE:
-                leads = then.fall is not None and then.fall(damping) < _LEADS * promised
-                return then.state if leads else now.state, True
+            # What remains is rounding, curvature that Gauss-Newton neglects, or an error of the
+            # derivatives.
+            if predicted <= _LITTLE:
+                closer = trial.fall is not None and trial.fall(damping) < _LEADS * predicted
+                return trial.state if closer else now.state, True
             damping *= 10
             if damping > _WORST_DAMPING:
                 return now.state, True
     return now.state, False
 
 
-def _change(fell: float, promised: float) -> float:
-    """What the damping is multiplied by after a step that lowered the cost (Nielsen 1999).
+def _change(decrease: float, predicted: float) -> float:
+    """Factor of the damping after a step that lowered the cost (Nielsen 1999).
 
-    It falls to a tenth after a step that kept its promise and doubles after one that kept none of
-    it: where Gauss and Newton's curvature is too small, every second step would go up otherwise.
+    A tenth at a gain ratio near one, two at a ratio near zero: where the Gauss-Newton curvature is
+    too small, every second step would raise the cost otherwise.
     """
-    if not 0.0 < promised < np.inf:
+    if not 0.0 < predicted < np.inf:
         return _LEAST_CHANGE
-    gain = min(fell / promised, 1.0)
+    gain = min(decrease / predicted, 1.0)
     return _LINEAR_CHANGE if gain > _LINEAR else max(_LEAST_CHANGE, 1.0 - (2.0 * gain - 1.0) ** 3)

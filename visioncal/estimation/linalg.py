@@ -12,9 +12,9 @@ from visioncal.core.types import FloatArray, IntArray, Mask
 
 _Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 
-# Squared pivots of a matrix of unit diagonal below which Cholesky's factor is mostly rounding.
+# Squared Cholesky pivots of a unit-diagonal matrix below which the factor is mostly rounding.
 _LEAST_PIVOT_SQ = 1e-11
-# Share of the noise's variance under which a fit has taken all of it.
+# Share of the noise variance below which a residual direction has no redundancy left.
 _VANISHED = 1e-6
 
 
@@ -25,8 +25,8 @@ class Spectrum:
     The scaling makes them independent of the units of the parameters.
 
     Attributes:
-        values: (n,) ascending, not negative.
-        vectors: (n, n), one direction a column, in the parameters' own units, of unit length.
+        values: (n,) ascending, non-negative.
+        vectors: (n, n) unit vectors in the parameters' own units, one per column.
     """
 
     values: FloatArray
@@ -34,7 +34,7 @@ class Spectrum:
 
     @property
     def ratio(self) -> float:
-        """Smallest over largest eigenvalue: 0 where a direction is not determined at all."""
+        """Smallest over largest eigenvalue; 0 if a direction is unobservable."""
         return float(self.values[0] / self.values[-1]) if self.values[-1] > 0 else 0.0
 
 
@@ -47,19 +47,19 @@ def spectrum(information: FloatArray) -> Spectrum:
 
 
 def scaled_values(information: FloatArray) -> FloatArray:
-    """(..., n) eigenvalues, as `spectrum` has them, of (..., n, n) information matrices."""
+    """Computes the eigenvalues (..., n) of `spectrum` for (..., n, n) information matrices."""
     scale = _scale(information)
     values = np.linalg.eigvalsh(information * scale[..., :, None] * scale[..., None, :])
     return np.asarray(np.maximum(values, 0.0))
 
 
 def covariance_from(information: FloatArray) -> FloatArray:
-    """Inverts (..., n, n) information matrices, scaled first to a unit diagonal.
+    """Inverts (..., n, n) information matrices after scaling them to a unit diagonal.
 
-    A direction without information gets a large but finite variance, never a NaN; whoever asks
-    for a covariance has looked at the spectrum before.
+    A direction without information gets a large but finite variance, never a NaN; callers check
+    the spectrum first.
     """
-    if information.ndim == 2:  # A large one by Cholesky, which takes a tenth of the time.
+    if information.ndim == 2:  # Cholesky takes a tenth of the time of an eigendecomposition.
         root = covariance_root(information)
         return np.asarray(root @ root.T)
     values, vectors, scale = _floored(information)
@@ -68,7 +68,7 @@ def covariance_from(information: FloatArray) -> FloatArray:
 
 
 def covariance_root(information: FloatArray) -> FloatArray:
-    """Factors `covariance_from(information)` as (n, n) `root @ root^T`, however singular."""
+    """Factors `covariance_from(information)` as (n, n) `root @ root^T`, even if singular."""
     scale = _scale(information)
     factor, failed = lapack.dpotrf(information * np.outer(scale, scale), lower=1)
     if not failed and np.diag(factor).min(initial=1.0) ** 2 > _LEAST_PIVOT_SQ:
@@ -79,34 +79,34 @@ def covariance_root(information: FloatArray) -> FloatArray:
 
 
 def _floored(information: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Eigenvalues (..., n), none of them zero, and vectors of scaled matrices, and the scales."""
+    """Positive eigenvalues (..., n) and eigenvectors of the scaled matrices, and the scales."""
     scale = _scale(information)
     values, vectors = _eigen(information * scale[..., :, None] * scale[..., None, :])
-    # Of a unit diagonal, the largest is at least one, unless there is no information at all.
+    # The largest eigenvalue is at least one for a unit diagonal, unless there is no information.
     floor = np.finfo(float).eps * np.maximum(values[..., -1:], 1.0)
     return np.maximum(values, floor), vectors, scale
 
 
 def covariance_among(information: FloatArray, among: Mask) -> FloatArray:
-    """Inverts (n, n) information on some unknowns, the others being where they are.
+    """Computes the covariance of some unknowns with the others held fixed.
 
     Args:
-        information: (n, n) on all unknowns.
-        among: (n,) those that are open.
+        information: (n, n) of all unknowns.
+        among: (n,) mask of the free unknowns.
 
     Returns:
-        (n, n), zero where an unknown is not among them.
+        (n, n) covariance, zero in the rows and columns of held unknowns.
     """
-    found = np.zeros_like(information)
-    places = np.ix_(among, among)
-    found[places] = covariance_from(information[places])
-    return found
+    covariance = np.zeros_like(information)
+    free = np.ix_(among, among)
+    covariance[free] = covariance_from(information[free])
+    return covariance
 
 
 def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues (..., n), ascending, and eigenvectors (..., n, n) of symmetric matrices."""
-    # The usual way, divide and conquer, gives up on some good matrices with many eigenvalues that
-    # are all but equal, as held unknowns make them; the other way is slower and does not.
+    # NumPy's divide and conquer fails on some valid matrices with many nearly equal eigenvalues,
+    # which held unknowns cause; the driver `evr` is slower but does not.
     try:
         return np.linalg.eigh(matrices)
     except np.linalg.LinAlgError:
@@ -121,16 +121,16 @@ def _eigen(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
 def gram(left: _Floats, right: _Floats) -> FloatArray:
     """Sums `left_i^T right_i` over blocks: (m, d, p) and (m, d, q), or (m, d), to (p, q) or (p,).
 
-    One product of tall matrices, which is many times faster than `einsum` over the blocks.
+    A single product of tall matrices is many times faster than `einsum` over the blocks.
     """
     rows = left.reshape(math.prod(left.shape[:-1]), left.shape[-1])
     return np.asarray(rows.T @ right.reshape(len(rows), *right.shape[2:]))
 
 
 def weighted_gram(blocks: FloatArray, weights: FloatArray) -> FloatArray:
-    """(p, p) products of (m, d, p) blocks with themselves, by the (m, d) rows that have a weight.
+    """Weighted Gram matrix (p, p) of (m, d, p) blocks; rows without a positive weight are skipped.
 
-    One product of a matrix with its own transpose, which takes half of what two matrices take.
+    A product of a matrix with its own transpose takes half the time of a general product.
     """
     rows = weights > 0.0
     half = np.sqrt(weights[rows])[:, None] * blocks[rows]
@@ -140,12 +140,12 @@ def weighted_gram(blocks: FloatArray, weights: FloatArray) -> FloatArray:
 def damped_step(
     information: FloatArray, gradient: FloatArray, damping: FloatArray | float
 ) -> FloatArray:
-    """Solves for Levenberg-Marquardt's step (Marquardt 1963: damping scaled by the diagonal).
+    """Solves for the Levenberg-Marquardt step (Marquardt 1963: damping scaled by the diagonal).
 
     Args:
         information: (..., n, n) normal matrices.
         gradient: (..., n) gradients of half the squared error.
-        damping: Share of the diagonal that is added to it, one for all or (..., 1).
+        damping: Share of the diagonal that is added to it, scalar or (..., 1).
 
     Returns:
         (..., n) steps.
@@ -159,25 +159,25 @@ def damped_step(
 def squared_lengths(
     residuals: FloatArray, left: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Squared lengths of residuals in units of a covariance, where that has not vanished.
+    """Computes squared Mahalanobis lengths of residuals in directions that have redundancy.
 
-    A residual that alone determines a direction is zero there, and has no variance either.
+    An observation that alone determines a direction has zero residual and variance there.
 
     Args:
         residuals: (m, d) residuals.
-        left: (m, d, d) their covariances: those of the noise, less what a fit has taken.
-        covariance: (m, d, d) covariances of the noise.
+        left: (m, d, d) residual covariances: noise covariance less the part absorbed by the fit.
+        covariance: (m, d, d) noise covariances.
 
     Returns:
-        (m,) squared lengths, and (m,) in how many directions they were measured.
+        (m,) squared lengths, and (m,) their degrees of freedom.
     """
     root = np.linalg.cholesky(covariance)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ left @ np.swapaxes(inverse, 1, 2))
-    white = (np.swapaxes(vectors, 1, 2) @ inverse @ residuals[:, :, None])[:, :, 0]
-    counts = values > _VANISHED
-    squares = np.where(counts, white**2 / np.where(counts, values, 1.0), 0.0)
-    return np.asarray(squares.sum(axis=1)), np.asarray(counts.sum(axis=1))
+    whitening = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(whitening @ left @ np.swapaxes(whitening, 1, 2))
+    white = (np.swapaxes(vectors, 1, 2) @ whitening @ residuals[:, :, None])[:, :, 0]
+    redundant = values > _VANISHED
+    squares = np.where(redundant, white**2 / np.where(redundant, values, 1.0), 0.0)
+    return np.asarray(squares.sum(axis=1)), np.asarray(redundant.sum(axis=1))
 
 
 def _scale(information: FloatArray) -> FloatArray:
