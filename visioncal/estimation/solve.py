@@ -1,4 +1,4 @@
-"""Solving a problem: Levenberg-Marquardt on all unknowns, and the noise's levels by REML."""
+"""Solver: Levenberg-Marquardt on all unknowns, with noise levels estimated by REML."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -37,42 +37,43 @@ from visioncal.estimation.variance import (
     estimate_sigmas,
 )
 
-# After shorter steps of frames [rad and m], first order is off by less than any noise.
+# Steps of frames below this [rad and m] have negligible second-order terms.
 _LINEAR = 1e-3
-# Shares of the cost by which it still falls at rest, and while the noise is sought.
+# Iterations of the noise levels; relative decrease of the cost at convergence, and while the noise
+# levels still change.
 _ROUNDS, _SETTLED, _NEARLY = 20, 1e-10, 1e-7
-# A healthy fit comes to rest within a few steps. One that creeps, as along the flat valley of an
-# arm's errors that stand for another cause, gets other levels of noise after so many.
+# A well-posed fit converges within a few steps. One that creeps, such as along the flat valley of
+# arm errors that mimic another cause, gets new noise levels after this many.
 _STEPS = 30
-# Noise levels that change by less have settled, far below what is known of them.
+# Relative change of noise levels at convergence, far below their uncertainty.
 _LEVELS_SETTLED = 1e-3
-# Arms and cameras err by some 0.6 mm for each mrad, give or take a factor of five.
+# Typical translation to rotation noise of arms and cameras [m/rad], within a factor of five.
 RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
 
 
 def ratio_prior(robots: Iterable[int], first: int = 0) -> RatioPrior:
-    """What is known of both levels of some robots, the first one's levels standing at a place."""
+    """Prior of the ratio of both noise levels of robots, whose levels begin at index `first`."""
     places = tuple((first + 2 * robot, first + 2 * robot + 1) for robot in robots)
     return replace(RATIO_PRIOR, places=places)
 
 
-# Robots' noise levels are started from above: at least here [rad and m].
+# Lower bound of the initial noise levels of robots [rad and m]: the search starts from above.
 _START_SIGMA = 5e-4
-# Where they are sought again, it is never from nothing, which no residuals would lift them from.
+# Lower bound of the initial levels of a repeated search: from zero, levels cannot grow.
 _ABOVE_NOTHING = 2e-5
-# Shares of the levels of rotation and translation that may be left beside errors of an arm.
+# Factors of the rotation and translation levels tried as start values beside errors of an arm.
 _LOWER = ((1.0, 1.0), (1.0, 0.25), (0.25, 1.0), (0.25, 0.25))
-# A sensor may be this much better or worse than is said of it, at the most.
+# Bounds of a sensor's noise relative to its stated noise.
 _SENSOR_RANGE = (1e-3, 1e4)
-# Levels below this are none [rad and m].
+# Levels below this count as zero [rad and m].
 _FLOOR = 1e-9
-# Eigenvalues of the information on a flange below this share of the largest are none.
+# Eigenvalues of the information on a flange below this share of the largest count as zero.
 _NULL = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The unknowns, the noise, and whether the fit converged."""
+    """Estimated unknowns and noise levels, and whether the fit converged."""
 
     state: State
     noise: Noise
@@ -81,17 +82,17 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """The observations once the flanges' errors have been eliminated, unit by unit.
+    """Normal equations with the flanges' errors eliminated, unit by unit.
 
     Attributes:
-        information: (p, p) on the unknowns, whatever the robots do.
+        information: (p, p) on the unknowns, with the flanges' errors unconstrained.
         gradient: (p,) half the gradient of the squared error.
         cost: The squared error.
-        errors: (u, 6 w) what each unit says of its flanges' errors.
-        jacobian: (u, 6 w, p) how that moves with the unknowns.
-        covariance: (u, 6 w, 6 w) of it, by the observations alone.
-        by_flanges: (u, 6 w, 6 w) how it moves with the flanges themselves: as much, where anything
-            was observed of them and the errors are theirs.
+        errors: (u, 6 w) estimate of each unit's flange errors.
+        jacobian: (u, 6 w, p) of these estimates by the unknowns.
+        covariance: (u, 6 w, 6 w) of these estimates, from the observations' noise alone.
+        by_flanges: (u, 6 w, 6 w) Jacobian of these estimates by the flange poses: the identity
+            where the flanges were observed and the errors are their own.
     """
 
     information: FloatArray
@@ -104,41 +105,41 @@ class Reduced:
 
 
 def starting_noise(problem: Problem) -> Noise:
-    """Noise to start from: robots from above, sensors as they are said to be."""
+    """Initial noise: robots from above, sensors as stated."""
     sensors = int(problem.observations.sensors.max(initial=-1)) + 1
     return Noise(np.full((len(problem.robots), 2), _START_SIGMA), np.ones(sensors))
 
 
 def fit_problem(problem: Problem, state: State, noise: Noise | None = None) -> Solution:
-    """Minimises the whitened residuals, estimating the noise's levels too.
+    """Minimises the whitened residuals and estimates the noise levels.
 
     Args:
-        problem: The observations that agree.
-        state: Where to start.
-        noise: Its levels to start from; those from above where None.
+        problem: The inlier observations.
+        state: Initial unknowns.
+        noise: Initial noise levels; `starting_noise` if None.
     """
     is_near, given = noise is not None, noise or starting_noise(problem)
-    # REML takes residuals as a step to their least would leave them: levels are near before it.
+    # REML includes one linear step of the unknowns, so levels are close before the first solve.
     noise = estimate_noise(problem, state, given, from_above=not is_near)
-    is_known = is_near and _alike(given, noise)
-    if is_known:
+    is_unchanged = is_near and _are_close(given, noise)
+    if is_unchanged:
         noise = given
-    for turn in range(0 if is_known else _ROUNDS):
-        start, before = state, noise
+    for turn in range(0 if is_unchanged else _ROUNDS):
+        start, previous = state, noise
         state, _ = solve_problem(
             problem, start, noise, is_near=is_near or turn > 0, most=_STEPS, settled=_NEARLY
         )
         if state is start:
             break
         noise = estimate_noise(problem, state, noise)
-        if _alike(before, noise):
+        if _are_close(previous, noise):
             break
-    # Weights are those at the start of a solve: once more, from the answer.
+    # A solve keeps the weights of its start: solve once more from the solution.
     state, settled = solve_problem(problem, state, noise, is_near=True)
     return Solution(state, noise, settled)
 
 
-def _alike(before: Noise, after: Noise) -> bool:
+def _are_close(before: Noise, after: Noise) -> bool:
     pairs = (before.robots, after.robots), (before.sensors, after.sensors)
     return all(np.allclose(*pair, rtol=_LEVELS_SETTLED, atol=_FLOOR) for pair in pairs)
 
@@ -152,38 +153,38 @@ def solve_problem(
     most: int = ITERATIONS,
     settled: float = _SETTLED,
 ) -> tuple[State, bool]:
-    """Minimises the residuals whitened by a known noise.
+    """Minimises the residuals whitened by a given noise.
 
     Args:
         problem: The observations.
-        state: Where to start.
-        noise: The noise.
-        is_near: Whether that is the answer under another noise.
-        most: So many steps.
+        state: Initial unknowns.
+        noise: Noise levels.
+        is_near: Whether the start is already a solution under other weights.
+        most: Maximum number of steps.
         settled: See `levenberg_marquardt`.
 
     Returns:
-        The unknowns, and whether they converged.
+        The unknowns, and whether the iteration converged.
     """
     moving = problem.moving
-    # Held at the start: weights that follow the unknowns would reward those with large noise.
+    # Weights are held: if they followed the unknowns, states with large noise would be favoured.
     whitening = _Whitening.of(problem, noise, problem.ideal_errors(state))
 
     def linearise(at: State) -> Linearised[State]:
         information, gradient, cost = whitening.equations(problem, at, problem.linear(at))
-        free, slope = information[np.ix_(moving, moving)], gradient[moving]
+        free, free_gradient = information[np.ix_(moving, moving)], gradient[moving]
 
         @cache
-        def move(damping: float) -> FloatArray:
-            whole = np.zeros(len(moving))
-            whole[moving] = damped_step(free, slope, damping)
-            return whole
+        def step_of(damping: float) -> FloatArray:
+            step = np.zeros(len(moving))
+            step[moving] = damped_step(free, free_gradient, damping)
+            return step
 
         return Linearised(
             at,
             cost,
-            lambda damping: at.moved(move(damping)),
-            lambda damping: -float(gradient @ move(damping)),
+            lambda damping: at.moved(step_of(damping)),
+            lambda damping: -float(gradient @ step_of(damping)),
         )
 
     damping = NEAR_DAMPING if is_near else START_DAMPING
@@ -191,12 +192,12 @@ def solve_problem(
 
 
 def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
-    """Solves for the unknowns without some observations, by one step from the fit of all.
+    """Solves for the unknowns without some observations, by one step from the converged fit of all.
 
     Args:
         problem: The n observations.
-        fit: Their fit, at rest.
-        kept: (n,) those that stay.
+        fit: Their converged fit.
+        kept: (n,) mask of the observations that remain.
     """
     linear, moving = problem.linear(fit.state), problem.moving
     whitening = _Whitening.of(problem, fit.noise, problem.ideal_errors(fit.state), kept)
@@ -210,15 +211,15 @@ def solve_without(problem: Problem, fit: Solution, kept: Mask) -> State:
 
 @dataclass(frozen=True, eq=False)
 class _Whitening:
-    """The inverse of the observations' covariance, with what flanges' errors take of it.
+    """Inverse of the observations' covariance, block diagonal less a low-rank part for each unit.
 
     Attributes:
-        weights: (n, 6, 6) the inverse of each one's own noise; of what is alone with its flange's
-            error, with that.
-        taken: (n, 6 w, 6) of what shares its unit's errors, how it moves these in units of their
-            root: summed over the unit and squared, that is taken off.
-        units: (n,) these units; -1 where nothing is shared.
-        count: How many there are.
+        weights: (n, 6, 6) inverse covariance of each observation's own noise, including its
+            flange's error if no other observation shares that.
+        taken: (n, 6 w, 6) factors of the Schur complement for shared flange errors: the square of
+            their product with the observations, summed over a unit, is subtracted.
+        units: (n,) unit of each observation; -1 if it shares no errors.
+        count: Number of units.
     """
 
     weights: FloatArray
@@ -230,12 +231,12 @@ class _Whitening:
     def of(
         cls, problem: Problem, noise: Noise, by_errors: FloatArray, among: Mask | None = None
     ) -> "_Whitening":
-        """The noise of observations that move with (n, 6, 6 w) their units' errors."""
-        # Of what is not `among` them nothing is known.
+        """Whitens observations with Jacobian (n, 6, 6 w) by their units' errors."""
+        # Observations not in `among` get zero weight.
         (of, members), alone = problem.units, problem.alone
         own, errors = problem.covariance(noise), problem.error_covariance(noise)
-        single = by_errors[alone]
-        own[alone] += single @ errors[of[alone]] @ np.swapaxes(single, 1, 2)
+        jacobian = by_errors[alone]
+        own[alone] += jacobian @ errors[of[alone]] @ np.swapaxes(jacobian, 1, 2)
         weights, units = np.asarray(np.linalg.inv(own), dtype=float), np.where(alone, -1, of)
         if among is not None:
             weights[~among] = 0.0
@@ -247,9 +248,9 @@ class _Whitening:
         # Errors of flanges are independent; those of repeats are not.
         roots, first = np.sqrt(np.maximum(errors, 0.0)), len(members) - len(problem.repeats)
         roots[first:] = np.linalg.cholesky(errors[first:])
-        turned = np.swapaxes(roots, 1, 2)
-        left = np.linalg.cholesky(turned @ information @ roots + np.eye(width))
-        taken[shared] = (np.linalg.inv(left) @ turned)[units[shared]] @ pulled
+        transposed = np.swapaxes(roots, 1, 2)
+        left = np.linalg.cholesky(transposed @ information @ roots + np.eye(width))
+        taken[shared] = (np.linalg.inv(left) @ transposed)[units[shared]] @ pulled
         return cls(weights, taken, units, len(members))
 
     def equations(
@@ -261,21 +262,21 @@ class _Whitening:
         for block in linear.blocks:
             # Residuals are the last column.
             columns, rows = np.append(block.columns, size), block.rows
-            every = np.concatenate([block.jacobian, linear.residuals[rows, :, None]], axis=2)
-            total[np.ix_(columns, columns)] += gram(every, self.weights[rows] @ every)
-            inside = self.units[rows] >= 0
-            if not inside.any():
+            augmented = np.concatenate([block.jacobian, linear.residuals[rows, :, None]], axis=2)
+            total[np.ix_(columns, columns)] += gram(augmented, self.weights[rows] @ augmented)
+            is_shared = self.units[rows] >= 0
+            if not is_shared.any():
                 continue
-            rows, every = rows[inside], every[inside]
+            rows, augmented = rows[is_shared], augmented[is_shared]
             order = np.argsort(self.units[rows], kind="stable")
             units, first = np.unique(self.units[rows[order]], return_index=True)
-            taken = np.add.reduceat(self.taken[rows[order]] @ every[order], first)
+            taken = np.add.reduceat(self.taken[rows[order]] @ augmented[order], first)
             shared[np.ix_(units, np.arange(width), columns)] += taken
         total -= gram(shared, shared)
-        known = problem.prior_information(state)
+        prior = problem.prior_information(state)
         return (
-            total[:-1, :-1] + known.information,
-            total[:-1, -1] + known.gradient,
+            total[:-1, :-1] + prior.information,
+            total[:-1, -1] + prior.gradient,
             float(total[-1, -1]) + problem.prior_cost(state),
         )
 
@@ -283,39 +284,39 @@ class _Whitening:
 def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArray) -> Reduced:
     """Eliminates the flanges' errors, unit by unit.
 
-    An observation that alone is a unit says what its flange's error is; of several, it is a Schur
-    complement.
+    A unit of a single observation is inverted for its flange's error; larger units are eliminated
+    by a Schur complement.
 
     Args:
         problem: The problem.
-        state: Where it was linearised.
-        linear: The residuals there.
+        state: The linearisation point.
+        linear: The linearised residuals.
         covariance: (n, 6, 6) of the observations' own noise.
     """
     of, members = problem.units
     width, size = linear.by_errors.shape[2], linear.size
     total, alone = np.zeros((size + 1, size + 1)), problem.alone
     own, inverse, blind, by_flanges = np.zeros((4, len(members), width, width))
-    cross, answer = np.zeros((2, len(members), width, size + 1))
+    cross, solved = np.zeros((2, len(members), width, size + 1))
     for block in linear.blocks:
         # Residuals are the last column.
         columns = np.append(block.columns, size)
-        every = np.concatenate([block.jacobian, linear.residuals[block.rows, :, None]], axis=2)
+        augmented = np.concatenate([block.jacobian, linear.residuals[block.rows, :, None]], axis=2)
         single = alone[block.rows]
         if single.any():
             rows = block.rows[single]
             turned = np.linalg.inv(linear.by_errors[rows, :, :6])
-            answer[np.ix_(of[rows], np.arange(6), columns)] = turned @ every[single]
+            solved[np.ix_(of[rows], np.arange(6), columns)] = turned @ augmented[single]
             by_flanges[of[rows], :6, :6] = turned @ linear.by_flanges[rows, :, :6]
             turned_covariance = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
             inverse[of[rows], :6, :6] = turned_covariance
             inverse[of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
-        rows, every = block.rows[~single], every[~single]
+        rows, augmented = block.rows[~single], augmented[~single]
         if not len(rows):
             continue
         weights = np.linalg.inv(covariance[rows])
-        weighted = weights @ every
-        total[np.ix_(columns, columns)] += gram(every, weighted)
+        weighted = weights @ augmented
+        total[np.ix_(columns, columns)] += gram(augmented, weighted)
         if of[rows[0]] < 0:
             continue
         order = np.argsort(of[rows], kind="stable")
@@ -323,39 +324,39 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
         by_errors = linear.by_errors[rows[order]]
         turned = np.swapaxes(by_errors, 1, 2)
         own[units] += np.add.reduceat(turned @ weights[order] @ by_errors, first)
-        of_both = np.ix_(units, np.arange(width), columns)
-        cross[of_both] += np.add.reduceat(turned @ weighted[order], first)
-    joined = np.setdiff1d(np.arange(len(members)), of[alone])
-    inverse[joined], blind[joined] = _pseudo_inverse(own[joined])
-    answer[joined] = inverse[joined] @ cross[joined]
-    by_flanges[joined] = inverse[joined] @ own[joined]
-    # A residual is what the flange's error made of it: the error itself has the other sign.
-    total = total - gram(cross[joined], answer[joined])
+        entries = np.ix_(units, np.arange(width), columns)
+        cross[entries] += np.add.reduceat(turned @ weighted[order], first)
+    multiple = np.setdiff1d(np.arange(len(members)), of[alone])
+    inverse[multiple], blind[multiple] = _pseudo_inverse(own[multiple])
+    solved[multiple] = inverse[multiple] @ cross[multiple]
+    by_flanges[multiple] = inverse[multiple] @ own[multiple]
+    # The estimated error has the opposite sign of the residual that it causes.
+    total = total - gram(cross[multiple], solved[multiple])
     known = problem.prior_information(state)
     return Reduced(
         total[:-1, :-1] + known.information,
         total[:-1, -1] + known.gradient,
         float(total[-1, -1]) + problem.prior_cost(state),
-        answer[:, :, -1],
-        answer[:, :, :-1],
+        solved[:, :, -1],
+        solved[:, :, :-1],
         inverse + blind,
         by_flanges,
     )
 
 
 def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverses (u, w, w) where there is information, and the prior where there is none."""
+    """Pseudo-inverses (u, w, w), and the variance `ANYTHING` on the null spaces."""
     values, vectors = np.linalg.eigh(information)
     most = values[:, -1:] if values.shape[1] else values
-    seen = values > _NULL * np.maximum(most, np.finfo(float).tiny)
-    inverse = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
-    turned = np.swapaxes(vectors, 1, 2)
-    blind = np.where(seen, 0.0, ANYTHING)
-    return (vectors * inverse[:, None, :]) @ turned, (vectors * blind[:, None, :]) @ turned
+    determined = values > _NULL * np.maximum(most, np.finfo(float).tiny)
+    inverse = np.where(determined, 1.0 / np.where(determined, values, 1.0), 0.0)
+    transposed = np.swapaxes(vectors, 1, 2)
+    null = np.where(determined, 0.0, ANYTHING)
+    return (vectors * inverse[:, None, :]) @ transposed, (vectors * null[:, None, :]) @ transposed
 
 
-def _whole(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Information (p, p), gradient (p,) and cost with what the units say, flanges erring."""
+def _total_equations(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Information (p, p), gradient (p,) and cost for (u, 6 w, 6 w) flange error covariances."""
     weights = np.linalg.inv(reduced.covariance + errors)
     weighted = weights @ reduced.jacobian
     cost = np.einsum("ui,uij,uj->", reduced.errors, weights, reduced.errors)
@@ -367,10 +368,10 @@ def _whole(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def fisher_information(problem: Problem, state: State, noise: Noise) -> FloatArray:
-    """Fisher information (p, p) on the unknowns, where all chains close exactly.
+    """Fisher information (p, p) on the unknowns, at poses for which all chains close exactly.
 
-    At the measured poses their noise would pass for information about directions that the motion
-    leaves open.
+    At the measured poses, noise would appear as information on directions that the motion leaves
+    undetermined.
     """
     return normal_equations(problem, state, noise, ideal=True)[0]
 
@@ -387,10 +388,10 @@ def normal_equations(
 
     Args:
         problem: The observations.
-        state: The point of linearisation.
-        noise: Its levels.
+        state: The linearisation point.
+        noise: Noise levels.
         ideal: See `Problem.linear`.
-        among: (n,) the observations that count; all where None.
+        among: (n,) mask of the observations to include; all if None.
     """
     return equations_and_cost(problem, state, noise, ideal=ideal, among=among)[:2]
 
@@ -403,25 +404,24 @@ def equations_and_cost(
     ideal: bool = False,
     among: Mask | None = None,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """What `normal_equations` gives, and the whitened squared error."""
+    """`normal_equations`, and the whitened squared error."""
     linear = problem.linear(state, ideal=ideal)
     return _Whitening.of(problem, noise, linear.by_errors, among).equations(problem, state, linear)
 
 
 def fitted_covariance(problem: Problem, state: State, noise: Noise) -> FloatArray:
-    """Covariance (p, p) of what a fit moves, where it was measured; zero of all else.
+    """Covariance (p, p) of the fitted unknowns, at the measured poses; zero for held ones.
 
-    It is that for tests of residuals, from which the fit has taken so much.
+    It serves residual tests: it is what the fit absorbed of the residuals' covariance.
     """
     return covariance_among(normal_equations(problem, state, noise)[0], problem.moving)
 
 
 def held_shift(problem: Problem, solution: Solution) -> FloatArray:
-    """How far the unknowns (p,) would move if what is held moved as well, to first order.
+    """First-order shift (p,) of the unknowns if the held ones were estimated as well.
 
-    What is held is wrong by its uncertainty, and by how far the observations pull at it:
-    beside the covariance, which counts the former, the square of this shift is the error of
-    holding.
+    Held values are wrong by their uncertainty, which the covariance includes, and by the shift that
+    the observations imply: the square of this shift is the additional error of holding them.
     """
     held = problem.counted & ~problem.moving
     if not held.any():
@@ -431,9 +431,9 @@ def held_shift(problem: Problem, solution: Solution) -> FloatArray:
 
 
 def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
-    """Covariance (p, p) of the unknowns, where all chains close exactly; zero of what is fixed.
+    """Covariance (p, p) of the unknowns, at poses for which all chains close; zero for fixed ones.
 
-    It is that of the result: held values count with what is known of them.
+    It is the uncertainty of the result: held values contribute with their prior.
     """
     information = fisher_information(problem, solution.state, solution.noise)
     return covariance_among(information, problem.counted)
@@ -442,24 +442,24 @@ def covariance_of(problem: Problem, solution: Solution) -> FloatArray:
 def estimate_noise(
     problem: Problem, state: State, noise: Noise, *, from_above: bool = False
 ) -> Noise:
-    """Estimates the noise's levels from the residuals at some state.
+    """Estimates the noise levels from the residuals at a state.
 
-    Robots' by restricted likelihood (REML); a sensor's by the share of its residuals that the fit
-    has left of it (Foerstner and Wrobel 2016, section 4.2.4), the others being known.
+    Robots' levels by restricted likelihood (REML); then each sensor's by its squared residuals over
+    their redundancy (Foerstner and Wrobel 2016, section 4.2.4), with the others held.
 
     Args:
         problem: The observations.
-        state: The unknowns, near the best ones.
-        noise: The levels to start from.
-        from_above: Whether robots' levels are to be sought from above what the residuals show,
-            since they may be anything: a start that is too low may stay there.
+        state: The unknowns, near the optimum.
+        noise: Initial levels.
+        from_above: Whether the search for robots' levels starts above the residuals instead of at
+            the initial levels: a search from too low a start may stay there.
     """
-    of_robots = robot_likelihood(problem, state, noise)
-    noise = replace(noise, robots=of_robots.levels(from_above=from_above)[0])
+    robots = robot_likelihood(problem, state, noise)
+    noise = replace(noise, robots=robots.levels(from_above=from_above)[0])
     if not len(noise.sensors):
         return noise
-    # By the sensors' noise alone, which is still the same.
-    squares, left = posterior(problem, state, noise, of_robots.reduced)
+    # The reduction depends on the sensors' noise only, which has not changed yet.
+    squares, left = posterior(problem, state, noise, robots.reduced)
     sensors = noise.sensors.copy()
     for at in range(len(sensors)):
         mine = problem.observations.sensors == at
@@ -485,16 +485,16 @@ def robot_levels(
 
 @dataclass(frozen=True, eq=False)
 class RobotLikelihood:
-    """The restricted likelihood of the robots' levels.
+    """Restricted likelihood of the robots' noise levels.
 
     Attributes:
-        reduced: What each unit says of its flanges' errors.
-        components: What makes up the covariance of that.
-        known: What is known of the unknowns that move without these errors.
-        moving: (p,) the unknowns that move.
+        reduced: The estimates of each unit's flange errors.
+        components: Variance components of these estimates.
+        known: Information on the free unknowns from other sources than these estimates.
+        moving: (p,) mask of the free unknowns.
         members: (u, w) the robots of each unit; see `Problem.units`.
-        stops: (u,) the stop of each unit that has any.
-        before: (r, 2) the levels that the robots had before.
+        stops: (u,) the stop of each unit that has observations.
+        before: (r, 2) the robots' previous levels.
     """
 
     reduced: Reduced
@@ -510,17 +510,17 @@ class RobotLikelihood:
 
     @cached_property
     def seen(self) -> Mask:
-        """(r,) which robots have been observed."""
+        """(r,) mask of the robots with observations."""
         return np.isin(np.arange(len(self.before)), self.members)
 
     @cached_property
     def jacobian(self) -> FloatArray:
-        """(u, 6 w, q) how the flanges' errors move with the unknowns that move."""
+        """(u, 6 w, q) Jacobian of the flange errors by the free unknowns."""
         return np.ascontiguousarray(self.reduced.jacobian[:, :, self.moving])
 
     @property
     def rms(self) -> FloatArray:
-        """(2,) root mean square of the errors' rotation [rad] and translation [m]."""
+        """(2,) RMS of the flange errors' rotation [rad] and translation [m]."""
         squares = self.reduced.errors.reshape(-1, 2, 3) ** 2
         return np.asarray(np.sqrt(np.mean(squares, axis=(0, 2))))
 
@@ -532,12 +532,12 @@ class RobotLikelihood:
         settled: float = SETTLED,
         enough: float = np.inf,
     ) -> tuple[FloatArray, float]:
-        """The most likely levels, and the negative logarithm of their likelihood.
+        """Finds the maximum-likelihood levels, and the negative log-likelihood there.
 
         Args:
-            start: (r, 2) the levels to start from; or (2 r + k,) with those of k more components.
-            free: (2 r + k,) which of them are sought, robot by robot.
-            least: Below which they are not sought.
+            start: (r, 2) initial levels; or (2 r + k,) with those of k more components.
+            free: (2 r + k,) mask of the levels to estimate, robot by robot.
+            least: Lower bound of the levels.
             settled: See `estimate_sigmas`.
             enough: See `variance.most_likely`.
         """
@@ -556,28 +556,28 @@ class RobotLikelihood:
         return sigmas.reshape(start.shape), value
 
     def levels(self, *, from_above: bool) -> tuple[FloatArray, float]:
-        """The robots' levels (r, 2), as `robot_levels` gives them."""
+        """Estimates the robots' levels (r, 2); see `robot_levels`."""
         if from_above:
             return self.white
         return self._levels(np.maximum(self.before, _ABOVE_NOTHING))
 
     @cached_property
     def white(self) -> tuple[FloatArray, float]:
-        """The levels (r, 2) from above, and the negative logarithm of their likelihood."""
+        """Levels (r, 2) from a search from above, and the negative log-likelihood there."""
         return self._levels(np.maximum(self.rms, _START_SIGMA) * np.ones_like(self.before))
 
     def start_beside(self, robot: int, moves: FloatArray) -> tuple[FloatArray, float]:
-        """Where to seek the levels beside random effects of a robot's flange, all of one size.
+        """Initial levels with additional random effects, of equal variance, on a robot's flange.
 
-        Effects may make up for most of what the robot's levels are without them, of rotation, of
-        translation, or of both: the likeliest of these cases is taken.
+        Effects may explain most of the robot's rotation level, translation level, or both: the
+        case of the highest likelihood is returned.
 
         Args:
-            robot: The robot, by its place.
-            moves: (s, 6, k) by stop, how its flange moves with the effects.
+            robot: Index of the robot.
+            moves: (s, 6, k) Jacobian of its flange by the effects at each stop.
 
         Returns:
-            The levels (r, 2), and the size of the effects; zero where none is likelier.
+            The levels (r, 2), and the size of the effects; zero if none raises the likelihood.
         """
         mine, moved = (self.members == robot).any(axis=1), self.moved(robot, moves)
         start, least = (self.white[0], 0.0), np.inf
@@ -588,7 +588,7 @@ class RobotLikelihood:
         return start
 
     def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, WeightedResiduals], ...]:
-        """What units say, weighed by `white`, and by lower levels of one robot."""
+        """Fits at the levels `white`, and at lower levels of one robot."""
         if robot not in self._weighed:
             lower = np.ones((len(_LOWER), *self.before.shape))
             lower[:, robot] = _LOWER
@@ -601,7 +601,7 @@ class RobotLikelihood:
 
     @property
     def negative_log_likelihood(self) -> float:
-        """The negative log-likelihood at the most likely levels, with what no level changes."""
+        """Negative log-likelihood at the levels `white`, including the cost no level affects."""
         return self.white[1] + 0.5 * self.reduced.cost
 
     def _levels(self, start: FloatArray) -> tuple[FloatArray, float]:
@@ -611,14 +611,14 @@ class RobotLikelihood:
         return self.most_likely(start, np.repeat(self.seen, 2))
 
     def beside(self, robot: int, moves: FloatArray) -> Self:
-        """The likelihood with k more unknowns, the last ones, that move a robot's flange.
+        """Appends k unknowns that move a robot's flange.
 
-        What units say of their flanges' errors is all that they say of these: nothing is left of
-        them once the errors are eliminated.
+        They affect the units' flange error estimates only: `reduced.information` has nothing on
+        them, since the errors are eliminated there.
 
         Args:
-            robot: The robot, by its place.
-            moves: (s, 6, k) by stop, how its flange moves with them.
+            robot: Index of the robot.
+            moves: (s, 6, k) Jacobian of its flange by them at each stop.
         """
         reduced, size = self.reduced, moves.shape[2]
         jacobian = np.zeros((*reduced.errors.shape, size))
@@ -636,63 +636,63 @@ class RobotLikelihood:
         )
 
     def moved(self, robot: int, moves: FloatArray) -> FloatArray:
-        """(m, 6 w, k) how what a robot's m units say moves with its flange's `moves` (s, 6, k)."""
+        """Jacobian (m, 6 w, k) of the estimates of a robot's m units, for `moves` (s, 6, k)."""
         units, slots = np.nonzero(self.members == robot)
         places = 6 * slots[:, None, None] + np.arange(6)
         by_flange = np.take_along_axis(self.reduced.by_flanges[units], places, axis=2)
         return np.asarray(by_flange @ moves[self.stops[units]])
 
     def scaled(self, robot: int, levels: FloatArray, scales: FloatArray) -> FloatArray:
-        """The negative logarithm of the likelihood, up to a constant, as one robot's noise grows.
+        """Negative log-likelihood, up to a constant, for scaled noise levels of one robot.
 
-        In each unit the covariance at the levels and what the robot adds to it are made diagonal
-        together; only their ratio then changes with the scale.
+        In each unit the total covariance and the robot's part of it are diagonalised together; only
+        their ratio then changes with the scale.
 
         Args:
-            robot: The robot.
+            robot: Index of the robot.
             levels: (r, 2) all robots' levels.
-            scales: (k,) by how much this one's are larger.
+            scales: (k,) factors of this robot's levels.
 
         Returns:
             (k,) values.
         """
         total = self.components.total(np.maximum(levels.ravel(), LEAST_SIGMA))
         white = np.linalg.inv(np.linalg.cholesky(total))
-        mine = (self.members == robot).any(axis=1)
+        own = (self.members == robot).any(axis=1)
         added = np.repeat(np.where(self.members == robot, 1.0, 0.0), 6, axis=1)
         added *= np.tile(np.repeat(levels[robot], 3), self.members.shape[1]) ** 2
         shares, axes = np.linalg.eigh((white * added[:, None]) @ np.swapaxes(white, 1, 2))
         white = np.swapaxes(axes, 1, 2) @ white
         jacobian, errors = white @ self.jacobian, (white @ self.reduced.errors[..., None])[..., 0]
-        others, left = jacobian[~mine], errors[~mine]
+        others, left = jacobian[~own], errors[~own]
         information = self.known.information + gram(others, others)
         gradient = self.known.gradient + gram(others, left)
-        jacobian, errors, found = jacobian[mine], errors[mine], np.empty(len(scales))
-        for at, scale in enumerate(scales.tolist()):
-            grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[mine], np.finfo(float).tiny)
+        jacobian, errors, values = jacobian[own], errors[own], np.empty(len(scales))
+        for index, scale in enumerate(scales.tolist()):
+            grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[own], np.finfo(float).tiny)
             weighted = errors / grown
             root = covariance_root(information + weighted_gram(jacobian, 1.0 / grown))
-            pull = root.T @ (gradient + gram(jacobian, weighted))
-            squares = float(np.sum(errors * weighted) - pull @ pull)
+            projected = root.T @ (gradient + gram(jacobian, weighted))
+            squares = float(np.sum(errors * weighted) - projected @ projected)
             determinants = float(np.log(grown).sum() - 2.0 * np.linalg.slogdet(root)[1])
-            found[at] = 0.5 * (squares + determinants)
-        return found
+            values[index] = 0.5 * (squares + determinants)
+        return values
 
 
 def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
-    """The likelihood of the robots' levels, those of the sensors being known."""
-    # A fit, its tests and the arms of all robots ask for the same one.
-    for there, before, found in problem.last_likelihood:
-        is_same = there is state and np.array_equal(before.sensors, noise.sensors)
-        if is_same and isinstance(found, RobotLikelihood):
-            alike = np.array_equal(before.robots, noise.robots)
-            return found if alike else replace(found, before=noise.robots)
-    found = _robot_likelihood(problem, state, noise)
-    problem.last_likelihood[:] = [(state, noise, found)]
-    return found
+    """Restricted likelihood of the robots' levels, with those of the sensors held."""
+    # A fit, its tests and the arm models of all robots use the same one.
+    for last_state, last_noise, cached in problem.last_likelihood:
+        is_same = last_state is state and np.array_equal(last_noise.sensors, noise.sensors)
+        if is_same and isinstance(cached, RobotLikelihood):
+            alike = np.array_equal(last_noise.robots, noise.robots)
+            return cached if alike else replace(cached, before=noise.robots)
+    cached = _reduced_likelihood(problem, state, noise)
+    problem.last_likelihood[:] = [(state, noise, cached)]
+    return cached
 
 
-def _robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
+def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
     of, members = problem.units
     stops = np.zeros(len(members), dtype=np.int64)
     stops[of[of >= 0]] = problem.observations.stops[of >= 0]
@@ -704,13 +704,13 @@ def _robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLike
         for axis in range(3):
             at = 6 * slots + axis
             parts[2 * robot, rows, at] = parts[2 * robot + 1, rows, at + 3] = 1.0
-    moving, known = problem.moving, reduced.covariance.copy()
+    moving, covariance = problem.moving, reduced.covariance.copy()
     if problem.repeats:
         first = len(members) - len(problem.repeats)
-        known[first:] += problem.error_covariance(noise)[first:]
+        covariance[first:] += problem.error_covariance(noise)[first:]
     return RobotLikelihood(
         reduced,
-        Components(known, parts),
+        Components(covariance, parts),
         PriorInformation(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
         moving,
         members,
@@ -722,73 +722,74 @@ def _robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLike
 def posterior(
     problem: Problem, state: State, noise: Noise, reduced: Reduced
 ) -> tuple[FloatArray, FloatArray]:
-    """What the fit leaves of each observation once its flange's error is known as well as it is.
+    """Squared posterior residuals of the observations, and their redundancies.
 
     Args:
         problem: The observations.
         state: The unknowns.
-        noise: Its levels.
-        reduced: What `reduce` gives of these.
+        noise: Noise levels.
+        reduced: Result of `reduce` for these.
 
     Returns:
-        (n,) squared residuals in units of their own noise, after the step to their least, and (n,)
-        the redundancy of each: how many of its directions were left over to judge by, of which
-        those squares are an estimate.
+        (n,) squared residuals in units of their own noise, after a Gauss-Newton step and less the
+        estimated flange errors, and (n,) their redundancies, the expected values of the squares.
     """
     own = problem.covariance(noise)
     weights, linear = np.linalg.inv(own), problem.linear(state)
     errors = problem.error_covariance(noise)
-    information, gradient, _ = _whole(reduced, errors)
-    known = covariance_among(information, problem.moving)
-    step = -known @ gradient
+    information, gradient, _ = _total_equations(reduced, errors)
+    fitted = covariance_among(information, problem.moving)
+    step = -fitted @ gradient
     of, _ = problem.units
-    residuals, gone = linear.residuals.copy(), np.zeros_like(weights)
-    # The flanges' errors as their prior and their observations have them together.
+    residuals, absorbed = linear.residuals.copy(), np.zeros_like(weights)
+    # Posterior of the flange errors from their prior and their observations.
     gain = errors @ np.linalg.inv(reduced.covariance + errors)
-    flange = (gain @ (reduced.errors + reduced.jacobian @ step)[:, :, None])[:, :, 0]
-    # All unknowns move the errors, and few an observation: what both make is by unit.
-    taken = gain @ reduced.jacobian
-    common = (taken.reshape(-1, taken.shape[2]) @ known).reshape(taken.shape)
-    left = errors - gain @ errors + common @ np.swapaxes(taken, 1, 2)
+    flange_errors = (gain @ (reduced.errors + reduced.jacobian @ step)[:, :, None])[:, :, 0]
+    # Flange errors depend on all unknowns, an observation on few: this product is formed by unit.
+    response = gain @ reduced.jacobian
+    common = (response.reshape(-1, response.shape[2]) @ fitted).reshape(response.shape)
+    remaining = errors - gain @ errors + common @ np.swapaxes(response, 1, 2)
     for block in linear.blocks:
         jacobian, columns = block.jacobian, block.columns
-        spread = jacobian.reshape(-1, len(columns)) @ known[np.ix_(columns, columns)]
-        gone[block.rows] = spread.reshape(jacobian.shape) @ np.swapaxes(jacobian, 1, 2)
+        products = jacobian.reshape(-1, len(columns)) @ fitted[np.ix_(columns, columns)]
+        absorbed[block.rows] = products.reshape(jacobian.shape) @ np.swapaxes(jacobian, 1, 2)
         residuals[block.rows] += jacobian @ step[columns]
-        inside = of[block.rows] >= 0
-        rows = block.rows[inside]
+        in_unit = of[block.rows] >= 0
+        rows = block.rows[in_unit]
         by_errors, units = linear.by_errors[rows], of[rows]
-        turned = np.swapaxes(by_errors, 1, 2)
-        residuals[rows] -= (by_errors @ flange[units][:, :, None])[:, :, 0]
-        both = jacobian[inside] @ np.swapaxes(common[:, :, columns][units], 1, 2) @ turned
-        gone[rows] += by_errors @ left[units] @ turned - both - np.swapaxes(both, 1, 2)
+        transposed = np.swapaxes(by_errors, 1, 2)
+        residuals[rows] -= (by_errors @ flange_errors[units][:, :, None])[:, :, 0]
+        cross = jacobian[in_unit] @ np.swapaxes(common[:, :, columns][units], 1, 2) @ transposed
+        absorbed[rows] += (
+            by_errors @ remaining[units] @ transposed - cross - np.swapaxes(cross, 1, 2)
+        )
     squares = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
     directions = np.where(problem.observations.has_rotation, 6.0, 3.0)
-    return squares, directions - np.einsum("nij,nji->n", weights, gone)
+    return squares, directions - np.einsum("nij,nji->n", weights, absorbed)
 
 
 def mahalanobis_sq(
     problem: Problem, used: Mask, solution: Solution
 ) -> tuple[FloatArray, FloatArray]:
-    """How far each observation is from what the others predict, its flange's error being free.
+    """Mahalanobis distances of observations from their prediction, flange error included as noise.
 
-    For a used one it is the deletion residual's, by the identity of Cook and Weisberg (1982,
-    section 2.2).
+    For an observation in the fit it is that of the deletion residual, by the identity of Cook and
+    Weisberg (1982, section 2.2).
 
     Args:
         problem: All n observations.
-        used: (n,) those that the fit was made from.
+        used: (n,) mask of the observations in the fit.
         solution: The unknowns and the noise.
 
     Returns:
-        (n,) squared Mahalanobis distances, and (n,) in how many directions they were measured.
+        (n,) squared Mahalanobis distances, and (n,) their degrees of freedom.
     """
     linear = problem.linear(solution.state)
     information = normal_equations(problem, solution.state, solution.noise, among=used)[0]
-    known = covariance_among(information, problem.moving)
+    fitted = covariance_among(information, problem.moving)
     noise = problem.total_covariance(linear, solution.noise)
-    left = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.covariance(known)
-    squares, directions = squared_lengths(linear.residuals, left, noise)
+    covariance = noise + np.where(used, -1.0, 1.0)[:, None, None] * linear.covariance(fitted)
+    squares, directions = squared_lengths(linear.residuals, covariance, noise)
     unmeasured = 6 - problem.observations.directions
     return squares, np.asarray(directions - unmeasured, dtype=float)
 
@@ -796,37 +797,37 @@ def mahalanobis_sq(
 def left_out_residuals(
     problem: Problem, state: State, noise: Noise, among: Mask | None = None
 ) -> FloatArray:
-    """Residuals (n, 6) of each observation from a fit without it, to first order.
+    """Deletion residuals (n, 6): of each observation from a fit without it, to first order.
 
-    With it go all that share its flange's error. By the identity of Cook and Weisberg (1982,
-    section 2.2), with the noise as it is.
+    All observations that share its flange's error are left out with it. By the identity of Cook and
+    Weisberg (1982, section 2.2), with the noise levels held.
 
     Args:
         problem: The observations.
-        state: The answer.
-        noise: Its levels.
-        among: (n,) those that are asked for; all where None.
+        state: The solution.
+        noise: Noise levels.
+        among: (n,) mask of the observations to compute; all if None. NaN for the others.
     """
     linear, fitted = problem.linear(state), fitted_covariance(problem, state, noise)
-    asked = np.ones(len(problem), dtype=bool) if among is None else among
-    found, residuals = np.full((len(problem), 6), np.nan), linear.residuals
+    wanted = np.ones(len(problem), dtype=bool) if among is None else among
+    deletion, residuals = np.full((len(problem), 6), np.nan), linear.residuals
     errors, own = problem.error_covariance(noise), problem.covariance(noise)
-    alone = asked.copy()
+    alone = wanted.copy()
     for unit, rows in problem.shared_units:
         alone[rows] = False
-        if not asked[rows].any():
+        if not wanted[rows].any():
             continue
         by_errors, jacobian = (
             array.reshape(6 * len(rows), -1)
             for array in (linear.by_errors[rows], linear.jacobian_of(rows))
         )
         total = block_diag(*own[rows]) + by_errors @ errors[unit] @ by_errors.T
-        without = covariance_from(total - jacobian @ fitted @ jacobian.T)
-        found[rows] = (total @ without @ residuals[rows].ravel()).reshape(-1, 6)
+        inverse = covariance_from(total - jacobian @ fitted @ jacobian.T)
+        deletion[rows] = (total @ inverse @ residuals[rows].ravel()).reshape(-1, 6)
     singles = problem.total_covariance(linear, noise)[alone]
-    left = singles - linear.covariance(fitted)[alone]
-    found[alone] = (singles @ covariance_from(left) @ residuals[alone, :, None])[:, :, 0]
-    return found
+    remaining = singles - linear.covariance(fitted)[alone]
+    deletion[alone] = (singles @ covariance_from(remaining) @ residuals[alone, :, None])[:, :, 0]
+    return deletion
 
 
 def whitened(
@@ -837,16 +838,16 @@ def whitened(
     *,
     ideal: bool = True,
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n, d) of unit covariance, and their derivatives (n, d, p).
+    """Whitened residuals (n, d) and their Jacobian (n, d, p).
 
-    The squares of the derivatives, summed, are all of the information but what is known beside the
-    observations. Rows of one unit are made independent of those before them.
+    The Gram matrix of the Jacobian is the information without the priors. Rows of a unit are
+    decorrelated from those before them.
 
     Args:
         problem: The observations.
-        state: The point of linearisation.
-        noise: Its levels.
-        measured: (6,) the d components of the poses that count; None for all.
+        state: The linearisation point.
+        noise: Noise levels.
+        measured: (6,) mask of the d pose components to include; None for all.
         ideal: See `Problem.linear`.
     """
     linear, own = problem.linear(state, ideal=ideal), problem.covariance(noise)
@@ -855,18 +856,20 @@ def whitened(
     rows, by_errors = rows[:, kept], linear.by_errors[:, kept]
     own = own[:, kept][:, :, kept]
     total = problem.total_covariance(linear, noise)[:, kept][:, :, kept]
-    found = np.asarray(np.linalg.solve(np.linalg.cholesky(total), rows))
+    white = np.asarray(np.linalg.solve(np.linalg.cholesky(total), rows))
     errors = problem.error_covariance(noise)
-    for unit, of in problem.shared_units:
-        jacobian = by_errors[of].reshape(len(of) * len(kept), -1)
-        among = block_diag(*own[of]) + jacobian @ errors[unit] @ jacobian.T
-        flat = rows[of].reshape(len(jacobian), -1)
-        found[of] = np.linalg.solve(np.linalg.cholesky(among), flat).reshape(rows[of].shape)
-    return found[:, :, -1], found[:, :, :-1]
+    for unit, members in problem.shared_units:
+        jacobian = by_errors[members].reshape(len(members) * len(kept), -1)
+        covariance = block_diag(*own[members]) + jacobian @ errors[unit] @ jacobian.T
+        flat = rows[members].reshape(len(jacobian), -1)
+        white[members] = np.linalg.solve(np.linalg.cholesky(covariance), flat).reshape(
+            rows[members].shape
+        )
+    return white[:, :, -1], white[:, :, :-1]
 
 
 def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
-    """Squared distances (n,) from what is predicted, the unknowns being as they are."""
+    """Squared Mahalanobis distances (n,) of the residuals by the noise alone, unknowns held."""
     linear = problem.linear(solution.state)
     total = problem.total_covariance(linear, solution.noise)
     white = np.linalg.solve(total, linear.residuals[:, :, None])[:, :, 0]
@@ -875,11 +878,11 @@ def by_noise_alone(problem: Problem, solution: Solution) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class RepeatErrors:
-    """The errors that repeats of one still frame by another share, as q more unknowns.
+    """Errors shared by repeats of one static frame seen by another, as q additional unknowns.
 
     Attributes:
-        jacobian: (n, 6, q) by them.
-        values: (q,) the most likely ones.
+        jacobian: (n, 6, q) of the residuals by these errors.
+        values: (q,) maximum-posterior estimates.
         covariance: (p + q, p + q) of all unknowns, these last.
     """
 
@@ -889,9 +892,9 @@ class RepeatErrors:
 
     @classmethod
     def of(cls, problem: Problem, solution: Solution) -> "RepeatErrors":
-        """Finds them beside a fit at rest."""
+        """Estimates them at a converged fit."""
         state, noise, (of, members) = solution.state, solution.noise, problem.units
-        known = fitted_covariance(problem, state, noise)
+        fitted = fitted_covariance(problem, state, noise)
         linear, count = problem.linear(state), len(problem.repeats)
         rows = np.flatnonzero(of >= len(members) - count) if count else np.zeros(0, np.int64)
         places = 6 * (of[rows] - len(members) + count)[:, None] + np.arange(6)
@@ -902,44 +905,44 @@ class RepeatErrors:
         own = jacobian[rows]
         weighted = np.linalg.solve(problem.covariance(noise)[rows], own)
         prior = problem.error_covariance(noise)[len(members) - count :, :6, :6]
-        among = block_diag(*np.linalg.inv(prior)) if count else np.zeros((0, 0))
-        inverse = np.linalg.inv(among + gram(weighted, own))
+        prior_information = block_diag(*np.linalg.inv(prior)) if count else np.zeros((0, 0))
+        inverse = np.linalg.inv(prior_information + gram(weighted, own))
         values = -inverse @ gram(weighted, linear.residuals[rows])
-        follow = -inverse @ gram(weighted, linear.jacobian_of(rows))
-        beside = known @ follow.T
-        whole = np.block([[known, beside], [beside.T, inverse + follow @ beside]])
-        return cls(jacobian, values, whole)
+        response = -inverse @ gram(weighted, linear.jacobian_of(rows))
+        cross = fitted @ response.T
+        covariance = np.block([[fitted, cross], [cross.T, inverse + response @ cross]])
+        return cls(jacobian, values, covariance)
 
 
 def equations_from(
     problem: Problem, solution: Solution, errors: RepeatErrors, asked: IntArray
 ) -> Iterator[tuple[int, FloatArray, FloatArray]]:
-    """Information and gradient of the observations from each stop on, the last first.
+    """Accumulates information and gradient of the observations from each stop on, last stop first.
 
     Args:
         problem: The observations.
         solution: The unknowns and the noise.
-        errors: What repeats share, which come last among the unknowns.
-        asked: (a,) the unknowns that are asked for.
+        errors: Shared errors of repeats, which come last among the unknowns.
+        asked: (a,) indices of the unknowns of interest.
 
     Yields:
-        Each stop with what it and all after it say of these, (a, p + q) and (a,): what is known
-        besides does not count.
+        Each stop with the rows of the information (a, p + q) and gradient (a,) of it and all later
+        stops, without priors.
     """
     state, stops = solution.state, problem.observations.stops
-    # What repeats share is an unknown here, and no noise.
+    # Errors shared by repeats are unknowns here, not noise.
     apart, linear = replace(problem, with_repeats=False), problem.linear(state)
     whitening = _Whitening.of(apart, solution.noise, linear.by_errors)
     residuals = linear.residuals + errors.jacobian @ errors.values
-    every = np.concatenate([linear.jacobian, errors.jacobian, residuals[:, :, None]], axis=2)
-    total = np.zeros((len(asked), every.shape[2]))
+    augmented = np.concatenate([linear.jacobian, errors.jacobian, residuals[:, :, None]], axis=2)
+    total = np.zeros((len(asked), augmented.shape[2]))
     for stop in np.unique(stops)[::-1].tolist():
-        mine = np.flatnonzero(stops == stop)
-        rows, units = every[mine], whitening.units[mine]
-        total = total + gram(rows[:, :, asked], whitening.weights[mine] @ rows)
+        at_stop = np.flatnonzero(stops == stop)
+        rows, units = augmented[at_stop], whitening.units[at_stop]
+        total = total + gram(rows[:, :, asked], whitening.weights[at_stop] @ rows)
         for unit in np.unique(units[units >= 0]).tolist():
-            together = units == unit
-            pulled = np.swapaxes(whitening.taken[mine[together]], 1, 2)
-            taken = gram(pulled, rows[together])
+            in_unit = units == unit
+            pulled = np.swapaxes(whitening.taken[at_stop[in_unit]], 1, 2)
+            taken = gram(pulled, rows[in_unit])
             total -= taken[:, asked].T @ taken
         yield stop, total[:, :-1], total[:, -1]
