@@ -233,24 +233,24 @@ class _Whitening:
     ) -> "_Whitening":
         """Whitens observations with Jacobian (n, 6, 6 w) by their units' errors."""
         # Observations not in `among` get zero weight.
-        (of, members), alone = problem.units, problem.alone
+        (unit_of, members), alone = problem.units, problem.alone
         own, errors = problem.covariance(noise), problem.error_covariance(noise)
         jacobian = by_errors[alone]
-        own[alone] += jacobian @ errors[of[alone]] @ np.swapaxes(jacobian, 1, 2)
-        weights, units = np.asarray(np.linalg.inv(own), dtype=float), np.where(alone, -1, of)
+        own[alone] += jacobian @ errors[unit_of[alone]] @ np.swapaxes(jacobian, 1, 2)
+        weights, units = np.asarray(np.linalg.inv(own), dtype=float), np.where(alone, -1, unit_of)
         if among is not None:
             weights[~among] = 0.0
         shared, width = units >= 0, by_errors.shape[2]
         taken = np.zeros((len(weights), width, 6))
-        pulled = np.swapaxes(by_errors[shared], 1, 2) @ weights[shared]
+        weighted = np.swapaxes(by_errors[shared], 1, 2) @ weights[shared]
         information = np.zeros((len(members), width, width))
-        np.add.at(information, units[shared], pulled @ by_errors[shared])
+        np.add.at(information, units[shared], weighted @ by_errors[shared])
         # Errors of flanges are independent; those of repeats are not.
         roots, first = np.sqrt(np.maximum(errors, 0.0)), len(members) - len(problem.repeats)
         roots[first:] = np.linalg.cholesky(errors[first:])
         transposed = np.swapaxes(roots, 1, 2)
-        left = np.linalg.cholesky(transposed @ information @ roots + np.eye(width))
-        taken[shared] = (np.linalg.inv(left) @ transposed)[units[shared]] @ pulled
+        factor = np.linalg.cholesky(transposed @ information @ roots + np.eye(width))
+        taken[shared] = (np.linalg.inv(factor) @ transposed)[units[shared]] @ weighted
         return cls(weights, taken, units, len(members))
 
     def equations(
@@ -293,10 +293,10 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
         linear: The linearised residuals.
         covariance: (n, 6, 6) of the observations' own noise.
     """
-    of, members = problem.units
+    unit_of, members = problem.units
     width, size = linear.by_errors.shape[2], linear.size
     total, alone = np.zeros((size + 1, size + 1)), problem.alone
-    own, inverse, blind, by_flanges = np.zeros((4, len(members), width, width))
+    own, inverse, null_variance, by_flanges = np.zeros((4, len(members), width, width))
     cross, solved = np.zeros((2, len(members), width, size + 1))
     for block in linear.blocks:
         # Residuals are the last column.
@@ -306,28 +306,28 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
         if single.any():
             rows = block.rows[single]
             turned = np.linalg.inv(linear.by_errors[rows, :, :6])
-            solved[np.ix_(of[rows], np.arange(6), columns)] = turned @ augmented[single]
-            by_flanges[of[rows], :6, :6] = turned @ linear.by_flanges[rows, :, :6]
+            solved[np.ix_(unit_of[rows], np.arange(6), columns)] = turned @ augmented[single]
+            by_flanges[unit_of[rows], :6, :6] = turned @ linear.by_flanges[rows, :, :6]
             turned_covariance = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
-            inverse[of[rows], :6, :6] = turned_covariance
-            inverse[of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
+            inverse[unit_of[rows], :6, :6] = turned_covariance
+            inverse[unit_of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
         rows, augmented = block.rows[~single], augmented[~single]
         if not len(rows):
             continue
         weights = np.linalg.inv(covariance[rows])
         weighted = weights @ augmented
         total[np.ix_(columns, columns)] += gram(augmented, weighted)
-        if of[rows[0]] < 0:
+        if unit_of[rows[0]] < 0:
             continue
-        order = np.argsort(of[rows], kind="stable")
-        units, first = np.unique(of[rows[order]], return_index=True)
+        order = np.argsort(unit_of[rows], kind="stable")
+        units, first = np.unique(unit_of[rows[order]], return_index=True)
         by_errors = linear.by_errors[rows[order]]
         turned = np.swapaxes(by_errors, 1, 2)
         own[units] += np.add.reduceat(turned @ weights[order] @ by_errors, first)
         entries = np.ix_(units, np.arange(width), columns)
         cross[entries] += np.add.reduceat(turned @ weighted[order], first)
-    multiple = np.setdiff1d(np.arange(len(members)), of[alone])
-    inverse[multiple], blind[multiple] = _pseudo_inverse(own[multiple])
+    multiple = np.setdiff1d(np.arange(len(members)), unit_of[alone])
+    inverse[multiple], null_variance[multiple] = _pseudo_inverse(own[multiple])
     solved[multiple] = inverse[multiple] @ cross[multiple]
     by_flanges[multiple] = inverse[multiple] @ own[multiple]
     # The estimated error has the opposite sign of the residual that it causes.
@@ -339,7 +339,7 @@ def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArra
         float(total[-1, -1]) + problem.prior_cost(state),
         solved[:, :, -1],
         solved[:, :, :-1],
-        inverse + blind,
+        inverse + null_variance,
         by_flanges,
     )
 
@@ -459,14 +459,14 @@ def estimate_noise(
     if not len(noise.sensors):
         return noise
     # The reduction depends on the sensors' noise only, which has not changed yet.
-    squares, left = posterior(problem, state, noise, robots.reduced)
+    squares, redundancies = posterior(problem, state, noise, robots.reduced)
     sensors = noise.sensors.copy()
-    for at in range(len(sensors)):
-        mine = problem.observations.sensors == at
-        redundancy = float(left[mine].sum())
+    for sensor in range(len(sensors)):
+        observed = problem.observations.sensors == sensor
+        redundancy = float(redundancies[observed].sum())
         if redundancy > 1.0:
-            factor = np.sqrt(float(squares[mine].sum()) / redundancy)
-            sensors[at] = np.clip(sensors[at] * factor, *_SENSOR_RANGE)
+            factor = np.sqrt(float(squares[observed].sum()) / redundancy)
+            sensors[sensor] = np.clip(sensors[sensor] * factor, *_SENSOR_RANGE)
     if len(problem.least_levels):
         sensors = np.maximum(sensors, problem.least_levels)
     return replace(noise, sensors=sensors)
@@ -664,9 +664,9 @@ class RobotLikelihood:
         shares, axes = np.linalg.eigh((white * added[:, None]) @ np.swapaxes(white, 1, 2))
         white = np.swapaxes(axes, 1, 2) @ white
         jacobian, errors = white @ self.jacobian, (white @ self.reduced.errors[..., None])[..., 0]
-        others, left = jacobian[~own], errors[~own]
+        others, other_errors = jacobian[~own], errors[~own]
         information = self.known.information + gram(others, others)
-        gradient = self.known.gradient + gram(others, left)
+        gradient = self.known.gradient + gram(others, other_errors)
         jacobian, errors, values = jacobian[own], errors[own], np.empty(len(scales))
         for index, scale in enumerate(scales.tolist()):
             grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[own], np.finfo(float).tiny)
@@ -693,9 +693,9 @@ def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikel
 
 
 def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
-    of, members = problem.units
+    unit_of, members = problem.units
     stops = np.zeros(len(members), dtype=np.int64)
-    stops[of[of >= 0]] = problem.observations.stops[of >= 0]
+    stops[unit_of[unit_of >= 0]] = problem.observations.stops[unit_of >= 0]
     reduced = reduce(problem, state, problem.linear(state), problem.covariance(noise))
     count, width = len(problem.robots), members.shape[1]
     parts = np.zeros((2 * count, len(members), 6 * width))
@@ -740,7 +740,7 @@ def posterior(
     information, gradient, _ = _total_equations(reduced, errors)
     fitted = covariance_among(information, problem.moving)
     step = -fitted @ gradient
-    of, _ = problem.units
+    unit_of, _ = problem.units
     residuals, absorbed = linear.residuals.copy(), np.zeros_like(weights)
     # Posterior of the flange errors from their prior and their observations.
     gain = errors @ np.linalg.inv(reduced.covariance + errors)
@@ -754,9 +754,9 @@ def posterior(
         products = jacobian.reshape(-1, len(columns)) @ fitted[np.ix_(columns, columns)]
         absorbed[block.rows] = products.reshape(jacobian.shape) @ np.swapaxes(jacobian, 1, 2)
         residuals[block.rows] += jacobian @ step[columns]
-        in_unit = of[block.rows] >= 0
+        in_unit = unit_of[block.rows] >= 0
         rows = block.rows[in_unit]
-        by_errors, units = linear.by_errors[rows], of[rows]
+        by_errors, units = linear.by_errors[rows], unit_of[rows]
         transposed = np.swapaxes(by_errors, 1, 2)
         residuals[rows] -= (by_errors @ flange_errors[units][:, :, None])[:, :, 0]
         cross = jacobian[in_unit] @ np.swapaxes(common[:, :, columns][units], 1, 2) @ transposed
@@ -893,11 +893,11 @@ class RepeatErrors:
     @classmethod
     def of(cls, problem: Problem, solution: Solution) -> "RepeatErrors":
         """Estimates them at a converged fit."""
-        state, noise, (of, members) = solution.state, solution.noise, problem.units
+        state, noise, (unit_of, members) = solution.state, solution.noise, problem.units
         fitted = fitted_covariance(problem, state, noise)
         linear, count = problem.linear(state), len(problem.repeats)
-        rows = np.flatnonzero(of >= len(members) - count) if count else np.zeros(0, np.int64)
-        places = 6 * (of[rows] - len(members) + count)[:, None] + np.arange(6)
+        rows = np.flatnonzero(unit_of >= len(members) - count) if count else np.zeros(0, np.int64)
+        places = 6 * (unit_of[rows] - len(members) + count)[:, None] + np.arange(6)
         jacobian = np.zeros((len(problem), 6, 6 * count))
         jacobian[rows[:, None, None], np.arange(6)[:, None], places[:, None]] = linear.by_errors[
             rows, :, :6
