@@ -1,8 +1,8 @@
-"""The joint fit of corners, lenses, boards and frames: its unknowns, and its linearisation.
+"""Joint bundle adjustment of lenses, boards and frames.
 
-Each view's corners are compressed to its pose and to how that moves with its lens and its board;
-the chains of frames are closed over all stops with what is left open of these. Linearising anew at
-the answer, until it stays, is Gauss-Newton's method on the whole problem.
+The corners of each view are compressed to its pose and the Jacobian of that by lens and board
+parameters; the closure of the frame chains over all stops is fitted with the free ones of these.
+Relinearising at the solution until convergence is Gauss-Newton's method on the whole problem.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,77 +32,77 @@ from visioncal.estimation.solve import (
 )
 from visioncal.estimation.variance import PriorInformation
 
-# Freeing unknowns must gain more than noise does in one session of ten thousand.
+# False-alarm probability of the test for freeing unknowns.
 _FALSE_ALARM = 1e-4
-# Values that move by less than this share of their sigma have settled.
+# Values that change by less than this share of their sigma have converged; maximum of iterations.
 _SETTLED, _ROUNDS = 0.02, 8
-# A step after which corners fit worse by this factor is too long; so often is it halved.
+# A step is halved while it increases the corner residuals by this factor; maximum of halvings.
 _FOLLOWS, _HALVINGS = 2.0, 12
-# What is stated is contradicted by so many standard deviations.
+# Standard deviations from which on a stated value counts as contradicted.
 _CONTRADICTION = 3.0
-# Errors of an arm's links are taken to be of one size; those few that a board's scale looks like
-# may well be so much larger.
+# The prior assumes arm link errors of equal size; the few that mimic a board's scale may be larger
+# by this factor.
 _UNEVEN = 2.0
-# A motion with so little information on a size, beside what is stated, has none: it is rounding.
+# Information on a size below this share of its prior is rounding.
 _UNMEASURED = 1e-6
 
 
 class FrameModel(Protocol):
-    """The frames' side of the fit: all that is no corner."""
+    """Frame part of the joint fit: everything but the corners."""
 
     @property
     def noise(self) -> Noise | None:
-        """Levels to start from; None for those from above."""
+        """Initial noise levels; None for `starting_noise`."""
 
     @property
     def errors(self) -> tuple[ArmErrors, ...]:
-        """The errors of arms that were found."""
+        """Estimated arm errors."""
 
     @property
     def has_links(self) -> bool:
-        """Whether errors of an arm's links are free, which a board's scale may look like."""
+        """Whether arm link errors are free, which are correlated with a board's scale."""
 
     @property
     def has_errors(self) -> bool:
-        """Whether errors of an arm are free at all."""
+        """Whether any arm errors are free."""
 
     def problem(self, seen: LinearisedCorners) -> Problem:
-        """The problem of what the fit uses, with lenses and boards as its first effect."""
+        """Builds the problem of the used observations, with lenses and boards as first effect."""
 
     def rows(self, seen: LinearisedCorners) -> IntArray:
-        """(n,) which view each observation of this problem is; -1 for none of them."""
+        """(n,) index of the view of each of its observations; -1 for none."""
 
 
 @dataclass(frozen=True, eq=False)
 class ConvergedFit:
-    """The fit at rest: the linearisation, the problem of all frames, and what came out."""
+    """Converged fit: linearised corners, the problem of all frames, and its solution."""
 
     linearised: LinearisedCorners
     problem: Problem
     fit: Solution
-    # Those that were last asked for; see `Scores.of`.
+    # Cache of `Scores.of`.
     _scores: list[tuple[FrameModel, "Scores"]] = field(default_factory=list, init=False, repr=False)
 
     @property
     def columns(self) -> slice:
-        """The columns of lenses and boards: the first effect's."""
+        """Columns of the free lens and board parameters, the first effect."""
         first = 6 * len(self.problem.unknown)
         return slice(first, first + len(self.linearised.free))
 
     @property
     def frames(self) -> Mapping[str, FloatArray]:
-        """Where the unknown frames are."""
+        """Poses of the unknown frames."""
         return self.problem.frames(self.fit.state)
 
     @property
     def others(self) -> FloatArray:
-        """(k,) the values of all other effects."""
+        """(k,) values of all other effects."""
         mine = self.problem.effect_columns.get(LENSES, self.columns)
         return self.fit.state.values[mine.stop - self.columns.start :]
 
     @property
     def change(self) -> FloatArray:
-        """(f,) by how much the free values moved from where they were linearised."""
+        """(f,) change of the free values from the linearisation point."""
         free = self.linearised.free
         return np.asarray(
             self.fit.state.values[: len(free)] - self.linearised.camera_parameters.values[free]
@@ -110,19 +110,19 @@ class ConvergedFit:
 
     @property
     def camera_parameters(self) -> CameraParameters:
-        """Lenses and boards as they came out; what was held is where it was."""
+        """Fitted lens and board parameters; held ones are unchanged."""
         free = self.linearised.free
         return self.linearised.camera_parameters.with_values(
             free, self.fit.state.values[: len(free)]
         )
 
     def covariance(self) -> FloatArray:
-        """(p, p) covariance of what the fit moves, where it was measured."""
+        """(p, p) covariance of the fitted unknowns, at the measured poses."""
         return fitted_covariance(self.problem, self.fit.state, self.fit.noise)
 
     @property
     def moving(self) -> IntArray:
-        """Places of the values that the fit moves."""
+        """Indices of the fitted lens and board values."""
         return self.linearised.moving
 
 
@@ -134,18 +134,18 @@ def fit_jointly(
     others: FloatArray | None = None,
     before: LinearisedCorners | None = None,
 ) -> ConvergedFit:
-    """Linearises and fits in turn, until the values stay where they are.
+    """Alternates linearisation of the corners and the frame fit until the values converge.
 
     Args:
-        optics: Corners, lenses and boards to start from.
-        side: What is known of the frames.
-        moving: Places of the values that the fit moves.
-        frames: Where to start.
-        others: The values of all other effects to start from; where they were linearised if None.
-        before: Where corners were linearised before; see `CameraParameters.seen`.
+        optics: Corners, and initial lens and board parameters.
+        side: Frame part of the fit.
+        moving: Indices of the lens and board values to fit.
+        frames: Initial poses of the unknown frames.
+        others: Initial values of all other effects; their linearisation point if None.
+        before: Previous linearisation of the corners; see `CameraParameters.linearised`.
 
     Raises:
-        ConvergenceError: They run away: what the robot says has nothing to do with what is seen.
+        ConvergenceError: The fit diverges: the robot's poses do not belong to the images.
     """
     with diverging():
         return _settled(side, _fitted(side, optics.linearised(moving, before), frames, others))
@@ -153,13 +153,13 @@ def fit_jointly(
 
 @contextmanager
 def diverging() -> Iterator[None]:
-    """Says of what fails within that the fit diverges.
+    """Reports failures of linear algebra in its context as divergence of the fit.
 
     Raises:
-        ConvergenceError: Matrices were singular, or not finite.
+        ConvergenceError: A matrix was singular or not finite.
     """
     try:
-        # Numbers that run away overflow before they fail.
+        # Diverging values overflow before linear algebra fails.
         with np.errstate(over="ignore", invalid="ignore"):
             yield
     except np.linalg.LinAlgError as error:
@@ -175,7 +175,7 @@ def diverging() -> Iterator[None]:
 def refit_jointly(
     fitted: ConvergedFit, side: FrameModel, moving: IntArray, optics: CameraParameters | None = None
 ) -> ConvergedFit:
-    """Settles once more from an answer, with other values free, or by other priors."""
+    """Refits from a converged fit, with other free values or other priors."""
     return fit_jointly(
         optics or fitted.camera_parameters,
         side,
@@ -191,19 +191,19 @@ def _settled(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
         sigma = np.sqrt(np.diag(fitted.covariance())[fitted.columns])
         if np.all(np.abs(fitted.change) <= _SETTLED * sigma):
             break
-        seen = _stepped(fitted)
-        if seen is fitted.linearised:
+        corners = _stepped(fitted)
+        if corners is fitted.linearised:
             raise np.linalg.LinAlgError("the corners follow no part of the step")
-        before, fitted = fitted, _fitted(side, seen, fitted.frames, fitted.others)
-        if not (before.fit.settled or fitted.fit.settled):
+        previous, fitted = fitted, _fitted(side, corners, fitted.frames, fitted.others)
+        if not (previous.fit.settled or fitted.fit.settled):
             break
     return fitted
 
 
 def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
-    """Linearises where the fit came to rest, or on the way there as far as the corners follow."""
-    # Far from the answer, as where a lens was stated for images of another size, the whole step
-    # leads to lenses that see nothing.
+    """Linearises the corners at the fitted values, or after a shorter step if they fit worse."""
+    # Far from the solution, as with a lens stated for another image size, the full step leads to
+    # lenses that image nothing.
     limits = [_FOLLOWS * floored_sigma_px(sigma) for sigma in fitted.linearised.sigmas_px]
     optics, free, change = (
         fitted.linearised.camera_parameters,
@@ -211,38 +211,38 @@ def _stepped(fitted: ConvergedFit) -> LinearisedCorners:
         fitted.change,
     )
     for _ in range(_HALVINGS):
-        there = optics.with_values(free, optics.values[free] + change)
+        candidate = optics.with_values(free, optics.values[free] + change)
         change = change / 2
-        if there.has_lenses:
-            seen = there.linearised(fitted.moving)
-            if all(sigma <= limit for sigma, limit in zip(seen.sigmas_px, limits, strict=True)):
-                return seen
+        if candidate.has_lenses:
+            corners = candidate.linearised(fitted.moving)
+            if all(sigma <= limit for sigma, limit in zip(corners.sigmas_px, limits, strict=True)):
+                return corners
     return fitted.linearised
 
 
 def _fitted(
     side: FrameModel,
-    seen: LinearisedCorners,
+    corners: LinearisedCorners,
     frames: Mapping[str, FloatArray],
     others: FloatArray | None,
 ) -> ConvergedFit:
-    problem = side.problem(seen)
+    problem = side.problem(corners)
     start = problem.start(frames)
     if others is not None:
         first = len(start.values) - len(others)
         start = State(start.edges, np.concatenate([start.values[:first], others]))
-    return ConvergedFit(seen, problem, fit_problem(problem, start, side.noise))
+    return ConvergedFit(corners, problem, fit_problem(problem, start, side.noise))
 
 
 @dataclass(frozen=True)
 class MeasuredScale:
-    """What the chain alone says of a board's scale, as if no size had been stated.
+    """Scale of a board (or rig) measured by the chain alone, without the prior of its size.
 
     Attributes:
-        board: Which board.
-        scale: By which share the board is larger than stated.
+        board: Index of the board.
+        scale: Relative deviation from the stated size, positive if larger.
         sigma: Its standard deviation.
-        stated_sigma: What the stated size is known to.
+        stated_sigma: Relative standard deviation of the stated size.
     """
 
     board: int
@@ -252,49 +252,49 @@ class MeasuredScale:
 
     @property
     def is_another(self) -> bool:
-        """Whether it differs from the stated one by more than chance."""
+        """Whether it differs significantly from the stated size, taken as exact."""
         return (self.scale / self.sigma) ** 2 > chance_limit(1)
 
     @property
     def contradicts(self) -> bool:
-        """Whether it differs by more than both uncertainties explain."""
+        """Whether it differs by more than both uncertainties combined explain."""
         return abs(self.scale) > _CONTRADICTION * float(np.hypot(self.sigma, self.stated_sigma))
 
 
 def measured_scale(side: FrameModel, fitted: ConvergedFit, board: int = 0) -> MeasuredScale:
-    """Measures a board's size by the robots' motion; its sigma is infinite where that cannot."""
+    """Measures a board's scale by the robots' motion; infinite sigma if it is unobservable."""
     optics = fitted.linearised.camera_parameters
-    (place,) = optics.scale_of(board)
-    stated, known = optics.stated_scale_sigma(board), float(optics.prior_sigma[place] ** -2.0)
-    step, covariance = Scores.of(side, fitted).asked_for(np.array([place]), fitted.moving)
-    # What was stated is taken away again: without it the rest may leave the size open.
-    measured = 1.0 / float(covariance[0, 0]) - known
-    if measured <= _UNMEASURED * known:
+    (index,) = optics.scale_of(board)
+    stated, prior = optics.stated_scale_sigma(board), float(optics.prior_sigma[index] ** -2.0)
+    step, covariance = Scores.of(side, fitted).asked_for(np.array([index]), fitted.moving)
+    # The prior is subtracted afterwards: without it the scale may be undetermined.
+    measured = 1.0 / float(covariance[0, 0]) - prior
+    if measured <= _UNMEASURED * prior:
         return MeasuredScale(board, 0.0, np.inf, stated)
-    with_stated = float(fitted.camera_parameters.values[place] + step[0])
+    with_stated = float(fitted.camera_parameters.values[index] + step[0])
     return MeasuredScale(
         board,
-        with_stated * (1.0 + known / measured),
+        with_stated * (1.0 + prior / measured),
         (_UNEVEN if side.has_links else 1.0) * measured**-0.5,
         stated,
     )
 
 
 def measured_rig(side: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -> MeasuredScale:
-    """Measures the size of a rig of points by the robots' motion; its table is taken for exact.
+    """Measures the scale of a rig of points by the robots' motion, its table being taken as exact.
 
-    A larger rig farther away looks the same: its views alone say nothing of that.
+    Its views alone cannot determine it: a larger rig farther away looks the same.
 
     Args:
-        side: The frames' side of the fit.
-        fitted: The fit.
-        frame: The rig's.
-        rig: Which target it is.
+        side: Frame part of the fit.
+        fitted: The converged fit.
+        frame: Frame of the rig.
+        rig: Index of the rig among the targets.
     """
     problem, state = fitted.problem, fitted.fit.state
     problem = problem.with_effects([*problem.effects, target_sizes(problem, [frame])])
-    there = State(state.edges, np.append(state.values, 0.0))
-    information, gradient = normal_equations(problem, there, fitted.fit.noise)
+    extended = State(state.edges, np.append(state.values, 0.0))
+    information, gradient = normal_equations(problem, extended, fitted.fit.noise)
     covariance = covariance_among(information, problem.moving)
     sigma = (_UNEVEN if side.has_links else 1.0) * float(covariance[-1, -1] ** 0.5)
     return MeasuredScale(rig, -float(covariance[-1] @ gradient), sigma, 0.0)
@@ -303,88 +303,88 @@ def measured_rig(side: FrameModel, fitted: ConvergedFit, frame: str, rig: int) -
 def rig_by_stated_arms(
     fitted: ConvergedFit, stated: Problem, frame: str, rig: int
 ) -> MeasuredScale | None:
-    """Measures the size of a rig by arms as they are stated; see `measured_rig`.
+    """Measures the scale of a rig with nominal arms; see `measured_rig`.
 
-    Longer links explain a larger rig as well: one size is simpler than many links.
+    Longer links explain a larger rig as well, but one scale is simpler than many link errors.
 
     Args:
-        fitted: The fit, with arms that were calibrated.
-        stated: The same observations, with arms as stated.
-        frame: The rig's.
-        rig: Which target it is.
+        fitted: The fit, with calibrated arms.
+        stated: The same observations, with nominal arms.
+        frame: Frame of the rig.
+        rig: Index of the rig among the targets.
 
     Returns:
-        Its size; None where arms that err are likelier.
+        Its scale; None if arm errors have the higher likelihood.
     """
-    sized = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
-    fit = fit_problem(sized, State(fitted.fit.state.edges, sized.start_values))
+    with_scale = stated.with_effects([*stated.effects, target_sizes(stated, [frame])])
+    fit = fit_problem(with_scale, State(fitted.fit.state.edges, with_scale.start_values))
 
-    def unlikely(problem: Problem, at: Solution) -> float:
-        return robot_likelihood(problem, at.state, at.noise).white[1]
+    def nll(problem: Problem, solution: Solution) -> float:
+        return robot_likelihood(problem, solution.state, solution.noise).white[1]
 
-    if unlikely(sized, fit) > unlikely(fitted.problem, fitted.fit):
+    if nll(with_scale, fit) > nll(fitted.problem, fitted.fit):
         return None
-    sigma = float(covariance_of(sized, fit)[-1, -1] ** 0.5)
+    sigma = float(covariance_of(with_scale, fit)[-1, -1] ** 0.5)
     return MeasuredScale(rig, float(fit.state.values[-1]), sigma, 0.0)
 
 
 def target_sizes(problem: Problem, frames: Sequence[str], sigma: float = np.inf) -> Effect:
-    """The sizes of targets as unknowns, which move all that is seen of each towards the camera.
+    """Effect of target scales, which change the measured distance of a target from the camera.
 
     Args:
         problem: The observations.
-        frames: The targets' k frames.
-        sigma: What each size is known to, as a share of itself.
+        frames: Frames of the k targets.
+        sigma: Relative standard deviation of each size a priori.
     """
-    # A target that was moved has a frame for each place where it was.
+    # A target that was moved has a frame for each of its locations, named with a suffix.
     observed = np.array([name.partition("@")[0] for name in problem.observations.observed])
     poses = problem.observations.measured
-    by_size = np.zeros((len(observed), 6, len(frames)))
-    by_size[:, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
-    by_size *= (observed[:, None] == np.array(frames))[:, None]
-    known = PriorInformation(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
-    return Effect.free("sizes of targets", known, by_size)
+    jacobian = np.zeros((len(observed), 6, len(frames)))
+    jacobian[:, 3:] = np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:]
+    jacobian *= (observed[:, None] == np.array(frames))[:, None]
+    prior = PriorInformation(sigma**-2.0 * np.eye(len(frames)), np.zeros(len(frames)))
+    return Effect.free("sizes of targets", prior, jacobian)
 
 
 def moved_mahalanobis_sq(fitted: ConvergedFit, places: IntArray) -> float:
-    """Squared distance of some values from the stated ones, in units of their covariance.
+    """Squared Mahalanobis distance of fitted lens and board values from the stated ones.
 
     Args:
-        fitted: A fit that moves these values among others.
-        places: (k,) where they stand among the values.
+        fitted: A fit in which these values are free.
+        places: (k,) indices of the values.
     """
     at = fitted.columns.start + np.searchsorted(fitted.linearised.free, places)
-    away = (fitted.camera_parameters.values - fitted.camera_parameters.stated)[places]
-    return float(away @ np.linalg.solve(fitted.covariance()[np.ix_(at, at)], away))
+    offset = (fitted.camera_parameters.values - fitted.camera_parameters.stated)[places]
+    return float(offset @ np.linalg.solve(fitted.covariance()[np.ix_(at, at)], offset))
 
 
 def contradicted_lens(fitted: ConvergedFit, camera: str) -> bool:
-    """Whether given intrinsics are farther off than what they are known to explains."""
+    """Whether stated intrinsics deviate by more than their prior explains."""
     optics = fitted.camera_parameters
-    away = (optics.values - optics.stated)[optics.lenses[camera]]
-    return contradicts(away, lens_prior(optics.problems[camera].scene))
+    deviation = (optics.values - optics.stated)[optics.lenses[camera]]
+    return contradicts(deviation, lens_prior(optics.problems[camera].scene))
 
 
 def contradicts(away: FloatArray, prior_sigma: FloatArray) -> bool:
-    """Whether (k,) values are farther from the stated ones than what is known of them explains."""
+    """Whether any of (k,) deviations from stated values exceeds what its prior sigma explains."""
     return bool(np.any(np.abs(away) > _CONTRADICTION * prior_sigma))
 
 
 def chance_limit(freedom: int) -> float:
-    """What a squared error may fall by chance when so many more values are free (chi-square)."""
+    """Chi-square limit of the squared error's decrease by chance for additional free values."""
     return float(chi2_limit(_FALSE_ALARM, freedom))
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """What the data ask of values that a fit holds (Rao's score test).
+    """Normal equations for score tests of the values that a fit holds (Rao).
 
     Attributes:
         information: (p, p) with all values free.
         gradient: (p,) of half the squared error, at the fit.
-        moving: (p,) which columns a fit moves.
-        columns: Those of lenses and boards.
-        places: Which values these are of.
+        moving: (p,) mask of the columns that are free in the problem.
+        columns: Columns of the lens and board values.
+        places: Indices of the values in these columns.
     """
 
     information: FloatArray
@@ -395,39 +395,39 @@ class Scores:
 
     @classmethod
     def of(cls, side: FrameModel, fitted: ConvergedFit) -> "Scores":
-        """The scores of all values, at a fit."""
-        for asked, found in fitted._scores:
-            if asked is side:
-                return found
-        seen = fitted.linearised.freed(np.arange(len(fitted.linearised.camera_parameters.values)))
+        """Computes the scores of all values at a converged fit."""
+        for cached_side, scores in fitted._scores:
+            if cached_side is side:
+                return scores
+        freed = fitted.linearised.freed(np.arange(len(fitted.linearised.camera_parameters.values)))
         values = fitted.fit.state.values[len(fitted.linearised.free) :]
         values = np.concatenate([fitted.camera_parameters.values, values])
-        problem, there = side.problem(seen), State(fitted.fit.state.edges, values)
+        problem, state = side.problem(freed), State(fitted.fit.state.edges, values)
         first = fitted.columns.start
-        found = cls(
-            *normal_equations(problem, there, fitted.fit.noise),
+        scores = cls(
+            *normal_equations(problem, state, fitted.fit.noise),
             problem.moving,
-            slice(first, first + len(seen.free)),
-            seen.free,
+            slice(first, first + len(freed.free)),
+            freed.free,
         )
-        fitted._scores[:] = [(side, found)]
-        return found
+        fitted._scores[:] = [(side, scores)]
+        return scores
 
     def gain(self, moving: IntArray) -> float:
-        """How much the squared error falls when these values are free (Rao's score test)."""
-        among = self.moving.copy()
-        among[self.columns] = np.isin(self.places, moving)
-        return float(self.gradient @ covariance_among(self.information, among) @ self.gradient)
+        """Decrease of the squared error if these values are free (Rao's score statistic)."""
+        free = self.moving.copy()
+        free[self.columns] = np.isin(self.places, moving)
+        return float(self.gradient @ covariance_among(self.information, free) @ self.gradient)
 
     def asked_for(self, places: IntArray, moving: IntArray) -> tuple[FloatArray, FloatArray]:
-        """By how much (k,) held values would move if they were free, and its (k, k) covariance.
+        """Step (k,) of held values if they were free, and its (k, k) covariance.
 
         Args:
-            places: Which values.
-            moving: Those that are free beside them.
+            places: (k,) indices of the held values.
+            moving: Indices of the values that are free as well.
         """
-        among = self.moving.copy()
-        among[self.columns] = np.isin(self.places, np.union1d(moving, places))
-        covariance = covariance_among(self.information, among)
-        at = self.columns.start + np.searchsorted(self.places, places)
-        return -covariance[at] @ self.gradient, covariance[np.ix_(at, at)]
+        free = self.moving.copy()
+        free[self.columns] = np.isin(self.places, np.union1d(moving, places))
+        covariance = covariance_among(self.information, free)
+        columns = self.columns.start + np.searchsorted(self.places, places)
+        return -covariance[columns] @ self.gradient, covariance[np.ix_(columns, columns)]
