@@ -358,7 +358,7 @@ class Problem:
 
     @cached_property
     def alone(self) -> Mask:
-        """(n,) mask of measured poses with a single flange error, which no other observation has."""
+        """(n,) mask of measured poses with one flange error, shared by no other observation."""
         of, members = self.units
         count = np.bincount(of[of >= 0], minlength=len(members))
         single = (count == 1) & (members >= 0).any(axis=1) & (members[:, 1:] < 0).all(axis=1)
@@ -421,7 +421,7 @@ class Problem:
 
     @cached_property
     def flange_jacobian(self) -> Mapping[str, FloatArray]:
-        """Jacobian (n, 6, k) of each robot's flange by all effects; omits robots that none moves."""
+        """Jacobian (n, 6, k) of each robot's flange by all effects; omits unaffected robots."""
         robots = dict.fromkeys(robot for effect in self.effects for robot in effect.flange_jacobian)
         stops = self.observations.stops
         return {
