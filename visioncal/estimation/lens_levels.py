@@ -134,7 +134,7 @@ class _Likelihood:
 
     @cached_property
     def _members(self) -> tuple[FloatArray, FloatArray]:
-        """Indicators of each value's level: (v, l, k) of single views, (q, k) of the unknowns."""
+        """Indicators of each value's level: (v, l, k) of single views, (q, k) of unknowns."""
         levels = np.flatnonzero(self.counts)
         modes = np.zeros((len(self.gradient), len(levels)))
         modes[len(self.known) :] = self.modes[:, None] == levels
@@ -274,7 +274,7 @@ class _Likelihood:
     def minimised(
         self, logs: FloatArray, closed: tuple[int, ...], enough: float = np.inf
     ) -> tuple[float, FloatArray]:
-        """Minimum and the levels' logarithms there; those in `closed` stay at their lower bounds."""
+        """Minimum and the levels' logarithms there; `closed` ones stay at their lower bounds."""
         low, high = self.limits(closed)
         hardly = HARDLY * np.maximum(self.counts, 1.0)
         start = np.clip(logs, low, high)
