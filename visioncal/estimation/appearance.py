@@ -274,7 +274,7 @@ def compress_points(
     information = without.products[:shared, :shared]
     roots = without.roots[stack.view_of, None]
     residuals = roots * projected.residuals
-    poses, raw, coefficients = fit.cam_from_target, projected.residuals, None
+    poses, unscaled, coefficients = fit.cam_from_target, projected.residuals, None
     by_field = np.zeros((len(poses), 6, 0))
     if levels is not None and levels.field + levels.breathing > 0.0:
         modes = np.zeros((len(stack.px), 0))
@@ -302,9 +302,9 @@ def compress_points(
         stack.weigh(shift)
         shift += all_columns[:, :, shared:last] @ coefficients.mean[2 * modes.shape[1] :]
         shift += stack.products_with_views(projected.by_pose, moved_poses[:, :, None])[:, :, 0]
-        residuals, raw = residuals + roots * shift, raw + shift
+        residuals, unscaled = residuals + roots * shift, unscaled + shift
         by_field = by_field @ coefficients.moving_roots
     pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
     return Compressed(
-        poses, without.information, answer, information, pulls, raw, by_field, coefficients
+        poses, without.information, answer, information, pulls, unscaled, by_field, coefficients
     )

@@ -141,7 +141,7 @@ class _Likelihood:
         return (self.kinds[:, :, None] == levels).astype(float), modes
 
     def __call__(self, logs: FloatArray, *, is_sloped: bool = True) -> LikelihoodValue:
-        """Negative log-likelihood, gradient and Hessian; the latter are zero without `is_sloped`."""
+        """Negative log-likelihood, gradient and Hessian; these two are zero without `is_sloped`."""
         # Where the Hessian is not positive definite, the average information replaces it (Gilmour,
         # Thompson and Cullis 1995), which is never negative.
         t, variances, is_random = len(self.known), np.exp(2.0 * logs), self.kinds >= 0
