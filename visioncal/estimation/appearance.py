@@ -1,12 +1,11 @@
-"""What all views share besides the edges: the lens, and the board as it really is.
+"""Common parameters of all views: intrinsics of the lens and shape of the board.
 
-A printed board is stretched, longer one way than the other, sheared, and bent. In the target's
-frame, a corner p lies at `(1 + scale) p + aspect (-x, y, 0) / 2 + shear (y, x, 0) / 2 + z(x, y)`, z
-being a polynomial of second and third order. What of it is an offset or a tilt belongs to the
-board's pose and is taken out, so that the target's frame is that of the plane which fits the
-corners best.
+A printed board has errors of scale, aspect ratio, shear and bend. In the target's frame, a corner p
+lies at `(1 + scale) p + aspect (-x, y, 0) / 2 + shear (y, x, 0) / 2 + z(x, y)`, with a polynomial z
+of second and third order without offset and tilt, which belong to the board's pose: the target's
+frame is that of the plane that fits the corners best.
 
-The points of a rig are where its table has them, or near there, each by what it is known to.
+The points of a rig deviate from its table by their stated standard deviations.
 """
 
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ from visioncal.vision.targets import corner_positions
 LENS_AND_BOARD = "lens and board"
 SCALE, ASPECT, SHEAR = 0, 1, 9
 _BENDS = slice(2, 9)
-# The places are those of files, too; shear came last.
+# Files use the same order; shear was added last.
 BOARD_NAMES = (
     "scale",
     "aspect",
@@ -42,15 +41,15 @@ BOARD_NAMES = (
 # Exponents of the polynomial's terms.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
-# What is known of any printed board: its sides differ by 0.1 % or so, its rows and columns meet at
-# a right angle to 1 mrad or so, and it is bent by a hundredth of its size at the most.
+# Prior of any printed board: its aspect ratio is right to about 0.1 %, its right angles to about
+# 1 mrad, and its bend is at most a hundredth of its size.
 _ASPECT_SIGMA, _SHEAR_SIGMA, _BOW_SIGMA_SHARE = 1e-3, 1e-3, 1e-2
-# A rig of more points is taken for exact: each adds three unknowns that all views share.
+# Rigs with more points are taken as exact: each point adds three unknowns common to all views.
 MOST_LOOSE = 100
 
 
 def board_basis(positions: FloatArray) -> FloatArray:
-    """Derivatives of the corners' places by the board's shape.
+    """Derivatives of the corner positions with respect to the board's shape.
 
     Args:
         positions: (c, 3) corners of the flat board, in the target's frame [m].
@@ -72,10 +71,10 @@ def board_basis(positions: FloatArray) -> FloatArray:
 
 
 def shape_basis(target: Target) -> FloatArray:
-    """Derivatives (c, 3, s) of a target's corners by its shape.
+    """Derivatives (c, 3, s) of a target's corners with respect to its shape.
 
-    A printed board's are those of `board_basis`, of an exact rig there are none, and of another one
-    the places of its points are the shape.
+    The shape of a printed board is that of `board_basis`; that of a rig are the positions of its
+    points, or nothing if the rig is exact.
     """
     positions = corner_positions(target)
     if target.kind != "points":
@@ -85,20 +84,20 @@ def shape_basis(target: Target) -> FloatArray:
 
 
 def boards_basis(targets: Sequence[Target]) -> FloatArray:
-    """Derivatives of several targets' corners by all of their shapes, (c, 3, s)."""
+    """Derivatives (c, 3, s) of several targets' corners with respect to all of their shapes."""
     parts = [shape_basis(target) for target in targets]
     flat = block_diag(*(part.reshape(3 * len(part), part.shape[2]) for part in parts))
     return np.asarray(flat.reshape(len(flat) // 3, 3, flat.shape[1]))
 
 
 def shape_slices(targets: Sequence[Target], first: int = 0) -> tuple[slice, ...]:
-    """Where each target's shape stands among all of them, the first one's at `first`."""
+    """Slice of each target's shape among all shapes, which begin at index `first`."""
     ends = first + np.cumsum([0, *(len(board_prior(target)) for target in targets)])
     return tuple(slice(*pair) for pair in pairwise(ends.tolist()))
 
 
 def board_prior(target: Target) -> FloatArray:
-    """Standard deviations (s,) of the target's shape, as they are known beforehand."""
+    """Prior standard deviations (s,) of the target's shape."""
     if target.kind == "points":
         sigmas = target.point_sigmas_m if len(target.point_sigmas_m) <= MOST_LOOSE else ()
         return np.repeat(sigmas, 3).astype(float)
@@ -110,12 +109,12 @@ def board_prior(target: Target) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """A camera and a board as they really are.
+    """Intrinsics of a camera and shapes of the boards.
 
     Attributes:
         camera: The intrinsics.
-        board: (s,) the shapes of all targets, printed ones in the order of `BOARD_NAMES`; zero for
-            the stated ones.
+        board: (s,) deviations of all targets from their stated shapes, those of printed boards in
+            the order of `BOARD_NAMES`.
     """
 
     camera: Camera
@@ -135,16 +134,16 @@ class Appearance:
 
 @dataclass(frozen=True, eq=False)
 class LensBoardParameters:
-    """Which unknowns of an appearance are free, and what is known of them without the robot.
+    """Free parameters of an appearance, with the information on them from all but the robot.
 
     Attributes:
-        appearance: The values that the views' poses were made with.
+        appearance: The values for which the views' poses were estimated.
         basis: (c, 3, s) of `boards_basis`, by corner number.
         positions: (c, 3) corners of the flat boards, each in its own frame [m].
-        columns: (k,) the free ones' places among the appearance's values.
-        anchored: (k,) mask of those that stay where they are, and count in the covariance only.
-        information: (k, k) on them, from the corners and from what is known beforehand.
-        gradient: (k,) half the gradient of what is known, at their present values.
+        columns: (k,) indices of the free parameters among the appearance's values.
+        anchored: (k,) mask of those that are held and only count in the covariance.
+        information: (k, k) on the free parameters, from the corners and the prior.
+        gradient: (k,) half the gradient of the same, at the present values.
     """
 
     appearance: Appearance
@@ -156,27 +155,27 @@ class LensBoardParameters:
     gradient: FloatArray
 
     def effect(self, shift: FloatArray) -> Effect:
-        """Puts it as the chain takes it, with the (m, 6, k) shifts of its views."""
-        known = PriorInformation(self.information, self.gradient)
-        return replace(Effect.free(LENS_AND_BOARD, known, shift), held=self.anchored)
+        """The parameters as an effect on observations, given their (m, 6, k) Jacobian."""
+        prior = PriorInformation(self.information, self.gradient)
+        return replace(Effect.free(LENS_AND_BOARD, prior, shift), held=self.anchored)
 
 
 @dataclass(frozen=True, eq=False)
 class Compressed:
-    """What the corners say, view by view, of poses and appearance: nothing else is needed of them.
+    """Normal equations of the corners, reduced to poses and appearance.
 
-    Information is for corners of 1 px noise.
+    Information is for a corner noise of 1 px.
 
     Attributes:
-        cam_from_target: (v, 4, 4) the poses that fit best under the appearance.
+        cam_from_target: (v, 4, 4) the best-fitting poses for the appearance.
         information: (v, 6, 6) on each pose's right perturbation.
-        by_shared: (v, 6, k) how each pose moves with the appearance.
-        shared_information: (k, k) on the appearance, the poses being free.
-        shared_pulls: (v, k) half the gradient of the squared error by the appearance.
+        by_shared: (v, 6, k) Jacobian of the poses with respect to the appearance.
+        shared_information: (k, k) on the appearance, with free poses (Schur complement).
+        shared_pulls: (v, k) half the gradient of each view's squared error by the appearance.
         residuals: (n, 2) [px].
-        by_field: (v, 6, m) how each pose moves with the lens beyond its model, by
-            coefficients as large as the corners' noise; see `lens_field`.
-        coefficients: What corners say of these coefficients; None where there are none.
+        by_field: (v, 6, m) Jacobian of the poses with respect to lens errors beyond the model, for
+            coefficients in units of the corner noise; see `lens_field`.
+        coefficients: Estimate of these coefficients from the corners; None where there are none.
     """
 
     cam_from_target: FloatArray
@@ -195,12 +194,12 @@ class Compressed:
 
     @property
     def field_freedom(self) -> float:
-        """How many coefficients of the lens beyond its model the corners determine."""
+        """Effective number of coefficients of lens errors that the corners determine."""
         return 0.0 if self.coefficients is None else self.coefficients.freedom
 
     @property
     def shared_gradient(self) -> FloatArray:
-        """(k,) that of all views together."""
+        """(k,) half the gradient by the appearance, of all views."""
         return np.asarray(self.shared_pulls.sum(axis=0))
 
 
@@ -216,24 +215,26 @@ def compress(
     """Compresses corners to normal equations in each view's pose and the shared appearance.
 
     Args:
-        stack: The corners of v views, at their places on the flat boards.
+        stack: The corners of v views, on the flat boards.
         basis: (c, 3, s) of `boards_basis`, by corner number.
-        appearance: Where to linearise.
-        starts: (v, 4, 4) `cam_from_target` to start from.
-        scales: Places of the boards' scales among the appearance's values, which views alone do
-            not show.
-        shares: (v,) as how much of a view each counts for the appearance: of those that show the
-            same as others, whatever is wrong with one is wrong with all.
-        levels: Sizes of what the lens does beyond its model; nothing where None.
+        appearance: The linearisation point.
+        starts: (v, 4, 4) initial `cam_from_target`.
+        scales: Indices of the boards' scales among the appearance's values, which views alone do
+            not determine.
+        shares: (v,) weight of each view for the appearance; views that repeat each other share
+            their errors, and one weight.
+        levels: Levels of lens errors beyond the model; None for no such errors.
     """
     shape = basis[stack.ids]
     bent = stack.with_points(stack.points + shape @ appearance.board)
-    found = compress_points(bent, appearance.camera, starts, shape, shares=shares, levels=levels)
-    # A larger board farther away looks the same: what is left is rounding.
+    compressed = compress_points(
+        bent, appearance.camera, starts, shape, shares=shares, levels=levels
+    )
+    # A larger board farther away looks the same: any information on scale is rounding.
     if scales is not None:
-        information = found.shared_information
-        information[scales] = information[:, scales] = found.shared_pulls[:, scales] = 0.0
-    return found
+        information = compressed.shared_information
+        information[scales] = information[:, scales] = compressed.shared_pulls[:, scales] = 0.0
+    return compressed
 
 
 def compress_points(
@@ -246,62 +247,64 @@ def compress_points(
     shares: FloatArray | None = None,
     levels: LensLevels | None = None,
 ) -> Compressed:
-    """Compresses corners to normal equations in poses, lens and whatever moves corners.
+    """Compresses corners to normal equations in poses, lens and values that move corners.
 
     Args:
-        stack: The corners of v views, where they are on the target.
+        stack: The corners of v views, at their positions on the target.
         camera: The intrinsics.
-        starts: (v, 4, 4) `cam_from_target` to start from.
-        by_values: (n, 3, s) how the corners move on the target with s values.
-        lens: Whether the intrinsics come first of what is shared; else they are held.
-        shares: As `compress` has them.
-        levels: Sizes of what the lens does beyond its model; nothing where None.
+        starts: (v, 4, 4) initial `cam_from_target`.
+        by_values: (n, 3, s) derivatives of the corners on the target with respect to s values.
+        lens: Whether the intrinsics are free, and come first of the shared values.
+        shares: (v,) see `compress`.
+        levels: Levels of lens errors beyond the model; None for no such errors.
     """
     fit = fit_poses(stack, camera, starts)
-    now = reproject(stack, camera, fit.cam_from_target, lens=lens)
-    moved = now.by_point @ by_values
-    stack.weigh(moved)
-    columns = [now.by_intrinsics, moved]
-    shared = now.by_intrinsics.shape[2] + moved.shape[2]
+    projected = reproject(stack, camera, fit.cam_from_target, lens=lens)
+    by_shape = projected.by_point @ by_values
+    stack.weigh(by_shape)
+    columns = [projected.by_intrinsics, by_shape]
+    shared = projected.by_intrinsics.shape[2] + by_shape.shape[2]
     if levels is not None:
         breath = breathing_columns(stack, camera, fit.cam_from_target, levels.breathing)
         stack.weigh(breath)
-        columns += [breath, now.residuals[:, :, None]]
-    every = np.concatenate(columns, axis=2)
-    without = WithoutPoses.of(stack, now.by_pose, every, shares)
+        columns += [breath, projected.residuals[:, :, None]]
+    all_columns = np.concatenate(columns, axis=2)
+    without = WithoutPoses.of(stack, projected.by_pose, all_columns, shares)
     left, answer = without.left[:, :, :shared], without.answer[:, :, :shared]
     information = without.products[:shared, :shared]
     roots = without.roots[stack.view_of, None]
-    residuals = roots * now.residuals
-    poses, own, found = fit.cam_from_target, now.residuals, None
+    residuals = roots * projected.residuals
+    poses, unscaled, coefficients = fit.cam_from_target, projected.residuals, None
     by_field = np.zeros((len(poses), 6, 0))
     if levels is not None and levels.field + levels.breathing > 0.0:
         modes = np.zeros((len(stack.px), 0))
         if levels.field > 0.0:
             modes = levels.field * field_modes(stack.px, camera.resolution, levels.length)
         following, products = without.with_modes(modes)
-        # The residuals stand between breathing, which comes last, and the field.
-        last = every.shape[2] - 1
+        # Columns: shared values, breathing, residuals, field. Coefficients: field, then breathing.
+        last = all_columns.shape[2] - 1
         beyond = np.r_[last + 1 : len(products), shared:last]
         by_field = following[:, :, beyond]
-        found = Coefficients.of(
+        coefficients = Coefficients.of(
             products[np.ix_(beyond, beyond)],
             products[np.ix_(beyond, np.arange(shared))],
             products[beyond, last],
             by_field,
             without.information,
         )
-        # Coefficients follow what is shared: that then says nothing of them, nor they of it.
-        information = information + products[:shared, beyond] @ found.slope
-        answer = answer + by_field @ found.slope
-        moved_poses = by_field @ found.mean
+        # Eliminates the coefficients, which makes them independent of the shared values.
+        information = information + products[:shared, beyond] @ coefficients.slope
+        answer = answer + by_field @ coefficients.slope
+        moved_poses = by_field @ coefficients.mean
         poses = poses @ exp(moved_poses)
-        of_modes = found.mean[: 2 * modes.shape[1]].reshape(2, -1)
-        away = modes @ of_modes.T
-        stack.weigh(away)
-        away += every[:, :, shared:last] @ found.mean[2 * modes.shape[1] :]
-        away += stack.products_with_views(now.by_pose, moved_poses[:, :, None])[:, :, 0]
-        residuals, own = residuals + roots * away, own + away
-        by_field = by_field @ found.moving_roots
+        of_modes = coefficients.mean[: 2 * modes.shape[1]].reshape(2, -1)
+        shift = modes @ of_modes.T
+        stack.weigh(shift)
+        shift += all_columns[:, :, shared:last] @ coefficients.mean[2 * modes.shape[1] :]
+        shift += stack.products_with_views(projected.by_pose, moved_poses[:, :, None])[:, :, 0]
+        residuals, unscaled = residuals + roots * shift, unscaled + shift
+        by_field = by_field @ coefficients.moving_roots
     pulls = stack.sum_by_view(np.einsum("nij,ni->nj", left, residuals))
-    return Compressed(poses, without.information, answer, information, pulls, own, by_field, found)
+    return Compressed(
+        poses, without.information, answer, information, pulls, unscaled, by_field, coefficients
+    )

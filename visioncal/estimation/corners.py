@@ -1,7 +1,7 @@
-"""The corners of all views in one stack, and their reprojection with its derivatives.
+"""Corners of all views in one stack, and their reprojection with its derivatives.
 
-The model: px = camera(cam_from_target * p_target) + noise. All views are worked on at once; sums
-over a view's corners are segments of the stack.
+The model: px = camera(cam_from_target * p_target) + noise. All views are processed at once; the
+corners of a view are a contiguous segment of the stack.
 """
 
 from collections.abc import Mapping
@@ -18,35 +18,35 @@ from visioncal.estimation.linalg import covariance_from, gram
 from visioncal.estimation.viewnoise import weights_by_view
 from visioncal.vision.camera import project_with_jacobian
 
-# Stated noise is contradicted by residuals that chance gives in one session of ten thousand, where
-# they are off by more than the rounding to the one digit that people state.
+# Chi-square test of the stated noise: false alarm in one session of ten thousand, and least ratio,
+# which is the rounding of a noise that is stated with one digit.
 _FALSE_ALARM, _ROUNDED = 1e-4, 1.3
-# Exact corners show no noise; a millionth of a pixel keeps their covariance a covariance.
+# Exact corners have no noise; a millionth of a pixel keeps their covariance positive definite.
 _LEAST_SIGMA_PX = 1e-6
 
 
 def floored_sigma_px(sigma_px: float) -> float:
-    """Noise of a corner's coordinate as covariances can bear it: never none at all [px]."""
+    """Noise of a corner's coordinate, at least the floor that keeps covariances regular [px]."""
     return max(sigma_px, _LEAST_SIGMA_PX)
 
 
 @dataclass(frozen=True, eq=False)
 class CornerStack:
-    """The corners of v views, n in all.
+    """The n corners of v views.
 
     Attributes:
         views: (v,) view numbers.
-        blurs: (v,) width of each view's edges, as a sigma [px].
-        starts: (v,) where each view's corners begin.
+        blurs: (v,) blur of each view's edges, as a sigma [px].
+        starts: (v,) index of each view's first corner.
         view_of: (n,) index of each corner's view.
         ids: (n,) each corner's number on the target.
         points: (n, 3) corners on the target [m].
-        px: (n, 2) where they were seen [px].
-        weights: (n,) by how much more than others each corner is known, as a ratio of standard
-            deviations; None where all are known alike.
-        stated_px: Standard deviation of a corner of weight one, where it is stated [px].
-        zooms: (n, 2) how far one random change of each view's focus displaces its corners, in units
-            of their noise, by no weights; None where there is none.
+        px: (n, 2) detected image positions [px].
+        weights: (n,) weights of the corners' residuals, inverse to their standard deviations; None
+            where all are one.
+        stated_px: Stated standard deviation of a corner of weight one [px]; None if not stated.
+        zooms: (n, 2) displacement of the corners by one sigma of their view's focus jitter, in
+            units of the corner noise, unweighted; None for no jitter.
     """
 
     views: tuple[int, ...]
@@ -82,7 +82,7 @@ class CornerStack:
         )
 
     def keep(self, mask: Mask) -> "CornerStack":
-        """Returns the stack of the corners in an (n,) mask; views left without any vanish."""
+        """Returns the stack of the corners in an (n,) mask, without views that have none."""
         kept_views, view_of = np.unique(self.view_of[mask], return_inverse=True)
         return CornerStack(
             tuple(self.views[at] for at in kept_views),
@@ -98,29 +98,29 @@ class CornerStack:
         )
 
     def with_points(self, points: FloatArray) -> "CornerStack":
-        """Returns the stack with its corners elsewhere on the target, (n, 3) [m]."""
+        """Returns the stack with other (n, 3) positions of its corners on the target [m]."""
         return replace(self, points=points)
 
     def weighed(self, residuals: FloatArray) -> "CornerStack":
-        """Returns the stack with views weighing as their residuals ask for, if noise is not stated.
+        """Returns the stack with views reweighted by their residuals, if noise is not stated.
 
         Args:
-            residuals: (n, 2) by the weights that the corners have [px].
+            residuals: (n, 2) weighted by the present weights [px].
         """
-        # What exact corners leave is rounding, which says nothing of a view.
+        # The residuals of exact corners are rounding errors.
         if float(np.sqrt(np.mean(residuals**2))) <= _LEAST_SIGMA_PX:
             return self
         squares = self.sum_by_view(np.sum(residuals**2, axis=1))
         by_view = weights_by_view(squares, np.asarray(2 * self.counts - 6, float))
         if by_view is None or self.stated_px is not None:
             return self
-        before = 1.0 if self.weights is None else self.weights
-        return replace(self, weights=before * by_view[self.view_of])
+        old_weights = 1.0 if self.weights is None else self.weights
+        return replace(self, weights=old_weights * by_view[self.view_of])
 
     def weigh(self, *rows: FloatArray) -> None:
-        """Puts (n, 2, ...) rows in units of the corners' noise, in place.
+        """Whitens (n, 2, ...) rows by the corner noise, in place.
 
-        Noise of a corner is its own, by its weight, and what a random change of focus makes of it.
+        The noise is each corner's own, by its weight, and the focus jitter of its view.
         """
         kept = [row for row in rows if row.size]
         if self.weights is not None:
@@ -133,47 +133,50 @@ class CornerStack:
 
     @cached_property
     def weighed_zooms(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 2) `zooms` by the corners' weights, and (v,) their squares."""
+        """(n, 2) weighted `zooms`, and (v,) the sums of their squares."""
         if self.zooms is None:
             return np.zeros((len(self.px), 2)), np.zeros(len(self.starts))
-        found = self.zooms if self.weights is None else self.weights[:, None] * self.zooms
-        return found, self.sum_by_view(np.sum(found**2, axis=1))
+        weighted = self.zooms if self.weights is None else self.weights[:, None] * self.zooms
+        return weighted, self.sum_by_view(np.sum(weighted**2, axis=1))
 
     def _refocus(self, array: FloatArray) -> None:
-        """Multiplies (n, 2, ...) rows by the inverse root of 1 + z z^T of each view, in place."""
+        """Multiplies (n, 2, ...) rows by each view's (1 + z z^T)^(-1/2), z of `zooms`, in place."""
         zooms, squares = self.weighed_zooms
         share = (1.0 - 1.0 / np.sqrt(1.0 + squares)) / np.maximum(squares, np.finfo(float).tiny)
         flat = array.reshape(len(array), 2, -1)
         along = share[:, None] * self.products_by_view(zooms[:, :, None], flat)[:, 0]
-        taken = zooms[:, :, None] * along[self.view_of][:, None]
-        np.subtract(array, taken.reshape(array.shape), out=array)
+        removed = zooms[:, :, None] * along[self.view_of][:, None]
+        np.subtract(array, removed.reshape(array.shape), out=array)
 
     @property
     def counts(self) -> IntArray:
-        """(v,) corners a view."""
+        """(v,) number of corners of each view."""
         return np.diff(np.append(self.starts, len(self.px)))
 
     def sigma_px(self, residuals: FloatArray, unknowns: int) -> float:
-        """Noise of a corner's coordinate: as it is stated, or else by the residuals [px].
+        """Noise of a corner's coordinate, stated or estimated from the residuals [px].
 
-        Residuals that are larger than what is stated explains count, too.
+        The estimate also replaces a stated noise that is significantly smaller.
 
         Args:
             residuals: (n, 2) of the stack [px].
-            unknowns: How many were fitted.
+            unknowns: Number of fitted parameters.
         """
-        shown, off = self.shown_px(residuals, unknowns), self.contradicts(residuals, unknowns)
-        if self.stated_px is None or (off and shown > self.stated_px):
-            return shown
+        estimated, is_contradicted = (
+            self.shown_px(residuals, unknowns),
+            self.contradicts(residuals, unknowns),
+        )
+        if self.stated_px is None or (is_contradicted and estimated > self.stated_px):
+            return estimated
         return self.stated_px
 
     def shown_px(self, residuals: FloatArray, unknowns: int) -> float:
-        """Noise of a corner's coordinate by the residuals alone [px]; see `sigma_px`."""
+        """Noise of a corner's coordinate, estimated from the residuals [px]; see `sigma_px`."""
         freedom = max(residuals.size - unknowns, 1)
         return float(np.sqrt(np.sum(residuals**2) / freedom))
 
     def contradicts(self, residuals: FloatArray, unknowns: int) -> bool:
-        """Whether residuals show another noise than is stated; see `sigma_px`."""
+        """Whether the residuals significantly contradict the stated noise; see `sigma_px`."""
         freedom = residuals.size - unknowns
         if self.stated_px is None or freedom < 1:
             return False
@@ -183,7 +186,7 @@ class CornerStack:
         return bool(above or below)
 
     def sum_by_view(self, values: FloatArray) -> FloatArray:
-        """Sums (n, ...) values over the corners of each view, to (v, ...)."""
+        """Sums (n, ...) values over the corners of each view: (v, ...)."""
         return np.asarray(np.add.reduceat(values, self.starts, axis=0))
 
     def products_by_view(self, left: FloatArray, right: FloatArray) -> FloatArray:
@@ -199,36 +202,36 @@ class CornerStack:
         )
 
     def products_with_modes(self, left: FloatArray, modes: FloatArray) -> FloatArray:
-        """Sums products of (n, 2, j) with (n, e) modes, along x and then y: (v, j, 2 e)."""
+        """Products by view of (n, 2, j) with (n, e) modes along x, then along y: (v, j, 2 e)."""
         size, ends = left.shape[2], np.append(self.starts, len(left))
         flat = left.reshape(len(left), -1)
-        found = np.empty((len(self.starts), 2 * size, modes.shape[1]))
-        for (start, end), value in zip(pairwise(ends.tolist()), found, strict=True):
+        products = np.empty((len(self.starts), 2 * size, modes.shape[1]))
+        for (start, end), value in zip(pairwise(ends.tolist()), products, strict=True):
             np.matmul(flat[start:end].T, modes[start:end], out=value)
-        both = found.reshape(len(found), 2, size, -1)
+        both = products.reshape(len(products), 2, size, -1)
         return np.concatenate([both[:, 0], both[:, 1]], axis=2)
 
     def products_with_views(self, left: FloatArray, right: FloatArray) -> FloatArray:
-        """Products `left right` of each view's corners (n, 2, j) and its (v, j, k): (n, 2, k)."""
-        found = np.empty((2 * len(left), right.shape[2]))
-        rows, ends = left.reshape(len(found), -1), 2 * np.append(self.starts, len(left))
+        """Products of each corner's (n, 2, j) and its view's (v, j, k): (n, 2, k)."""
+        products = np.empty((2 * len(left), right.shape[2]))
+        rows, ends = left.reshape(len(products), -1), 2 * np.append(self.starts, len(left))
         for (start, end), value in zip(pairwise(ends.tolist()), right, strict=True):
-            np.matmul(rows[start:end], value, out=found[start:end])
-        return found.reshape(*left.shape[:2], -1)
+            np.matmul(rows[start:end], value, out=products[start:end])
+        return products.reshape(*left.shape[:2], -1)
 
 
 @dataclass(frozen=True, eq=False)
 class WithoutPoses:
-    """Columns of a stack once the poses have followed them.
+    """Jacobian columns of a stack after elimination of the views' poses.
 
     Attributes:
         stack: The corners.
-        by_pose: (n, 2, 6) in units of their noise.
-        information: (v, 6, 6) information on the poses.
-        inverse: (v, 6, 6) the inverse of that.
-        roots: (v,) by which share of a view each counts, as a root.
-        answer: (v, 6, c) how the poses follow.
-        left: (n, 2, c) what is left of the columns, by the roots.
+        by_pose: (n, 2, 6) derivatives by the poses, in units of the corner noise.
+        information: (v, 6, 6) on the poses.
+        inverse: (v, 6, 6) inverse of the information.
+        roots: (v,) square roots of the views' weights.
+        answer: (v, 6, c) response of the poses to the columns' parameters.
+        left: (n, 2, c) columns projected orthogonally to the poses, times the roots.
     """
 
     stack: CornerStack
@@ -247,17 +250,19 @@ class WithoutPoses:
         columns: FloatArray,
         shares: FloatArray | None,
     ) -> "WithoutPoses":
-        """Eliminates the poses from (n, 2, c) columns in units of the corners' noise.
+        """Eliminates the poses from (n, 2, c) columns in units of the corner noise.
+
+        The columns are projected explicitly: their products are then positive semidefinite and
+        accurate, whereas a difference of products would magnify rounding a millionfold.
 
         Args:
             stack: The corners of v views.
-            by_pose: (n, 2, 6).
-            columns: What is left of them, squared, is never less than none, and as exact as the
-                square of their error. A difference of two squares would magnify it a millionfold.
-            shares: (v,) as how much of a view each counts; as one where None.
+            by_pose: (n, 2, 6) derivatives by the poses.
+            columns: (n, 2, c).
+            shares: (v,) weights of the views; one where None.
         """
-        # At these very derivatives: the information of a step before would leave columns that are
-        # not at right angles to the poses, and products of `with_modes` that no columns have.
+        # Information of exactly these derivatives: with that of an earlier step, columns would not
+        # be orthogonal to the poses, and the products of `with_modes` would be inconsistent.
         information = stack.products_by_view(by_pose, by_pose)
         inverse = covariance_from(information)
         roots = np.ones(len(inverse)) if shares is None else np.sqrt(shares)
@@ -270,21 +275,21 @@ class WithoutPoses:
 
     @cached_property
     def products(self) -> FloatArray:
-        """(c, c) of what is left of the columns."""
+        """(c, c) products of the projected columns."""
         return gram(self.left, self.left)
 
     def with_modes(self, modes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Puts a field's modes behind the columns.
+        """Appends the modes of a distortion field to the columns.
 
-        Each moves corners along one axis alone, and poses follow little of it: products of the
-        modes themselves are exact enough, and take a fifth of the time.
+        Each mode moves corners along one axis only, and poses absorb little of it: a difference of
+        products is accurate enough, and takes a fifth of the time.
 
         Args:
-            modes: (n, e) along one axis of the image, by no weights.
+            modes: (n, e) along one axis of the image, unweighted.
 
         Returns:
-            (v, 6, c + 2 e) how the poses follow, and (c + 2 e, c + 2 e) the products of what is
-            left of all.
+            (v, 6, c + 2 e) response of the poses, and (c + 2 e, c + 2 e) products of all projected
+            columns.
         """
         if not modes.size:
             return self.answer, self.products
@@ -301,28 +306,28 @@ class WithoutPoses:
         between = stack.products_with_modes(by_pose, modes)
         answer = -self.inverse @ between
         size = count + 2 * modes.shape[1]
-        found = np.empty((size, size))
-        found[:count, :count] = self.products
+        all_products = np.empty((size, size))
+        all_products[:count, :count] = self.products
         crossed = left.reshape(len(left), -1).T @ modes
-        found[:count, count:] = np.concatenate([crossed[:count], crossed[count:]], axis=1)
-        found[count:, :count] = found[:count, count:].T
-        counted = modes * roots[:, None]
+        all_products[:count, count:] = np.concatenate([crossed[:count], crossed[count:]], axis=1)
+        all_products[count:, :count] = all_products[:count, count:].T
+        weighted = modes * roots[:, None]
         products = gram(self.roots[:, None, None] ** 2 * between, answer)
-        products += np.kron(np.eye(2), counted.T @ counted)
+        products += np.kron(np.eye(2), weighted.T @ weighted)
         if stack.zooms is not None:
             along = stack.products_with_modes(zooms[:, :, None], modes)[:, 0]
             along *= (self.roots / np.sqrt(1.0 + squares))[:, None]
             products -= along.T @ along
-        found[count:, count:] = products
-        return np.concatenate([self.answer, answer], axis=2), found
+        all_products[count:, count:] = products
+        return np.concatenate([self.answer, answer], axis=2), all_products
 
     def by_view(self, column: int, modes: FloatArray) -> FloatArray:
-        """(v, c + 2 e) products of one column with all, view by view; without any focus."""
-        stack, mine = self.stack, self.left[:, :, column : column + 1]
+        """(v, c + 2 e) products of one column with all, by view; for stacks without `zooms`."""
+        stack, own = self.stack, self.left[:, :, column : column + 1]
         if stack.weights is not None:
             modes = modes * stack.weights[:, None]
-        behind = stack.products_with_modes(self.roots[stack.view_of, None, None] * mine, modes)
-        return np.concatenate([stack.products_by_view(mine, self.left), behind], axis=2)[:, 0]
+        by_modes = stack.products_with_modes(self.roots[stack.view_of, None, None] * own, modes)
+        return np.concatenate([stack.products_by_view(own, self.left), by_modes], axis=2)[:, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,10 +335,10 @@ class Reprojection:
     """Reprojection of a stack.
 
     Attributes:
-        residuals: (n, 2) predicted minus seen, by the corners' weights [px].
-        by_pose: (n, 2, 6) derivatives by each view's right perturbation of cam_from_target.
+        residuals: (n, 2) predicted minus detected, weighted [px].
+        by_pose: (n, 2, 6) derivatives by the right perturbation of the view's `cam_from_target`.
         by_intrinsics: (n, 2, k) derivatives by the intrinsics.
-        by_point: (n, 2, 3) derivatives by each corner's place on the target, by no weights.
+        by_point: (n, 2, 3) derivatives by each corner's position on the target, unweighted.
     """
 
     residuals: FloatArray
@@ -351,13 +356,13 @@ def reproject(
         stack: The corners of v views.
         camera: The intrinsics.
         cam_from_target: (v, 4, 4) one pose a view.
-        lens: Whether derivatives by the intrinsics are wanted; else k = 0.
+        lens: Whether to compute derivatives by the intrinsics; else k = 0.
 
     Returns:
-        Residuals and derivatives. A point at or behind the camera counts as seen a whole image
-        away, without a derivative, so that a step that puts it there is not taken.
+        Residuals and derivatives. A point at or behind the camera gets a residual as large as the
+        image and zero derivatives, so that a solver rejects the step that moves it there.
     """
-    # Written out by components: batched products of matrices this small are mostly overhead.
+    # By components, as batched products of matrices this small are mostly overhead.
     rotation = np.ascontiguousarray(np.moveaxis(cam_from_target[:, :3, :3], 0, 2))
     rotation = rotation[:, :, stack.view_of]
     px, py, pz = stack.points.T
@@ -370,7 +375,7 @@ def reproject(
         by_cam[0] * columns[0, at] + by_cam[1] * columns[1, at] + by_cam[2] * columns[2, at]
         for at in range(3)
     )
-    # A turn by w moves point p by w x p: a row b of derivatives becomes p x b.
+    # A rotation w moves point p by w x p: a row b of derivatives by the point becomes p x b.
     px, py, pz = (value[:, None] for value in (px, py, pz))
     by_pose = np.empty((*bx.shape, 6))
     for at, column in enumerate(
@@ -385,7 +390,7 @@ def reproject(
         projection.jacobian_intrinsics[behind] = 0.0
     is_weighed = stack.weights is not None or stack.zooms is not None
     by_point = by_pose[:, :, 3:].copy() if is_weighed else by_pose[:, :, 3:]
-    # Each of the three belongs to this call alone.
+    # In place: these three arrays are local to this call.
     stack.weigh(residuals, by_pose, projection.jacobian_intrinsics)
     return Reprojection(residuals, by_pose, projection.jacobian_intrinsics, by_point)
 

@@ -1,7 +1,7 @@
-"""Effect of lenses and boards: every camera has its lens, and all see the same boards.
+"""Effect of lenses and boards: each camera has its own lens, and all see the same boards.
 
-Each camera's corners are compressed to poses with their covariance, to how these move with lens and
-boards, and to information on lens and boards; here the latter comes together, with the priors.
+Each camera's corners are compressed to poses with their covariance and Jacobian with respect to
+lens and boards, and to information on lens and boards, which is summed here and joined by priors.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -26,12 +26,12 @@ LENSES = "lenses and boards"
 
 @dataclass(frozen=True, eq=False)
 class CameraParameters:
-    """The cameras' corners, and what lenses and boards are taken to be.
+    """Parameters of all lenses and boards, with the cameras' corners.
 
     Attributes:
-        problems: Each camera's corners, by the camera.
-        values: (k,) all lenses' intrinsics, camera by camera, and then all boards' shapes.
-        poses: (v, 4, 4) of the views, camera by camera.
+        problems: Each camera's corners, by camera name.
+        values: (k,) intrinsics of all lenses, camera by camera, then all boards' shapes.
+        poses: (v, 4, 4) `cam_from_target` of the views, camera by camera.
         resized: Printed boards whose scales are free from the start.
     """
 
@@ -44,11 +44,11 @@ class CameraParameters:
     def of(
         cls, problems: Mapping[str, CornerProblem], poses: Mapping[str, FloatArray]
     ) -> "CameraParameters":
-        """Lenses and boards as they are stated or were estimated before.
+        """Lenses and boards as stated or previously estimated.
 
         Args:
             problems: Each camera's corners, of the same boards.
-            poses: (v, 4, 4) the poses of each camera's views, in the order of its corners.
+            poses: (v, 4, 4) poses of each camera's views, in the order of its corners.
         """
         lenses = [intrinsics(problem.scene.camera) for problem in problems.values()]
         boards = next(iter(problems.values())).basis.shape[2]
@@ -60,7 +60,7 @@ class CameraParameters:
 
     @cached_property
     def lenses(self) -> Mapping[str, slice]:
-        """Places of each camera's intrinsics among the values."""
+        """Slice of each camera's intrinsics among the values."""
         places, at = {}, 0
         for name, problem in self.problems.items():
             places[name] = slice(at, at + len(problem.lens))
@@ -69,100 +69,101 @@ class CameraParameters:
 
     @property
     def boards(self) -> slice:
-        """Places of the boards' shapes."""
+        """Slice of the boards' shapes among the values."""
         return slice(sum(len(problem.lens) for problem in self.problems.values()), len(self.values))
 
     @property
     def printed(self) -> list[int]:
-        """Which boards are printed; see `CornerProblem.printed`."""
+        """Indices of the printed boards; see `CornerProblem.printed`."""
         return self._one.printed
 
     def scale_of(self, board: int) -> IntArray:
-        """Place (1,) of one printed board's scale."""
+        """Index (1,) of one printed board's scale."""
         return self._here(self._one.scale_of(board))
 
     def shape_of(self, board: int) -> IntArray:
-        """Places (9,) of one printed board's aspect, shear and bend."""
+        """Indices (9,) of one printed board's aspect, shear and bend."""
         return self._here(self._one.shape_of(board))
 
     def moved_points(self, rig: int) -> FloatArray:
-        """(3 n,) how far the points of a rig are from its table's [m]; empty for exact ones."""
+        """(3 n,) deviations of a rig's points from its table [m]; empty for an exact rig."""
         return self.values[self._here(self._one.points_of(rig))]
 
     @property
     def corners(self) -> tuple[FloatArray, ...]:
-        """The corners (c, 3) of every board, as it is taken to be, in its frame [m]."""
+        """Corners (c, 3) of each board with its present shape, in its frame [m]."""
         one = self._one
         places = one.positions + one.basis @ self.values[self.boards]
         return tuple(places[one.corners_of(index)] for index in range(len(one.scene.targets)))
 
     @property
     def _one(self) -> CornerProblem:
-        """Any camera's corners: all see the same boards."""
+        """Corners of the first camera; as to boards, all cameras are alike."""
         return next(iter(self.problems.values()))
 
     def _here(self, places: IntArray) -> IntArray:
-        """Places of boards' values, by those that they have with one camera alone."""
+        """Converts indices of board values among one camera's columns to those among all values."""
         return np.asarray(places - len(self._one.lens) + self.boards.start)
 
     @cached_property
     def prior_sigma(self) -> FloatArray:
-        """(k,) what the values are known to beforehand; inf where nothing is."""
+        """(k,) prior standard deviations of the values; inf for no prior."""
         lenses = [problem.prior_sigma[problem.lens] for problem in self.problems.values()]
         return np.concatenate([*lenses, self._one.prior_sigma[len(self._one.lens) :]])
 
     @cached_property
     def stated(self) -> FloatArray:
-        """(k,) the values as they are stated, or were estimated before."""
+        """(k,) stated or previously estimated values."""
         return CameraParameters.of(
             self.problems, {name: np.zeros((0, 4, 4)) for name in self.problems}
         ).values
 
     @property
     def first(self) -> IntArray:
-        """What is free from the start."""
-        found = [self.places(name)[problem.first] for name, problem in self.problems.items()]
-        return np.unique(np.concatenate([*found, *map(self.scale_of, self.resized)]))
+        """Indices of the values that are free from the start."""
+        indices = [self.places(name)[problem.first] for name, problem in self.problems.items()]
+        return np.unique(np.concatenate([*indices, *map(self.scale_of, self.resized)]))
 
     @property
     def counted(self) -> IntArray:
-        """What is uncertain and counts in the covariance, whether it is free or not."""
-        found = (self.places(name)[problem.counted] for name, problem in self.problems.items())
-        return np.unique(np.concatenate([*found]))
+        """Indices of the values that count in the covariance, whether free or held."""
+        indices = (self.places(name)[problem.counted] for name, problem in self.problems.items())
+        return np.unique(np.concatenate([*indices]))
 
     @property
     def shape(self) -> IntArray:
-        """Places of the printed boards' aspects, shears and bends."""
+        """Indices of the printed boards' aspects, shears and bends."""
         return self._here(self._one.shape)
 
     def stated_scale_sigma(self, board: int) -> float:
-        """What the stated size of a printed board is known to, as a share of it."""
+        """Relative standard deviation of the stated size of a printed board."""
         target = self._one.scene.targets[board]
         return target.square_sigma_m / target.square_m
 
     def lens_of(self, name: str) -> IntArray:
-        """Places of one camera's intrinsics."""
+        """Indices of one camera's intrinsics."""
         return np.arange(self.lenses[name].start, self.lenses[name].stop)
 
     @property
     def has_spare_corners(self) -> bool:
-        """Whether all cameras show more corners than it takes to free lens and board."""
+        """Whether all cameras have enough corners to estimate lens and board."""
         return all(problem.has_spare_corners for problem in self.problems.values())
 
     def without_prior(self, places: Iterable[int]) -> "CameraParameters":
-        """The same, some values of which nobody has stated."""
-        gone = np.array([*places])
+        """Returns them without priors of some values."""
+        indices = np.array([*places])
         problems = {
-            name: problem.without_prior(np.flatnonzero(np.isin(self.places(name), gone)))
+            name: problem.without_prior(np.flatnonzero(np.isin(self.places(name), indices)))
             for name, problem in self.problems.items()
         }
         return replace(self, problems=problems)
 
     def doubting(self, lenses: Mapping[str, tuple[FloatArray, IntArray]]) -> "CameraParameters":
-        """The same, given intrinsics of cameras being known to (k,), and those in doubt counting.
+        """Returns them with other uncertainties of given intrinsics.
 
         Args:
-            lenses: Both by camera, places being those among its own intrinsics.
+            lenses: By camera, (k,) prior standard deviations of its intrinsics, and indices among
+                these of the doubted ones, which count in the covariance.
         """
         problems = {
             name: problem.with_lens_sigma(*lenses[name]) if name in lenses else problem
@@ -171,13 +172,13 @@ class CameraParameters:
         return replace(self, problems=problems)
 
     def with_sizes(self, scales: Mapping[int, float]) -> "CameraParameters":
-        """The same, printed boards being larger than stated by some shares, free from the start."""
+        """Returns them with given scales of printed boards, free from the start without a prior."""
         places = [int(self.scale_of(board)[0]) for board in scales]
         unstated = replace(self.without_prior(places), resized=tuple(scales))
         return unstated.with_values(np.array(places), np.array([*scales.values()]))
 
     def contesting(self, names: Collection[str]) -> "CameraParameters":
-        """The same, the intrinsics of some cameras being held although corners contradict them."""
+        """Returns them with intrinsics of cameras held although their corners contradict them."""
         problems = {
             name: replace(problem, contested=name in names)
             for name, problem in self.problems.items()
@@ -185,17 +186,17 @@ class CameraParameters:
         return replace(self, problems=problems)
 
     def weighed(self, seen: "LinearisedCorners") -> "CameraParameters":
-        """The same, views weighing as the residuals of all corners ask for."""
+        """Returns them with views reweighted by the residuals of all corners."""
         problems = {
-            name: replace(corner_problem, stack=corner_problem.stack.weighed(own.residuals))
-            for (name, corner_problem), own in zip(
+            name: replace(corner_problem, stack=corner_problem.stack.weighed(compressed.residuals))
+            for (name, corner_problem), compressed in zip(
                 self.problems.items(), seen.compressed, strict=True
             )
         }
         return replace(self, problems=problems)
 
     def with_levels(self, levels: Mapping[str, LensLevels]) -> "CameraParameters":
-        """The same, lenses erring beyond their models by these sizes."""
+        """Returns them with other levels of lens errors beyond the models."""
         problems = {
             name: problem.with_levels(levels[name]) if name in levels else problem
             for name, problem in self.problems.items()
@@ -204,7 +205,7 @@ class CameraParameters:
 
     @property
     def levels(self) -> dict[str, LensLevels]:
-        """The sizes of what lenses do beyond their models, as far as they were estimated."""
+        """Levels of lens errors beyond the models, of cameras for which they were estimated."""
         return {
             name: problem.levels
             for name, problem in self.problems.items()
@@ -212,21 +213,21 @@ class CameraParameters:
         }
 
     def camera(self, name: str) -> Camera:
-        """A camera with its lens as it is taken to be."""
+        """A camera with its present intrinsics."""
         return with_intrinsics(self.problems[name].scene.camera, self.values[self.lenses[name]])
 
     @property
     def has_lenses(self) -> bool:
-        """Whether every camera has a lens that can be: its focal lengths are positive."""
+        """Whether the focal lengths of all cameras are positive."""
         return all(self.values[place][:2].min() > 0 for place in self.lenses.values())
 
     @property
     def points(self) -> FloatArray:
-        """(c, 3) where the corners of all boards lie, each on its own board [m]."""
+        """(c, 3) corners of all boards, each in its board's frame [m]."""
         return np.concatenate(self.corners)
 
     def with_values(self, free: IntArray, found: FloatArray) -> "CameraParameters":
-        """Returns them with (f,) values at some places."""
+        """Returns them with (f,) other values at given indices."""
         values = self.values.copy()
         values[free] = found
         return replace(self, values=values)
@@ -234,14 +235,14 @@ class CameraParameters:
     def linearised(
         self, moving: IntArray, before: "LinearisedCorners | None" = None
     ) -> "LinearisedCorners":
-        """Compresses all corners, (f,) values being free.
+        """Compresses all corners with (f,) free values.
 
         Args:
-            moving: Places of these values.
-            before: Where they were linearised before: what a camera's corners say there holds where
-                neither its lens, boards, poses nor weights have changed since.
+            moving: Indices of these values.
+            before: A previous linearisation, reused for cameras whose lens, boards, poses and
+                weights have not changed since.
         """
-        found, sigmas = [], []
+        by_camera, sigmas = [], []
         information = np.zeros((len(self.values), len(self.values)))
         gradient = np.zeros(len(self.values))
         for name, problem in self.problems.items():
@@ -251,15 +252,15 @@ class CameraParameters:
             weight = 1.0 / floored_sigma_px(sigma) ** 2
             information[np.ix_(places, places)] += weight * compressed.shared_information
             gradient[places] += weight * compressed.shared_gradient
-            found.append(compressed)
+            by_camera.append(compressed)
             sigmas.append(sigma)
-        poses = np.concatenate([compressed.cam_from_target for compressed in found])
+        poses = np.concatenate([compressed.cam_from_target for compressed in by_camera])
         corners = PriorInformation(information, gradient)
         optics = replace(self, poses=poses)
-        return LinearisedCorners(optics, np.sort(moving), tuple(found), tuple(sigmas), corners)
+        return LinearisedCorners(optics, np.sort(moving), tuple(by_camera), tuple(sigmas), corners)
 
     def compressed(self, name: str) -> Compressed:
-        """What one camera's corners say, linearised at its poses."""
+        """Compresses one camera's corners, linearised at its poses."""
         problem = self.problems[name]
         return compress(
             problem.stack,
@@ -272,7 +273,7 @@ class CameraParameters:
         )
 
     def rows(self, name: str) -> slice:
-        """The rows of one camera's views among all."""
+        """Slice of one camera's views among all views."""
         names, counts = (
             list(self.problems),
             [len(problem.stack.views) for problem in self.problems.values()],
@@ -281,7 +282,7 @@ class CameraParameters:
         return slice(first, first + counts[names.index(name)])
 
     def places(self, name: str) -> IntArray:
-        """Places of what one camera's corners determine: its lens and all boards."""
+        """Indices of the values that one camera's corners depend on: its lens and all boards."""
         lens, boards = self.lenses[name], self.boards
         return np.concatenate(
             [np.arange(lens.start, lens.stop), np.arange(boards.start, boards.stop)]
@@ -290,14 +291,14 @@ class CameraParameters:
 
 @dataclass(frozen=True, eq=False)
 class LinearisedCorners:
-    """What all corners say of poses, lenses and boards, where they were linearised.
+    """All corners, linearised in poses, lenses and boards.
 
     Attributes:
-        camera_parameters: Where that was.
-        moving: Places of the values that a fit moves.
-        compressed: What each camera's corners say.
+        camera_parameters: The linearisation point.
+        moving: Indices of the values that a fit moves.
+        compressed: Normal equations of each camera's corners.
         sigmas_px: Each camera's noise of a corner's coordinate [px].
-        corners: What the corners say of all values, the poses being free.
+        corners: Information of the corners on all values, with free poses.
     """
 
     camera_parameters: CameraParameters
@@ -308,16 +309,16 @@ class LinearisedCorners:
 
     @cached_property
     def free(self) -> IntArray:
-        """(f,) places of the values that are uncertain: those that move, and others that count."""
+        """(f,) indices of the uncertain values: moving ones, and held ones that count."""
         return np.union1d(self.moving, self.camera_parameters.counted)
 
     @property
     def held(self) -> Mask:
-        """(f,) which of them stay where they are."""
+        """(f,) mask of the held ones among the `free` values."""
         return ~np.isin(self.free, self.moving)
 
     def holds_lens(self, name: str) -> bool:
-        """Whether a camera has a lens that is uncertain, and stays where it is."""
+        """Whether the intrinsics of a camera are uncertain but held."""
         optics = self.camera_parameters
         if name not in optics.lenses:
             return False
@@ -326,7 +327,7 @@ class LinearisedCorners:
 
     @property
     def known(self) -> PriorInformation:
-        """What is known of the free values without any robot."""
+        """Information on the free values from corners and priors, without any robot."""
         optics, free = self.camera_parameters, self.free
         prior = 1.0 / optics.prior_sigma[free] ** 2
         return PriorInformation(
@@ -337,18 +338,18 @@ class LinearisedCorners:
     def freed(
         self, moving: IntArray, optics: CameraParameters | None = None
     ) -> "LinearisedCorners":
-        """The same with other values moving, or with other priors."""
+        """Returns it with other moving values, or other priors."""
         return replace(
             self, moving=np.sort(moving), camera_parameters=optics or self.camera_parameters
         )
 
     def still(self, optics: CameraParameters, name: str) -> Compressed | None:
-        """What one camera's corners say, if other parameters have it alike; else None."""
-        mine, there = self.camera_parameters.problems[name], optics.problems[name]
+        """Normal equations of one camera, if they also hold for other parameters; else None."""
+        own, other = self.camera_parameters.problems[name], optics.problems[name]
         places = optics.places(name)
         is_alike = (
-            there.stack is mine.stack
-            and there.levels == mine.levels
+            other.stack is own.stack
+            and other.levels == own.levels
             and optics.poses is self.camera_parameters.poses
             and np.array_equal(optics.values[places], self.camera_parameters.values[places])
         )
@@ -366,49 +367,49 @@ class LinearisedCorners:
 
     @property
     def by_free(self) -> FloatArray:
-        """How all views' poses (v, 6, f) move with the free values."""
-        found = np.zeros((len(self.views), 6, len(self.free)))
+        """Jacobian (v, 6, f) of all views' poses with respect to the free values."""
+        moves = np.zeros((len(self.views), 6, len(self.free)))
         for name, compressed in zip(self.camera_parameters.problems, self.compressed, strict=True):
             places = self.camera_parameters.places(name)
             own = np.isin(self.free, places)
             columns = np.searchsorted(places, self.free[own])
-            found[self.camera_parameters.rows(name), :, own] = compressed.by_shared[:, :, columns]
-        return found
+            moves[self.camera_parameters.rows(name), :, own] = compressed.by_shared[:, :, columns]
+        return moves
 
     @cached_property
     def by_field(self) -> FloatArray:
-        """How all views' poses (v, 6, m) move with the lenses beyond their models."""
+        """Jacobian (v, 6, m) of all views' poses by the coefficients of lens errors."""
         sizes = [compressed.by_field.shape[2] for compressed in self.compressed]
-        found = np.zeros((len(self.views), 6, sum(sizes)))
+        moves = np.zeros((len(self.views), 6, sum(sizes)))
         view = at = 0
         for compressed, size in zip(self.compressed, sizes, strict=True):
-            found[view : view + len(compressed.by_field), :, at : at + size] = compressed.by_field
+            moves[view : view + len(compressed.by_field), :, at : at + size] = compressed.by_field
             view, at = view + len(compressed.by_field), at + size
-        return found
+        return moves
 
     def effect(self, rows: IntArray) -> Effect:
-        """The free values as an effect on observations, and behind them those of `by_field`.
+        """The free values, then the coefficients of `by_field`, as an effect on observations.
 
         Args:
-            rows: (n,) which of the views each observation is; -1 for none of them.
+            rows: (n,) the view of each observation; -1 for none.
         """
-        mine, fields = rows >= 0, self.by_field.shape[2]
+        is_view, fields = rows >= 0, self.by_field.shape[2]
         by_sensor = np.zeros((len(rows), 6, len(self.free) + fields))
-        by_sensor[mine] = np.concatenate([self.by_free, self.by_field], axis=2)[rows[mine]]
+        by_sensor[is_view] = np.concatenate([self.by_free, self.by_field], axis=2)[rows[is_view]]
         sizes = [compressed.by_field.shape[2] for compressed in self.compressed]
         variances = np.repeat([floored_sigma_px(sigma) ** 2 for sigma in self.sigmas_px], sizes)
-        # Coefficients follow the free values: neither says anything of the other.
-        known = PriorInformation(
+        # Coefficients are independent of the free values: no information between them.
+        prior = PriorInformation(
             np.asarray(block_diag(self.known.information, np.diag(1.0 / variances))),
             np.append(self.known.gradient, np.zeros(fields)),
         )
         values = np.append(self.camera_parameters.values[self.free], np.zeros(fields))
         held = np.append(self.held, np.zeros(fields, dtype=bool))
-        return Effect(LENSES, values, known, held, by_sensor, random=fields)
+        return Effect(LENSES, values, prior, held, by_sensor, random=fields)
 
     @property
     def views(self) -> tuple[int, ...]:
-        """The views, camera by camera."""
+        """Numbers of the views, camera by camera."""
         return tuple(
             view
             for problem in self.camera_parameters.problems.values()
