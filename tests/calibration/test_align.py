@@ -226,7 +226,7 @@ def test_lenses_come_from_images_of_their_own():
     assert len(found.views) == len(cell.sights) - 24
 
 
-@pytest.mark.parametrize("mode", ["auto", slow("hold")])
+@pytest.mark.parametrize("mode", ["auto", "hold"])
 def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     cell, right = clean
     session = cell_session(cell, "cell", seen="names")

@@ -82,9 +82,6 @@ def covariance_from_other_sources(
         parts["held_values"] = np.outer(shift, shift)
     for robot, arm in arms.items():
         if arm.errors is not None and not arm.errors.is_estimated:
-            # An effect of the fit that has the arm's errors estimates them.
-            if f"arm of {robot}" in problem.effect_columns:
-                continue
             errors = misfit_covariance(problem, fit.state, fit.noise, robot, arm.errors)
             parts[f"arm{_source_suffix(arms, robot)}"] = errors
         elif arm.errors is not None:

@@ -30,8 +30,7 @@ from visioncal.core.choices import SolverName
 from visioncal.core.errors import ConvergenceError, DegenerateError, VisioncalError
 from visioncal.core.types import Mask, Mount
 from visioncal.estimation.arm import rows_of
-from visioncal.estimation.joint import fit_jointly as settle_looks
-from visioncal.estimation.joint import target_sizes
+from visioncal.estimation.joint import fit_jointly, target_sizes
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.observability import (
     check_observability,
@@ -272,7 +271,7 @@ def _fit_lenses_and_frames(
         views = _views_by_camera(observed, solved.poses)
         optics = side.looks(observed.scenes, views).with_levels(levels)
         if observed.is_misread:
-            return solved.with_joint_fit(side, settle_looks(optics, side, optics.first, frames))
+            return solved.with_joint_fit(side, fit_jointly(optics, side, optics.first, frames))
         try:
             fitted, side = refine_jointly(side, optics, frames)
         except ConvergenceError:
@@ -330,19 +329,25 @@ def _with_functions(solved: CellFit) -> CellFit:
 def _converge_arms(solved: CellFit) -> CellFit:
     """Fits and relinearises the calibrated arms in turn until they converge."""
     is_modelled = any(arm.model is not None for arm in solved.arms.values())
-    for iteration in range(_ROUNDS if is_modelled else 0):
+    fitted_effects = {effect.name for effect in solved.inlier_fit.problem.effects}
+    # The fit may still estimate an arm that is nominal again, with other inliers.
+    is_outdated = any(
+        f"arm of {name}" in fitted_effects and not arm.has_free_errors()
+        for name, arm in solved.arms.items()
+    )
+    for iteration in range(_ROUNDS if is_modelled or is_outdated else 0):
         solved = solved.with_arm_poses()
         if solved.linearised_corners is None:
             effects = (*solved.clock_effects, *arm_effects(solved.arms))
             solved = replace(solved, inlier_fit=_with_effects(solved.inlier_fit, effects))
         else:
             side, corners = solved.frame_model, solved.linearised_corners
-            fitted = settle_looks(
+            fitted = fit_jointly(
                 corners.camera_parameters, side, corners.moving, solved.frames, None, corners
             )
             if iteration == 0:  # Errors of the arm may have been attributed to the lens.
                 optics = fitted.camera_parameters.with_levels(lens_levels(side, fitted))
-                fitted = settle_looks(optics, side, fitted.moving, fitted.frames, fitted.others)
+                fitted = fit_jointly(optics, side, fitted.moving, fitted.frames, fitted.others)
             solved = solved.with_joint_fit(side, fitted)
         problem, state = solved.inlier_fit.problem, solved.inlier_fit.fit.state
         moved = {name: arm.relinearised(problem, state) for name, arm in solved.arms.items()}

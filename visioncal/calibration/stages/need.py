@@ -186,8 +186,6 @@ def _arm_bias(fitted: PickInputs, robot: str) -> FloatArray | None:
     arm = fitted.arms.get(robot)
     if arm is None or arm.model is not None or arm.errors is None or arm.errors.is_estimated:
         return None
-    if f"arm of {robot}" in fitted.full_problem.effect_columns:
-        return None  # They are estimated by an effect of the fit.
     state, noise = fitted.fit.state, fitted.fit.noise
     return arm.errors.sigma * misfit_jacobian(fitted.full_problem, state, noise, robot, arm.errors)
 
