@@ -17,12 +17,15 @@ from visioncal.calibration.pipeline.guess_inputs import (
     numbers_in,
     places_of,
     robot_numbers,
-    with_camera_poses,
 )
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.pipeline.steps import stages_before
 from visioncal.calibration.stages.cameras import COUNTED_BACKWARDS
-from visioncal.calibration.stages.corner_numbers import numbering_finding
+from visioncal.calibration.stages.corner_numbers import (
+    MOST_FROM_BEHIND,
+    numbering_finding,
+    share_from_behind,
+)
 from visioncal.calibration.stages.doubts import is_scattered
 from visioncal.calibration.stages.joints import match_joints
 from visioncal.calibration.stages.robots import CameraTargetPair, pairs_of
@@ -112,33 +115,23 @@ def misread_pose_finding(run: RunState) -> Finding | None:
     exchanged = tuple(views[row].number for row in swap)
     step = READ_AGAIN
     if is_mirrored:
-        step = _MIRRORED_CORNERS if _corners_are_mirrored(run) else _MIRRORED
+        step = _MIRRORED_CORNERS if session_is_mirrored(run.session) else _MIRRORED
     return Finding(_MISREAD, guess.sentence, step, exchanged)
 
 
-def _corners_are_mirrored(run: RunState) -> bool:
-    """Whether corners.csv shows boards from behind, which a camera cannot see."""
+def session_is_mirrored(session: Session) -> bool:
+    """Whether a session's corners.csv shows boards from behind, which a camera cannot see."""
     # Neither a left-handed robot frame has that effect, nor images that were mirrored before
     # another program numbered their corners.
-    session = run.session
-    if any(view.image for view in session.views) or not session.corners:
+    boards, corners = session.boards, session.corners
+    if any(view.image for view in session.views) or not corners:
         return False
-    if any(board.kind == "points" for board in session.boards.values()):
+    if any(board.kind == "points" for board in boards.values()):
         # The z axis of points may have either sign.
         return False
-    poses = camera_numbers(run).poses()
-    # A board's z axis points into it, away from the camera.
-    away = np.sum(poses[:, :3, 2] * poses[:, :3, 3], axis=1)
-    return bool(np.nanmedian(away) < 0.0)
-
-
-def session_is_mirrored(session: Session) -> bool:
-    """Whether a session's corners.csv shows boards from behind, which a camera cannot see.
-
-    Raises:
-        VisioncalError: The camera's poses cannot be found.
-    """
-    return _corners_are_mirrored(with_camera_poses(RunState(session)))
+    seen = [view for view in session.views if view.number in corners]
+    views = [(corners[view.number], boards[session.board_of(view)]) for view in seen]
+    return share_from_behind(views) > MOST_FROM_BEHIND
 
 
 def _constant_rotations(run: RunState) -> Finding | None:

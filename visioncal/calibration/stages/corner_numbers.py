@@ -23,7 +23,7 @@ _FEWEST = 6
 # Largest distance outside the image at which detectors place corners of its edge [px].
 _BORDER_PX = 2.0
 # Share of the views from which on targets count as seen from behind.
-_MOST_FROM_BEHIND = 0.5
+MOST_FROM_BEHIND = 0.5
 # Share from which on their corners are numbered so in all views: single ones may be wrong.
 _ALL_FROM_BEHIND = 0.9
 # Largest number of corners in a row that is tried; a sheet of paper holds fewer.
@@ -110,7 +110,7 @@ def check_axes(views: Sequence[tuple[Corners, Target]], resolution: tuple[int, i
             next_step=f"If images are {width} x {height} px, exchange the headings u_px and v_px "
             f"in corners.csv; else write resolution = [{height}, {width}] in session.toml.",
         )
-    if np.mean([_is_from_behind(*view) for view in boards]) > _MOST_FROM_BEHIND:
+    if share_from_behind(boards) > MOST_FROM_BEHIND:
         raise DataError(
             f"corners.csv: {columns} are exchanged: {seen}, with the columns exchanged none, and "
             "as they are, the target would be seen from behind.",
@@ -183,7 +183,7 @@ def numbering_finding(views: Sequence[Corners], target: Target, name: str = "") 
     # The z axis of a rig may point either way.
     if target.kind == "points" or not views:
         return None
-    if np.mean([_is_from_behind(corners, target) for corners in views]) < _ALL_FROM_BEHIND:
+    if share_from_behind([(corners, target) for corners in views]) < _ALL_FROM_BEHIND:
         return None
     order, step = ": counterclockwise", "Number them clockwise from the marker's upper left"
     if target.kind in _EXTRA_COLUMNS:
@@ -213,6 +213,11 @@ def numbering_finding(views: Sequence[Corners], target: Target, name: str = "") 
 
 def _is_beyond(px: FloatArray, size: FloatArray) -> bool:
     return bool(((px < -_BORDER_PX) | (px > size - 1.0 + _BORDER_PX)).any())
+
+
+def share_from_behind(views: Sequence[tuple[Corners, Target]]) -> float:
+    """Share of the views whose corners have the orientation of a board seen from behind."""
+    return float(np.mean([_is_from_behind(*view) for view in views]))
 
 
 def _is_from_behind(corners: Corners, target: Target) -> bool:

@@ -133,26 +133,21 @@ def _fit_with_own_weights(
     estimating = freeing.freed(freely=False)
     if all(error.is_estimated for error in freeing.errors):
         return selected, estimating
-    fitted = fit_jointly(
-        selected.camera_parameters,
-        estimating,
-        selected.moving,
-        selected.frames,
-        before=selected.linearised,
-    )
+    fitted = _with_other_effects(estimating, selected)
     new_side = estimating.with_errors(fitted)
     # Errors that were not significant under the stated lenses may be so under these.
     if [error.is_estimated for error in new_side.errors] != [
         error.is_estimated for error in estimating.errors
     ]:
-        fitted = fit_jointly(
-            fitted.camera_parameters,
-            new_side,
-            fitted.moving,
-            fitted.frames,
-            before=fitted.linearised,
-        )
+        fitted = _with_other_effects(new_side, fitted)
     return fitted, new_side
+
+
+def _with_other_effects(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
+    """Fits again with other effects beside lenses and boards, which start at their own values."""
+    return fit_jointly(
+        fitted.camera_parameters, side, fitted.moving, fitted.frames, before=fitted.linearised
+    )
 
 
 def _with_refined_matrices(side: FrameModel, fitted: ConvergedFit) -> ConvergedFit:
@@ -265,9 +260,7 @@ def _still_significant(
     """The fit with arm errors and with those freed values that are still significant."""
     # Before, these errors were part of the noise: values that had absorbed them return to the
     # stated ones, and real deviations are clear now.
-    refit = fit_jointly(
-        fitted.camera_parameters, side, fitted.moving, fitted.frames, before=fitted.linearised
-    )
+    refit = _with_other_effects(side, fitted)
     optics = fitted.camera_parameters
     groups = [optics.shape_of(index) for index in optics.printed] + [
         optics.lens_of(problem) for problem in optics.problems

@@ -71,7 +71,7 @@ def cross_validate(
                 continue
             state = refit(kept)
             predicted = problem.predicted(state)
-            off_m, off_rad = _apart(problem, state, predicted)
+            off_m, off_rad = pose_residuals(problem, state, predicted)
             away_m[held], away_rad[held] = off_m[held], off_rad[held]
             rms_px[held] = pixels(np.flatnonzero(held), predicted[held], state)
     method = "leave-one-out" if folds == count else f"{folds}-fold"
@@ -88,12 +88,11 @@ def _needed_frames(problem: Problem) -> Mask:
     return needed
 
 
-def pose_residuals(problem: Problem, state: State) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n,) [m] and (n,) [rad] of observations."""
-    return _apart(problem, state, problem.predicted(state))
-
-
-def _apart(problem: Problem, state: State, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+def pose_residuals(
+    problem: Problem, state: State, predicted: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (n,) [m] and (n,) [rad] of observations; (n, 4, 4) `predicted` if known."""
+    predicted = problem.predicted(state) if predicted is None else predicted
     away_m, away_rad = distances(problem.measured(state), predicted)
     observations = problem.observations
     # The rotation of a mere point is arbitrary.
