@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.cells import calibrated, session_of
 from support.commands import visioncal
-from support.marks import slow
 from support.whole_cells import OPTIONS
 
 from visioncal.calibration.pipeline import align, calibrate

@@ -329,10 +329,10 @@ def _with_functions(solved: CellFit) -> CellFit:
 def _converge_arms(solved: CellFit) -> CellFit:
     """Fits and relinearises the calibrated arms in turn until they converge."""
     is_modelled = any(arm.model is not None for arm in solved.arms.values())
-    fitted_effects = {effect.name for effect in solved.inlier_fit.problem.effects}
+    effects_of_fit = solved.inlier_fit.problem.effect_columns
     # The fit may still estimate an arm that is nominal again, with other inliers.
     is_outdated = any(
-        f"arm of {name}" in fitted_effects and not arm.has_free_errors()
+        f"arm of {name}" in effects_of_fit and not arm.has_free_errors()
         for name, arm in solved.arms.items()
     )
     for iteration in range(_ROUNDS if is_modelled or is_outdated else 0):
