@@ -19,7 +19,12 @@ from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.closed_form import SOLVERS
 from visioncal.estimation.linalg import covariance_from, damped_step, spectrum
 from visioncal.estimation.problem_parts import ROBOT, Effect, Noise, State
-from visioncal.estimation.solve import estimate_noise, fit_problem, solve_problem, starting_noise
+from visioncal.estimation.solve import (
+    estimate_noise,
+    fit_problem,
+    solve_problem,
+    starting_noise,
+)
 from visioncal.estimation.variance import PriorInformation
 from visioncal.simulation import CellOptions, measured_poses, simulate
 

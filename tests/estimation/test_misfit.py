@@ -22,7 +22,10 @@ from visioncal.estimation.intervals import noise_intervals
 from visioncal.estimation.lens_field import LensLevels
 from visioncal.estimation.problem_parts import ROBOT, State
 from visioncal.estimation.residual_tests import drift, lens_field, neighbours
-from visioncal.estimation.solve import covariance_of, fit_problem
+from visioncal.estimation.solve import (
+    covariance_of,
+    fit_problem,
+)
 from visioncal.estimation.variance import profile_interval
 from visioncal.session.columns import POSE
 from visioncal.simulation import CellOptions, fine_camera, simulate

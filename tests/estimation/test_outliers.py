@@ -13,7 +13,11 @@ from visioncal.core.transforms import exp
 from visioncal.estimation.chain import chain
 from visioncal.estimation.outliers import distances
 from visioncal.estimation.problem_parts import ROBOT, State
-from visioncal.estimation.solve import Solution, fit_problem, solve_problem
+from visioncal.estimation.solve import (
+    Solution,
+    fit_problem,
+    solve_problem,
+)
 from visioncal.simulation import CellOptions, fine_camera, simulate, wide_camera
 
 WORLDS = {

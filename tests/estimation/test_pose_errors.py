@@ -9,7 +9,11 @@ from visioncal.estimation.arm import SIGNIFICANT, misfit_covariance
 from visioncal.estimation.chain import chain
 from visioncal.estimation.pose_errors import find_pose_errors, left_out_clusters
 from visioncal.estimation.problem_parts import ROBOT
-from visioncal.estimation.solve import covariance_of, fit_problem, solve_problem
+from visioncal.estimation.solve import (
+    covariance_of,
+    fit_problem,
+    solve_problem,
+)
 
 X, Z = exp(np.array([0.1, -0.2, 0.3, 0.03, -0.05, 0.09])), exp(np.array([0, 0, 0, 0.6, 0.1, 0.0]))
 SIGMAS = np.repeat([3e-4, 2e-4], 3)

@@ -11,8 +11,10 @@ from visioncal.calibration.stages.pair_observations import Sighted
 from visioncal.calibration.stages.pairwise import Candidates
 from visioncal.estimation.model_evidence import SIZES_M, TURN_PER_M
 from visioncal.estimation.moves import Move
+from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.outliers import inliers_and_moves, refine_inliers
 from visioncal.estimation.problem_parts import Effect, FramePrior, Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.slight_steps import evidence_gain, find_slight_move
 from visioncal.estimation.solve import (
     RepeatErrors,
@@ -20,9 +22,7 @@ from visioncal.estimation.solve import (
     covariance_of,
     equations_from,
     fit_problem,
-    normal_equations,
     posterior,
-    robot_likelihood,
     solve_problem,
 )
 from visioncal.estimation.variance import PriorInformation

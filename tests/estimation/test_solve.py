@@ -10,14 +10,18 @@ from support.cells import calibrated
 from visioncal.core.errors import ConvergenceError
 from visioncal.estimation import joint
 from visioncal.estimation.intervals import expected_levels
-from visioncal.estimation.problem_parts import ROBOT, Effect
-from visioncal.estimation.solve import (
-    RATIO_PRIOR,
+from visioncal.estimation.normal_equations import (
     equations_and_cost,
+    normal_equations,
+)
+from visioncal.estimation.problem_parts import ROBOT, Effect
+from visioncal.estimation.robot_likelihood import (
+    RATIO_PRIOR,
+    robot_likelihood,
+)
+from visioncal.estimation.solve import (
     fit_problem,
     left_out_residuals,
-    normal_equations,
-    robot_likelihood,
     solve_problem,
 )
 from visioncal.estimation.variance import (

@@ -11,8 +11,8 @@ from support.planned import next_best, plan_cell, postures_in_view, so_far_of, t
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import exp
 from visioncal.estimation.linalg import covariance_from, covariance_root
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import fisher_information
 from visioncal.live.planning.accuracy import Wish
 from visioncal.live.planning.cell import Box
 from visioncal.live.planning.design import CRITERIA, choose_stops, shortfall

@@ -10,7 +10,10 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmData
 from visioncal.estimation.chain import chain, robot_part
 from visioncal.estimation.problem_parts import ROBOT, Noise, State
-from visioncal.estimation.solve import Solution, covariance_of
+from visioncal.estimation.solve import (
+    Solution,
+    covariance_of,
+)
 from visioncal.robot import Loads
 
 ERROR_RAD = 1e-3

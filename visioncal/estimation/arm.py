@@ -15,9 +15,10 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.solve import RobotLikelihood, normal_equations
+from visioncal.estimation.robot_likelihood import RobotLikelihood
 from visioncal.estimation.variance import LEAST_SIGMA, Components, PriorInformation, level_weight
 from visioncal.robot import Robot
 

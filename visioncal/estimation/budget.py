@@ -10,9 +10,9 @@ from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import skew
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.linalg import covariance_among, gram
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Linear, Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import fisher_information
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,10 +18,14 @@ from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.clock import clock_effect
 from visioncal.estimation.effects.delays import Delay, compress_delayed, shares_of, target_twists
 from visioncal.estimation.linalg import covariance_from, gram
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.outliers import closed_form
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, State
-from visioncal.estimation.solve import Solution, fisher_information, fit_problem
+from visioncal.estimation.solve import (
+    Solution,
+    fit_problem,
+)
 from visioncal.estimation.trajectory import Trajectory
 from visioncal.estimation.variance import PriorInformation
 

@@ -8,7 +8,10 @@ import numpy as np
 from visioncal.core.types import FloatArray
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import RATIO_PRIOR, robot_likelihood
+from visioncal.estimation.robot_likelihood import (
+    RATIO_PRIOR,
+    robot_likelihood,
+)
 from visioncal.estimation.variance import profile_interval
 
 # Logarithms of the integration's scales, from a hundredth, below which levels add nothing to a

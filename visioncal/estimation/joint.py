@@ -19,16 +19,16 @@ from visioncal.estimation.arm import ArmErrors
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.effects.lenses import LENSES, CameraParameters, LinearisedCorners
 from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.scene import lens_prior
 from visioncal.estimation.solve import (
     Solution,
     covariance_of,
     fit_problem,
     fitted_covariance,
-    normal_equations,
-    robot_likelihood,
 )
 from visioncal.estimation.variance import PriorInformation
 

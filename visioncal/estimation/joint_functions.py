@@ -22,7 +22,11 @@ from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, HARMONICS, WEIGH
 from visioncal.estimation.linalg import gram, weighted_gram
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import RobotLikelihood, ratio_prior, robot_likelihood
+from visioncal.estimation.robot_likelihood import (
+    RobotLikelihood,
+    ratio_prior,
+    robot_likelihood,
+)
 from visioncal.estimation.variance import (
     LEAST_SIGMA,
     MOST_SIGMA,

@@ -17,12 +17,14 @@ from visioncal.estimation.arm import SIGNIFICANT, ArmErrors, find_arm_errors, ro
 from visioncal.estimation.armmodel import BACKLASH, COMPLIANCE, WEIGHT
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import (
+from visioncal.estimation.robot_likelihood import (
     RobotLikelihood,
+    robot_likelihood,
+)
+from visioncal.estimation.solve import (
     Solution,
     fit_problem,
     left_out_residuals,
-    robot_likelihood,
 )
 
 

@@ -22,9 +22,10 @@ from visioncal.estimation.corners import CornerStack, WithoutPoses, floored_sigm
 from visioncal.estimation.effects.lenses import LENSES, LinearisedCorners
 from visioncal.estimation.lens_field import LensLevels, distances, field_modes, zooms
 from visioncal.estimation.linalg import covariance_from, gram
+from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import normal_equations, ratio_prior
+from visioncal.estimation.robot_likelihood import ratio_prior
 from visioncal.estimation.variance import HARDLY, LikelihoodValue, most_likely
 
 # Candidate correlation lengths of the field, as shares of the image's width; index of the first

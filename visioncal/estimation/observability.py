@@ -14,9 +14,9 @@ from visioncal.core.types import FloatArray, Mount
 from visioncal.estimation.chain import edge_names, robot_part
 from visioncal.estimation.corners import floored_sigma_px
 from visioncal.estimation.linalg import covariance_among, spectrum
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import fisher_information
 
 # Scaled eigenvalue ratio below which the motion does not determine a direction.
 _NULL_RATIO = 1e-8

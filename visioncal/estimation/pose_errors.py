@@ -28,9 +28,13 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import TWIST_UNITS, ArmErrors, pose_basis, rows_of, stops_of
 from visioncal.estimation.budget import less_noise
 from visioncal.estimation.linalg import covariance_among, covariance_root
+from visioncal.estimation.normal_equations import normal_equations
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import RATIO_PRIOR, normal_equations, robot_likelihood
+from visioncal.estimation.robot_likelihood import (
+    RATIO_PRIOR,
+    robot_likelihood,
+)
 from visioncal.estimation.variance import LEAST_SIGMA, MOST_SIGMA, LikelihoodValue
 
 # Distance between postures equivalent to a rotation by a radian [m].

@@ -145,7 +145,7 @@ class Problem:
     is_combined: bool = False
     # Last results of `linear`, keyed by `ideal`: a fit, its noise and its tests use the same one.
     _last: dict[bool, tuple[State, Linear]] = field(default_factory=dict, init=False, repr=False)
-    # Cached result of `solve.robot_likelihood`.
+    # Cached result of `robot_likelihood.robot_likelihood`.
     last_likelihood: list[tuple[State, Noise, object]] = field(
         default_factory=list, init=False, repr=False
     )

@@ -28,6 +28,7 @@ from visioncal.estimation.moves import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import UNEVEN, Effect, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.solve import (
     RepeatErrors,
     Solution,
@@ -35,7 +36,6 @@ from visioncal.estimation.solve import (
     equations_from,
     fit_problem,
     fitted_covariance,
-    robot_likelihood,
 )
 from visioncal.estimation.variance import PriorInformation
 

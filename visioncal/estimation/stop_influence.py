@@ -4,9 +4,10 @@ import numpy as np
 
 from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.linalg import covariance_among, covariance_from, gram
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import fisher_information, whitened
+from visioncal.estimation.solve import whitened
 
 
 def stop_influence(

@@ -22,8 +22,13 @@ from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
 from visioncal.estimation.residual_tests import inflation
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.slight_steps import Slip, step_covariance, with_step
-from visioncal.estimation.solve import Solution, covariance_of, held_shift, robot_likelihood
+from visioncal.estimation.solve import (
+    Solution,
+    covariance_of,
+    held_shift,
+)
 
 # Name of a sudden step (a frame that moved, a joint that slipped) as a source of uncertainty.
 STEP = "what moved at once"

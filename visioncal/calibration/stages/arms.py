@@ -38,7 +38,11 @@ from visioncal.estimation.armmodel import RIGID, ArmModel, blocks_of
 from visioncal.estimation.armpair import ArmData, ArmPair
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.solve import RobotLikelihood, Solution, robot_likelihood
+from visioncal.estimation.robot_likelihood import (
+    RobotLikelihood,
+    robot_likelihood,
+)
+from visioncal.estimation.solve import Solution
 from visioncal.results.arm import (
     ArmErrorsResult,
     ArmSections,

@@ -13,7 +13,10 @@ from visioncal.core.transforms import adjoint, invert
 from visioncal.core.types import FloatArray, IntArray, Mask
 from visioncal.estimation.moves import Move
 from visioncal.estimation.problem import Problem
-from visioncal.estimation.solve import Solution, by_noise_alone
+from visioncal.estimation.solve import (
+    Solution,
+    by_noise_alone,
+)
 
 # False-alarm probability of an observation at its own stop, and the factor on its squared distance
 # for other ones: the prediction has errors, too, and wrong stops are much farther.

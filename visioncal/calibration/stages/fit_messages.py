@@ -25,7 +25,10 @@ from visioncal.estimation.joint import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.scene import ONLY_CAMERA, CornerProblem, Scene
-from visioncal.estimation.solve import covariance_of, held_shift
+from visioncal.estimation.solve import (
+    covariance_of,
+    held_shift,
+)
 from visioncal.session.frames import frame_name
 from visioncal.vision.camera import normalise, project
 

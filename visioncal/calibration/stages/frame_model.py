@@ -15,8 +15,12 @@ from visioncal.estimation.joint import ConvergedFit
 from visioncal.estimation.pose_errors import find_pose_errors
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
+from visioncal.estimation.robot_likelihood import robot_likelihood
 from visioncal.estimation.scene import CornerProblem, Scene, repeat_shares
-from visioncal.estimation.solve import fit_problem, fitted_covariance, robot_likelihood
+from visioncal.estimation.solve import (
+    fit_problem,
+    fitted_covariance,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,10 @@ from visioncal.estimation.kinematics import (
 )
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import robot_levels, starting_noise
+from visioncal.estimation.solve import (
+    robot_levels,
+    starting_noise,
+)
 from visioncal.results import Rms
 from visioncal.results.arm import NOMINAL, ArmLevel, ArmResult, UnseenView
 from visioncal.robot import Loads

@@ -13,9 +13,9 @@ from visioncal.estimation.arm import LEVER_M
 from visioncal.estimation.chain import chain
 from visioncal.estimation.closed_form import SOLVERS, Solver, lone_axis
 from visioncal.estimation.linalg import covariance_from, spectrum
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem_parts import Noise, State
 from visioncal.estimation.robust import nearest, trimmed_start, trimmed_sum
-from visioncal.estimation.solve import fisher_information
 
 # Triples of views to start from: with half of the views unusable, all 40 contain a bad one with
 # probability (1 - 1/8)^40 = 0.5 %.

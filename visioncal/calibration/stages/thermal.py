@@ -24,7 +24,11 @@ from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import State
-from visioncal.estimation.solve import Solution, robot_likelihood, starting_noise
+from visioncal.estimation.robot_likelihood import robot_likelihood
+from visioncal.estimation.solve import (
+    Solution,
+    starting_noise,
+)
 from visioncal.results.arm import (
     DriftPoint,
     DriftResidual,

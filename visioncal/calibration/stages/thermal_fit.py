@@ -17,12 +17,14 @@ from visioncal.core.types import FloatArray, IntArray
 from visioncal.estimation.arm import rows_of
 from visioncal.estimation.levenberg_marquardt import Linearised, levenberg_marquardt
 from visioncal.estimation.linalg import covariance_among, damped_step
+from visioncal.estimation.normal_equations import (
+    equations_and_cost,
+    fisher_information,
+)
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
 from visioncal.estimation.solve import (
-    equations_and_cost,
     estimate_noise,
-    fisher_information,
     fit_problem,
     robot_levels,
 )

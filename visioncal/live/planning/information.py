@@ -28,9 +28,9 @@ from visioncal.estimation.armpair import ArmPair
 from visioncal.estimation.chain import chain
 from visioncal.estimation.corners import CornerStack, floored_sigma_px
 from visioncal.estimation.linalg import covariance_from, gram
+from visioncal.estimation.normal_equations import fisher_information
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Effect, Noise, State
-from visioncal.estimation.solve import fisher_information
 from visioncal.estimation.variance import PriorInformation
 from visioncal.estimation.workspace import postures
 from visioncal.live.planning.cell import Box, PlanCell

@@ -21,9 +21,12 @@ from visioncal.estimation.appearance import LensBoardParameters
 from visioncal.estimation.armmodel import ArmModel
 from visioncal.estimation.chain import robot_part
 from visioncal.estimation.linalg import covariance_among
+from visioncal.estimation.normal_equations import (
+    fisher_information,
+    normal_equations,
+)
 from visioncal.estimation.problem import Problem
 from visioncal.estimation.problem_parts import Noise, State
-from visioncal.estimation.solve import fisher_information, normal_equations
 from visioncal.live.planning.cell import Box, Limits, PlanCell
 from visioncal.live.planning.information import RecordedStops
 from visioncal.robot import Robot

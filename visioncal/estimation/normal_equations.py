@@ -1,0 +1,237 @@
+"""Normal equations of a problem: whitening, and elimination of the flanges' errors."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.linalg import gram
+from visioncal.estimation.problem import ANYTHING, Linear, Problem
+from visioncal.estimation.problem_parts import Noise, State
+
+# Eigenvalues of the information on a flange below this share of the largest count as zero.
+_NULL = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """Normal equations with the flanges' errors eliminated, unit by unit.
+
+    Attributes:
+        information: (p, p) on the unknowns, with the flanges' errors unconstrained.
+        gradient: (p,) half the gradient of the squared error.
+        cost: The squared error.
+        errors: (u, 6 w) estimate of each unit's flange errors.
+        jacobian: (u, 6 w, p) of these estimates by the unknowns.
+        covariance: (u, 6 w, 6 w) of these estimates, from the observations' noise alone.
+        by_flanges: (u, 6 w, 6 w) Jacobian of these estimates by the flange poses: the identity
+            where the flanges were observed and the errors are their own.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    cost: float
+    errors: FloatArray
+    jacobian: FloatArray
+    covariance: FloatArray
+    by_flanges: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Inverse of the observations' covariance, block diagonal less a low-rank part for each unit.
+
+    Attributes:
+        weights: (n, 6, 6) inverse covariance of each observation's own noise, including its
+            flange's error if no other observation shares that.
+        taken: (n, 6 w, 6) factors of the Schur complement for shared flange errors: the square of
+            their product with the observations, summed over a unit, is subtracted.
+        units: (n,) unit of each observation; -1 if it shares no errors.
+        count: Number of units.
+    """
+
+    weights: FloatArray
+    taken: FloatArray
+    units: IntArray
+    count: int
+
+    @classmethod
+    def of(
+        cls, problem: Problem, noise: Noise, by_errors: FloatArray, among: Mask | None = None
+    ) -> "Whitening":
+        """Whitens observations with Jacobian (n, 6, 6 w) by their units' errors."""
+        # Observations not in `among` get zero weight.
+        (unit_of, members), alone = problem.units, problem.alone
+        own, errors = problem.covariance(noise), problem.error_covariance(noise)
+        jacobian = by_errors[alone]
+        own[alone] += jacobian @ errors[unit_of[alone]] @ np.swapaxes(jacobian, 1, 2)
+        weights, units = np.asarray(np.linalg.inv(own), dtype=float), np.where(alone, -1, unit_of)
+        if among is not None:
+            weights[~among] = 0.0
+        shared, width = units >= 0, by_errors.shape[2]
+        taken = np.zeros((len(weights), width, 6))
+        weighted = np.swapaxes(by_errors[shared], 1, 2) @ weights[shared]
+        information = np.zeros((len(members), width, width))
+        np.add.at(information, units[shared], weighted @ by_errors[shared])
+        # Errors of flanges are independent; those of repeats are not.
+        roots, first = np.sqrt(np.maximum(errors, 0.0)), len(members) - len(problem.repeats)
+        roots[first:] = np.linalg.cholesky(errors[first:])
+        transposed = np.swapaxes(roots, 1, 2)
+        factor = np.linalg.cholesky(transposed @ information @ roots + np.eye(width))
+        taken[shared] = (np.linalg.inv(factor) @ transposed)[units[shared]] @ weighted
+        return cls(weights, taken, units, len(members))
+
+    def equations(
+        self, problem: Problem, state: State, linear: Linear
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Information (p, p), gradient (p,) of half the whitened squared error, and that error."""
+        size, width = linear.size, self.taken.shape[1]
+        total, shared = np.zeros((size + 1, size + 1)), np.zeros((self.count, width, size + 1))
+        for block in linear.blocks:
+            # Residuals are the last column.
+            columns, rows = np.append(block.columns, size), block.rows
+            augmented = np.concatenate([block.jacobian, linear.residuals[rows, :, None]], axis=2)
+            total[np.ix_(columns, columns)] += gram(augmented, self.weights[rows] @ augmented)
+            is_shared = self.units[rows] >= 0
+            if not is_shared.any():
+                continue
+            rows, augmented = rows[is_shared], augmented[is_shared]
+            order = np.argsort(self.units[rows], kind="stable")
+            units, first = np.unique(self.units[rows[order]], return_index=True)
+            taken = np.add.reduceat(self.taken[rows[order]] @ augmented[order], first)
+            shared[np.ix_(units, np.arange(width), columns)] += taken
+        total -= gram(shared, shared)
+        prior = problem.prior_information(state)
+        return (
+            total[:-1, :-1] + prior.information,
+            total[:-1, -1] + prior.gradient,
+            float(total[-1, -1]) + problem.prior_cost(state),
+        )
+
+
+def reduce(problem: Problem, state: State, linear: Linear, covariance: FloatArray) -> Reduced:
+    """Eliminates the flanges' errors, unit by unit.
+
+    A unit of a single observation is inverted for its flange's error; larger units are eliminated
+    by a Schur complement.
+
+    Args:
+        problem: The problem.
+        state: The linearisation point.
+        linear: The linearised residuals.
+        covariance: (n, 6, 6) of the observations' own noise.
+    """
+    unit_of, members = problem.units
+    width, size = linear.by_errors.shape[2], linear.size
+    total, alone = np.zeros((size + 1, size + 1)), problem.alone
+    own, inverse, null_variance, by_flanges = np.zeros((4, len(members), width, width))
+    cross, solved = np.zeros((2, len(members), width, size + 1))
+    for block in linear.blocks:
+        # Residuals are the last column.
+        columns = np.append(block.columns, size)
+        augmented = np.concatenate([block.jacobian, linear.residuals[block.rows, :, None]], axis=2)
+        single = alone[block.rows]
+        if single.any():
+            rows = block.rows[single]
+            turned = np.linalg.inv(linear.by_errors[rows, :, :6])
+            solved[np.ix_(unit_of[rows], np.arange(6), columns)] = turned @ augmented[single]
+            by_flanges[unit_of[rows], :6, :6] = turned @ linear.by_flanges[rows, :, :6]
+            turned_covariance = turned @ covariance[rows] @ np.swapaxes(turned, 1, 2)
+            inverse[unit_of[rows], :6, :6] = turned_covariance
+            inverse[unit_of[rows], 6:, 6:] = ANYTHING * np.eye(width - 6)
+        rows, augmented = block.rows[~single], augmented[~single]
+        if not len(rows):
+            continue
+        weights = np.linalg.inv(covariance[rows])
+        weighted = weights @ augmented
+        total[np.ix_(columns, columns)] += gram(augmented, weighted)
+        if unit_of[rows[0]] < 0:
+            continue
+        order = np.argsort(unit_of[rows], kind="stable")
+        units, first = np.unique(unit_of[rows[order]], return_index=True)
+        by_errors = linear.by_errors[rows[order]]
+        turned = np.swapaxes(by_errors, 1, 2)
+        own[units] += np.add.reduceat(turned @ weights[order] @ by_errors, first)
+        entries = np.ix_(units, np.arange(width), columns)
+        cross[entries] += np.add.reduceat(turned @ weighted[order], first)
+    multiple = np.setdiff1d(np.arange(len(members)), unit_of[alone])
+    inverse[multiple], null_variance[multiple] = _pseudo_inverse(own[multiple])
+    solved[multiple] = inverse[multiple] @ cross[multiple]
+    by_flanges[multiple] = inverse[multiple] @ own[multiple]
+    # The estimated error has the opposite sign of the residual that it causes.
+    total = total - gram(cross[multiple], solved[multiple])
+    known = problem.prior_information(state)
+    return Reduced(
+        total[:-1, :-1] + known.information,
+        total[:-1, -1] + known.gradient,
+        float(total[-1, -1]) + problem.prior_cost(state),
+        solved[:, :, -1],
+        solved[:, :, :-1],
+        inverse + null_variance,
+        by_flanges,
+    )
+
+
+def _pseudo_inverse(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pseudo-inverses (u, w, w), and the variance `ANYTHING` on the null spaces."""
+    values, vectors = np.linalg.eigh(information)
+    most = values[:, -1:] if values.shape[1] else values
+    determined = values > _NULL * np.maximum(most, np.finfo(float).tiny)
+    inverse = np.where(determined, 1.0 / np.where(determined, values, 1.0), 0.0)
+    transposed = np.swapaxes(vectors, 1, 2)
+    null = np.where(determined, 0.0, ANYTHING)
+    return (vectors * inverse[:, None, :]) @ transposed, (vectors * null[:, None, :]) @ transposed
+
+
+def total_equations(reduced: Reduced, errors: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Information (p, p), gradient (p,) and cost for (u, 6 w, 6 w) flange error covariances."""
+    weights = np.linalg.inv(reduced.covariance + errors)
+    weighted = weights @ reduced.jacobian
+    cost = np.einsum("ui,uij,uj->", reduced.errors, weights, reduced.errors)
+    return (
+        reduced.information + gram(reduced.jacobian, weighted),
+        reduced.gradient + gram(weighted, reduced.errors),
+        reduced.cost + float(cost),
+    )
+
+
+def fisher_information(problem: Problem, state: State, noise: Noise) -> FloatArray:
+    """Fisher information (p, p) on the unknowns, at poses for which all chains close exactly.
+
+    At the measured poses, noise would appear as information on directions that the motion leaves
+    undetermined.
+    """
+    return normal_equations(problem, state, noise, ideal=True)[0]
+
+
+def normal_equations(
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    *,
+    ideal: bool = False,
+    among: Mask | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Information (p, p) and gradient (p,) of half the whitened squared error.
+
+    Args:
+        problem: The observations.
+        state: The linearisation point.
+        noise: Noise levels.
+        ideal: See `Problem.linear`.
+        among: (n,) mask of the observations to include; all if None.
+    """
+    return equations_and_cost(problem, state, noise, ideal=ideal, among=among)[:2]
+
+
+def equations_and_cost(
+    problem: Problem,
+    state: State,
+    noise: Noise,
+    *,
+    ideal: bool = False,
+    among: Mask | None = None,
+) -> tuple[FloatArray, FloatArray, float]:
+    """`normal_equations`, and the whitened squared error."""
+    linear = problem.linear(state, ideal=ideal)
+    return Whitening.of(problem, noise, linear.by_errors, among).equations(problem, state, linear)

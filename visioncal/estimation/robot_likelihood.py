@@ -1,0 +1,276 @@
+"""Restricted likelihood (REML) of the robots' noise levels at a fit."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from visioncal.core.types import FloatArray, IntArray, Mask
+from visioncal.estimation.linalg import covariance_root, gram, weighted_gram
+from visioncal.estimation.normal_equations import Reduced, reduce
+from visioncal.estimation.problem import Problem
+from visioncal.estimation.problem_parts import Noise, State
+from visioncal.estimation.variance import (
+    LEAST_SIGMA,
+    SETTLED,
+    Components,
+    PriorInformation,
+    RatioPrior,
+    WeightedResiduals,
+    estimate_sigmas,
+)
+
+# Typical translation to rotation noise of arms and cameras [m/rad], within a factor of five.
+RATIO_PRIOR = RatioPrior(ratio=0.6, log_sigma=1.5)
+
+
+def ratio_prior(robots: Iterable[int], first: int = 0) -> RatioPrior:
+    """Prior of the ratio of both noise levels of robots, whose levels begin at index `first`."""
+    places = tuple((first + 2 * robot, first + 2 * robot + 1) for robot in robots)
+    return replace(RATIO_PRIOR, places=places)
+
+
+# Lower bound of the initial noise levels of robots [rad and m]: the search starts from above.
+START_SIGMA = 5e-4
+# Lower bound of the initial levels of a repeated search: from zero, levels cannot grow.
+_ABOVE_NOTHING = 2e-5
+# Factors of the rotation and translation levels tried as start values beside errors of an arm.
+_LOWER = ((1.0, 1.0), (1.0, 0.25), (0.25, 1.0), (0.25, 0.25))
+
+
+@dataclass(frozen=True, eq=False)
+class RobotLikelihood:
+    """Restricted likelihood of the robots' noise levels.
+
+    Attributes:
+        reduced: The estimates of each unit's flange errors.
+        components: Variance components of these estimates.
+        known: Information on the free unknowns from other sources than these estimates.
+        moving: (p,) mask of the free unknowns.
+        members: (u, w) the robots of each unit; see `Problem.units`.
+        stops: (u,) the stop of each unit that has observations.
+        before: (r, 2) the robots' previous levels.
+    """
+
+    reduced: Reduced
+    components: Components
+    known: PriorInformation
+    moving: Mask
+    members: IntArray
+    stops: IntArray
+    before: FloatArray
+    _weighed: dict[int, tuple[tuple[FloatArray, WeightedResiduals], ...]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    @cached_property
+    def seen(self) -> Mask:
+        """(r,) mask of the robots with observations."""
+        return np.isin(np.arange(len(self.before)), self.members)
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """(u, 6 w, q) Jacobian of the flange errors by the free unknowns."""
+        return np.ascontiguousarray(self.reduced.jacobian[:, :, self.moving])
+
+    @property
+    def rms(self) -> FloatArray:
+        """(2,) RMS of the flange errors' rotation [rad] and translation [m]."""
+        squares = self.reduced.errors.reshape(-1, 2, 3) ** 2
+        return np.asarray(np.sqrt(np.mean(squares, axis=(0, 2))))
+
+    def most_likely(
+        self,
+        start: FloatArray,
+        free: Mask,
+        least: FloatArray | float = LEAST_SIGMA,
+        settled: float = SETTLED,
+        enough: float = np.inf,
+    ) -> tuple[FloatArray, float]:
+        """Finds the maximum-likelihood levels, and the negative log-likelihood there.
+
+        Args:
+            start: (r, 2) initial levels; or (2 r + k,) with those of k more components.
+            free: (2 r + k,) mask of the levels to estimate, robot by robot.
+            least: Lower bound of the levels.
+            settled: See `estimate_sigmas`.
+            enough: See `variance.most_likely`.
+        """
+        sigmas, value = estimate_sigmas(
+            self.reduced.errors,
+            self.jacobian,
+            self.components,
+            self.known,
+            start.ravel(),
+            free,
+            ratio_prior(np.flatnonzero(self.seen).tolist()),
+            least,
+            settled,
+            enough,
+        )
+        return sigmas.reshape(start.shape), value
+
+    def levels(self, *, from_above: bool) -> tuple[FloatArray, float]:
+        """Estimates the robots' levels (r, 2); see `robot_levels`."""
+        if from_above:
+            return self.white
+        return self._levels(np.maximum(self.before, _ABOVE_NOTHING))
+
+    @cached_property
+    def white(self) -> tuple[FloatArray, float]:
+        """Levels (r, 2) from a search from above, and the negative log-likelihood there."""
+        return self._levels(np.maximum(self.rms, START_SIGMA) * np.ones_like(self.before))
+
+    def start_beside(self, robot: int, moves: FloatArray) -> tuple[FloatArray, float]:
+        """Initial levels with additional random effects, of equal variance, on a robot's flange.
+
+        Effects may explain most of the robot's rotation level, translation level, or both: the
+        case of the highest likelihood is returned.
+
+        Args:
+            robot: Index of the robot.
+            moves: (s, 6, k) Jacobian of its flange by the effects at each stop.
+
+        Returns:
+            The levels (r, 2), and the size of the effects; zero if none raises the likelihood.
+        """
+        mine, moved = (self.members == robot).any(axis=1), self.moved(robot, moves)
+        start, least = (self.white[0], 0.0), np.inf
+        for levels, weighed in self._weighed_about(robot):
+            size, gain = weighed.likely_size(moved, mine)
+            if weighed.value - gain < least and (gain > 0.0 or least == np.inf):
+                start, least = (levels, size), weighed.value - gain
+        return start
+
+    def _weighed_about(self, robot: int) -> tuple[tuple[FloatArray, WeightedResiduals], ...]:
+        """Fits at the levels `white`, and at lower levels of one robot."""
+        if robot not in self._weighed:
+            lower = np.ones((len(_LOWER), *self.before.shape))
+            lower[:, robot] = _LOWER
+            every = np.maximum(self.white[0] * lower, LEAST_SIGMA)
+            given = self.reduced.errors, self.jacobian, self.components, self.known
+            self._weighed[robot] = tuple(
+                (levels, WeightedResiduals.of(*given, np.log(levels.ravel()))) for levels in every
+            )
+        return self._weighed[robot]
+
+    @property
+    def negative_log_likelihood(self) -> float:
+        """Negative log-likelihood at the levels `white`, including the cost no level affects."""
+        return self.white[1] + 0.5 * self.reduced.cost
+
+    def _levels(self, start: FloatArray) -> tuple[FloatArray, float]:
+        if not len(self.components.known):
+            return self.before, 0.0
+        start = np.where(self.seen[:, None], start, self.before)
+        return self.most_likely(start, np.repeat(self.seen, 2))
+
+    def beside(self, robot: int, moves: FloatArray) -> Self:
+        """Appends k unknowns that move a robot's flange.
+
+        They affect the units' flange error estimates only: `reduced.information` has nothing on
+        them, since the errors are eliminated there.
+
+        Args:
+            robot: Index of the robot.
+            moves: (s, 6, k) Jacobian of its flange by them at each stop.
+        """
+        reduced, size = self.reduced, moves.shape[2]
+        jacobian = np.zeros((*reduced.errors.shape, size))
+        jacobian[(self.members == robot).any(axis=1)] = self.moved(robot, moves)
+        return replace(
+            self,
+            reduced=replace(
+                reduced,
+                information=np.pad(reduced.information, (0, size)),
+                gradient=np.pad(reduced.gradient, (0, size)),
+                jacobian=np.concatenate([reduced.jacobian, jacobian], axis=2),
+            ),
+            known=self.known.beside(size),
+            moving=np.pad(self.moving, (0, size), constant_values=True),
+        )
+
+    def moved(self, robot: int, moves: FloatArray) -> FloatArray:
+        """Jacobian (m, 6 w, k) of the estimates of a robot's m units, for `moves` (s, 6, k)."""
+        units, slots = np.nonzero(self.members == robot)
+        places = 6 * slots[:, None, None] + np.arange(6)
+        by_flange = np.take_along_axis(self.reduced.by_flanges[units], places, axis=2)
+        return np.asarray(by_flange @ moves[self.stops[units]])
+
+    def scaled(self, robot: int, levels: FloatArray, scales: FloatArray) -> FloatArray:
+        """Negative log-likelihood, up to a constant, for scaled noise levels of one robot.
+
+        In each unit the total covariance and the robot's part of it are diagonalised together; only
+        their ratio then changes with the scale.
+
+        Args:
+            robot: Index of the robot.
+            levels: (r, 2) all robots' levels.
+            scales: (k,) factors of this robot's levels.
+
+        Returns:
+            (k,) values.
+        """
+        total = self.components.total(np.maximum(levels.ravel(), LEAST_SIGMA))
+        white = np.linalg.inv(np.linalg.cholesky(total))
+        own = (self.members == robot).any(axis=1)
+        added = np.repeat(np.where(self.members == robot, 1.0, 0.0), 6, axis=1)
+        added *= np.tile(np.repeat(levels[robot], 3), self.members.shape[1]) ** 2
+        shares, axes = np.linalg.eigh((white * added[:, None]) @ np.swapaxes(white, 1, 2))
+        white = np.swapaxes(axes, 1, 2) @ white
+        jacobian, errors = white @ self.jacobian, (white @ self.reduced.errors[..., None])[..., 0]
+        others, other_errors = jacobian[~own], errors[~own]
+        information = self.known.information + gram(others, others)
+        gradient = self.known.gradient + gram(others, other_errors)
+        jacobian, errors, values = jacobian[own], errors[own], np.empty(len(scales))
+        for index, scale in enumerate(scales.tolist()):
+            grown = np.maximum(1.0 + (scale**2 - 1.0) * shares[own], np.finfo(float).tiny)
+            weighted = errors / grown
+            root = covariance_root(information + weighted_gram(jacobian, 1.0 / grown))
+            projected = root.T @ (gradient + gram(jacobian, weighted))
+            squares = float(np.sum(errors * weighted) - projected @ projected)
+            determinants = float(np.log(grown).sum() - 2.0 * np.linalg.slogdet(root)[1])
+            values[index] = 0.5 * (squares + determinants)
+        return values
+
+
+def robot_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
+    """Restricted likelihood of the robots' levels, with those of the sensors held."""
+    # A fit, its tests and the arm models of all robots use the same one.
+    for last_state, last_noise, cached in problem.last_likelihood:
+        is_same = last_state is state and np.array_equal(last_noise.sensors, noise.sensors)
+        if is_same and isinstance(cached, RobotLikelihood):
+            alike = np.array_equal(last_noise.robots, noise.robots)
+            return cached if alike else replace(cached, before=noise.robots)
+    cached = _reduced_likelihood(problem, state, noise)
+    problem.last_likelihood[:] = [(state, noise, cached)]
+    return cached
+
+
+def _reduced_likelihood(problem: Problem, state: State, noise: Noise) -> RobotLikelihood:
+    unit_of, members = problem.units
+    stops = np.zeros(len(members), dtype=np.int64)
+    stops[unit_of[unit_of >= 0]] = problem.observations.stops[unit_of >= 0]
+    reduced = reduce(problem, state, problem.linear(state), problem.covariance(noise))
+    count, width = len(problem.robots), members.shape[1]
+    parts = np.zeros((2 * count, len(members), 6 * width))
+    for robot in range(count):
+        rows, slots = np.nonzero(members == robot)
+        for axis in range(3):
+            at = 6 * slots + axis
+            parts[2 * robot, rows, at] = parts[2 * robot + 1, rows, at + 3] = 1.0
+    moving, covariance = problem.moving, reduced.covariance.copy()
+    if problem.repeats:
+        first = len(members) - len(problem.repeats)
+        covariance[first:] += problem.error_covariance(noise)[first:]
+    return RobotLikelihood(
+        reduced,
+        Components(covariance, parts),
+        PriorInformation(reduced.information[np.ix_(moving, moving)], reduced.gradient[moving]),
+        moving,
+        members,
+        stops,
+        noise.robots,
+    )
