@@ -121,7 +121,7 @@ def test_heavy_libraries_enter_in_one_place():
         ),
         ("visioncal.cli.calibrate", {"numpy", "rich", "visioncal.core.types"}),
         (
-            "visioncal.cli.align, visioncal.cli.batch, visioncal.cli.demo, visioncal.cli.diff, "
+            "visioncal.cli.batch, visioncal.cli.demo, visioncal.cli.diff, "
             "visioncal.cli.convert, visioncal.cli.correct, visioncal.cli.doctor, "
             "visioncal.cli.dynamics_gains, visioncal.cli.dynamics_identify, "
             "visioncal.cli.dynamics_payload, visioncal.cli.dynamics_plan, "

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from visioncal.core.version import __version__
 
 if TYPE_CHECKING:
-    from visioncal.calibration.pipeline import align, calibrate
+    from visioncal.calibration.pipeline import calibrate
     from visioncal.calibration.pipeline.checkup import Checkup, doctor
     from visioncal.calibration.verification import verify
     from visioncal.core.errors import (
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from visioncal.live.planning.plan import make_plan
     from visioncal.present.report import write_report
     from visioncal.present.report.drawing import Drawing
-    from visioncal.results import Alignment, Calibration, Verdict
+    from visioncal.results import Calibration, Verdict
     from visioncal.results.compare import compare
     from visioncal.results.compensation import CalibratedArm, Corrected, correct
     from visioncal.robot import Loads
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from visioncal.vision.targets import load_target
 
 _HOMES = {
-    "Alignment": "visioncal.results",
     "Batch": "visioncal.interchange.batch",
     "CalibratedArm": "visioncal.results.compensation",
     "Calibration": "visioncal.results",
@@ -73,7 +72,6 @@ _HOMES = {
     "Sight": "visioncal.frames.single_view",
     "Verdict": "visioncal.results",
     "VisioncalError": "visioncal.core.errors",
-    "align": "visioncal.calibration.pipeline",
     "batch": "visioncal.interchange.batch",
     "calibrate": "visioncal.calibration.pipeline",
     "compare": "visioncal.results.compare",
@@ -99,7 +97,6 @@ _HOMES = {
 }
 
 __all__ = [
-    "Alignment",
     "Batch",
     "CalibratedArm",
     "Calibration",
@@ -120,7 +117,6 @@ __all__ = [
     "Verdict",
     "VisioncalError",
     "__version__",
-    "align",
     "batch",
     "calibrate",
     "compare",

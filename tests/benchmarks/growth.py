@@ -19,7 +19,7 @@ import numpy as np
 from results import first, write_section
 from support.cells import known_of
 
-from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.steps import STAGES
 from visioncal.simulation import CellOptions, fine_camera, simulate
 from visioncal.simulation.layout import CameraAt, Moved, NetworkOptions
@@ -70,7 +70,7 @@ def of_cameras(task: tuple[int, int, bool]) -> dict[str, float]:
     corners = {view_corners.view: view_corners for view_corners in cell.corners}
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begin = time.process_time()
-    found = align(session, corners=corners)
+    found = calibrate(session, corners=corners)
     taken = time.process_time() - begin
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     return {

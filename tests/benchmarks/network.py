@@ -15,7 +15,7 @@ import numpy as np
 from results import few, wished, write_section
 from support.networkbound import network_bound
 
-from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import FloatArray
 from visioncal.results import Calibration
@@ -43,7 +43,7 @@ def drawn(options: NetworkOptions, seed: int) -> NetworkOptions:
 
 def aligned(cell: SimulatedCell) -> Calibration:
     session = cell_session(cell, "network", seen="names")
-    return align(
+    return calibrate(
         session, corners={view_corners.view: view_corners for view_corners in cell.corners}
     )
 

@@ -17,7 +17,7 @@ from multiprocessing import Pool
 import numpy as np
 from results import wished, write_section
 
-from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Corners, FloatArray
 from visioncal.results import Calibration
@@ -114,7 +114,7 @@ class Outcome:
 
 def outcome(seed: int) -> Outcome:
     made = world(seed)
-    found = align(made.session, corners=made.corners)
+    found = calibrate(made.session, corners=made.corners)
     names = [edge.partition("_from_")[2] for edge in found.edges]
     rows = np.array([name in made.cell.parents for name in names])
     covariance = found.joint_covariance[np.ix_(*[np.repeat(rows, 6)] * 2)]

@@ -9,12 +9,12 @@ from support.cells import calibrated, session_of
 from support.commands import visioncal
 from support.whole_cells import OPTIONS
 
-from visioncal.calibration.pipeline import align, calibrate
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import exp, invert, log
 from visioncal.core.types import Target
 from visioncal.interchange.exports import Selection, document
-from visioncal.results import Alignment, to_document
+from visioncal.results import Calibration, to_document
 from visioncal.robot import load_robot
 from visioncal.session import Session
 from visioncal.session.columns import POSE, pose_row
@@ -42,7 +42,7 @@ RIGHT = CameraAt("right", place_m=(0.15, 0.95, 1.25), camera=fine_camera())
 
 def aligned(cell):
     session = cell_session(cell, "cell", seen="names")
-    return align(session, corners={corner.view: corner for corner in cell.corners})
+    return calibrate(session, corners={corner.view: corner for corner in cell.corners})
 
 
 @pytest.fixture(scope="module")
@@ -122,12 +122,12 @@ def test_a_frame_that_moves_with_a_robot_asks_for_its_pose(clean):
 
 def test_it_is_the_same_after_it_was_saved(clean, tmp_path):
     _, found = clean
-    found.save(tmp_path / "alignment.json")
-    again = Alignment.load(tmp_path)
+    found.save(tmp_path / "calibration.json")
+    again = Calibration.load(tmp_path)
     assert to_document(again) == to_document(found)
-    (tmp_path / "alignment.json").write_text(json.dumps({"schema": 9}))
-    with pytest.raises(DataError, match="schema is 9, this version reads 1"):
-        Alignment.load(tmp_path)
+    (tmp_path / "calibration.json").write_text(json.dumps({"schema": 9}))
+    with pytest.raises(DataError, match="schema is 9, this version reads 2"):
+        Calibration.load(tmp_path)
 
 
 def test_the_weakest_link_is_the_frame_that_is_known_worst(clean):
@@ -233,7 +233,7 @@ def test_a_lens_that_is_stated_wrong_is_refined_or_kept_as_asked(clean, mode):
     wrong = np.add(stated["matrix"], [8.0, 8.0, -3.0, 4.0])
     left = {**stated, "matrix": wrong.tolist(), "intrinsics": mode}
     document = {**session.document, "cameras": {**session.document["cameras"], "left": left}}
-    found = align(
+    found = calibrate(
         replace(session, document=document),
         corners={corner.view: corner for corner in cell.corners},
     )
@@ -271,7 +271,7 @@ def test_noise_of_corners_refuses_no_lens(pixel_px):
         for name, table in session.document["cameras"].items()
     }
     session = replace(session, document={**session.document, "cameras": cameras})
-    found = align(
+    found = calibrate(
         session, corners={view_corners.view: view_corners for view_corners in cell.corners}
     )
     # The same stops: at 1 px a camera's place is open by 7 mm, which nobody can use.
@@ -281,7 +281,7 @@ def test_noise_of_corners_refuses_no_lens(pixel_px):
 def test_cameras_in_the_hand_and_poses_that_are_given():
     cameras = (CameraAt("left", "a"), CameraAt("right", "b"))
     cell = simulate(NetworkOptions(cameras=cameras, boards=(FLOOR,), stops=STOPS))
-    found = align(cell_session(cell, "cell", seen="poses"))
+    found = calibrate(cell_session(cell, "cell", seen="poses"))
     away, squared = off(cell, found, "base_a", "base_b")
     assert np.linalg.norm(away[3:]) < 1e-3
     # The noise of the given poses is estimated, too: fewer are told than they are.
@@ -333,7 +333,7 @@ def test_readings_of_one_instrument_in_millimetres_are_refused_in_a_cell():
     )
     # Its images are not there, either, which is said before.
     with pytest.raises(DataError, match="no instrument reads farther than 160 m"):
-        align(replace(session, views=views))
+        calibrate(replace(session, views=views))
 
 
 def test_an_instrument_that_reads_nothing_in_common_is_reported_with_what_would_tie_it():
@@ -354,9 +354,9 @@ def test_arms_that_err_are_named_and_their_offsets_found_where_that_is_asked_for
     cell = simulate(NetworkOptions(robots=ERRING, stops=STOPS))
     session = cell_session(cell, "cell", seen="names")
     corners = {view_corners.view: view_corners for view_corners in cell.corners}
-    reported = align(session, corners=corners, level="hand-eye")
+    reported = calibrate(session, corners=corners, level="hand-eye")
     assert sum("follow the arm's posture" in reason for reason in reported.verdict.reasons) == 2
-    found = align(session, corners=corners)
+    found = calibrate(session, corners=corners)
     assert found.verdict.status == "good"
     for robot in ("a", "b"):
         kinematics = found.cell.robots[robot].arm
@@ -412,10 +412,12 @@ def test_a_robot_without_joints_stays_as_it_reports_itself(clean):
         target_document=session.target_document,
         robot_document=session.robot_document,
     )
-    found = align(bare, corners={corner.view: corner for corner in cell.corners}, level="offsets")
+    found = calibrate(
+        bare, corners={corner.view: corner for corner in cell.corners}, level="offsets"
+    )
     assert sum("stays as it reports itself" in reason for reason in found.verdict.reasons) == 2
     with pytest.raises(DataError, match="level 'all'"):
-        align(bare, level="all")
+        calibrate(bare, level="all")
 
 
 def test_a_robot_that_nothing_ties_is_refused_with_what_would_tie_it():
@@ -476,7 +478,7 @@ ABOUT_Z = np.array([[0.0, 0.0, angle] for angle in np.linspace(-2.0, 2.0, 8)])
 
 def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
     session, base_b = four_axes_beside_six(ABOUT_Z, {"z_m": 0.03, "sigma_m": 1e-4})
-    edge = align(session).between("base_a", "base_b")
+    edge = calibrate(session).between("base_a", "base_b")
     away = log(invert(base_b) @ edge.matrix)
     # Chi-square of 6 beyond 22 is 0.1 %.
     assert away @ np.linalg.solve(edge.covariance, away) < 22.0
@@ -485,10 +487,10 @@ def test_a_measured_offset_ties_an_arm_of_four_axes_to_a_cell():
 
 def test_what_an_arm_that_hardly_turns_is_advised_to_do():
     with pytest.raises(DegenerateError, match="nothing ties base_b to base_a") as caught:
-        align(four_axes_beside_six(ABOUT_Z, None)[0])
+        calibrate(four_axes_beside_six(ABOUT_Z, None)[0])
     assert "for [prior.flange_b_from_target_plate_b]" in caught.value.next_step
     with pytest.raises(DegenerateError, match="differ in position only") as caught:
-        align(four_axes_beside_six(np.zeros((8, 3)), None)[0])
+        calibrate(four_axes_beside_six(np.zeros((8, 3)), None)[0])
     assert caught.value.next_step == (
         "To tie base_b: add 3 or more stops in which flange_b is tilted by 20 to 40 degrees about "
         "different axes, not only about one."
@@ -531,7 +533,7 @@ def test_motion_that_leaves_an_offset_from_an_only_robot_open_is_named(
     motion, words, left_open, mount, seen
 ):
     with pytest.raises(DegenerateError, match=words) as caught:
-        align(seen(simulate(CellOptions(mount=mount, motion=motion))))
+        calibrate(seen(simulate(CellOptions(mount=mount, motion=motion))))
     culprit, frame = caught.value.culprits[0], "the cell"
     if seen is one_camera:
         frame = "the tool" if mount == "eye-in-hand" else "the base"
@@ -547,7 +549,7 @@ def test_a_view_of_a_whole_cell_that_allows_two_poses_is_left_out():
             target=small, pixel_sigma_px=0.3, distance_m=(1.0, 1.5), tilt_rad=(0.0, 0.5), seed=3
         )
     )
-    found = align(session_of(cell), corners=dict(enumerate(cell.corners)))
+    found = calibrate(session_of(cell), corners=dict(enumerate(cell.corners)))
     reasons = calibrated(cell, joints=False).reasons
     assert reasons[4] == "ambiguous: two poses of the target fit image and motion alike"
     assert {view.view: view.reason for view in found.views}[4] == reasons[4]
@@ -556,11 +558,11 @@ def test_a_view_of_a_whole_cell_that_allows_two_poses_is_left_out():
 def test_two_stops_of_an_only_robot_are_too_few():
     cell = simulate(CellOptions(mount="eye-to-hand", views=2))
     with pytest.raises(DegenerateError, match="2 usable stops of the robot, at least 3"):
-        align(one_camera(cell))
+        calibrate(one_camera(cell))
     with pytest.raises(
         DegenerateError, match=r"too few, .* all 2 stops of the robot turn"
     ) as caught:
-        align(two_cameras(cell))
+        calibrate(two_cameras(cell))
     assert "see target at 5 stops or more" in caught.value.next_step
 
 
@@ -630,7 +632,7 @@ def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
         for view, corner in corners.items()
     }
     kept, without = (
-        align(replace(session, views=tuple(views)), corners=mapping)
+        calibrate(replace(session, views=tuple(views)), corners=mapping)
         for mapping in (
             spoilt,
             {view: corner for view, corner in corners.items() if view not in held},
@@ -644,7 +646,7 @@ def test_rows_held_back_have_no_part_in_frames_lenses_and_noise(clean):
     # Their residuals are told all the same: three pixels in each coordinate.
     px = [view.rms_px for view in kept.views if not view.used]
     assert np.sqrt(np.mean(np.square(px))) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.1)
-    found = align(replace(session, views=tuple(views)), corners=corners)
+    found = calibrate(replace(session, views=tuple(views)), corners=corners)
     written = to_document(found)["validation"]
     # Left out once or in turn is the same to chance, of so many views; in its pair, of some.
     assert written["holdout"]["px"] == pytest.approx(written["held_out"]["px"], rel=0.3)
@@ -675,7 +677,7 @@ def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
     cell, _ = clean
     session, corners = cell_session(cell, "cell", seen="names"), dict(enumerate(cell.corners))
     moved = with_elbow_of_b(session, lambda value: value | {"q3_rad": value["q3_rad"] + 0.2})
-    found = align(moved, corners=corners)
+    found = calibrate(moved, corners=corners)
     (words,) = [reason for reason in found.verdict.reasons if "elbow_joint" in reason]
     assert words.startswith("Robot b: the joint angles do not belong to ur5e as they are declared.")
     assert "moved by -11.4" in words
@@ -684,13 +686,13 @@ def test_joints_of_one_robot_are_held_against_what_the_cameras_see(clean):
     assert squared < 22.0
     turned = with_elbow_of_b(session, lambda value: value | {"q3_rad": -value["q3_rad"]})
     with pytest.raises(DataError, match=r"^robot b: .* not those of ur5e .* of the opposite sign"):
-        align(turned, corners=corners)
+        calibrate(turned, corners=corners)
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_one_camera_on_one_robot_is_a_cell_of_one(mount):
     session = cell_session(simulate(CellOptions(mount=mount, views=15)), "cell", seen="poses")
-    found, other = align(session), calibrate(session)
+    found, other = calibrate(session), calibrate(session)
     assert to_document(replace(found, created="")) == to_document(replace(other, created=""))
     stood = session.views[0].base_from_flange().as_matrix()
     first, second = (found.edges[edge].matrix for edge in found.edges)
@@ -716,8 +718,6 @@ def test_one_robot_with_two_fixed_cameras_is_calibrated_by_the_same_way(tmp_path
     assert done.status == 0
     written = json.loads((out / "calibration.json").read_text())
     assert written == json.loads(done.out)
-    aligned = json.loads((out / "alignment.json").read_text())
-    assert aligned["transforms"] == written["transforms"]
     assert set(written["transforms"]) == {
         "cell_from_cam_left",
         "cell_from_cam_right",
@@ -739,7 +739,7 @@ def test_an_arm_that_bends_is_as_elastic_in_a_cell_as_by_itself(tmp_path):
     )
     cell_session(bending, "pairs", seen="poses").save(tmp_path / "pairs")
     alone = calibrate(Session.load(tmp_path / "pairs"))
-    cell = align(two_cameras(bending)).of(camera="left")
+    cell = calibrate(two_cameras(bending)).of(camera="left")
     assert cell.arm.level == "elastic"
     assert alone.arm.level == "elastic"
     rows = zip(*(calibration.elastic.joints for calibration in (alone, cell)), springs, strict=True)
@@ -772,7 +772,9 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     crept = exp(share * np.array([0, 0, 0, 0, 6e-4, 0])) @ cell.robots["a"].base_from_flange
     session, corners = reported(cell, "a", crept)
     (said,) = [
-        reason for reason in align(session, corners=corners).verdict.reasons if "drift" in reason
+        reason
+        for reason in calibrate(session, corners=corners).verdict.reasons
+        if "drift" in reason
     ]
     assert said.startswith("Robot a: residuals drift with time")
     # Forty stops that repeat to 0.03 mm leave some 0.03 mm of what crept by 0.6 mm.
@@ -780,7 +782,7 @@ def test_what_is_no_noise_of_a_robot_is_said_of_that_robot():
     rng = np.random.default_rng(1)
     alike = np.repeat(rng.standard_normal((10, 6)) * np.repeat([4e-4, 2e-4], 3), 4, axis=0)
     session, corners = reported(cell, "b", cell.robots["b"].base_from_flange @ exp(alike))
-    found = align(session, corners=corners)
+    found = calibrate(session, corners=corners)
     assert any(reason.startswith("Robot b: neighbouring stops") for reason in found.verdict.reasons)
     assert not any(reason.startswith("Robot a:") for reason in found.verdict.reasons)
     _, squared = off(cell, found, "base_a", "base_b")

@@ -55,7 +55,7 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def out(folder, tmp_path_factory) -> Path:
     found = tmp_path_factory.mktemp("out")
-    assert visioncal("align", folder, "-o", found).status == 0
+    assert visioncal("calibrate", folder, "-o", found).status == 0
     return found
 
 
@@ -79,7 +79,7 @@ def test_cameras_exchanged_in_all_rows_are_told_by_the_size_of_their_images(fold
     shutil.copytree(folder, wrong)
     other = {"left": "right", "right": "left"}
     edit_rows(wrong, lambda rows: [row | {"camera": other[row["camera"]]} for row in rows])
-    done = visioncal("align", wrong, "-o", tmp_path / "out")
+    done = visioncal("calibrate", wrong, "-o", tmp_path / "out")
     assert done.status == 2
     assert "that is the size of camera right's" in done.err
     assert "Where left and right are exchanged in the column camera of views.csv" in done.err
@@ -99,8 +99,8 @@ def test_what_was_detected_lies_over_the_image_of_the_camera_that_saw_it(folder,
 def test_the_recording_is_the_session_and_holds_the_result(folder, out, tmp_path):
     recording = out / "recording.rrd"
     assert Session.load(recording).digest() == Session.load(folder).digest()
-    assert visioncal("align", recording, "-o", tmp_path / "again").status == 0
-    texts = [(value / "alignment.json").read_text() for value in (out, tmp_path / "again")]
+    assert visioncal("calibrate", recording, "-o", tmp_path / "again").status == 0
+    texts = [(value / "calibration.json").read_text() for value in (out, tmp_path / "again")]
     # Commands name the session that each was made from, and the folder that it was written to.
     paths = {str(recording): str(folder), str(tmp_path / "again"): str(out)}
     for path, same in paths.items():

@@ -368,11 +368,11 @@ def test_the_result_is_in_the_convention_that_is_asked_for(calibrated_cell, conv
     places = found["workspace_map"]
     assert 150 < len(places) <= 200
     assert all(0.0 < place["sigma_mm"] < 5.0 and place["z_m"] > 0.0 for place in places)
-    worths = [value["worth"] for value in found["stops"]]
+    worths = [value["influence"] for value in found["stops"]]
     assert worths == sorted(worths, reverse=True)
     assert {value["view"] for value in found["stops"]} == set(known.used)
     counts = found["observability"]
-    assert (counts["columns"], counts["identifiable"], counts["told"]) == (48, 30, 30)
+    assert (counts["columns"], counts["identifiable"], counts["determined"]) == (48, 30, 30)
     assert counts["condition"] == pytest.approx(1.0 / counts["o2"])
 
 

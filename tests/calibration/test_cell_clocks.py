@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.swept_cells import AHEAD_S, cell_of, swept_session
 
-from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.simulation.layout import NetworkOptions
@@ -24,7 +24,7 @@ def swept():
 @pytest.fixture(scope="module")
 def found(swept):
     _, session, corners = swept
-    return align(session, corners=corners)
+    return calibrate(session, corners=corners)
 
 
 def test_the_offset_of_one_camera_is_found_by_the_motion(found):
@@ -60,7 +60,7 @@ def test_a_camera_that_saw_nothing_else_is_placed_as_its_covariance_says(swept, 
 def test_what_is_stated_of_one_camera_is_contradicted_by_name(swept):
     _, session, corners = swept
     document = {**session.document, "clocks": {"side": {"camera_minus_robot_s": 0.02}}}
-    found = align(replace(session, document=document), corners=corners)
+    found = calibrate(replace(session, document=document), corners=corners)
     (doubt,) = [reason for reason in found.verdict.reasons if "is stated as +20.00 ms" in reason]
     assert doubt.startswith(CLOCK)
     assert found.cell.details.clocks[CLOCK].stated_s == 0.02
@@ -71,7 +71,7 @@ def test_a_clock_of_no_camera_is_refused(swept):
     _, session, corners = swept
     document = {**session.document, "clocks": {"sied": {"camera_minus_robot_s": 0.02}}}
     with pytest.raises(DataError, match=r"clocks\.sied is of no camera"):
-        align(replace(session, document=document), corners=corners)
+        calibrate(replace(session, document=document), corners=corners)
 
 
 @pytest.mark.slow
@@ -80,7 +80,7 @@ def test_rows_whose_motion_tells_no_offset_are_left_out_and_say_so(swept):
     _, session, corners = swept
     timed = [view for view in session.views if view.stamp_s is not None]
     views = tuple(view for view in session.views if view.stamp_s is None or view in timed[:5])
-    found = align(replace(session, views=views), corners=corners)
+    found = calibrate(replace(session, views=views), corners=corners)
     lost = [view for view in found.views if view.seer == "cam_side"]
     assert len(lost) == 5
     assert all(not view.used and "clock" in view.reason for view in lost)

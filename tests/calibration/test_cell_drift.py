@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.results import Calibration
@@ -44,7 +44,7 @@ def session(cell):
 
 
 def aligned(cell, session, level):
-    return align(session, corners={corner.view: corner for corner in cell.corners}, level=level)
+    return calibrate(session, corners={corner.view: corner for corner in cell.corners}, level=level)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from visioncal.calibration.pipeline import align
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert, log
 from visioncal.simulation import simulate
@@ -25,7 +25,7 @@ def cell():
 def aligned(cell, prior, **columns):
     session = cell_session(cell, "cell", seen="names")
     session = replace(session, document={**session.document, "prior": prior}, **columns)
-    return align(session, corners={corner.view: corner for corner in cell.corners})
+    return calibrate(session, corners={corner.view: corner for corner in cell.corners})
 
 
 def whole(matrix, sigma_m, sigma_rad):
@@ -85,12 +85,12 @@ def test_a_camera_that_sees_nothing_of_the_rest_is_tied_by_a_drawing():
         if view.text.get("camera") != "left" or view.text.get("target") != "floor"
     ]
     corners = {view_corners.view: view_corners for view_corners in cell.corners}
-    loose = align(replace(session, views=tuple(kept)), corners=corners)
+    loose = calibrate(replace(session, views=tuple(kept)), corners=corners)
     assert {untied.frame for untied in loose.cell.untied} == {"cam_right", "target_floor"}
     rig = cell.between("cam_left", "cam_right")
     prior = {"cam_left_from_cam_right": whole(rig, 1e-4, 1e-4)}
     document = {**session.document, "prior": prior}
-    found = align(replace(session, views=tuple(kept), document=document), corners=corners)
+    found = calibrate(replace(session, views=tuple(kept), document=document), corners=corners)
     assert not found.cell.untied
     edge = found.between("base_a", "target_floor")
     away = log(invert(cell.between("base_a", "target_floor")) @ edge.matrix)

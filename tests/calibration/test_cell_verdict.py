@@ -9,7 +9,7 @@ from support.commands import visioncal
 from support.problems import observed, pose, world
 from support.whole_cells import FLOOR, OPTIONS, PLATE, part, recorded
 
-from visioncal.calibration.pipeline import align, misread_poses, running
+from visioncal.calibration.pipeline import calibrate, misread_poses, running
 from visioncal.calibration.pipeline.checkup import doctor
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.interchange.formats.view_exchange import exchange_views
@@ -87,7 +87,7 @@ def poses(session, robot):
 
 
 def test_a_sound_cell_is_good_and_says_how_good(session):
-    found = align(session)
+    found = calibrate(session)
     assert found.verdict.status == "good"
     good_for, reason = found.verdict.reasons
     assert good_for.startswith("It is good for tasks of ")
@@ -105,7 +105,7 @@ def test_poses_are_counted_by_robot_and_stop(session):
 
 def test_frames_that_take_up_a_calibrated_arms_zeros_are_no_doubt():
     slipped = RobotAt("b", CELL.robots[1].place_m, offset_sigma_rad=5e-3)
-    found = align(
+    found = calibrate(
         recorded(simulate(replace(CELL, robots=(CELL.robots[0], slipped), stops=24, seed=0)))
     )
     # No stop tells the zeros of the first joint and of the last one from a base and a plate that
@@ -124,7 +124,7 @@ def test_one_wrong_pose_of_a_robot_is_named(session):
         if view.stop == stop and view.text.get("robot") == "b" and view.cell("x_m"):
             row.update(pose | {"x_m": repr(float(pose["x_m"]) + 0.02)})
 
-    found = align(rewritten(session, push))
+    found = calibrate(rewritten(session, push))
     (reason,) = [reason for reason in found.verdict.reasons if "Robot b did not stand" in reason]
     assert f"at stop {stop} where its pose says: all {len(mine)} views" in reason
     assert "moved by 20 mm" in reason
@@ -147,7 +147,7 @@ def test_a_robot_whose_poses_are_misread_is_named_first(session):
 
     misread = rewritten(session, turn)
     with pytest.raises(DegenerateError) as refused:
-        align(misread)
+        calibrate(misread)
     words = "Robot b: With the robot's rotations as a quaternion w, x, y, z, the chain closes"
     assert str(refused.value).startswith(words)
     assert "rows of robot b in views.csv" in refused.value.next_step
@@ -163,7 +163,7 @@ def test_poses_of_a_robot_that_are_exchanged_are_named(session):
         if other is not None and view.text.get("robot") == "b" and view.cell("x_m"):
             row.update(told[other])
 
-    found = align(rewritten(session, exchange))
+    found = calibrate(rewritten(session, exchange))
     words = f"The poses of robot b at stops {first} and {second} are exchanged: views"
     assert any(reason.startswith(words) for reason in found.verdict.reasons)
     out = [view.view for view in found.views if not view.used]
@@ -176,13 +176,13 @@ def test_two_images_that_are_exchanged_have_a_command_that_mends_them(session):
     of_one = [view.number for view in views if view.text["camera"] == views[0].text["camera"]]
     first, second = of_one[1], of_one[3]
     swapped = exchange_views(session, first, second)
-    found = align(swapped)
+    found = calibrate(swapped)
     (wrong,) = (finding for finding in found.verdict.findings if finding.kind == "exchanged_views")
     assert set(wrong.views) == {first, second}
     assert f"--exchange {first},{second}" in wrong.do.command
     mended = exchange_views(swapped, first, second)
     assert len(mended.declaration.corrected) == 2
-    again = align(mended)
+    again = calibrate(mended)
     assert all(view.used for view in again.views if view.view in (first, second))
     other = next(view.number for view in session.views if view.text["target"] != "plate_b")
     with pytest.raises(DataError, match=r"of another .*target"):
@@ -194,7 +194,7 @@ def test_a_camera_whose_corners_are_bad_is_named(session):
     mine = {view.number for view in session.views if view.text.get("camera") == "right"}
     noise = np.random.default_rng(0).normal(0.0, 1.5, table.px.shape)
     blurred = np.where(np.isin(table.views, list(mine))[:, None], table.px + noise, table.px)
-    verdict = align(replace(session, corner_table=replace(table, px=blurred))).verdict
+    verdict = calibrate(replace(session, corner_table=replace(table, px=blurred))).verdict
     assert verdict.status == "check"
     (reason,) = [reason for reason in verdict.reasons if "corners deviate" in reason]
     assert reason.startswith("cam_right: corners deviate by 1.5 px")
@@ -204,7 +204,7 @@ def test_a_camera_whose_corners_are_bad_is_named(session):
 @pytest.mark.slow
 def test_a_board_of_another_size_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], target=BOARDS["checkerboard"], scale=1.004))
-    verdict = align(recorded(simulate(replace(CELL, boards=boards)))).verdict
+    verdict = calibrate(recorded(simulate(replace(CELL, boards=boards)))).verdict
     assert verdict.status == "check"
     (reason,) = [reason for reason in verdict.reasons if "larger than stated" in reason]
     assert reason.startswith("By the robot's motion the board plate_b is 0.4 % larger than stated")
@@ -213,7 +213,7 @@ def test_a_board_of_another_size_is_named():
 
 def test_a_board_that_is_bent_is_named():
     boards = (*CELL.boards[:2], replace(CELL.boards[2], bow_m=1e-3))
-    verdict = align(recorded(simulate(replace(CELL, boards=boards)))).verdict
+    verdict = calibrate(recorded(simulate(replace(CELL, boards=boards)))).verdict
     assert any(reason.startswith("The board plate_b is not flat") for reason in verdict.reasons)
     assert sum("not flat" in reason for reason in verdict.reasons) == 1
 
@@ -223,7 +223,7 @@ def test_a_lens_that_is_not_as_stated_is_named(session):
     document = deepcopy(dict(session.document))
     matrix = document["cameras"]["right"]["matrix"]
     document["cameras"]["right"]["matrix"] = [1.005 * matrix[0], 1.005 * matrix[1], *matrix[2:]]
-    verdict = align(rewritten(session, lambda *_: None, document)).verdict
+    verdict = calibrate(rewritten(session, lambda *_: None, document)).verdict
     words = "cam_right: the given intrinsics do not fit these images and were refined: fx, fy"
     assert any(reason.startswith(words) for reason in verdict.reasons)
     assert sum("given intrinsics" in reason for reason in verdict.reasons) == 1
@@ -252,14 +252,14 @@ def test_a_lens_of_half_the_resolution_is_named_where_corners_hardly_deviate_by_
     document = deepcopy(dict(session.document))
     matrix = document["cameras"]["right"]["matrix"]
     document["cameras"]["right"]["matrix"] = [0.5 * value for value in matrix]
-    found = align(rewritten(session, lambda *_: None, document))
+    found = calibrate(rewritten(session, lambda *_: None, document))
     assert found.verdict.causes[0].kind == "other_lens"
     assert found.verdict.causes[0].words.startswith("cam_right: the stated matrix is for images")
     assert all(view.used for view in found.views)
 
 
 def test_few_stops_are_told_by_robot(session):
-    verdict = align(part(session, 0, 8)).verdict
+    verdict = calibrate(part(session, 0, 8)).verdict
     assert verdict.status == "check"
     for robot in ("a", "b"):
         assert any(
@@ -307,7 +307,7 @@ def test_motion_about_one_axis_is_refused_with_what_it_leaves_open():
     with pytest.raises(
         DegenerateError, match="all 14 stops of robot b turn about base_b's z"
     ) as caught:
-        align(turned(0.0))
+        calibrate(turned(0.0))
     assert caught.value.culprits == ("base_b's offset along base_b's z",)
     assert "add 3 or more stops in which flange_b is tilted" in caught.value.next_step
 
@@ -316,14 +316,14 @@ def test_poor_motion_is_refused_with_the_direction_that_it_leaves_open():
     with pytest.raises(
         DegenerateError, match="offset along the cell's z has a predicted"
     ) as caught:
-        align(turned(0.3))
+        calibrate(turned(0.3))
     assert "base_b's offset along the cell's z" in caught.value.culprits
     assert "all 14 stops of robot b turn about base_b's z to within 0." in caught.value.message
 
 
 def test_noise_refuses_nothing():
     # Thirty times a usual camera's and robot's.
-    verdict = align(turned(35.0, noise=30.0)).verdict
+    verdict = calibrate(turned(35.0, noise=30.0)).verdict
     assert verdict.status == "bad"
     assert any("Weakly determined by the motion" in reason for reason in verdict.reasons)
     assert sum("Left out of the fit, views disagree" in reason for reason in verdict.reasons) == 1
@@ -342,7 +342,7 @@ def test_a_board_of_another_size_is_named_with_all_views_used(which, scale, seed
     boards = list(CELL.boards)
     boards[which] = replace(boards[which], target=BOARDS["checkerboard"], scale=scale)
     cell = replace(CELL, boards=tuple(boards), stops=24, seed=seed)
-    found = align(recorded(simulate(cell)))
+    found = calibrate(recorded(simulate(cell)))
     assert found.verdict.causes[0].kind == "board_size"
     assert words in found.verdict.causes[0].words
     assert all(view.used for view in found.views)
@@ -355,7 +355,7 @@ def test_a_robot_in_millimetres_is_named_with_its_reading(session):
 
     misread = rewritten(session, in_millimetres)
     with pytest.raises(DegenerateError) as caught:
-        align(misread)
+        calibrate(misread)
     assert caught.value.message.startswith("Robot a: With the robot's positions in mm, the chain")
     assert "base_from_flange in metres" in caught.value.next_step
     (found,) = [finding for finding in doctor(misread).findings if finding.kind == "misread_poses"]
@@ -390,7 +390,7 @@ def test_exchanged_names_are_the_cause_that_is_said_first(session, kind, names, 
 
     wrong = rewritten(part(session, 0, 10), exchanged)
     with pytest.raises(DegenerateError) as caught:
-        align(wrong)
+        calibrate(wrong)
     assert caught.value.message.startswith(words)
     assert f"In the column {kind} of views.csv, write {names[1]} for {names[0]}" in (
         caught.value.next_step
@@ -403,7 +403,7 @@ def test_exchanges_are_tried_only_where_views_disagree(session, monkeypatch):
     # A cell that is sound has no pair that does not close.
     monkeypatch.setattr(misread_poses, "exchanged_names", None)
     monkeypatch.setattr(running, "exchanged_names", None)
-    assert align(session).verdict.status == "good"
+    assert calibrate(session).verdict.status == "good"
     assert not [
         finding for finding in doctor(session).findings if finding.kind == "exchanged_names"
     ]
@@ -413,7 +413,7 @@ def test_exchanges_are_tried_only_where_views_disagree(session, monkeypatch):
 def test_poses_that_were_measured_worse_than_others_are_no_outliers(seed):
     # A board that is seen squarely turns unseen: errors of its pose have no single size.
     poses = cell_session(simulate(replace(CELL, seed=seed)), "two arms", seen="poses")
-    found = align(poses)
+    found = calibrate(poses)
     assert found.verdict.status == "good"
     assert all(view.used for view in found.views)
 
@@ -421,5 +421,5 @@ def test_poses_that_were_measured_worse_than_others_are_no_outliers(seed):
 def test_a_few_uneven_poses_are_no_move(tmp_path):
     simulated = ("simulate", tmp_path / "cell", "--cell", "camera-and-tracker", "--no-images")
     assert visioncal(*simulated, "--seed", "6").status == 0
-    found = align(Session.load(tmp_path / "cell"))
+    found = calibrate(Session.load(tmp_path / "cell"))
     assert (found.verdict.status, found.cell.moved) == ("good", ())

@@ -24,7 +24,7 @@ from support.rigs import (
     write_two_targets,
 )
 
-from visioncal import align, calibrate
+from visioncal import calibrate
 from visioncal.calibration.pipeline import run
 from visioncal.calibration.stages.corner_numbers import OTHER_NUMBERS
 from visioncal.calibration.stages.detect import detect
@@ -450,7 +450,7 @@ def test_targets_of_rows_are_those_of_their_views(tmp_path):
 
 
 def test_a_cell_of_two_cameras_is_aligned(tmp_path):
-    found = align(write_two_cameras(tmp_path / "cell"))
+    found = calibrate(write_two_cameras(tmp_path / "cell"))
     x, z = truth(IN_HAND)
     for name, true in {
         "flange_from_cam_left": x,

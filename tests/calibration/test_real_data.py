@@ -94,7 +94,7 @@ def test_two_cameras_of_one_arm_are_one_cell(real_data, tmp_path):
         '[targets.board]\ntarget = "target.toml"\n'
         '[frames]\ncam_c1 = "cell"\ncam_c4 = "cell"\ntarget_board = "flange_a"\n'
     )
-    result = visioncal.align(tmp_path)
+    result = visioncal.calibrate(tmp_path)
     assert "stops 25 and 26 are exchanged" in result.verdict.top[0]
     assert any(move.frame == "cam_c4" for move in result.cell.moved)
 

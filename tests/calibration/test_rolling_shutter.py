@@ -8,7 +8,7 @@ from support.cells import calibrated_sweep
 from support.marks import slow
 from support.swept_cells import HOW, cell_of, swept_session
 
-from visioncal.calibration.pipeline import align, calibrate
+from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.run_state import RunState
 from visioncal.calibration.stages import clock_sweep
 from visioncal.core.transforms import exp, invert, log
@@ -170,7 +170,7 @@ def test_poses_that_others_measured_say_nothing_of_rows():
 def test_a_camera_of_a_whole_cell_has_its_own():
     cell = cell_of(NetworkOptions(stops=16, seed=1), replace(HOW, readout_s=READOUT_S))
     session, corners = swept_session(cell)
-    found = align(session, corners=corners)
+    found = calibrate(session, corners=corners)
     (told,) = found.cell.details.clocks.values()
     shutter = told.shutter
     assert shutter.kind == "rolling"

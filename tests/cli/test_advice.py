@@ -164,7 +164,7 @@ def test_of_a_whole_cell(place):
         return row | ({"x_m": str(float(row["x_m"]) + 0.03)} if is_there else {})
 
     edit_rows(place / "cell", lambda rows: [*map(pushed, rows)])
-    done = visioncal("align", "cell", "-o", "out")
+    done = visioncal("calibrate", "cell", "-o", "out")
     assert done.status == 0
     assert printed_commands(done.said), done.said
     assert list(failures(done.said)) == []

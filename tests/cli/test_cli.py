@@ -318,8 +318,7 @@ def test_the_listing_has_the_first_words_of_each_command_s_own_help(path):
     for name in path:
         group = group.imported(name)
     assert isinstance(group, LazyGroup)
-    # The help of `align` is that of `calibrate`, whose other name it is.
-    listed = {name: words for name, words in group.listed.items() if name != "align"}
+    listed = dict(group.listed)
     own = {name: group.imported(name).help.split("\n\n")[0] for name in listed}
     assert listed == {name: " ".join(words.split()) for name, words in own.items()}
 
@@ -350,12 +349,6 @@ CHOICES = {
     },
     "fixture": {"cad_unit": UNITS_M},
 }
-
-
-def test_align_is_another_name_for_calibrate():
-    calibrate, align = (get_command(app).imported(name) for name in ("calibrate", "align"))
-    assert [param.opts for param in align.params] == [param.opts for param in calibrate.params]
-    assert align.help == calibrate.help
 
 
 @pytest.mark.parametrize("name", CHOICES)

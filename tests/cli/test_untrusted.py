@@ -8,7 +8,6 @@ from support.commands import visioncal
 
 COMMANDS = (
     ("calibrate", "{}", "-o", "out"),
-    ("align", "{}", "-o", "out"),
     ("convert", "{}", "out"),
     ("report", "{}"),
     ("export", "{}", "--to", "ros"),

@@ -16,8 +16,7 @@ from visioncal.core.files import write_json
 from visioncal.core.transforms import adjoint, invert
 from visioncal.interchange.exports import Selection, document, export
 from visioncal.interchange.result_files import load_calibration, load_exportable
-from visioncal.results import CameraResult, Verdict
-from visioncal.results.document import to_alignment
+from visioncal.results import CameraResult, Verdict, to_document
 from visioncal.session.choosing import Choice
 from visioncal.simulation import fisheye_camera, wide_camera
 
@@ -26,7 +25,7 @@ POSE = {"rotation": ("x", "y", "z", "w"), "translation": ("x", "y", "z")}
 
 
 def test_any_frame_is_written_in_any_other(tmp_path):
-    write_json(tmp_path / "alignment.json", to_alignment(CELL, CELL.cell))
+    write_json(tmp_path / "calibration.json", to_document(CELL))
     source = load_exportable(tmp_path)
     text = export(source, "text", Selection("base_b_from_cam_top"))
     expected = (
@@ -147,8 +146,8 @@ def test_a_bad_verdict_is_warned_of():
 
 
 def test_what_needs_one_camera_takes_the_only_one_that_fits(tmp_path):
-    write_json(tmp_path / "alignment.json", to_alignment(CELL, CELL.cell))
-    for path in (tmp_path, tmp_path / "alignment.json"):
+    write_json(tmp_path / "calibration.json", to_document(CELL))
+    for path in (tmp_path, tmp_path / "calibration.json"):
         found = load_calibration(path)
         expected = CELL.between("base_b", "cam_top")
         np.testing.assert_allclose(found.edges["base_from_cam"].matrix, expected.matrix)

@@ -132,7 +132,7 @@ def test_the_pictures_have_words_for_those_who_do_not_see_them(html):
 
 def test_results_without_what_later_versions_add_are_shown_with_what_they_have(sample):
     document = calibrated()
-    for name in ("workspace_map", "not_told", "stops", "left_out", "convention"):
+    for name in ("workspace_map", "not_determined", "stops", "left_out", "convention"):
         del document[name]
     for value in document["parameters"]:
         del value["sigma"]

@@ -1,7 +1,6 @@
 """Recordings of aligned cells: the session and the result lie in them without loss."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from visioncal.core.transforms import invert, pose_difference
 from visioncal.interchange.exports import Selection, export
 from visioncal.interchange.outputs import write_outputs
 from visioncal.interchange.result_files import load_exportable
-from visioncal.present.recording import paths, read_calibration, read_evidence, read_session
+from visioncal.present.recording import paths, read_calibration, read_session
 from visioncal.present.recording.reader import chunks
 from visioncal.present.recording.rrd_messages import scan
 from visioncal.present.recording.scene import SceneDrawing
@@ -22,7 +21,6 @@ from visioncal.results import Calibration, Edge, ViewResult, to_document
 from visioncal.session import MemoryImages, Session
 from visioncal.simulation import BoardAt, CameraAt, NetworkOptions, cell_session, simulate
 
-KEPT = Path(__file__).parents[1] / "data"
 OPTIONS = NetworkOptions(
     cameras=(CameraAt("top"), CameraAt("hand", "a")),
     boards=(BoardAt("plate", "b"), BoardAt("floor")),
@@ -81,7 +79,6 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
     files = write_outputs(tmp_path / "out", session, Run(found, ())).files
     assert [file.name for file in files] == [
         "calibration.json",
-        "alignment.json",
         "report.html",
         "recording.rrd",
     ]
@@ -96,16 +93,6 @@ def test_session_and_result_come_back_from_the_recording(cell, session, tmp_path
     for entity in ("/cameras/top", "/targets/plate/sheet", "/robots/b/links", "/sight"):
         assert entity in drawn
     assert "/network" in drawn
-
-
-def test_recordings_of_cells_by_earlier_versions_open():
-    kept = KEPT / "recording_of_cell.rrd"
-    calibration = read_calibration(kept)
-    assert calibration.cell.tree["target_plate"] == "flange_b"
-    assert calibration.verdict.status == "good"
-    assert calibration.session_sha256 == read_session(kept).digest()
-    assert len(calibration.views) == len(read_session(kept).views)
-    assert read_evidence(kept) == ()
 
 
 def test_a_changed_result_is_noticed(cell, session, tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from rerun.chunk import OptimizationProfile, RrdReader
-from support.kept import KEPT, assert_same, kept_session, kept_streams
+from support.kept import assert_same
 from support.samples import Sample, made_up
 
 from visioncal.core.errors import DataError
@@ -21,7 +21,7 @@ from visioncal.core.types import Corners
 from visioncal.present.recording import codec, notes, paths, read_session, write_recording
 from visioncal.present.viewer import blueprint
 from visioncal.results.evidence import ViewEvidence, magnification
-from visioncal.session import MemoryImages, Session, Stream
+from visioncal.session import MemoryImages, Session
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "sessions"
 
@@ -94,14 +94,6 @@ def test_odd_facts_survive(tmp_path: Path) -> None:
     assert_same(session, read_session(write_session(tmp_path / "odd.rrd", session)))
 
 
-@pytest.mark.parametrize(("version", "streams"), [(1, {}), (2, {}), (3, kept_streams())])
-def test_recordings_of_all_formats_open(version: int, streams: dict[str, Stream]) -> None:
-    kept = kept_session().with_streams(streams)
-    again = read_session(KEPT / f"recording_format_{version}.rrd")
-    assert_same(kept, again)
-    assert again.warnings == kept.warnings
-
-
 def test_newer_format_names_the_version_that_it_needs(
     sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,6 +104,17 @@ def test_newer_format_names_the_version_that_it_needs(
     with pytest.raises(DataError, match=f"format {codec.FORMAT + 1}") as error:
         read_session(path)
     assert "Install visioncal 9.1 or newer" in error.value.next_step
+
+
+def test_an_older_format_asks_for_the_session(
+    sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as older:
+        older.setattr(codec, "FORMAT", codec.FORMAT - 1)
+        path = write_session(tmp_path / "older.rrd", sample.session)
+    with pytest.raises(DataError, match=f"format {codec.FORMAT - 1}") as error:
+        read_session(path)
+    assert "folder again" in error.value.next_step
 
 
 def test_recording_that_rerun_saved_again_opens(

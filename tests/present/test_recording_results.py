@@ -6,12 +6,9 @@ from pathlib import Path
 
 import pytest
 from support.kept import (
-    KEPT,
     assert_same,
     assert_same_evidence,
     cells,
-    kept_calibration,
-    kept_evidence,
 )
 from support.samples import Sample, made_up
 
@@ -63,16 +60,6 @@ def test_results_come_back_exactly(sample: Sample, tmp_path: Path) -> None:
     alone = Calibration.load(tmp_path / "calibration.json")
     assert to_document(calibration) == to_document(alone)
     assert_same_evidence(evidence, read_evidence(path))
-
-
-def test_results_of_the_kept_recording_open() -> None:
-    kept = KEPT / "recording_format_2.rrd"
-    calibration = read_calibration(kept)
-    assert calibration is not None
-    ours, theirs = to_document(kept_calibration()), to_document(calibration)
-    # The version is that of the program that writes the document.
-    assert {**theirs, "visioncal": ""} == {**ours, "visioncal": ""}
-    assert_same_evidence(kept_evidence(), read_evidence(kept))
 
 
 def test_session_alone_has_no_results(captured: Path) -> None:

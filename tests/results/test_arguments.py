@@ -19,7 +19,6 @@ BOARD = "charuco_9x6_30mm"
 METHODS = {
     "Session": ("load", "from_arrays", "from_corners"),
     "Calibration": ("load",),
-    "Alignment": ("load",),
     "CalibratedArm": ("of",),
     "Plane": ("horizontal", "of_frame", "through"),
     "Loads": ("alike",),

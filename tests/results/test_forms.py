@@ -8,8 +8,7 @@ from support.aligned_cells import made_up_cell
 from support.samples import made_up, with_frames
 
 from visioncal.core.errors import DataError
-from visioncal.results import Alignment, Calibration
-from visioncal.results.document import to_alignment
+from visioncal.results import Calibration, to_document
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +47,7 @@ def calibrated(tmp_path_factory) -> str:
         (("elastic",), {"weight_moments": [[1], [1, 2]]}, "an array of n x n numbers"),
         (("kinematics",), {"level": "offsets", "robot": {"joint": 1}}, "robot: name is missing"),
         (("mount",), "eye-to-hand", r"transforms.base_from_cam is missing, and mount is 'eye-to"),
-        (("schema",), 9, r"schema is 9, this version reads 1\. A newer"),
+        (("schema",), 9, r"schema is 9, this version reads 2\. A newer"),
     ],
 )
 def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path: Path, place, value, words):
@@ -67,14 +66,14 @@ def test_what_a_calibration_does_not_hold_is_named(calibrated, tmp_path: Path, p
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("observations", [{"view": 0}], r"observations\[0\].used is missing"),
+        ("views", [{"view": 0}], r"views\[0\]\.[a-z]+ is missing"),
         ("noise", {"a": {"translation_mm": "0.1"}}, "noise.a.translation_mm is '0.1'"),
         ("cameras", [], r"cameras is \[\]; a table is needed"),
         ("weakest", None, "weakest is None; a text is needed"),
     ],
 )
-def test_what_an_alignment_does_not_hold_is_named(tmp_path: Path, key, value, words):
-    path, cell = tmp_path / "alignment.json", made_up_cell(1)
-    path.write_text(json.dumps(to_alignment(cell, cell.cell) | {key: value}))
+def test_what_a_cell_s_result_does_not_hold_is_named(tmp_path: Path, key, value, words):
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(to_document(made_up_cell(1)) | {key: value}))
     with pytest.raises(DataError, match=words):
-        Alignment.load(path)
+        Calibration.load(path)

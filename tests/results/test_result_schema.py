@@ -37,7 +37,7 @@ def test_what_is_shipped_is_what_the_types_say():
 
 
 @pytest.mark.parametrize("name", ["elastic", "warm", "pick"])
-def test_earlier_files_keep_it(name):
+def test_stored_files_keep_it(name):
     assert faults(stored(name)) == []
 
 

@@ -25,7 +25,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import invert, log
 from visioncal.interchange.result_files import load_result
-from visioncal.results import Alignment, Calibration, RobotResult, to_document
+from visioncal.results import Calibration, RobotResult, to_document
 from visioncal.robot import Robot
 from visioncal.session import Session
 from visioncal.simulation import BoardAt, NetworkOptions, RobotAt, cell_session, simulate
@@ -60,7 +60,7 @@ def found(folder):
 
 def test_the_file_has_the_sections_of_one_camera_by_name(folder):
     written = json.loads((folder / "out" / "calibration.json").read_text())
-    assert written["schema"] == 1
+    assert written["schema"] == 2
     assert set(written["cameras"]) == {"left", "hand"}
     assert set(written["robots"]) == {"a", "b"}
     assert set(written["targets"]) == {"floor", "plate_a", "plate_b"}
@@ -160,19 +160,6 @@ def test_it_reads_back_as_it_was_written(found, folder, tmp_path):
     one = (folder / "out" / "calibration.json").read_text()
     assert (tmp_path / "again.json").read_text() == one
     assert to_document(load_result(folder / "out" / "recording.rrd")) == json.loads(one)
-
-
-def test_an_alignment_of_an_older_version_opens(found, folder, tmp_path):
-    (tmp_path / "alignment.json").write_text((folder / "out" / "alignment.json").read_text())
-    for path in (tmp_path, tmp_path / "alignment.json"):
-        old = Calibration.load(path).of("left", "b")
-        new = found.of("left", "b")
-        np.testing.assert_array_equal(old.joint_covariance, new.joint_covariance)
-        assert old.noise == new.noise
-        assert old.robot is None
-    assert Alignment.load(tmp_path).edges.keys() == found.edges.keys()
-    with pytest.raises(DataError, match="does not hold the covariance of its fit"):
-        verify(Session.load(folder / "later").of("left", "b"), old)
 
 
 @pytest.mark.parametrize(("camera", "robot", "target"), PAIRS)
@@ -315,19 +302,9 @@ def test_further_stages_of_a_robot_stand_in_its_section(found, tmp_path):
     )
 
 
-def test_errors_of_the_arms_are_said_where_a_part_does_not_have_them(found):
-    details = replace(found.cell.details, further={"arms": {"a": {}}})
-    fitted = replace(found, cell=replace(found.cell, details=details))
-    verdict = fitted.of("left", "a").verdict
-    assert verdict.status == "check"
-    assert "errors of its arms" in verdict.reasons[0]
-
-
 def test_the_result_of_one_pair_replaces_that_of_the_cell(folder, tmp_path):
     Session.load(folder / "session").of("left", "b").save(tmp_path / "one")
-    (tmp_path / "alignment.json").write_text("of the cell")
     assert visioncal("calibrate", tmp_path / "one", "-o", tmp_path).status == 0
-    assert not (tmp_path / "alignment.json").exists()
     assert Calibration.load(tmp_path).cell is None
 
 

@@ -7,7 +7,7 @@ import pytest
 from support.commands import visioncal
 from support.wrong_arms import target_in_camera
 
-from visioncal.calibration.pipeline import align, calibrate
+from visioncal.calibration.pipeline import calibrate
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import invert
 from visioncal.estimation.workspace import postures
@@ -62,7 +62,7 @@ def error_mm(cell, calibration) -> float:
 
 def test_an_arm_is_known_better_from_several_sessions_than_from_one(cells, sessions):
     alone = calibrate(sessions[0], level="offsets")
-    joined = align(join_sessions(sessions), level="offsets")
+    joined = calibrate(join_sessions(sessions), level="offsets")
     parts = [joined.of(camera=name, target=name) for name in ("s1", "s2")]
     sigma, before = (calibration.arm.workspace_sigma_mm.median for calibration in (parts[0], alone))
     # Three times the stops: 0.6 of the sigma, less what the session's own frames leave.

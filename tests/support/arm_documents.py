@@ -69,10 +69,10 @@ def calibrated() -> dict[str, Any]:
             {"x_m": x, "y_m": y, "z_m": z, "sigma_mm": 0.05 + 0.1 * float(np.hypot(x, y))}
             for x, y, z in places.tolist()
         ],
-        "observability": {"columns": 48, "identifiable": 30, "told": 29, "condition": 54.2}
+        "observability": {"columns": 48, "identifiable": 30, "determined": 29, "condition": 54.2}
         | {"o1": 0.21, "o2": 0.0184, "o3": 0.0031, "o4": 6e-5, "o5": 0.0012},
-        "not_told": [NOT_TOLD],
-        "stops": [{"view": view, "worth": worth} for view, worth in WORTH.items()],
+        "not_determined": [NOT_TOLD],
+        "stops": [{"view": view, "influence": influence} for view, influence in WORTH.items()],
         "left_out": [_unseen(view) for view in (0, 1, 2, 4, 5, 7, 8)],
     }
 

@@ -5,10 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from visioncal.core.types import Corners
-from visioncal.results import Calibration, Edge, Rms, SolverResult, Validation, Verdict, ViewResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.session import MemoryImages, Session, Stream, View
 
@@ -88,38 +85,3 @@ def kept_streams() -> dict[str, Stream]:
     """What the newest of the kept recordings holds besides."""
     samples = np.array([[0.0, 0.1, 20.5], [1e-3, -0.0, np.nan], [2e-3, 1e300, -5e-324]])
     return {"robot": Stream(("stamp_s", "q1_rad", "temp1_c"), samples)}
-
-
-def kept_calibration() -> Calibration:
-    """The result in the newest of the kept recordings."""
-    base_from_cam = RigidTransform.from_components(
-        [0.1, 1 / 3, -0.7], Rotation.from_quat([0.5, 0.5, 0.5, 0.5])
-    )
-    flange_from_target = RigidTransform.from_components([0.0, 0.0, 0.1], Rotation.identity())
-    covariance = np.diag([1e-8, 2e-8, 3e-8, 1e-9, 2e-9, 3e-9])
-    transforms = {"base_from_cam": base_from_cam, "flange_from_target": flange_from_target}
-    return Calibration(
-        "kept, grün",
-        "0" * 64,
-        "2026-11-20T10:11:12+00:00",
-        "eye-to-hand",
-        {name: Edge(transform.as_matrix(), covariance) for name, transform in transforms.items()},
-        np.kron(np.eye(2), covariance),
-        {
-            "park": SolverResult(
-                {name: transform.as_matrix() for name, transform in transforms.items()}, 0.1, 0.2
-            )
-        },
-        {"pixel_px": 0.1},
-        (ViewResult(7, used=True, residual_mm=0.1, residual_deg=0.2), ViewResult(4, used=False)),
-        Rms(0.1, 0.2),
-        Validation("none", Rms(0.3, 0.4)),
-        Verdict.of("check", "too few views"),
-    )
-
-
-def kept_evidence() -> tuple[ViewEvidence, ...]:
-    """The evidence in the newest of the kept recordings, not in the order of the views."""
-    px = np.array([[1 / 3, 2.0], [-0.0, 1e-300]])
-    corners = Corners(7, np.array([0, 3]), px, 0.1)
-    return (ViewEvidence(4), ViewEvidence(7, corners, px + 0.1, np.eye(4), np.eye(4)))

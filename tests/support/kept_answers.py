@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from support.cells import calibrated
 
-from visioncal.calibration.pipeline import align, calibrate
+from visioncal.calibration.pipeline import calibrate
 from visioncal.calibration.pipeline.result import result_of
 from visioncal.core.codec import write
 from visioncal.core.errors import VisioncalError
@@ -138,7 +138,7 @@ def answer_of_session(path: Path) -> Answer:
     """Calibrates or, where it is a whole cell, aligns a recorded session."""
     session = Session.load(path)
     if len(session.robots) > 1 or len(session.cameras) > 1:
-        return _of_cell(align(session))
+        return _of_cell(calibrate(session))
     return _of_calibration(calibrate(session))
 
 
@@ -165,7 +165,7 @@ def _network(level: str = "auto", **options) -> Callable[[], Answer]:
         cell = simulate(NetworkOptions(**options))
         session: Session = cell_session(cell, "network", seen="names")
         corners = {view_corners.view: view_corners for view_corners in cell.corners}
-        return _of_cell(align(session, level=level, corners=corners))
+        return _of_cell(calibrate(session, level=level, corners=corners))
 
     return case
 

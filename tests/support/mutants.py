@@ -87,7 +87,7 @@ READINGS: tuple[Reading, ...] = (
     *_each("calibrate", "IT -o OUT", "board", "board", "held", "pairs", "pairs", "arm", "sweep"),
     *_each("calibrate", "IT -o OUT", "warm", "tracked", "board.rrd", "pairs.rrd"),
     Reading("calibrate", "pairs", "IT -o OUT --json"),
-    *_each("align", "IT -o OUT", "network", "network", "pairs"),
+    *_each("calibrate", "IT -o OUT", "network", "network", "pairs"),
     *_each("doctor", "IT", "board", "pairs", "arm"),
     Reading("touch-test", "board", "IT -c [board_out]"),
     *_each("report", "IT -o OUT/report.html", "out", "board_out", "network_out", "warm_out"),

@@ -258,10 +258,6 @@ def _others_rrd(_: Inputs, path: Path) -> None:
     stream.disconnect()
 
 
-def _format_of_old(_: Inputs, path: Path) -> None:
-    shutil.copyfile(Path(__file__).parents[1] / "data" / "recording_format_1.rrd", path)
-
-
 def _foreign(name: str) -> Callable[[Inputs, Path], None]:
     """A recording in the form of others; a file of a folder of its own."""
 
@@ -295,7 +291,7 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "warm_out": _command("calibrate", "[warm]", "-o"),
     "tracked": _tracked,
     "network": _network,
-    "network_out": _command("align", "[network]", "-o"),
+    "network_out": _command("calibrate", "[network]", "-o"),
     "motions": _motions,
     "loaded": _loaded,
     "currents/empty": _currents(None),
@@ -318,7 +314,6 @@ MAKERS: Mapping[str, Callable[[Inputs, Path], None]] = {
     "pictures": _pictures,
     "recorded": _recorded,
     "another.rrd": _others_rrd,
-    "old.rrd": _format_of_old,
     "oak.json": _oak,
     "lens.yaml": _lens,
 } | {

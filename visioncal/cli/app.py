@@ -30,7 +30,6 @@ class _Commands(LazyGroup):
         "calibrate": "Turn a session into a hand-eye calibration, with reasons to trust it or not.",
         "doctor": "Say what is wrong with a session before it is calibrated, and what to type.",
         "batch": "Calibrate many sessions at once, and report which stand out of their fleet.",
-        "align": "Another name for calibrate.",
         "report": "Make the report of an earlier calibration again, or its certificate.",
         "verify": "Check whether a calibration still holds, and what has changed if it does not.",
         "diff": "Show what changed between two calibrations, and what is only noise.",

@@ -31,7 +31,7 @@ def export_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="An output folder, its calibration.json, alignment.json or dynamics.json, a "
+            help="An output folder, its calibration.json or dynamics.json, a "
             "recording (.rrd), or "
             "a file of frames."
         ),

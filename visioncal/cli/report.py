@@ -22,9 +22,7 @@ _EXIT_OTHERS = 3
 def report_command(
     calibration: Annotated[
         Path,
-        typer.Argument(
-            help="An output folder, its calibration.json or alignment.json, or a recording (.rrd)."
-        ),
+        typer.Argument(help="An output folder, its calibration.json, or a recording (.rrd)."),
     ],
     out: Annotated[
         Path | None,

@@ -1,4 +1,4 @@
-"""Output folders of `calibrate`, `align`, `verify`, `plan` and `dynamics`."""
+"""Output folders of `calibrate`, `verify`, `plan` and `dynamics`."""
 
 import shlex
 import traceback
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 CALIBRATION, REPORT, RECORDING = "calibration.json", "report.html", "recording.rrd"
 VERIFY = "verify.json"
-ALIGNMENT = "alignment.json"
 STOPS, PLAN, PROGRAM, PREVIEW = "stops.csv", "plan.json", "plan.script", "plan.rrd"
 
 _Writer: TypeAlias = Callable[[Path], None]
@@ -112,11 +111,7 @@ def write_outputs(
 
         drawings[RECORDING] = record
     results: dict[str, _Writer] = {CALIBRATION: run.calibration.save}
-    if (cell := run.calibration.cell) is not None:
-        from visioncal.results.document import to_alignment
-
-        results[ALIGNMENT] = _text(json_text(to_alignment(run.calibration, cell)))
-    return _write(folder, results, drawings, (ALIGNMENT,), without)
+    return _write(folder, results, drawings, without=without)
 
 
 def write_check(

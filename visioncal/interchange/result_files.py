@@ -63,7 +63,7 @@ def load_result(path: Path) -> Calibration:
     """Loads a result, of one camera and one robot or of a cell.
 
     Args:
-        path: As for `load_calibration`; or the alignment.json of a cell.
+        path: As for `load_calibration`.
 
     Raises:
         DataError: There is none, or it cannot be read.
@@ -111,7 +111,7 @@ def load_exportable(path: Path) -> "Calibration | FrameFile | Identified":
     """Loads anything that can be exported: a result, frames, or an arm's dynamics.
 
     Args:
-        path: As there, or an alignment.json or a dynamics.json, recognised by its content, a folder
+        path: As there, or a dynamics.json, recognised by its content, a folder
             with one and no calibration.json, or the recording of a cell.
 
     Raises:

@@ -12,11 +12,9 @@ from visioncal.results.result import Calibration
 from visioncal.results.views import HELD_BACK, Rms, Validation, ViewResult
 
 # Former name of a whole cell's result.
-Alignment = Calibration
 
 __all__ = [
     "HELD_BACK",
-    "Alignment",
     "Calibration",
     "CameraResult",
     "CellResult",

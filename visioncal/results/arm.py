@@ -240,7 +240,7 @@ class Observability:
 
     columns: int
     identifiable: int
-    determined: Annotated[int, Key("told")]
+    determined: int
     condition: float | None = None
     o1: float | None = None
     o2: float | None = None
@@ -254,7 +254,7 @@ class StopInfluence:
     """A stop by its view, and the relative growth of the mean variance without it."""
 
     view: int
-    influence: Annotated[float, Key("worth")]
+    influence: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,7 +317,7 @@ class ArmResult(Section):
     functions: JointFunctions | None = None
     measured: tuple[JointRange, ...] = ()
     observability: Observability | None = None
-    not_determined: Annotated[tuple[str, ...] | None, Key("not_told")] = None
+    not_determined: tuple[str, ...] | None = None
     stops: tuple[StopInfluence, ...] = ()
     left_out: tuple[UnseenView, ...] = ()
     holdout: tuple[UnseenView, ...] = ()
@@ -400,7 +400,7 @@ class JointSpring:
     joint: str
     compliance_rad_per_nm: float
     sigma_rad_per_nm: float
-    determined: Annotated[bool, Key("told")]
+    determined: bool
     torque_nm: tuple[float, float]
     stiffness_nm_per_rad: float | None = None
     stiffness_sigma_nm_per_rad: float | None = None
@@ -451,7 +451,7 @@ class ElasticResult(Section):
     """
 
     joints: tuple[JointSpring, ...]
-    not_determined: Annotated[tuple[str, ...], Key("not_told")]
+    not_determined: tuple[str, ...]
     weight: str
     payload_kg: tuple[float, float]
     sag_mm: Sag
@@ -570,7 +570,7 @@ class ThermalResult(Section):
     joints: tuple[JointDrift, ...]
     covariance: Covariance
     lengths_m: Annotated[FloatArray, Array((-1, 3))]
-    not_determined: Annotated[tuple[str, ...], Key("not_told")]
+    not_determined: tuple[str, ...]
     residual_mm: DriftResidual
     likelihood_ratio: float
     rises_k: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""Forms of calibration.json (one camera and robot, or a whole cell) and of alignment.json."""
+"""Forms of calibration.json: of one camera and robot, and of a whole cell."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ from visioncal.core.types import Mount
 from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
 from visioncal.results.arm import StoredRobot
-from visioncal.results.cell import CellResult, Moved, UnconnectedFrame
+from visioncal.results.cell import CellResult
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, RayFrame
@@ -31,16 +31,13 @@ from visioncal.results.parts import (
     StoredVerdict,
     check_schema,
 )
-from visioncal.results.sections import BoardResult, CalibrationSections, CellDetails, RigResult
+from visioncal.results.sections import BoardResult, CalibrationSections, RigResult
 from visioncal.results.views import CellView, Rms, Validation, ViewResult, rms_of
-from visioncal.session.frames import object_name
 
 if TYPE_CHECKING:
     from visioncal.results.result import Calibration
 
 
-# Former name of a whole cell's file.
-ALIGNMENT = "alignment.json"
 # The estimated transforms by name.
 Edges = Annotated[Mapping[str, StoredEdge], Key("transforms")]
 
@@ -70,7 +67,7 @@ class CalibrationForm:
         frames: Tools and fixtures by transform name.
     """
 
-    schema: Literal[1]
+    schema: Literal[2]
     visioncal: str = __version__
     created: str
     session: SessionForm
@@ -117,7 +114,7 @@ class CellForm:
         further: Unknown sections, kept as they are.
     """
 
-    schema: Literal[1]
+    schema: Literal[2]
     visioncal: str = __version__
     created: str
     session: SessionForm
@@ -135,36 +132,10 @@ class CellForm:
     further: Annotated[Mapping[str, Any], REST] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class AlignmentForm:
-    """alignment.json: former file of a whole cell, with fewer sections and other names."""
-
-    schema: Literal[1]
-    visioncal: str = __version__
-    created: str
-    session: SessionForm
-    reference: str
-    tree: Annotated[Mapping[str, str], Key("frames")]
-    flanges: Annotated[Mapping[str, str], Key("robots")]
-    edges: Edges
-    joint_covariance: JointCovariance
-    lenses: Annotated[Mapping[str, CameraResult], Key("cameras")]
-    noise: Mapping[str, Mapping[str, float]]
-    views: Annotated[tuple[ViewResult, ...], Key("observations")]
-    moved: tuple[Moved, ...]
-    untied: tuple[UnconnectedFrame, ...]
-    weakest: str
-    verdict: StoredVerdict
-    need: NeedMet | None = None
-    details: CellDetails
-
-
 # Fields of the forms that a calibration, or its cell, has under the same names.
 _CONVERTED = "schema visioncal session joint_covariance"
 _OF_PAIR = field_names_except(CalibrationForm, f"{_CONVERTED} ray_frame")
 _OF_CELL = field_names_except(CellForm, f"{_CONVERTED} views validation")
-_ALIGNED = ("created", "edges", "views", "verdict", "need")
-_IN_CELL = field_names_except(AlignmentForm, " ".join((_CONVERTED, "flanges lenses", *_ALIGNED)))
 
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
@@ -190,18 +161,6 @@ def _cell_form(calibration: "Calibration", cell: CellResult) -> CellForm:
     )
 
 
-def to_alignment(calibration: "Calibration", cell: CellResult) -> dict[str, Any]:
-    """Content of alignment.json of a whole cell."""
-    form = AlignmentForm(
-        flanges=cell.flanges,
-        lenses=cell.lenses,
-        **_head(calibration),
-        **{name: getattr(calibration, name) for name in _ALIGNED},
-        **{name: getattr(cell, name) for name in _IN_CELL},
-    )
-    return write(AlignmentForm, form)
-
-
 def _head(calibration: "Calibration") -> dict[str, Any]:
     """Fields of all forms that a calibration holds in other types."""
     return {
@@ -212,7 +171,7 @@ def _head(calibration: "Calibration") -> dict[str, Any]:
 
 
 def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a calibration, read from a document of `to_document` or `to_alignment`.
+    """Fields of a calibration, read from a document of `to_document`.
 
     Raises:
         DataError: It is of another schema, or no calibration; the message names the field.
@@ -220,8 +179,6 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     check_schema(document)
     if "tree" in document:
         return _cell_fields(read(CellForm, document, ""))
-    if {"reference", "transforms"} <= document.keys():
-        return _alignment_fields(read(AlignmentForm, document, ""))
     form = read(CalibrationForm, document, "")
     _check_camera(form)
     known_keys = set().union(*(entry.keys for entry in entries(CalibrationForm)))
@@ -230,7 +187,7 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
     return _head_fields(form) | fields | read_fields(CalibrationSections, rest, "")
 
 
-def _head_fields(form: CalibrationForm | CellForm | AlignmentForm) -> dict[str, Any]:
+def _head_fields(form: CalibrationForm | CellForm) -> dict[str, Any]:
     """Inverse of `_head`."""
     return {
         "session_name": form.session.name,
@@ -260,17 +217,6 @@ def _cell_fields(form: CellForm) -> dict[str, Any]:
     if form.validation is not None:
         fields["validation"] = form.validation
     return fields | {name: getattr(form, name) for name in _OF_CELL}
-
-
-def _alignment_fields(form: AlignmentForm) -> dict[str, Any]:
-    cell = CellResult(
-        cameras={object_name(name, "camera"): lens for name, lens in form.lenses.items()},
-        robots={},
-        targets={},
-        **{name: getattr(form, name) for name in _IN_CELL},
-    )
-    fields = _head_fields(form) | _derived_fields(cell, form.views)
-    return fields | {name: getattr(form, name) for name in _ALIGNED}
 
 
 def _derived_fields(cell: CellResult, views: tuple[ViewResult, ...]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Parts of a calibration beside its transforms, and the form of its verdict in files."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -9,14 +9,13 @@ from scipy.spatial.transform import RigidTransform
 from visioncal.core.codec import DROPPED, INLINE, REST, WrittenForm
 from visioncal.core.errors import DataError
 from visioncal.core.types import Need
-from visioncal.core.verdict import Finding, Remedy, Verdict, VerdictStatus
+from visioncal.core.verdict import Finding, Verdict, VerdictStatus
 from visioncal.results.arm import ArmSections
 from visioncal.results.edge import StoredPose
 from visioncal.robot import Robot
 
-# Version of the form of all results.
-SCHEMA: Literal[1] = 1
-
+# Version of the form of calibration.json.
+SCHEMA: Literal[2] = 2
 
 _ROBOT_FORM = WrittenForm(
     lambda item: dict(item.document), lambda item, _: Robot.from_document(item) if item else None
@@ -136,13 +135,6 @@ class CauseForm:
             do="" if finding.do is None else str(finding.do),
         )
 
-    def finding(self, words: str) -> Finding:
-        """The finding, with the words of a reason that begins with its sentence."""
-        step = Remedy(self.do) if self.do else None
-        return Finding(
-            self.cause, words, step, probability=self.probability, without_it=self.without_it
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class VerdictForm:
@@ -153,14 +145,14 @@ class VerdictForm:
         reasons: Its reasons, in sentences.
         good_for_mm: Smallest need that it would be good for [mm]; absent where there is none.
         causes: Probable causes why it is not good, most probable first.
-        findings: The findings behind the reasons; absent in files of earlier versions.
+        findings: The findings behind the reasons.
     """
 
     status: VerdictStatus
     reasons: tuple[str, ...]
     good_for_mm: float | None = None
     causes: tuple[CauseForm, ...] = ()
-    findings: tuple[Finding, ...] | None = None
+    findings: tuple[Finding, ...] = ()
 
     @classmethod
     def of(cls, verdict: Verdict) -> "VerdictForm":
@@ -175,19 +167,7 @@ class VerdictForm:
 
     def verdict(self, _: str) -> Verdict:
         """The verdict."""
-        findings = tuple(self._earlier_findings()) if self.findings is None else self.findings
-        return Verdict(self.status, findings, self.good_for_mm)
-
-    def _earlier_findings(self) -> Iterator[Finding]:
-        """Findings from reasons and causes; a reason may begin with a cause's sentence."""
-        causes = {cause.sentence: cause for cause in self.causes}
-        for reason in self.reasons:
-            matching = next((cause for cause in causes if reason.startswith(cause)), None)
-            if matching is None:
-                yield Finding("remark", reason)
-            else:
-                yield causes.pop(matching).finding(reason)
-        yield from (cause.finding(sentence) for sentence, cause in causes.items())
+        return Verdict(self.status, self.findings, self.good_for_mm)
 
 
 StoredVerdict = Annotated[Verdict, WrittenForm(VerdictForm.of, VerdictForm.verdict, VerdictForm)]

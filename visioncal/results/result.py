@@ -26,7 +26,7 @@ from visioncal.estimation.chain import edge_names
 from visioncal.estimation.intervals import freedom_of
 from visioncal.results.arm import NOMINAL, ArmResult, ArmSections
 from visioncal.results.cell import CellResult
-from visioncal.results.document import ALIGNMENT, fields_from_document, to_document
+from visioncal.results.document import fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, RayFrame, ray_frame
@@ -419,17 +419,14 @@ class Calibration(CalibrationSections):
     @classmethod
     @typed
     def load(cls, path: Path | str) -> Self:
-        """Reads a calibration.json or an alignment.json, or the one in a folder.
+        """Reads a calibration.json, or the one in a folder.
 
         Raises:
             DataError: The file is missing or is not a calibration of a known schema.
         """
         file = Path(path)
         if file.is_dir():
-            before = file / ALIGNMENT
             file = file / "calibration.json"
-            # A folder written by an older version.
-            file = before if before.is_file() and not file.exists() else file
             if not file.exists() and (file.parent / DYNAMICS_FILE).is_file():
                 raise DataError(
                     f"{path} is a result of visioncal dynamics identify, and has no calibration.",

@@ -9,7 +9,6 @@ from scipy.linalg import block_diag
 
 from visioncal.core.codec import entries
 from visioncal.core.types import FloatArray
-from visioncal.core.verdict import Finding, Verdict
 from visioncal.results.arm import ArmSections
 from visioncal.results.cell import CellResult
 from visioncal.results.edge import Edge
@@ -59,7 +58,7 @@ def selected_fields(
         "views": tuple(view.of_pair for view in views),
         "rms": rms,
         "validation": Validation.of(method, views),
-        "verdict": _verdict(whole.verdict, cell),
+        "verdict": whole.verdict,
         "camera": None if camera is None else camera.carried(jacobian),
         "robot": arm.model,
         "frames": _frames(whole.tree, chosen),
@@ -141,18 +140,6 @@ def _noise(cell: CellResult, chosen: Chosen, rms: Rms) -> dict[str, float]:
             for name, value in zip(names, scatter, strict=True)
         }
     return levels
-
-
-def _verdict(verdict: Verdict, cell: CellResult) -> Verdict:
-    if "arms" not in cell.details.further:
-        return verdict
-    finding = Finding(
-        "arm_left_out",
-        "The whole cell was fitted with errors of its arms, which this part of it does not have: "
-        "by the poses as they are reported it is off by as much.",
-    )
-    status = "check" if verdict.status == "good" else verdict.status
-    return replace(verdict, status=status, findings=(finding, *verdict.findings))
 
 
 def _frames(tree: FrameTree, chosen: Chosen) -> dict[str, Frame]:

@@ -45,6 +45,7 @@ def calibrate(
     device: str = "auto",
     threads: int | None = None,
     keep_corners: bool = False,
+    corners: Mapping[int, Corners] | None = None,
 ) -> Calibration:
     """Calibrates a session.
 
@@ -72,6 +73,7 @@ def calibrate(
         keep_corners: Whether detected corners are cached in the session's folder, in `.visioncal`,
             for the next calibration. The cache is valid for the same images, board and version,
             and can be deleted.
+        corners: Corners detected before, by view; None to detect them.
 
     Returns:
         The result with its verdict.
@@ -90,55 +92,11 @@ def calibrate(
         keep_corners=keep_corners,
     )
     state = initial_state(session, **asked)
-    state = replace(state, session=state.session.needing(need_mm, need_deg))
+    with_need = state.session.needing(need_mm, need_deg)
+    state = replace(state, session=with_need, given_corners=corners)
     if dense:
         return run_dense(state.session, device=device, **asked).calibration
     return result_of(run_stages(state))
-
-
-@typed
-def align(
-    session: Session | Path | str,
-    *,
-    level: str = "auto",
-    convention: Convention | None = None,
-    need_mm: float | None = None,
-    need_deg: float | None = None,
-    corners: Mapping[int, Corners] | None = None,
-    progress: Progress | None = None,
-    threads: int | None = None,
-    keep_corners: bool = False,
-) -> Calibration:
-    """Calibrates a whole cell, as `calibrate` does, optionally from given corners.
-
-    Args:
-        session: A session, or the path of its folder or recording.
-        level: How far each arm is calibrated; beyond `hand-eye` it takes joint angles and a model.
-        convention: Joint table convention of calibrated arms' parameters.
-        need_mm: Required accuracy of picks [mm]; replaces that of `[need]`.
-        need_deg: The same in rotation [deg].
-        corners: Corners detected before, by view; None to detect them.
-        progress: Called with the progress of long work.
-        threads: As in `calibrate`.
-        keep_corners: As in `calibrate`.
-
-    Returns:
-        The result with its verdict; its `between` gives any frame in any other.
-
-    Raises:
-        DataError: The input is wrong or shows no target.
-        DegenerateError: A robot is linked to nothing, or a frame is undetermined.
-    """
-    state = initial_state(
-        session,
-        level=level,
-        convention=convention,
-        progress=progress,
-        threads=threads,
-        keep_corners=keep_corners,
-    )
-    with_need = state.session.needing(need_mm, need_deg)
-    return result_of(run_stages(replace(state, session=with_need, given_corners=corners)))
 
 
 def _is_worse(before: Run, after: Run) -> bool:

@@ -332,7 +332,7 @@ def _pushed_bases(solved: CellFit) -> list[PoseFault]:
             f"{base} is where it stood before."
         )
         views = _view_numbers(solved, after.tolist())
-        step = Remedy("Fasten it, and align the stops from there on alone.", look_at(views[0]))
+        step = Remedy("Fasten it, and calibrate the stops from there on alone.", look_at(views[0]))
         pushed = Finding("something_moved", words, step, views)
         faults.append(PoseFault(pushed, tuple(after.tolist())))
     return faults

@@ -26,8 +26,7 @@ from visioncal.session import Session, Stream, View
 from visioncal.session.columns import is_number
 from visioncal.session.corners import CornerTable
 
-# 2: writer's version, end mark, seals on results; 3: streams; 4: corners of an external detector;
-# 5: images that are stored elsewhere.
+# Only recordings of this format are read.
 FORMAT = 5
 # Stands for a number of views that was not known at the start.
 UNKNOWN = -1
@@ -59,7 +58,6 @@ class Header:
         corners: Seal of the external detector's corners; empty if there are none.
         images: What is stored of the images: empty for all, `thumbnail`, or `none`; their digests
             are in the rows in any case.
-        are in the rows in any case.
     """
 
     rows: int
@@ -90,7 +88,7 @@ class Header:
     def seal(self) -> str:
         """SHA-256 of the content."""
         content = list(vars(self).values())
-        # Seals of formats 2 to 4 do not cover the fields that later formats added.
+        # Without the last fields, where they are empty.
         while not content[-1] and len(content) > len(vars(self)) - 3:
             content.pop()
         return sha256(json.dumps(content).encode())
@@ -224,22 +222,24 @@ def values_of(batch: pa.RecordBatch, archetype: str, position: int = 0) -> dict[
     return {name: value.as_py() for name, value in values.items() if value.is_valid}
 
 
-def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
-    """Reads the format and the header; `path` names the recording in messages.
+def read_header(batch: pa.RecordBatch, path: Path) -> Header:
+    """Reads the header; `path` names the recording in messages.
 
     Raises:
-        DataError: The format is newer than this version supports.
+        DataError: The recording is of another format.
         ValueError: The header was changed after it was written.
     """
     values = values_of(batch, _HEADER)
     (version,) = values["format"]
-    if version > FORMAT:
-        writer_version = values["visioncal"][0]
+    if version != FORMAT:
+        writer_version = values.get("visioncal", ["before 0.1"])[0]
         raise DataError(
             f"{path} is a recording of format {version}, written by visioncal {writer_version}; "
-            f"this version ({__version__}) reads formats up to {FORMAT}.",
+            f"this version ({__version__}) reads format {FORMAT}.",
             culprits=[str(path)],
-            next_step=f"Install visioncal {writer_version} or newer.",
+            next_step=f"Install visioncal {writer_version} or newer."
+            if version > FORMAT
+            else "Calibrate its session's folder again.",
         )
     header = Header(
         int(values["rows"][0]),
@@ -254,7 +254,7 @@ def read_header(batch: pa.RecordBatch, path: Path) -> tuple[int, Header]:
     )
     if header.seal() != values["seal"][0]:
         raise ValueError("the session's declaration was changed or damaged after it was written")
-    return version, header
+    return header
 
 
 def read_rows(batch: pa.RecordBatch) -> dict[int, StoredRow]:

@@ -67,8 +67,6 @@ CELL_FRAME = "cell"
 CELL = "/cell"
 SIGHT_LINE = "/sight"
 NETWORK = "/network"
-# Earlier versions stored the text of a cell's result here.
-ALIGNMENT = "/results/alignment"
 
 # A plan: obstacles, and the path of the arm.
 OBSTACLES = "/obstacles"

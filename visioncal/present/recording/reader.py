@@ -42,7 +42,7 @@ def read_session(path: Path) -> Session:
 
     Raises:
         DataError: The file is missing, is no recording of a session, was cut off before its first
-            view, is of a newer format, or has damaged session data; the message names the row or
+            view, is of another format, or has damaged session data; the message names the row or
             the image.
     """
     scanned = scan(path)
@@ -186,7 +186,7 @@ def chunks(
 
 
 def _read_records(scanned: Scan) -> _Records:
-    version_and_header: tuple[int, codec.Header] | None = None
+    header: codec.Header | None = None
     rows: dict[int, codec.StoredRow] = {}
     images: dict[int, _Image] = {}
     streams: dict[str, Stream] = {}
@@ -197,7 +197,7 @@ def _read_records(scanned: Scan) -> _Records:
     for frame, entity, batch in chunks(scanned, entities, damaged):
         try:
             if entity == paths.SESSION:
-                version_and_header = codec.read_header(batch, scanned.path)
+                header = codec.read_header(batch, scanned.path)
             elif entity == paths.STREAMS:
                 streams |= codec.read_samples(batch)
             elif entity == paths.CORNERS:
@@ -214,12 +214,8 @@ def _read_records(scanned: Scan) -> _Records:
                 closed = codec.read_end(batch)
         except _DAMAGE:
             damaged.append(frame)
-    if version_and_header is None:
+    if header is None:
         raise _no_header(scanned, damaged)
-    version, header = version_and_header
-    if version == 1 and scanned.finished:
-        # The first format had no end mark.
-        closed = header.rows
     return _Records(header, rows, images, streams, corners, closed, len(damaged))
 
 

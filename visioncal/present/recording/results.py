@@ -29,7 +29,6 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.session import Session
 
 _EVIDENCE, _RESULT = "visioncal.Evidence", "visioncal.Result"
-_ALIGNMENT = "visioncal.Alignment"
 
 
 def log_results(
@@ -195,7 +194,7 @@ def _read_result(path: Path) -> _Result:
     latest: dict[str, Any] = {}
     evidence: dict[str, dict[int, ViewEvidence]] = {}
     damaged: list[MessageFrame] = []
-    entities = (paths.CALIBRATION, paths.EVIDENCE, paths.ALIGNMENT)
+    entities = (paths.CALIBRATION, paths.EVIDENCE)
     try:
         for _, entity, batch in chunks(scan(path), entities, damaged):
             for position in range(batch.num_rows):
@@ -204,10 +203,7 @@ def _read_result(path: Path) -> _Result:
                     seen = _evidence(values)
                     evidence.setdefault(values["result"][0], {})[values["place"][0]] = seen
                 else:
-                    # Earlier versions stored no evidence for cells.
-                    no_evidence = {"result": [""], "evidence_count": [0]}
-                    latest = no_evidence | codec.values_of(batch, _ALIGNMENT, position)
-                    latest |= codec.values_of(batch, _RESULT, position) | codec.values_of(
+                    latest = codec.values_of(batch, _RESULT, position) | codec.values_of(
                         batch, "TextDocument", position
                     )
                     # Chunks damaged before this one hold no newer result.

@@ -62,7 +62,7 @@ def render(
     cell, suspects = calibration.cell, advice.suspects(calibration)
     subject = calibration.mount if cell is None else network.kinds(calibration.tree)
     return template("report.html.j2").render(
-        kind="Calibration report" if cell is None else "Alignment report",
+        kind="Calibration report",
         name=calibration.session_name,
         subtitle=f"{subject} \N{MIDDLE DOT} {facts.readable_time(calibration.created)}",
         notes=[note] if note else [],
