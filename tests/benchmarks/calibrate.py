@@ -133,7 +133,6 @@ def small(folder: Path) -> list[list[str]]:
         "all": [],
         "--no-recording": ["--no-recording"],
         "--no-report --no-recording": ["--no-report", "--no-recording"],
-        "the same, corners kept": ["--no-report", "--no-recording", "--keep-corners"],
     }
     kinds = dict(first(list(kinds.items())))
     found = medians(

@@ -104,7 +104,6 @@ def calibrate_command(
         level=level,
         convention=convention,
         threads=work.threads,
-        keep_corners=work.keep_corners,
     )
     left = frames_to_keep(out)
     with with_run_paths(session, out), shown_progress(quiet=as_json) as progress:

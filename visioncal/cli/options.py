@@ -94,14 +94,6 @@ class WorkOptions:
             help="Images searched in parallel; by default one a core. The result is the same.",
         ),
     ] = None
-    keep_corners: Annotated[
-        bool,
-        typer.Option(
-            "--keep-corners",
-            help="Keep what is found in the images, in .visioncal in the session's folder: the "
-            "next time need not look. It can be deleted.",
-        ),
-    ] = False
     no_report: Annotated[
         bool, typer.Option("--no-report", help=f"Leave {REPORT} out, which takes a second to draw.")
     ] = False

@@ -44,7 +44,6 @@ def calibrate(
     dense: bool = False,
     device: str = "auto",
     threads: int | None = None,
-    keep_corners: bool = False,
     corners: Mapping[int, Corners] | None = None,
 ) -> Calibration:
     """Calibrates a session.
@@ -70,9 +69,6 @@ def calibrate(
         device: Device of the dense fit: `auto` for a GPU where there is one, `cpu` or `cuda`.
         threads: How many images are searched in parallel; one a core where None. The result is the
             same to the bit.
-        keep_corners: Whether detected corners are cached in the session's folder, in `.visioncal`,
-            for the next calibration. The cache is valid for the same images, board and version,
-            and can be deleted.
         corners: Corners detected before, by view; None to detect them.
 
     Returns:
@@ -89,7 +85,6 @@ def calibrate(
         convention=convention,
         progress=progress,
         threads=threads,
-        keep_corners=keep_corners,
     )
     state = initial_state(session, **asked)
     with_need = state.session.needing(need_mm, need_deg)

@@ -74,7 +74,6 @@ class CalibrationOptions(TypedDict, total=False):
     convention: Convention | None
     progress: Progress | None
     threads: int | None
-    keep_corners: bool
 
 
 def run(
@@ -110,7 +109,6 @@ def initial_state(session: Session | Path | str, **asked: Unpack[CalibrationOpti
         loaded,
         asked.get("progress"),
         threads or 0,
-        asked.get("keep_corners", False),
         solver=solver,
         level=level,
         convention=convention,

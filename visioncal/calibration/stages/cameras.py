@@ -67,7 +67,6 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                     seen.progress,
                     among=views,
                     threads=seen.threads,
-                    keeps=seen.keeps_corners,
                 )
             corners, resolution = detections.corners, detections.resolution
             seen = seen.noting(detections.rejections, _other_size_findings(session, detections))

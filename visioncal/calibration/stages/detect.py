@@ -13,7 +13,6 @@ from threading import Condition
 import cv2
 import numpy as np
 
-from visioncal.calibration.stages.corner_cache import CornerCache, Searched
 from visioncal.calibration.stages.corner_numbers import (
     OTHER_NUMBERS,
     check_axes,
@@ -63,6 +62,21 @@ class Detections:
     other_sizes: Mapping[int, tuple[int, int]]
 
 
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """Result of searching one image.
+
+    Attributes:
+        found: The corners, or why there are none.
+        size: (width, height) of the image [px]; None where it cannot be read.
+        misfit: Whether markers were seen whose layout is not the target's.
+    """
+
+    found: Corners | Rejection
+    size: tuple[int, int] | None
+    misfit: bool = False
+
+
 class _MemoryBudget:
     """Limit on the image data that threads hold at once, in shares of the largest image."""
 
@@ -92,7 +106,6 @@ def detect(
     *,
     among: Sequence[View] | None = None,
     threads: int = 0,
-    keeps: bool = False,
 ) -> Detections:
     """Finds the declared target in each image of a session.
 
@@ -101,7 +114,6 @@ def detect(
         progress: Called after each image.
         among: The views to search; None for all.
         threads: Number of parallel images; 0 for one a core.
-        keeps: Whether to cache detections beside the session.
 
     Returns:
         The corners and the rejected views.
@@ -118,18 +130,17 @@ def detect(
     stated = _stated_resolution(session, among)
     searches: list[Searched] = []
     others = {board for board in session.boards if _shows_another(session, board, views)}
-    budget, cache = _MemoryBudget(), CornerCache.beside(session, grows=keeps)
+    budget = _MemoryBudget()
     with _ONE_OPENCV_THREAD.held(), ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
 
         def search_view(view: View) -> Searched:
             quick = session.board_of(view) in others
-            return _search(session, view, stated, budget, cache, quick=quick)
+            return _search(session, view, stated, budget, quick=quick)
 
         for search in pool.map(search_view, views):
             searches.append(search)
             if progress is not None:
                 progress("detect", len(searches), len(views))
-    cache.save()
     given = [view for view in among if view.has_corners]
     resolution = _common_resolution(session, views, searches, given, stated)
     sizes = {view.number: search.size for view, search in zip(views, searches, strict=True)}
@@ -231,7 +242,6 @@ def _search(
     view: View,
     stated: tuple[int, int] | None,
     budget: _MemoryBudget,
-    cache: CornerCache,
     *,
     quick: bool,
 ) -> Searched:
@@ -247,21 +257,13 @@ def _search(
     if stated not in (None, size) and 0 < pixels <= MOST_PIXELS:
         # It is refused in any case, and need not be searched.
         return Searched(Rejection(view.number, f"{view.image} is of another size"), size)
-    # Hashing images takes time, too.
-    key = cache.key(data, target, name) if cache.entries or cache.grows else ""
-    cached = cache.get(key, view.number)
-    if cached is not None:
-        return cached
     most = MOST_CHECKERBOARD_PIXELS if target.kind == "checkerboard" else MOST_PIXELS
     with budget.taken(pixels / most):
         image = _decoded(view, data)
         if isinstance(image, Rejection):
             return Searched(image, None)
         found, misfit = find_corners(image, target, view.number, quick=quick, name=name)
-    searched = Searched(found, (image.shape[1], image.shape[0]), misfit)
-    if not quick:
-        cache.put(key, searched)
-    return searched
+    return Searched(found, (image.shape[1], image.shape[0]), misfit)
 
 
 def find_corners(

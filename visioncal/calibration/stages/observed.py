@@ -56,7 +56,6 @@ class Observed:
         session: The recording.
         progress: Reports long work.
         threads: Number of images that are processed at a time; 0 for one per core.
-        keeps_corners: Whether detected corners are cached beside the session.
         cameras: Observations of each camera with images, by its frame.
         poses: The target's pose by view; several candidates until one is chosen.
         reasons: Why a view cannot be used, by view.
@@ -74,7 +73,6 @@ class Observed:
     session: Session
     progress: Progress | None = None
     threads: int = 0
-    keeps_corners: bool = False
     cameras: Mapping[str, CameraObservations] = field(default_factory=dict)
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     reasons: Mapping[int, str] = field(default_factory=dict)
