@@ -9,26 +9,26 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import chdir, contextmanager
+from contextlib import chdir
 from dataclasses import replace
 from pathlib import Path
-from threading import Thread
 
 import cv2
 import numpy as np
+from rerun.experimental import ViewerClient
 from results import QUICK
 from support.broken_sessions import BROKEN, broken_session
 from support.browser import CHROMIUM, Page, chromium
 from support.commands import visioncal
 
 import visioncal as package
-from visioncal.present.viewer import web
+from visioncal.present.recording import paths
+from visioncal.present.viewer.process import free_port, viewer_process
 from visioncal.simulation import CellOptions, simulate, write_session
 
 _FOLDER = Path(__file__).parents[2] / "recordings"
 # How long the viewer has for its drawing, without a graphics card [s].
-_PATIENCE_S = 240.0
+_PATIENCE_S = 60.0
 
 
 def main() -> None:
@@ -58,10 +58,7 @@ def main() -> None:
             for name, folder, row in (
                 () if QUICK else (("demo", "out", 5), ("viewer", "doubted", 6))
             ):
-                _sized(page, 1400, 880, is_phone=False)
-                with _served(Path(folder, "recording.rrd")) as url:
-                    page.visit(f"{url}#when=view@{row}")
-                    _keep(name, page.picture_once(_Settled(), _PATIENCE_S))
+                _keep(name, _viewed(Path(folder, "recording.rrd"), row))
 
 
 def _sized(page: Page, width: int, height: int, *, is_phone: bool) -> None:
@@ -74,28 +71,24 @@ def _sized(page: Page, width: int, height: int, *, is_phone: bool) -> None:
     )
 
 
-class _Settled:
-    """Whether a picture shows much, and the same as the one some seconds before."""
-
-    def __init__(self) -> None:
-        self._before = np.zeros(0)
-
-    def __call__(self, picture: np.ndarray) -> bool:
-        time.sleep(8.0)
-        same = self._before.shape == picture.shape and np.mean(self._before != picture) < 1e-3
-        self._before = picture
-        return bool(same and picture.std() > 40.0)
-
-
-@contextmanager
-def _served(recording: Path) -> Iterator[str]:
-    server = web._server(web._routes(recording), 0)
-    Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}/"
-    finally:
-        server.shutdown()
-        server.server_close()
+def _viewed(recording: Path, row: int) -> np.ndarray:
+    """Picture (h, w, 3) of the viewer at a row of the recording's views."""
+    port, file = free_port(), Path("viewer.png")
+    options = ("--headless", "--bind", "127.0.0.1", "--port", str(port))
+    with viewer_process(*options, "--window-size", "1400x880", str(recording)) as process:
+        for line in process.stdout:
+            if "Listening" in line:
+                break
+        client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        end, before, picture = time.monotonic() + _PATIENCE_S, np.zeros(0), np.zeros(1)
+        # What it draws at once is not yet all of it.
+        while time.monotonic() < end and not np.array_equal(before, picture):
+            time.sleep(3.0)
+            before = picture
+            client.set_time(paths.TIMELINE, sequence=row, play_state="paused")
+            client.save_screenshot(str(file))
+            picture = cv2.imread(str(file))
+    return picture
 
 
 def _keep(name: str, picture: np.ndarray) -> None:

@@ -29,7 +29,6 @@ from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.record import record
 from visioncal.live.capture.take import TakenView
-from visioncal.live.drivers.oak_hosted import HostedOak
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.bench import Bench
 from visioncal.live.rehearsal.camera import RehearsalCamera
@@ -238,9 +237,8 @@ def record_beside(host: str, folder: Path, stops: int) -> None:
     cell = rehearsed_cell(RehearsalOptions(stops=stops, seed=SEED))
     scene = scene_of(folder.parent / "plan")
     eyes = TruthClient(host)
-    sight = RehearsalCamera(cell.truth, lambda at: eyes.state(at.tolist()).q)
-    through = HostedOak(sight.frame, sight.resolution, factory=sight.factory)
-    with closing(UrArm(host)) as arm, closing(through) as camera:
+    camera = RehearsalCamera(cell.truth, lambda at: eyes.state(at.tolist()).q)
+    with closing(UrArm(host)) as arm:
         live = LiveCell(arm, camera)
         facts = facts_of(scene, live, "session")
         print("begun", flush=True)
@@ -273,5 +271,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     need("rtde_control", "-e .[ur]")
-    need("depthai", "-e .[oak]")
     main()

@@ -1,4 +1,4 @@
-"""Sweeps, programs and files of a plan of motions, and `visioncal dynamics plan` as it is run."""
+"""Sweeps and files of a plan of motions, and `visioncal dynamics plan` as it is run."""
 
 import json
 from dataclasses import replace
@@ -12,16 +12,13 @@ from support.apart import clearances
 from support.commands import Done, visioncal
 from support.drawn import column
 from support.small_arm import small_arm, small_document
-from support.urscripts import STEP_S, driven
 
 from visioncal.cli import planned_motions
 from visioncal.cli.review import find_recording
 from visioncal.core.errors import DataError, DegenerateError
 from visioncal.core.transforms import compose
 from visioncal.dynamics.excitation import excite
-from visioncal.dynamics.fourier import Harmonics, Series
 from visioncal.dynamics.limits import MotionMargins, motion_limits
-from visioncal.dynamics.plan_files import excitation_program, sweeps_program
 from visioncal.dynamics.sweeps import Stroke, SweepRequest, Sweeps, plan_sweeps
 from visioncal.present.recording import paths
 from visioncal.robot import load_robot
@@ -29,7 +26,6 @@ from visioncal.robot.bodies import Body
 from visioncal.simulation.arms import ur_arm
 
 TABLES = {"excitation.csv", "sweeps.csv", "plan.json", "plan.rrd"}
-PROGRAMS = {"excitation.script", "sweeps.script"}
 
 
 @pytest.fixture(autouse=True)
@@ -110,34 +106,6 @@ def test_joints_without_room_are_left_out_and_named():
         SweepRequest(speeds=1)
 
 
-def test_the_program_of_an_exciting_motion_drives_it():
-    series = Series(Harmonics(10.0, 5), np.random.default_rng(0).normal(size=(6, 9)))
-    text = excitation_program(load_robot("ur5e"), series)
-    start, sent = driven(text)
-    motion = series.sampled(1.0 / STEP_S)
-    # Nine decimals of eleven coefficients.
-    assert start == pytest.approx(motion.q[0], abs=1e-8)
-    assert len(sent) == len(motion)
-    assert np.abs(sent - motion.q).max() < 1e-8
-    assert len(text) < 4000
-    # Another controller's step gives the same motion.
-    slower = driven(text, 0.008)[1]
-    assert np.abs(slower - series.sampled(125.0).q).max() < 1e-8
-
-
-def test_the_program_of_sweeps_drives_them(sweeps):
-    start, sent = driven(sweeps_program(load_robot("ur5e"), sweeps))
-    assert start == pytest.approx(sweeps.home, abs=1e-9)
-    motion = sweeps.sampled(1.0 / STEP_S)
-    # Each stroke begins with a step of its own: up to one more for each of its halves and rests.
-    assert 0 <= len(sent) - len(motion) <= 2 * len(sweeps.strokes) + 1
-    assert np.abs(np.diff(sent, axis=0)).max() <= 1.001 * np.abs(motion.dq).max() * STEP_S
-    assert sent.min(axis=0) == pytest.approx(motion.q.min(axis=0), abs=1e-8)
-    assert sent.max(axis=0) == pytest.approx(motion.q.max(axis=0), abs=1e-8)
-    ways = [np.abs(np.diff(array, axis=0)).sum(axis=0) for array in (sent, motion.q)]
-    assert ways[0] == pytest.approx(ways[1], abs=1e-6)
-
-
 @pytest.fixture
 def quick(monkeypatch):
     """Searches a little only: what is written does not depend on how good it is."""
@@ -164,11 +132,11 @@ def small_file(folder: Path) -> Path:
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_plan_has_tables_programs_a_preview_and_all_of_it_as_json(tmp_path):
+def test_a_plan_has_tables_a_preview_and_all_of_it_as_json(tmp_path):
     out = tmp_path / "größer"
     done = plan("ur5e", out, "--rate", 100, "--harmonics", 3, "--duration", 12, "--sweep-speeds", 2)
     assert done.status == 0, done.err
-    assert {path.name for path in out.iterdir()} == TABLES | PROGRAMS
+    assert {path.name for path in out.iterdir()} == TABLES
     assert "for 54 base parameters (random motions:" in done.out
     assert "warning" not in done.out
     document = json.loads((out / "plan.json").read_text(encoding="utf-8"))
@@ -217,10 +185,10 @@ def test_a_preview_moves_the_arm_and_draws_its_curves(tmp_path):
 
 
 @pytest.mark.usefixtures("quick")
-def test_other_arms_get_no_program_and_old_ones_are_taken_away(tmp_path):
+def test_tables_of_an_earlier_plan_are_taken_away(tmp_path):
     out = tmp_path / "motions"
     out.mkdir()
-    for name in (*PROGRAMS, "notes.txt"):
+    for name in ("sweeps.csv", "notes.txt"):
         (out / name).write_text("old")
     done = plan(small_file(tmp_path), out, "--no-sweeps", "--harmonics", 3, "--json")
     assert done.status == 0, done.err

@@ -28,7 +28,7 @@ from visioncal.vision.camera import matrix_3x3, normalise
 NAMES = [export_format.name for export_format in EXPORT_FORMATS]
 EDGE_NAMES = [name for name in NAMES if name not in (*readers.ARM_FORMATS, "joint-corrections")]
 ANGLES = {"urdf", "kuka", "fanuc", "yaskawa", "staubli", "doosan"}
-LENSES = {"camera-info", "kalibr", "oak"}
+LENSES = {"camera-info", "kalibr"}
 RNG = np.random.default_rng(3)
 SAMPLE = made_up(5).calibration
 

@@ -23,13 +23,7 @@ SAMPLE = replace(made_up(5).calibration, frames={})
 CELL = replace(SAMPLE, frames=tool() | fixture(source="points.csv"))
 ALONE = placed.alone(tool(), fixture())
 FRAME_READERS = TOOL_READERS | FIXTURE_READERS
-NUMBERED = {"fanuc-utool", "fanuc-uframe"}
 TAKES = {export_format.name: export_format.takes for export_format in EXPORT_FORMATS}
-
-
-def wanted(name, **changes):
-    """What to ask of a format; FANUC's want to know which frame they set."""
-    return Selection(number=7 if name in NUMBERED else None, **changes)
 
 
 def of(name):
@@ -44,16 +38,15 @@ def off(name, text, matrix):
 @pytest.mark.parametrize("kind", CASES)
 @pytest.mark.parametrize("name", FRAME_READERS)
 def test_what_is_read_back_is_the_frame(name, kind):
-    # Written to the nanometre and to 1e-8 deg; FANUC's programs have 1e-6 deg, half of which may
-    # be cut from each of three angles.
-    tolerance = 3e-8 if name in NUMBERED else 1e-9
+    # Written to the nanometre and to 1e-8 deg.
+    tolerance = 1e-9
     if kind == "near a pitch of 90" and not name.startswith(("ur", "abb")):
         # Within 1e-7 rad of its singularity an Euler triple is taken to be singular: twice that.
         tolerance = 2.1e-7 + tolerance
     rotations = np.array(CASES[kind])
     for matrix in compose(rotations, RNG.uniform(-2, 2, (len(rotations), 3))):
         source = placed.alone(tool(matrix) if name in TOOL_READERS else fixture(matrix))
-        assert off(name, export(source, name, wanted(name)), matrix) < tolerance
+        assert off(name, export(source, name), matrix) < tolerance
 
 
 @pytest.mark.parametrize("name", sorted(set(READERS) - {"easy-handeye", "easy-handeye2"}))
@@ -85,58 +78,6 @@ BASE_DATA = (
     "BASE_DATA[1]={X 924.139893,Y 1099.00952,Z 527.833740,"
     "A -89.7931595,B 0.238999218,C -0.0562113412}"
 )
-# Three frames in the form in which ROBOGUIDE prints a program; as an example of that form served
-# maketp/results/SETUP_FRAMES.printtp.LS of github.com/LeroyDu56/CrossArm.
-SETUP_FRAMES = """/PROG  SETUP_FRAMES
-/ATTR
-OWNER\t\t= MNEDITOR;
-COMMENT\t\t= "frames";
-PROG_SIZE\t= 875;
-CREATE\t\t= DATE 26-10-06  TIME 16:17:00;
-MODIFIED\t= DATE 26-10-06  TIME 16:17:00;
-FILE_NAME\t= ;
-VERSION\t\t= 0;
-LINE_COUNT\t= 7;
-MEMORY_SIZE\t= 1191;
-PROTECT\t\t= READ_WRITE;
-TCD:  STACK_SIZE\t= 0,
-      TASK_PRIORITY\t= 50,
-      TIME_SLICE\t= 0,
-      BUSY_LAMP_OFF\t= 0,
-      ABORT_REQUEST\t= 0,
-      PAUSE_REQUEST\t= 0;
-DEFAULT_GROUP\t= 1,*,*,*,*;
-CONTROL_CODE\t= 00000000 00000000;
-LOCAL_REGISTERS\t= 0,0,0;
-/MN
-   1:  !two tools and a fixture ;
-   2:  PR[100]=P[1]    ;
-   3:  UTOOL[1]=PR[100] ;
-   4:  PR[100]=P[2]    ;
-   5:  UTOOL[2]=PR[100] ;
-   6:  PR[100]=P[3]    ;
-   7:  UFRAME[1]=PR[100] ;
-/POS
-P[1]{
-   GP1:
-\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
-\tX =     0.000  mm,\tY =     0.000  mm,\tZ =     0.000  mm,
-\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
-};
-P[2]{
-   GP1:
-\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
-\tX =     0.000  mm,\tY =     0.000  mm,\tZ =   150.000  mm,
-\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
-};
-P[3]{
-   GP1:
-\tUF : 0, UT : 1,\t\tCONFIG : 'N U T, 0, 0, 0',
-\tX =   900.000  mm,\tY =     0.000  mm,\tZ =   400.000  mm,
-\tW =     0.000 deg,\tP =     0.000 deg,\tR =     0.000 deg
-};
-/END
-"""
 
 
 def rounded(text, mark):
@@ -198,50 +139,6 @@ def test_kuka_frames_of_a_controllers_own_file(name, theirs, number):
     assert readers.kuka_named(active)[0] == ("$TOOL" if name == "kuka-tool" else "$BASE")
 
 
-def test_fanuc_frames_of_a_program_that_a_controller_printed():
-    theirs = readers.fanuc_program(SETUP_FRAMES)
-    assert {name: their[:3, 3].tolist() for name, their in theirs.items()} == {
-        "UTOOL[1]": [0, 0, 0],
-        "UTOOL[2]": [0, 0, 0.15],
-        "UFRAME[1]": [0.9, 0, 0.4],
-    }
-    for name, frames, number, title in (
-        ("fanuc-utool", tool(theirs["UTOOL[2]"]), 2, "SET_UT2"),
-        ("fanuc-uframe", fixture(theirs["UFRAME[1]"]), 1, "SET_UF1"),
-    ):
-        text = export(placed.alone(frames), name, Selection(number=number))
-        ours = readers.fanuc_program(text)
-        assert all(np.array_equal(theirs[key], our) for key, our in ours.items())
-        assert text.startswith(f"/PROG  {title}\r\n")
-        # Every line but the remarks, the names and the sizes stands in theirs as well.
-        kept = {trimmed(line) for line in SETUP_FRAMES.splitlines()}
-        others = [
-            line for line in text.splitlines() if trimmed(line) not in kept and "!" not in line
-        ]
-        assert [other.split()[0] for other in others] == [
-            "/PROG",
-            "COMMENT",
-            "PROG_SIZE",
-            "LINE_COUNT",
-            "MEMORY_SIZE",
-        ]
-
-
-def trimmed(line):
-    """A line without its number and the digits that a controller does not print."""
-    return re.sub(r" +", " ", re.sub(r"^ *\d+:", "", line).replace(".000000", ".000"))
-
-
-def test_fanuc_remarks_fit_and_say_what_is_lost():
-    long = {"flange_from_a_tool_with_a_very_long_name": placed.frame(np.eye(4), oriented=False)}
-    text = export(placed.alone(long), "fanuc-utool", Selection(number=12))
-    remarks = re.findall(r"^ *\d+:  (!.*) ;\r?$", text, re.M)
-    # A remark has 32 characters, its mark among them.
-    assert max(map(len, remarks)) == 32
-    assert "!PR[100] is overwritten" in remarks
-    assert "!rotation not measured" in remarks
-
-
 # --- What is taken, and what is refused.
 
 
@@ -249,8 +146,8 @@ def test_fanuc_remarks_fit_and_say_what_is_lost():
 def test_the_only_frame_of_its_kind_is_taken(name):
     edge, matrix = of(name)
     for source in (CELL, ALONE):
-        chosen = export(source, name, wanted(name))
-        assert chosen == export(source, name, wanted(name, edge=edge))
+        chosen = export(source, name)
+        assert chosen == export(source, name, Selection(edge=edge))
         # As above.
         assert off(name, chosen, matrix) < 3e-8
 
@@ -261,16 +158,16 @@ def test_of_several_frames_one_is_to_be_named(name):
     frames = CELL.frames | {f"{edge}_2": CELL.frames[edge]}
     for source in (replace(SAMPLE, frames=frames), FrameFile(frames)):
         with pytest.raises(DataError, match=f"2 .*{edge}, {edge}_2.*--edge") as caught:
-            export(source, name, wanted(name))
+            export(source, name)
         assert set(caught.value.culprits) == {edge, f"{edge}_2"}
-        assert export(source, name, wanted(name, edge=f"{edge}_2"))
+        assert export(source, name, Selection(edge=f"{edge}_2"))
 
 
 @pytest.mark.parametrize("name", FRAME_READERS)
 def test_a_calibration_without_frames_says_how_to_get_one(name):
     command = "tcp" if name in TOOL_READERS else "fixture"
     with pytest.raises(DataError, match=f"has no .*visioncal {command}"):
-        export(SAMPLE, name, wanted(name))
+        export(SAMPLE, name)
 
 
 @pytest.mark.parametrize(
@@ -285,23 +182,23 @@ def test_the_camera_or_the_board_can_be_a_frame_where_it_is_named(name, edge):
 def test_the_wrong_kind_is_refused_with_the_format_for_it(name):
     wrong = FIXTURE if name in TOOL_READERS else TOOL
     with pytest.raises(DataError, match=f"{name} writes .*{wrong} is a .*--to ") as caught:
-        export(CELL, name, wanted(name, edge=wrong))
+        export(CELL, name, Selection(edge=wrong))
     counterpart = caught.value.next_step.split()[-1].strip(".")
-    assert export(CELL, counterpart, wanted(counterpart, edge=wrong))
+    assert export(CELL, counterpart, Selection(edge=wrong))
     assert counterpart.split("-")[0] == name.split("-")[0]
 
 
 @pytest.mark.parametrize("name", FRAME_READERS)
 def test_an_inverse_is_no_tool_and_no_fixture(name):
     with pytest.raises(DataError, match=r"the inverse of .*--inverse"):
-        export(CELL, name, wanted(name, inverse=True))
+        export(CELL, name, Selection(inverse=True))
 
 
 def test_a_frame_of_another_parent_is_neither():
     frames = {"cam_from_tool": placed.frame(FLANGE_FROM_TOOL)}
     for name in FRAME_READERS:
         with pytest.raises(DataError, match="parent in cam"):
-            export(FrameFile(frames), name, wanted(name, edge="cam_from_tool"))
+            export(FrameFile(frames), name, Selection(edge="cam_from_tool"))
 
 
 def test_a_suffix_of_the_parent_is_no_other_kind():
@@ -347,12 +244,6 @@ def test_what_a_format_has_no_place_for_is_refused(name):
 def test_controllers_count_from_one(number):
     with pytest.raises(DataError, match="from 1"):
         export(CELL, "kuka-tool", Selection(number=number))
-
-
-@pytest.mark.parametrize("name", sorted(NUMBERED))
-def test_fanuc_wants_to_know_which_frame_is_overwritten(name):
-    with pytest.raises(DataError, match="--number"):
-        export(CELL, name)
 
 
 @pytest.mark.parametrize(
@@ -424,10 +315,8 @@ def test_ros_is_told_what_a_tool_is():
 def test_no_source_leaves_its_comment(name):
     hostile = 'x\nset_tcp(p[0])\r\nENDMODULE ; } !\u2028"'
     frames = tool(source=hostile) | fixture(source=hostile)
-    text = export(FrameFile(frames), name, wanted(name))
-    assert np.array_equal(
-        FRAME_READERS[name](text), FRAME_READERS[name](export(CELL, name, wanted(name)))
-    )
+    text = export(FrameFile(frames), name)
+    assert np.array_equal(FRAME_READERS[name](text), FRAME_READERS[name](export(CELL, name)))
 
 
 # --- Files and the command.
@@ -469,12 +358,10 @@ def test_the_command_writes_what_the_library_does(tmp_path):
     done = exporting(tmp_path, "--to", "kuka-tool", "--number", "4")
     assert (done.status, done.err) == (0, "")
     assert done.out == export(ALONE, "kuka-tool", Selection(number=4))
-    out = tmp_path / "SET_UF2.LS"
-    done = exporting(tmp_path, "--to", "fanuc-uframe", "--number", "2", "-o", out)
+    out = tmp_path / "base.dat"
+    done = exporting(tmp_path, "--to", "kuka-base", "--number", "2", "-o", out)
     assert done.status == 0, done.err
-    # A controller's listing has its lines ended as on its own disk.
-    assert out.read_bytes().decode() == export(ALONE, "fanuc-uframe", Selection(number=2))
-    assert b"/END\r\n" in out.read_bytes()
+    assert out.read_bytes().decode() == export(ALONE, "kuka-base", Selection(number=2))
 
 
 def test_the_command_takes_a_load_and_warns_without_one(tmp_path):

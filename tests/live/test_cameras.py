@@ -16,7 +16,6 @@ from visioncal.live.drivers import extras
 from visioncal.live.drivers.images import FolderCamera
 from visioncal.live.drivers.newest import Arrival
 from visioncal.live.drivers.oak import OakCamera
-from visioncal.live.drivers.oak_hosted import HostedOak
 from visioncal.live.drivers.protocols import CameraDevice, DeviceSetup
 from visioncal.live.drivers.uvc import GrabbedPictures, UvcCamera
 
@@ -28,10 +27,9 @@ def test_a_missing_extra_tells_the_command_that_installs_it(monkeypatch):
         raise ImportError(f"No module named {name!r}")
 
     monkeypatch.setattr(extras, "import_module", missing)
-    for open_it in (OakCamera, lambda: HostedOak(lambda: None, (64, 48))):
-        with pytest.raises(DriverError, match="depthai cannot be imported") as caught:
-            open_it()
-        assert "pip install 'depthai" in caught.value.next_step
+    with pytest.raises(DriverError, match="depthai cannot be imported") as caught:
+        OakCamera()
+    assert "pip install 'depthai" in caught.value.next_step
     assert os.environ["DEPTHAI_TELEMETRY"] == "0"
 
 

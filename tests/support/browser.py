@@ -6,7 +6,6 @@ import os
 import shlex
 import shutil
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,12 +37,9 @@ class Page:
     def __init__(self, reader: int, writer: int) -> None:
         self._reader, self._writer = os.fdopen(reader, "rb"), os.fdopen(writer, "wb")
         self._number, self._session = 0, ""
-        # The URLs that the page has asked for, those that its policy refused too.
-        self.requested: list[str] = []
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
         self._session = attached["sessionId"]
-        self.call("Network.enable")
         self.call("Page.enable")
 
     def visit(self, url: str) -> None:
@@ -70,10 +66,7 @@ class Page:
         while (byte := self._reader.read(1)) != b"\0":
             assert byte, "Chromium ended"
             data += byte
-        message = json.loads(data)
-        if message.get("method") == "Network.requestWillBeSent":
-            self.requested.append(message["params"]["request"]["url"])
-        return message
+        return json.loads(data)
 
     def close(self) -> None:
         """Closes the pipes."""
@@ -88,13 +81,6 @@ class Page:
     def printed(self) -> bytes:
         """The PDF that printing the page gives."""
         return base64.b64decode(self.call("Page.printToPDF", preferCSSPageSize=True)["data"])
-
-    def picture_once(self, is_drawn, patience_s: float) -> np.ndarray:
-        """Takes pictures until one passes; the last one where the patience ends."""
-        end = time.monotonic() + patience_s
-        while not is_drawn(picture := self.picture()) and time.monotonic() < end:
-            time.sleep(0.5)
-        return picture
 
 
 @contextmanager

@@ -131,7 +131,6 @@ READINGS: tuple[Reading, ...] = (
     Reading("export", "arm_out", "IT --to robot-dh --convention standard"),
     Reading("export", "arm_out", "IT --to ur-kinematics"),
     Reading("export", "frames.json", "IT --to kuka-tool --number 3 -o OUT/tool.dat"),
-    Reading("export", "oak.json", "[board_out] --to oak --onto IT"),
     Reading("tcp", "touches.csv", "IT -c OUT"),
     Reading("tcp", "touches.csv", "IT -o OUT/frames.json --json"),
     *_each("tcp", "[touches.csv] -c IT", "out", "board_out"),

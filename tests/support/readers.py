@@ -253,67 +253,16 @@ def kuka_base(text):
     return pose
 
 
-def fanuc_program(text):
-    """What a program of the teach pendant leaves in the controller's frames, by their names.
-
-    Its assignments are followed from a position to a register to a frame; others are no business
-    of a program that sets frames.
-    """
-    body, _, rest = text.replace("\r\n", "\n").partition("/POS\n")
-    listing = body.partition("/MN\n")[2]
-    positions = {
-        f"P[{number}]": _fanuc_position(fields)
-        for number, fields in re.findall(r"^P\[(\d+)\]\{\n(.*?)^\};", rest, re.M | re.S)
-    }
-    lines = re.findall(r"^ *\d+:  (.*?) *;$", listing, re.M)
-    assert len(lines) == len(listing.splitlines()) == int(re.search(r"COUNT\s*= (\d+)", body)[1])
-    registers, frames = {}, {}
-    for line in (line for line in lines if not line.startswith(("!", "MESSAGE", "PAUSE"))):
-        to, _, value = line.partition("=")
-        if to.startswith("PR["):
-            registers[to] = positions[value]
-        else:
-            frames[to] = registers[value]
-    assert rest.splitlines()[-1] == "/END"
-    return frames
-
-
-def _fanuc_position(fields):
-    units = {"X": "mm", "Y": "mm", "Z": "mm", "W": "deg", "P": "deg", "R": "deg"}
-    found = re.findall(r"([XYZWPR]) = *([-.\d]+) +(mm|deg)", fields)
-    assert [value[0] for value in found] == list(units)
-    assert all(units[name] == unit for name, _, unit in found)
-    x, y, z, w, p, r = (float(value[1]) for value in found)
-    w, p, r = np.radians([w, p, r])
-    return transform(rz(r) @ ry(p) @ rx(w), np.array([x, y, z]) / 1000)
-
-
-def _only(text, kind):
-    ((name, pose),) = fanuc_program(text).items()
-    assert re.fullmatch(rf"{kind}\[\d+\]", name)
-    return pose
-
-
-def fanuc_utool(text):
-    return _only(text, "UTOOL")
-
-
-def fanuc_uframe(text):
-    return _only(text, "UFRAME")
-
-
 # By the format's name: every format that holds a tool, and every one that holds a fixture.
 TOOL_READERS = {
     "ur-tcp": ur_tcp,
     "abb-tooldata": abb_tooldata,
     "kuka-tool": kuka_tool,
-    "fanuc-utool": fanuc_utool,
 }
 FIXTURE_READERS = {
     "ur-feature": ur_feature,
     "abb-wobjdata": abb_wobjdata,
     "kuka-base": kuka_base,
-    "fanuc-uframe": fanuc_uframe,
 }
 
 # Those of an arm, which test_arm_exports.py reads.

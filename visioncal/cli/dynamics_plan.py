@@ -85,8 +85,8 @@ def dynamics_plan_command(
 ) -> None:
     """Plan the motions that determine an arm's inertias and friction.
 
-    Writes an exciting motion and sweeps as tables (.csv), programs for a UR (.script), plan.json
-    and plan.rrd to look at. Nothing is sent to a robot. Exit status 2: the limits allow none.
+    Writes an exciting motion and sweeps as tables (.csv), plan.json and plan.rrd to look at.
+    Nothing is sent to a robot. Exit status 2: the limits allow none.
     """
     # Imported late, so that --help stays fast.
     from visioncal.cli.planned_motions import plan_motions

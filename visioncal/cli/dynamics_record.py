@@ -28,8 +28,8 @@ def dynamics_record_command(
 ) -> None:
     """Record angles, speeds and motor currents at the controller's full rate.
 
-    The motion is another's: start its program (such as excitation.script of `dynamics plan`) on the
-    pendant once this command waits for it. Exit status 0: it is recorded; 2: it is not.
+    The motion is another program's: start that once this command waits for it. Exit status 0: it
+    is recorded; 2: it is not.
     """
     # Imported late, so that --help stays fast.
 

@@ -10,7 +10,7 @@ from visioncal.cli.console import messages, say
 from visioncal.cli.options import Force, OutFile, PartOptions
 from visioncal.core.choices import EXPORT_NAMES, Convention
 from visioncal.core.errors import DataError
-from visioncal.core.files import check_free, read_text, write_atomically
+from visioncal.core.files import check_free, write_atomically
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
@@ -79,10 +79,6 @@ def export_command(
         str | None,
         typer.Option("--hash", help="ur-kinematics: the hash that ur_calibration extracts."),
     ] = None,
-    onto: Annotated[
-        Path | None,
-        typer.Option(help="oak: the device's own calibration JSON, of which all else is kept."),
-    ] = None,
     with_corrections: Annotated[
         bool,
         typer.Option(
@@ -106,7 +102,6 @@ def export_command(
     from visioncal.interchange.result_files import load_exportable
 
     load = _load(mass_kg, cog_mm)
-    kept = None if onto is None else read_text(onto)
     selection = Selection(
         edge,
         inverse,
@@ -116,7 +111,6 @@ def export_command(
         load,
         convention,
         calibration_hash,
-        kept,
         part.camera,
         part.robot,
         part.target,

@@ -266,7 +266,6 @@ def rehearse(
             "calibrate": ended - captured,
             "all": ended - start,
         },
-        bench.through_depthai,
         test,
     )
 
@@ -279,7 +278,6 @@ class Rehearsal:
         error: Chi-square test of its error.
         pace: Durations of the views; None with a fault.
         away_mm: Distance of the flange from its recorded position, by view [mm].
-        through_depthai: Whether the pictures went through depthai's pipeline.
     """
 
     options: RehearsalOptions
@@ -291,7 +289,6 @@ class Rehearsal:
     pace: Pace | None
     away_mm: tuple[float, ...]
     times_s: dict[str, float]
-    through_depthai: bool
     touch_test: TouchTest | None = None
 
     def document(self) -> dict[str, Any]:
@@ -301,7 +298,6 @@ class Rehearsal:
             "schema": 1,
             "visioncal": __version__,
             "versions": _versions(),
-            "through_depthai": self.through_depthai,
             **asdict(self.options),
             "passed": self.error.passed,
             "chi_square": asdict(self.error),
@@ -360,13 +356,6 @@ class Rehearsal:
 def _report_devices(bench: Bench) -> None:
     host = bench.controller.host
     say(f"simulated controller at {host}, driven by ur-rtde {version('ur-rtde')}")
-    if bench.through_depthai:
-        say(f"pictures through the pipeline of depthai {version('depthai')}")
-        return
-    say(
-        "depthai is not installed, so pictures are taken without its pipeline: "
-        "pip install 'depthai>=3.12,<4'"
-    )
 
 
 def _versions() -> dict[str, str]:

@@ -26,40 +26,35 @@ def review_command(
     web: Annotated[
         bool, typer.Option("--web", help="Show it in a browser instead of a window.")
     ] = False,
-    port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="With --web: where to listen; a free one otherwise."),
-    ] = None,
-    no_open: Annotated[
-        bool, typer.Option("--no-open", help="With --web: print the URL and open no browser.")
-    ] = False,
     view: Annotated[
-        int | None, typer.Option(help="The number of the view to open it at. Default: the worst.")
+        int | None,
+        typer.Option(
+            help="The number of the view to open the window at. Default: the worst; in a browser "
+            "the first."
+        ),
     ] = None,
 ) -> None:
     """Open a recording in the rerun viewer, on this machine alone.
 
     With --web the page's URL goes to stdout, and only this machine can reach it. Ctrl-C ends.
     """
-    if not web and (port is not None or no_open):
-        raise typer.BadParameter("--port and --no-open belong to --web.")
+    if web and view is not None:
+        raise typer.BadParameter("--view goes without --web: a browser opens at the first view.")
     file = find_recording(recording)
     # Imported late, so that --help stays fast.
     from visioncal.present.viewer import review_native, review_web
 
-    row = _row(file, view)
     if not web:
-        review_native(file, row)
+        review_native(file, _row(file, view))
         return
 
     def opened(url: str) -> None:
-        # The URL last: its reader may end the server at once, which would interrupt an import.
         say("Ctrl-C ends.")
         typer.echo(url)
-        if not no_open and not webbrowser.open(url):
+        if not webbrowser.open(url):
             say("No browser could be opened; visit the address above.")
 
-    review_web(file, port or 0, opened, row)
+    review_web(file, opened)
 
 
 def _row(file: Path, view: int | None) -> int | None:

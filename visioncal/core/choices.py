@@ -28,9 +28,9 @@ FOREIGN_NAMES = (
 )
 EXPORT_NAMES = (
     *("ros", "ros-launch", "moveit", "easy-handeye", "easy-handeye2", "urdf", "camera-info"),
-    *("kalibr", "oak", "opencv", "zivid", "text", "ur", "kuka", "fanuc", "abb", "staubli"),
+    *("kalibr", "opencv", "zivid", "text", "ur", "kuka", "fanuc", "abb", "staubli"),
     *("yaskawa", "doosan", "ur-tcp", "ur-feature", "abb-tooldata", "abb-wobjdata"),
-    *("kuka-tool", "kuka-base", "fanuc-utool", "fanuc-uframe", "robot-urdf", "robot-dh"),
+    *("kuka-tool", "kuka-base", "robot-urdf", "robot-dh"),
     *("ur-kinematics", "robot-json", "joint-corrections"),
 )
 # Simulated arms, and built-in descriptions of whole cells.

@@ -179,12 +179,11 @@ def write_plan(folder: Path, plan: "Plan", document: Mapping[str, Any]) -> Writt
 def write_motions(
     folder: Path, plan: "MotionPlan", rate_hz: float, document: Mapping[str, Any]
 ) -> Written:
-    """Writes planned motions as tables, programs, preview and JSON, atomically.
+    """Writes planned motions as tables, preview and JSON, atomically.
 
     Returns:
-        The files that were written: all but the preview even where drawing that failed. Robots that
-        are not programmed like a UR get no programs; files of an earlier plan that this one lacks
-        are removed.
+        The files that were written: all but the preview even where drawing that failed. Files of
+        an earlier plan that this one lacks are removed.
 
     Raises:
         DataError: The folder cannot be written; the files in it are unchanged.

@@ -21,7 +21,7 @@ Holds: TypeAlias = Literal["any edge", "hand-eye", "lens", "tool", "fixture"]
 # Options that apply to formats: to all of transforms, and to some formats.
 OfTransforms: TypeAlias = Literal["edge", "inverse", "parent", "child"]
 Takes: TypeAlias = (
-    OfTransforms | Literal["number", "load", "convention", "hash", "onto", "with-corrections"]
+    OfTransforms | Literal["number", "load", "convention", "hash", "with-corrections"]
 )
 _OPTIONS: Mapping[Takes, str] = {"load": "--mass-kg and --cog-mm"}
 _T = TypeVar("_T")
@@ -50,7 +50,6 @@ class Selection:
         child: Exported name of the frame whose pose it is; the camera, in a format of lenses.
         number: Number of the controller's tool or base.
         calibration_hash: The `hash` of a UR's own kinematics.
-        onto: An existing document that is to be updated.
         camera: Which camera of a cell is meant, in a format of lenses.
         robot: Which robot of a cell: its part is exported as of one camera and robot.
         target: Which target of a cell; likewise.
@@ -65,7 +64,6 @@ class Selection:
     load: Load | None = None
     convention: str | None = None
     calibration_hash: str | None = None
-    onto: str | None = None
     camera: str | None = None
     robot: str | None = None
     target: str | None = None
@@ -83,7 +81,6 @@ class Selection:
             "load": self.load,
             "convention": self.convention,
             "hash": self.calibration_hash,
-            "onto": self.onto,
             "with-corrections": self.with_corrections,
         }
         return tuple(name for name, option in options.items() if option not in (None, False))
@@ -102,7 +99,6 @@ class Content:
         lens: The camera, where there is one.
         origin: Where the result comes from, in one line.
         rotation_of: Our name of the frame whose rotation was copied; None where it was measured.
-        onto: The existing document to update, where there is one.
     """
 
     name: str
@@ -117,7 +113,6 @@ class Content:
     rotation_of: str | None = None
     number: int | None = None
     load: Load | None = None
-    onto: str | None = None
 
     @property
     def matrix(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Lens formats: ROS's camera_info, Kalibr's camera chain, the calibration of a Luxonis OAK."""
+"""Lens formats: ROS's camera_info and Kalibr's camera chain."""
 
 from collections.abc import Iterator
 
@@ -13,38 +13,11 @@ from visioncal.interchange.exports.content import (
     numbers,
     yaml_text,
 )
-from visioncal.live.drivers.oak_calibration import calibration_json
 from visioncal.vision.camera import matrix_3x3
 
 _CAMERA = {"cam": "camera"}
 # By number of coefficients: OpenCV's five, eight, and the fisheye's four.
 _ROS_MODELS = {5: "plumb_bob", 8: "rational_polynomial", 4: "equidistant"}
-
-
-def _write(content: Content) -> str:
-    """Writes the JSON of depthai's CalibrationHandler; the child's name is the camera's socket."""
-    return calibration_json(camera_of(content), content.child, content.onto)
-
-
-def _warn(content: Content) -> Iterator[str]:
-    yield from warn_of_field(content)
-    if content.onto is None:
-        yield (
-            "this calibration holds one camera and nothing of its board. Before a device is given "
-            "it, write it onto the device's own: --onto FILE, as "
-            "CalibrationHandler.eepromToJsonFile saves it."
-        )
-
-
-OAK = ExportFormat(
-    "oak",
-    "the lens as the calibration JSON of an OAK [px]; --child names the socket",
-    _write,
-    holds="lens",
-    frames={"cam": "CAM_A"},
-    takes=frozenset({"onto"}),
-    warn=_warn,
-)
 
 
 def camera_of(content: Content) -> Camera:

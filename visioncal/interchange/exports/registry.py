@@ -15,9 +15,8 @@ from visioncal.interchange.exports.arm import ArmFormat, select_arm
 from visioncal.interchange.exports.armfiles import ARMS, write_dynamics
 from visioncal.interchange.exports.content import Content, ExportFormat, OfTransforms, Selection
 from visioncal.interchange.exports.controllers import CONTROLLERS
-from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR, OAK
+from visioncal.interchange.exports.lens import CAMERA_INFO, KALIBR
 from visioncal.interchange.exports.matrices import OPENCV, TEXT, ZIVID
-from visioncal.interchange.exports.programs import PROGRAMS
 from visioncal.interchange.exports.robots import ROBOTS
 from visioncal.interchange.exports.ros import (
     EASY_HANDEYE,
@@ -48,13 +47,11 @@ EXPORT_FORMATS: tuple[ExportFormat | ArmFormat, ...] = (
     URDF,
     CAMERA_INFO,
     KALIBR,
-    OAK,
     OPENCV,
     ZIVID,
     TEXT,
     *ROBOTS,
     *CONTROLLERS,
-    *PROGRAMS,
     *ARMS,
 )
 _EVERYTHING = Selection()
@@ -224,7 +221,6 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         rotation_of,
         selection.number,
         selection.load,
-        selection.onto,
     )
 
 

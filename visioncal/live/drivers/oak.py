@@ -2,20 +2,24 @@
 
 import math
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack
+import weakref
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from pathlib import Path
+from datetime import timedelta
 from types import MappingProxyType, ModuleType
 
+import numpy as np
+
 from visioncal.core.errors import DriverError
-from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Camera
 from visioncal.live.drivers.extras import Handle, depthai
-from visioncal.live.drivers.oak_calibration import SOCKETS, factory_intrinsics
-from visioncal.live.drivers.oak_frames import FrameEnd, began_after, worded
+from visioncal.live.drivers.oak_calibration import factory_intrinsics
 from visioncal.live.drivers.protocols import DeviceSetup, Frame
 from visioncal.live.drivers.stopwatch import Stopwatch
+
+# The camera that every OAK has: the colour camera, or the only one.
+_SOCKET = "CAM_A"
 
 # The default resolution is the sensor's, divided by a whole number to at most this width [px].
 _WIDTH_PX = 2048
@@ -25,7 +29,6 @@ _SETTLE_S, _FIRST_S = 1.5, 5.0
 # Polling interval of waiting callers [s].
 _GLANCE_S = 0.05
 _UDEV_RULE = 'SUBSYSTEM=="usb", ATTRS{idVendor}=="03e7", MODE="0666"'
-_OPTIONS = ("socket", "rate_hz", "raw")
 
 
 class OakCamera:
@@ -36,25 +39,22 @@ class OakCamera:
     All of them are in `settings`.
 
     Args:
-        requested: Requested settings; `more` may name the `socket` (CAM_A), `rate_hz`, and `raw`, a
-            file to record every frame into, `.avi` or `.mkv`.
+        requested: Requested settings.
         device: Id, address or USB path of the OAK; None for the only one.
 
     Raises:
         DriverError: Depthai or the device is missing, or the device has no such camera.
-        DataError: Frames cannot be recorded into that file.
     """
 
     def __init__(self, requested: DeviceSetup | None = None, *, device: str | None = None) -> None:
-        dai = depthai()
+        dai = self._dai = depthai()
         requested = requested or DeviceSetup()
-        self._socket, rate_hz = _options(requested.more)
         with ExitStack() as closing:
             opened = _open_device(dai, device)
             closing.callback(opened.close)
-            with worded(dai, "The OAK", "does not start"):
-                sensor = _sensor(opened, self._socket)
-                self.name = f"{opened.getDeviceName()} {self._socket} ({sensor.sensorName})"
+            with _worded(dai, "The OAK", "does not start"):
+                sensor = _sensor(opened)
+                self.name = f"{opened.getDeviceName()} {_SOCKET} ({sensor.sensorName})"
                 self.resolution = requested.resolution or _default_resolution(
                     sensor.width, sensor.height
                 )
@@ -62,16 +62,15 @@ class OakCamera:
                 requested = _with_focus(requested, calibration, sensor)
                 pipeline = dai.Pipeline(opened)
                 node = pipeline.create(dai.node.Camera).build(sensor.socket)
-                output = self._output(dai, node, requested, sensor, rate_hz)
+                output = self._output(dai, node, requested, sensor)
                 control = node.inputControl.createInputQueue()
-            raw = requested.more.get("raw")
-            self._end = FrameEnd(
-                dai, pipeline, output, self.name, raw=None if raw is None else Path(raw)
-            )
-            closing.callback(self._end.close)
+                self._queue = output.createOutputQueue(maxSize=4, blocking=False)
+                pipeline.start()
+            # A pipeline that still runs when Python ends aborts the process.
+            closing.callback(weakref.finalize(self, _stop, pipeline))
             held = self._hold_settings(dai, requested, sensor, control)
             self.factory, provenance = self._intrinsics(calibration, sensor)
-            self.settings = MappingProxyType({"rate_hz": rate_hz, **provenance, **held})
+            self.settings = MappingProxyType({"rate_hz": _RATE_HZ, **provenance, **held})
             self._closing = closing.pop_all()
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
@@ -82,24 +81,36 @@ class OakCamera:
         """
         requested_at = time.monotonic()
         waiting = Stopwatch()
-        self._end.drop_old()
+        with _worded(self._dai, self.name):
+            self._queue.tryGetAll()
         while True:
-            frame = self._end.next(min(timeout_s, _GLANCE_S))
-            if frame is None and waiting.read() > timeout_s:
-                raise DriverError(
-                    f"{self.name} gave no picture within {timeout_s:g} s.",
-                    culprits=[self.name],
-                    next_step="Look at its cable and its power; then go on with --resume.",
-                )
-            if frame is not None and began_after(frame, requested_at):
-                return frame
+            message = self._message(min(timeout_s, _GLANCE_S))
+            if message is None:
+                if waiting.read() > timeout_s:
+                    raise DriverError(
+                        f"{self.name} gave no picture within {timeout_s:g} s.",
+                        culprits=[self.name],
+                        next_step="Look at its cable and its power; then go on with --resume.",
+                    )
+                continue
+            # Depthai's clock is this host's monotonic one.
+            middle_s = message.getTimestamp(self._dai.CameraExposureOffset.MIDDLE).total_seconds()
+            exposure_s = message.getExposureTime().total_seconds()
+            if middle_s - 0.5 * exposure_s >= requested_at:
+                image = np.array(message.getCvFrame(), dtype=np.uint8)
+                return Frame(image, middle_s, exposure_s or None)
 
     def close(self) -> None:
         """Stops and releases the device; may be called twice."""
         self._closing.close()
 
+    def _message(self, timeout_s: float) -> Handle | None:
+        """Depthai's message of the next frame; None where there is none in time."""
+        with _worded(self._dai, self.name):
+            return self._queue.get(timedelta(seconds=timeout_s))
+
     def _output(
-        self, dai: ModuleType, node: Handle, requested: DeviceSetup, sensor: Handle, rate_hz: float
+        self, dai: ModuleType, node: Handle, requested: DeviceSetup, sensor: Handle
     ) -> Handle:
         """Sets what is requested, and creates the camera node's output."""
         if requested.focus is not None:
@@ -110,16 +121,16 @@ class OakCamera:
         kind = dai.ImgFrame.Type.BGR888i if is_colour else dai.ImgFrame.Type.GRAY8
         # The factory's matrix is for pictures that are scaled and cropped, and still distorted.
         crop = dai.ImgResizeMode.CROP
-        return node.requestOutput(self.resolution, kind, crop, rate_hz, False)
+        return node.requestOutput(self.resolution, kind, crop, _RATE_HZ, False)
 
     def _hold_settings(
         self, dai: ModuleType, requested: DeviceSetup, sensor: Handle, control_queue: Handle
     ) -> dict[str, str | float]:
         """Fixes the settings that the camera determined by itself, and returns them."""
-        frame = self._end.message(_FIRST_S)
+        frame = self._message(_FIRST_S)
         until = time.monotonic() + _SETTLE_S
         while frame is not None and time.monotonic() < until:
-            frame = self._end.message(1.0)
+            frame = self._message(1.0)
         if frame is None:
             raise DriverError(
                 f"{self.name} starts, but gives no picture.",
@@ -144,39 +155,12 @@ class OakCamera:
     ) -> tuple[Camera | None, dict[str, str | float]]:
         """Factory intrinsics, with a setting that states their source or why they are not used."""
         try:
-            camera = factory_intrinsics(calibration, self._socket, self.resolution)
+            camera = factory_intrinsics(calibration, _SOCKET, self.resolution)
         except DriverError as error:
             return None, {"factory_intrinsics": f"not used: {error.message}"}
         focus = _calibrated_focus(calibration, sensor)
         suffix = "" if focus is None else f", for focus {focus}"
         return camera, {"factory_intrinsics": f"read from the device{suffix}"}
-
-
-def _options(more: Mapping[str, str]) -> tuple[str, float]:
-    """Socket and rate [Hz] from a user's options."""
-    for name in more:
-        if name not in _OPTIONS:
-            raise DriverError(
-                f"The OAK has no option {name!r}; {', '.join(_OPTIONS)} are there.",
-                culprits=[name],
-                next_step=did_you_mean(name, _OPTIONS),
-            )
-    socket = more.get("socket", SOCKETS[0])
-    if socket not in SOCKETS:
-        raise DriverError(
-            f"The OAK has no socket {socket!r}; {SOCKETS[0]} to {SOCKETS[-1]} are the names.",
-            culprits=["socket"],
-        )
-    try:
-        rate_hz = float(more.get("rate_hz", _RATE_HZ))
-    except ValueError:
-        rate_hz = math.nan
-    if not 0.0 < rate_hz < 1e3:
-        raise DriverError(
-            f"rate_hz is {more['rate_hz']!r}; pictures a second are needed, as 10.",
-            culprits=["rate_hz"],
-        )
-    return socket, rate_hz
 
 
 def _open_device(dai: ModuleType, device: str | None) -> Handle:
@@ -193,16 +177,16 @@ def _open_device(dai: ModuleType, device: str | None) -> Handle:
         ) from error
 
 
-def _sensor(device: Handle, socket: str) -> Handle:
-    """The device's description of the sensor on a socket."""
+def _sensor(device: Handle) -> Handle:
+    """The device's description of its camera's sensor."""
     sensors = {feature.socket.name: feature for feature in device.getConnectedCameraFeatures()}
-    if socket not in sensors:
+    if _SOCKET not in sensors:
         raise DriverError(
-            f"The OAK has no camera on {socket}; it has {', '.join(sensors) or 'none'}.",
-            culprits=[socket],
-            next_step="Name another socket, or look at the camera's ribbon cable.",
+            f"The OAK has no camera on {_SOCKET}; it has {', '.join(sensors) or 'none'}.",
+            culprits=[_SOCKET],
+            next_step="Look at the camera's ribbon cable.",
         )
-    return sensors[socket]
+    return sensors[_SOCKET]
 
 
 def _default_resolution(width: int, height: int) -> tuple[int, int]:
@@ -224,3 +208,25 @@ def _calibrated_focus(calibration: Handle, sensor: Handle) -> int | None:
         return None
     position = int(calibration.getLensPosition(sensor.socket))
     return position if position > 0 else None
+
+
+@contextmanager
+def _worded(dai: ModuleType, name: str, what: str = "gives no frames any more") -> Iterator[None]:
+    """Translates depthai's exceptions of devices, pipelines and closed queues.
+
+    Raises:
+        DriverError: Depthai raised one.
+    """
+    try:
+        yield
+    except (RuntimeError, dai.MessageQueue.QueueException) as error:
+        raise DriverError(
+            f"{name} {what}: {error}.",
+            culprits=[name],
+            next_step="Look at its cable and its power; then go on with --resume.",
+        ) from error
+
+
+def _stop(pipeline: Handle) -> None:
+    pipeline.stop()
+    pipeline.wait()

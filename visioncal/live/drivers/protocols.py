@@ -1,7 +1,7 @@
 """Interfaces of arms and cameras; the drivers know nothing of sessions or calibration."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 from visioncal.core.types import Camera, FloatArray, Image
@@ -166,11 +166,9 @@ class DeviceSetup:
         exposure_us: Exposure time [us].
         gain: ISO, or in the device's own unit.
         focus: Lens position in the device's own unit.
-        more: Options of the particular driver.
     """
 
     resolution: tuple[int, int] | None = None
     exposure_us: int | None = None
     gain: int | None = None
     focus: int | None = None
-    more: Mapping[str, str] = field(default_factory=dict)

@@ -3,19 +3,15 @@
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import replace
 
 import numpy as np
 
 from visioncal.core.choices import Faults
-from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
 from visioncal.live.capture.core import CaptureEvent
 from visioncal.live.capture.live import LiveCell
-from visioncal.live.drivers.extras import depthai
-from visioncal.live.drivers.oak_hosted import HostedOak
-from visioncal.live.drivers.protocols import CameraDevice
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.rehearsal.camera import Fault as CameraFault
 from visioncal.live.rehearsal.camera import Pace, RehearsalCamera
@@ -57,7 +53,6 @@ class Bench:
 
     Attributes:
         camera: The camera that observes the true arm.
-        through_depthai: Whether its pictures go through depthai's pipeline.
     """
 
     def __init__(self, cell: RehearsedCell, start_q: FloatArray) -> None:
@@ -73,7 +68,6 @@ class Bench:
         self.camera = RehearsalCamera(
             cell.truth, lambda at_s: self._truth.state(at_s.tolist()).q, pace=_PACE
         )
-        self.through_depthai = _has_depthai()
 
     @contextmanager
     def connected(self) -> Iterator[LiveCell]:
@@ -82,8 +76,8 @@ class Bench:
         Raises:
             DriverError: One of them cannot be opened.
         """
-        with closing(UrArm(self.controller.host)) as arm, closing(self._open_camera()) as camera:
-            yield LiveCell(arm, camera)
+        with closing(UrArm(self.controller.host)) as arm:
+            yield LiveCell(arm, self.camera)
 
     def restart(self, q: FloatArray) -> None:
         """Restarts a controller that has died, with the arm at its last posture [rad]."""
@@ -97,24 +91,9 @@ class Bench:
         self._truth.close()
         self.controller.close()
 
-    def _open_camera(self) -> CameraDevice:
-        if not self.through_depthai:
-            return self.camera
-        camera = self.camera
-        return HostedOak(
-            camera.frame, camera.resolution, factory=camera.factory, settings=camera.settings
-        )
-
 
 def _options_at(cell: RehearsedCell, q: FloatArray) -> ControllerOptions:
     return replace(cell.controller, q=tuple(np.asarray(q).tolist()))
-
-
-def _has_depthai() -> bool:
-    with suppress(DriverError):
-        depthai()
-        return True
-    return False
 
 
 class FaultInjection:

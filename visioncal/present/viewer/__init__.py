@@ -1,7 +1,6 @@
 """The rerun viewer: layouts of recordings, and ways to open them."""
 
 from visioncal.present.viewer.layout import blueprint
-from visioncal.present.viewer.native import review_native
-from visioncal.present.viewer.web import review_web
+from visioncal.present.viewer.native import review_native, review_web
 
 __all__ = ["blueprint", "review_native", "review_web"]

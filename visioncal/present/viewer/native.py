@@ -1,6 +1,8 @@
-"""Shows a recording in rerun's native viewer."""
+"""Shows a recording in rerun's viewer, in a window or in a browser."""
 
+import re
 import time
+from collections.abc import Callable
 from pathlib import Path
 from subprocess import Popen
 from threading import Thread
@@ -11,8 +13,10 @@ from visioncal.core.errors import DriverError
 from visioncal.present.recording import paths
 from visioncal.present.viewer.process import free_port, until_interrupted, viewer_process
 
+_HOST = "127.0.0.1"
 # Longest wait for the recording to load, and polling interval [s].
 _PATIENCE_S, _AGAIN_S = 60.0, 0.2
+_SERVING = re.compile(rf"connect at (http://{re.escape(_HOST)}:\d+\S*)")
 
 
 def review_native(recording: Path, row: int | None = None) -> None:
@@ -27,17 +31,42 @@ def review_native(recording: Path, row: int | None = None) -> None:
     """
     # The viewer listens to other programs, on this machine only.
     port = free_port()
-    arguments = ("--bind", "127.0.0.1", "--port", str(port), str(recording.absolute()))
+    arguments = ("--bind", _HOST, "--port", str(port), str(recording.absolute()))
     with until_interrupted(), viewer_process(*arguments) as process:
         if row is not None:
             Thread(target=_seek, args=(process, port, row), daemon=True).start()
         output, _ = process.communicate()
         if process.returncode != 0:
-            last_line = output.strip().splitlines()[-1:] or ["it did not say why"]
-            raise DriverError(
-                f"rerun's viewer ended with status {process.returncode}: {last_line[0]}.",
-                next_step="Without a display, show the recording in a browser: --web.",
-            )
+            raise _ended_error(process, output, "Without a display, show it in a browser: --web.")
+
+
+def review_web(recording: Path, opened: Callable[[str], None]) -> None:
+    """Serves a recording by rerun's own server to this machine, until Ctrl-C or SIGTERM.
+
+    Args:
+        recording: The `.rrd`.
+        opened: Called with the page's URL once it is available.
+
+    Raises:
+        DriverError: Rerun's command does not serve its web viewer.
+    """
+    ports = ("--port", str(free_port()), "--web-viewer-port", "0")
+    arguments = ("--serve-web", "--bind", _HOST, *ports, str(recording.absolute()))
+    with until_interrupted(), viewer_process(*arguments) as process:
+        output = ""
+        for line in process.stdout or ():
+            output += line
+            if serving := _SERVING.search(line):
+                opened(serving[1])
+        process.wait()
+        raise _ended_error(process, output, "Leave out --web for a window.")
+
+
+def _ended_error(process: Popen[str], output: str, step: str) -> DriverError:
+    last_line = output.strip().splitlines()[-1:] or ["it did not say why"]
+    return DriverError(
+        f"rerun's viewer ended with status {process.returncode}: {last_line[0]}.", next_step=step
+    )
 
 
 def _seek(process: Popen[str], port: int, row: int) -> None:
@@ -45,7 +74,7 @@ def _seek(process: Popen[str], port: int, row: int) -> None:
     deadline = time.monotonic() + _PATIENCE_S
     while process.poll() is None and time.monotonic() < deadline:
         try:
-            viewer = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
+            viewer = ViewerClient(f"rerun+http://{_HOST}:{port}/proxy")
             viewer.set_time(paths.TIMELINE, sequence=row, play_state="paused")
         except (OSError, RuntimeError, ValueError):
             time.sleep(_AGAIN_S)
