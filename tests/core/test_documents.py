@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from visioncal.core.documents import (
     as_numbers,
     parse_stored,
-    parse_xml,
     read_json,
     read_npy,
     read_npz,
@@ -133,31 +132,10 @@ def test_xml_has_no_document_type(file):
             read_xml(path)
     with pytest.raises(DataError, match="nested deeper"):
         read_xml(file("deep.xml", "<a>" * 100 + "</a>" * 100))
-    with pytest.raises(DataError, match="line 2 is no XML"):
+    with pytest.raises(DataError, match=r"is no XML.*line 2"):
         read_xml(file("cut.xml", "<a>\n<b>"))
     root = read_xml(file("good.xml", "<a>x<!-- no --><b c='1'> 2 </b>y</a>"))
-    assert (root.text, root.child("b").text, root.child("b").attributes) == ("xy", "2", {"c": "1"})
-
-
-def test_xml_knows_where_its_elements_stand():
-    text = b"""<a><b c='1>2'>x</b><d e="f" /><g></g></a>"""
-    root = parse_xml(text, "it")
-    pieces = {
-        element.tag: (
-            text[element.begin : element.inside],
-            text[element.inside : element.close],
-            text[element.begin : element.end],
-        )
-        for element in (root, root.child("b"), root.child("g"))
-    }
-    assert pieces == {
-        "a": (b"<a>", text[3:-4], text),
-        "b": (b"<b c='1>2'>", b"x", b"<b c='1>2'>x</b>"),
-        "g": (b"<g>", b"", b"<g></g>"),
-    }
-    empty = root.child("d")
-    assert [child.is_empty for child in root.children] == [False, True, False]
-    assert text[empty.begin : empty.end] == b'<d e="f" />' == text[empty.begin : empty.inside]
+    assert (root.findtext("b"), root.find("b").attrib) == (" 2 ", {"c": "1"})
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
@@ -353,7 +331,7 @@ HOSTILE = {
         "a: !!opencv-matrix {rows: 9999, cols: 0, dt: 999d, data: []}",
         "none that is read",
     ),
-    "twice.xml": ("<s><a>1</a><a>2</a></s>", "line 1: <a> is there twice"),
+    "twice.xml": ("<s><a>1</a><a>2</a></s>", "<a> is there twice"),
     "rows twice.xml": (
         "<s><a type_id='opencv-matrix'><rows>1</rows><rows>2</rows></a></s>",
         "<rows> is there twice",

@@ -325,7 +325,7 @@ def test_a_urdf_gets_the_inertias_and_keeps_the_rest():
     assert again.base_from_flange(states(robot)[0]) == pytest.approx(
         robot.base_from_flange(states(robot)[0]), abs=1e-12
     )
-    assert "<visual/>" in written
+    assert "<visual />" in written
     assert "<!-- identified - - yesterday -->" in written
     with pytest.raises(DataError, match="a robot of a URDF is needed"):
         urdf_with_inertias(load_robot("ur5e"), found)

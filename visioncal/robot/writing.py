@@ -1,16 +1,17 @@
 """Writing of robots as files: joint tables, URDFs, ur_description's kinematics."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+from xml.etree.ElementTree import Comment, Element, SubElement, fromstring, indent, tostring
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import tomli_w
 
 from visioncal.core.conventions import POSE_FORMS, ROTATION_FORMS, write_pose
-from visioncal.core.documents import Element, parse_xml
+from visioncal.core.documents import parse_xml
 from visioncal.core.errors import DataError
 from visioncal.core.files import one_line
 from visioncal.core.transforms import compose, invert, log
@@ -76,7 +77,7 @@ def small_urdf(robot: Robot, notes: Sequence[str] = ()) -> str:
     lines = [
         '<?xml version="1.0"?>',
         f"<robot name={quoteattr(robot.name)}>",
-        *comment_lines(robot, notes),
+        *(f"  <!-- {text} -->" for text in comment_texts(robot, notes)),
     ]
     lines.append(f"  <link name={quoteattr(links[0])}/>")
     for link, inertial in zip(links[1:], _inertials(robot), strict=True):
@@ -131,15 +132,12 @@ def _inertials(robot: Robot) -> list[list[str]]:
     return [inertial_lines(*body) for body in bodies]
 
 
-def comment_lines(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
-    """Lines of XML comments: the notes, and joint functions that are missing."""
+def comment_texts(robot: Robot, notes: Sequence[str] = ()) -> list[str]:
+    """Texts of XML comments: the notes, and joint functions that are missing."""
     missing = unexportable_functions(robot)
     said = f"Not in this file, for URDF cannot say it: {'; '.join(missing)}"
     # XML ends a comment at two hyphens.
-    texts = [
-        re.sub("-(?=-)", "- ", one_line(note)) for note in (*notes, *([said] if missing else []))
-    ]
-    return [f"  <!-- {text} -->" for text in texts]
+    return [re.sub("-(?=-)", "- ", one_line(note)) for note in (*notes, *[said][: len(missing)])]
 
 
 def _joint_lines(parent: str, child: str, placement: FloatArray) -> list[str]:
@@ -265,10 +263,10 @@ def fit_links(
 def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) -> str:
     """Writes the URDF of a robot with a calibrated geometry.
 
-    Only the origins of the joints between base and tip change, and that of the fixed joint before
-    the tip; where there is none, a link NAME_corrected with a fixed joint is added. Joint offsets
-    go into the origins. A URDF cannot hold gear ratio and eccentricity; a comment lists those that
-    are missing.
+    What the URDF says stays, though not its formatting: only the origins of the joints between
+    base and tip change, and that of the fixed joint before the tip; where there is none, a link
+    NAME_corrected with a fixed joint is added. Joint offsets go into the origins. A URDF cannot
+    hold gear ratio and eccentricity; a comment lists those that are missing.
 
     Args:
         nominal: The robot as the URDF describes it.
@@ -285,11 +283,9 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
             culprits=[nominal.name],
             next_step="Write a small URDF or a joint table instead.",
         )
-    data = text.encode("utf-8")
-    root, joints = joints_of(data)
+    root, joints = joints_of(text)
     old, new = nominal.chain, corrected.chain.with_offsets_placed()
     steps = invert(old.placements) @ new.placements
-    edits, comments = [], comment_lines(corrected, notes)
     for name, before, after, step in zip(
         (*old.joint_names, None), old.placements, new.placements, steps, strict=True
     ):
@@ -297,47 +293,43 @@ def corrected_urdf(nominal: Robot, corrected: Robot, notes: Sequence[str] = ()) 
             continue
         joint = _of_tip(joints, nominal) if name is None else joints[name]
         if joint is None:
-            edits.append((root.close, root.close, _corrected_tip_link(nominal.tip, joints, step)))
+            root.extend(_corrected_tip_link(nominal.tip, joints, step))
         else:
-            edits.append(_origin_edit(joint, _placement(joint) @ step))
-    if comments:
-        edits.append((root.inside, root.inside, ("\n" + "\n".join(comments)).encode("utf-8")))
-    return edited(data, edits)
+            _set_origin(joint, _placement(joint) @ step)
+    return _with_comments(root, comment_texts(corrected, notes))
 
 
 def corrected_tip(nominal: Robot, corrected: Robot) -> str:
     """Name of the frame in `corrected_urdf` that corresponds to the corrected flange."""
     if np.array_equal(nominal.chain.placements[-1], corrected.chain.placements[-1]):
         return nominal.tip
-    _, joints = joints_of(str(nominal.document["urdf"]).encode("utf-8"))
+    _, joints = joints_of(str(nominal.document["urdf"]))
     return nominal.tip if _of_tip(joints, nominal) else f"{nominal.tip}_corrected"
 
 
-def joints_of(data: bytes) -> tuple[Element, dict[str, Element]]:
+def joints_of(urdf: str) -> tuple[Element, dict[str, Element]]:
     """The root of a URDF, and its joints by name, without those nested in transmissions."""
-    root = parse_xml(data, "the URDF")
-    return root, {
-        child.attributes["name"]: child for child in root.children if child.tag == "joint"
-    }
+    root = parse_xml(urdf.encode("utf-8"), "the URDF")
+    return root, {joint.get("name", ""): joint for joint in root.iterfind("joint")}
 
 
 def end_of(joint: Element, end: str) -> str:
     """The `parent` or `child` link of a joint; empty where absent."""
-    link = joint.child(end)
-    return "" if link is None else link.attributes.get("link", "")
+    link = joint.find(end)
+    return "" if link is None else link.get("link", "")
 
 
-def edited(data: bytes, edits: Iterable[tuple[int, int, bytes]]) -> str:
-    """Text with pieces replaced: (begin, end, new piece), in bytes."""
-    for begin, end, piece in sorted(edits, reverse=True):
-        data = data[:begin] + piece + data[end:]
-    return data.decode("utf-8")
+def _with_comments(root: Element, comments: Sequence[str]) -> str:
+    """Text of an edited URDF, with comments at its head."""
+    root[:0] = [Comment(f" {comment} ") for comment in comments]
+    indent(root)
+    return f'<?xml version="1.0"?>\n{tostring(root, encoding="unicode")}\n'
 
 
 def _placement(joint: Element) -> FloatArray:
     """A joint's origin (4, 4) [m]."""
-    origin = joint.child("origin")
-    attributes = {} if origin is None else origin.attributes
+    origin = joint.find("origin")
+    attributes = {} if origin is None else origin.attrib
     xyz, rpy = (
         np.array(attributes.get(key, "0 0 0").split(), dtype=float) for key in ("xyz", "rpy")
     )
@@ -353,29 +345,25 @@ def _of_tip(joints: Mapping[str, Element], robot: Robot) -> Element | None:
     return next(named, None)
 
 
-def _origin_edit(joint: Element, placement: FloatArray) -> tuple[int, int, bytes]:
-    """The edit that gives a joint another origin."""
-    xyz, rpy = numbers_text(placement)
-    text = f'<origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"'.encode()
-    origin = joint.child("origin")
-    if origin is None:
-        return joint.inside, joint.inside, b"\n    " + text + b"/>"
-    return origin.begin, origin.inside, text + (b"/>" if origin.is_empty else b">")
+def _set_origin(joint: Element, placement: FloatArray) -> None:
+    """Gives a joint another origin (4, 4) [m]."""
+    origin = joint.find("origin")
+    origin = SubElement(joint, "origin") if origin is None else origin
+    for key, numbers in zip(("xyz", "rpy"), numbers_text(placement), strict=True):
+        origin.set(key, " ".join(numbers))
 
 
-def _corrected_tip_link(tip: str, joints: Mapping[str, Element], step: FloatArray) -> bytes:
+def _corrected_tip_link(
+    tip: str, joints: Mapping[str, Element], step: FloatArray
+) -> tuple[Element, Element]:
     """A link with a fixed joint for the corrected tip, where no fixed joint places the tip."""
-    xyz, rpy = numbers_text(step)
+    corrected = f"{tip}_corrected"
+    joint = Element("joint", name=f"{tip}_correction", type="fixed")
     parent = end_of(joints[tip], "child") if tip in joints else tip
-    link = quoteattr(f"{tip}_corrected")
-    return (
-        f"  <link name={link}/>\n"
-        f'  <joint name={quoteattr(f"{tip}_correction")} type="fixed">\n'
-        f"    <parent link={quoteattr(parent)}/>\n"
-        f"    <child link={link}/>\n"
-        f'    <origin xyz="{" ".join(xyz)}" rpy="{" ".join(rpy)}"/>\n'
-        "  </joint>\n"
-    ).encode()
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=corrected)
+    _set_origin(joint, step)
+    return Element("link", name=corrected), joint
 
 
 def with_inertias(robot: Robot, inertias: Inertias) -> Robot:
@@ -425,21 +413,17 @@ def urdf_with_inertias(robot: Robot, inertias: Inertias, notes: Sequence[str] = 
             culprits=[robot.name],
             next_step="Write a small URDF or a joint table instead.",
         )
-    data = text.encode("utf-8")
-    root, joints = joints_of(data)
-    links = {child.attributes["name"]: child for child in root.children if child.tag == "link"}
+    root, joints = joints_of(text)
+    links = {link.get("name", ""): link for link in root.iterfind("link")}
     masses = inertias.masses
     bodies = zip(masses.kg.tolist(), masses.centres_m, inertias.about_centres, strict=True)
-    edits = []
     for joint, body in zip(robot.joint_names, bodies, strict=True):
         own = end_of(joints[joint], "child")
         for name in _moving_with(own, joints, robot.joint_names):
-            lines = inertial_lines(*body) if name == own else []
-            edits.append(_inertial_edit(data, links[name], "\n".join(lines)))
-    if notes:
-        head = "\n" + "\n".join(comment_lines(robot, notes))
-        edits.append((root.inside, root.inside, head.encode("utf-8")))
-    return edited(data, edits)
+            for former in links[name].findall("inertial"):
+                links[name].remove(former)
+        links[own].append(fromstring("".join(inertial_lines(*body))))
+    return _with_comments(root, comment_texts(robot, notes))
 
 
 def _moving_with(link: str, joints: Mapping[str, Element], arm: Sequence[str]) -> list[str]:
@@ -452,16 +436,3 @@ def _moving_with(link: str, joints: Mapping[str, Element], arm: Sequence[str]) -
             if end_of(element, "parent") == name and joint not in arm
         ]
     return links
-
-
-def _inertial_edit(data: bytes, link: Element, inertial: str) -> tuple[int, int, bytes]:
-    """The edit that gives a link another inertia or none."""
-    old = link.child("inertial")
-    if old is not None:
-        return old.begin, old.end, inertial.strip().encode("utf-8")
-    if not inertial:
-        return link.inside, link.inside, b""
-    if not link.is_empty:
-        return link.inside, link.inside, f"\n{inertial}".encode()
-    slash = data.rindex(b"/", link.begin, link.inside)
-    return slash, link.inside, f">\n{inertial}\n  </link>".encode()

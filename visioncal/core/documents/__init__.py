@@ -9,11 +9,10 @@ from visioncal.core.documents.jsons import parse_stored, read_json
 from visioncal.core.documents.opencv import read_opencv
 from visioncal.core.documents.tables import TextTable, is_number, read_table
 from visioncal.core.documents.values import as_numbers, mapping, number, shown
-from visioncal.core.documents.xmls import Element, parse_xml, read_xml
+from visioncal.core.documents.xmls import parse_xml, read_xml
 from visioncal.core.documents.yamls import read_yaml
 
 __all__ = [
-    "Element",
     "TextTable",
     "as_numbers",
     "is_number",

@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 from visioncal.core.documents.jsons import read_json
 from visioncal.core.documents.tables import is_number
 from visioncal.core.documents.values import matrix_from
-from visioncal.core.documents.xmls import Element, read_xml
+from visioncal.core.documents.xmls import read_xml
 from visioncal.core.documents.yamls import read_yaml
 from visioncal.core.errors import DataError
 
@@ -48,31 +49,32 @@ def _with_matrices(value: object, where: str) -> object:
 
 
 def _from_xml(element: Element, where: str) -> object:
-    place = f"{where}, line {element.line}"
-    if element.attributes.get("type_id") in _MATRICES:
+    place, children = f"{where}: <{element.tag}>", [*element.iterfind("*")]
+    text = (element.text or "").strip()
+    if element.get("type_id") in _MATRICES:
         content = {
-            tag: item.text.strip('"') if tag == "dt" else _numbers(item.text, place)
+            tag: words.strip('" \n') if tag == "dt" else _numbers(words, place)
             for tag, item in _by_tag(element, where).items()
+            for words in [item.text or ""]
         }
         return matrix_from(content, place)
-    if element.children and all(child.tag == "_" for child in element.children):
-        return [_from_xml(child, where) for child in element.children]
-    if element.children:
+    if children and all(child.tag == "_" for child in children):
+        return [_from_xml(child, where) for child in children]
+    if children:
         return {tag: _from_xml(item, where) for tag, item in _by_tag(element, where).items()}
     try:
-        numbers = _numbers(element.text, place)
+        numbers = _numbers(text, place)
     except DataError:
-        return element.text.strip('"')
+        return text.strip('"')
     return numbers[0] if len(numbers) == 1 else numbers or ""
 
 
 def _by_tag(element: Element, where: str) -> dict[str, Element]:
     by_tag: dict[str, Element] = {}
-    for child in element.children:
+    for child in element.iterfind("*"):
         if by_tag.setdefault(child.tag, child) is not child:
-            place = f"{where}, line {child.line}"
             raise DataError(
-                f"{place}: <{child.tag[:60]}> is there twice; once is needed.", culprits=[place]
+                f"{where}: <{child.tag[:60]}> is there twice; once is needed.", culprits=[where]
             )
     return by_tag
 

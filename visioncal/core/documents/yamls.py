@@ -1,8 +1,7 @@
-"""Safe YAML, built from parser events: no constructors; aliases are refused."""
+"""Safe YAML of plain values and OpenCV's matrices; aliases are refused, sizes are bounded."""
 
 import math
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,31 +18,18 @@ from visioncal.core.documents.values import (
 from visioncal.core.errors import DataError
 
 _STANDARD = "tag:yaml.org,2002:"
-_PLAIN_TAGS = {
-    f"{_STANDARD}{name}" for name in ("map", "seq", "str", "int", "float", "bool", "null")
+_CONSTANTS: dict[str, object] = {"true": True, "yes": True, "on": True}
+_CONSTANTS |= {"false": False, "no": False, "off": False, "": None, "~": None, "null": None}
+_CONSTANTS |= {
+    f"{sign}{dot}inf": float(f"{sign}inf") for sign in ("", "+", "-") for dot in ("", ".")
 }
-_MATRIX_TAGS = {f"{_STANDARD}opencv-matrix", f"{_STANDARD}opencv-nd-matrix"}
-
-_INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
-# YAML 1.1 requires a point in floats; other programs are not always so strict.
-_FLOAT = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_WORDS = {
-    "": None,
-    "~": None,
-    "null": None,
-    "true": True,
-    "yes": True,
-    "on": True,
-    "false": False,
-    "no": False,
-    "off": False,
-    ".nan": math.nan,
-    "nan": math.nan,
-    ".inf": math.inf,
-    "+.inf": math.inf,
-    "inf": math.inf,
-    "-.inf": -math.inf,
-    "-inf": -math.inf,
+_CONSTANTS |= {"nan": math.nan, ".nan": math.nan}
+# YAML 1.1 has octal and sexagesimal numbers and dates, and requires a point in floats. Other
+# programs are not so strict: 010 is ten, 1e-3 a number, and a date is text.
+_FORMS = {
+    "int": r"[+-]?[0-9]{1,18}$",
+    "float": r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$",
+    "bool": rf"(?i:{'|'.join(map(re.escape, _CONSTANTS))})$",
 }
 
 
@@ -61,119 +47,87 @@ def parse_yaml(text: str, where: str) -> object:
     """Parses YAML as `read_yaml` does; `where` names its origin in errors."""
     # OpenCV's `%YAML:1.0` is no valid directive; an empty comment keeps line numbers.
     plain = re.sub(r"\A%YAML[^\n]*", "#", text)
-    builder = _Builder(where)
     try:
-        for event in yaml.parse(plain, Loader=_LOADER):
-            if isinstance(event, yaml.DocumentEndEvent):
-                break
-            builder.take(event)
+        _check_events(plain, where)
+        loader = _Loader(plain)
+        loader.where = where
+        return loader.get_data() if loader.check_data() else None
     except yaml.MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise DataError(f"{where}{line} is no YAML: {error.problem}.", culprits=[where]) from error
     except yaml.YAMLError as error:
         reason = " ".join(str(error).split())
         raise DataError(f"{where} is no YAML: {reason}.", culprits=[where]) from error
-    return builder.result
 
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-
-@dataclass
-class _Level:
-    """A list or mapping under construction; `key` awaits its value."""
-
-    content: dict[str, Any] | list[Any]
-    line: int
-    tag: str | None = None
-    key: str | None = None
-
-
-@dataclass
-class _Builder:
-    """Builds plain values from the parser's events."""
-
-    where: str
-    result: object = None
-    count: int = 0
-    levels: list[_Level] = field(default_factory=list)
-
-    def take(self, event: yaml.Event) -> None:
-        """Processes an event."""
+def _check_events(text: str, where: str) -> None:
+    """Checks size, depth and aliases before anything is built; raises DataError."""
+    count = depth = 0
+    for event in yaml.parse(text, Loader=_BASE):
+        if isinstance(event, yaml.DocumentEndEvent):
+            return
+        count += isinstance(event, yaml.NodeEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if count > MAX_VALUES:
+            raise too_many(where)
+        if depth > MAX_DEPTH:
+            raise too_deep(f"{where}, line {_line(event)}")
         if isinstance(event, yaml.AliasEvent):
-            raise self._refusal(
-                event, f"the alias *{event.anchor}", "values written out are needed"
-            )
-        if isinstance(event, yaml.ScalarEvent):
-            self._check_tag(event)
-            self._put(_scalar(event), event)
-        elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
-            self._check_tag(event)
-            self._open(event)
-        elif isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
-            level = self.levels.pop()
-            if level.tag in _MATRIX_TAGS:
-                self._put(matrix_from(level.content, f"{self.where}, line {level.line}"), event)
-            else:
-                self._put(level.content, event)
-
-    def _open(self, event: yaml.CollectionStartEvent) -> None:
-        if len(self.levels) >= MAX_DEPTH:
-            raise too_deep(self._place(event))
-        is_map = isinstance(event, yaml.MappingStartEvent)
-        self.levels.append(_Level({} if is_map else [], _line(event), event.tag))
-
-    def _put(self, value: object, event: yaml.Event) -> None:
-        self.count += 1
-        if self.count > MAX_VALUES:
-            raise too_many(self.where)
-        if not self.levels:
-            self.result = value
-            return
-        level = self.levels[-1]
-        if isinstance(level.content, list):
-            level.content.append(value)
-        elif level.key is None:
-            level.key = self._key(value, level.content, event)
-        else:
-            level.content[level.key] = value
-            level.key = None
-
-    def _key(self, value: object, content: dict[str, Any], event: yaml.Event) -> str:
-        if isinstance(value, dict | list):
-            raise self._refusal(event, "a list or mapping as a key", "a word is needed")
-        key = event.value if isinstance(event, yaml.ScalarEvent) else str(value)
-        if key in content:
-            raise self._refusal(event, f"the key {key[:60]!r} a second time", "once is needed")
-        return key
-
-    def _check_tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
-        tag = event.tag
-        matrix = isinstance(event, yaml.MappingStartEvent) and tag in _MATRIX_TAGS
-        if tag in (None, "!") or tag in _PLAIN_TAGS or matrix:
-            return
-        words = tag.removeprefix(_STANDARD)[:60]
-        raise self._refusal(event, f"the tag {words!r}", "plain values are needed")
-
-    def _place(self, event: yaml.Event) -> str:
-        return f"{self.where}, line {_line(event)}"
-
-    def _refusal(self, event: yaml.Event, seen: str, needed: str) -> DataError:
-        place = self._place(event)
-        return DataError(f"{place}: {seen}; {needed}.", culprits=[place])
+            seen = f"the alias *{event.anchor}"
+            raise _refusal(where, event, seen, "values written out are needed")
 
 
-def _line(event: yaml.Event) -> int:
-    return event.start_mark.line + 1 if event.start_mark else 0
+def _line(item: yaml.Event | yaml.Node) -> int:
+    return item.start_mark.line + 1 if item.start_mark else 0
 
 
-def _scalar(event: yaml.ScalarEvent) -> object:
-    """Converts a scalar: quoted ones are text, plain ones a number or constant if they match."""
-    text = event.value
-    if not event.implicit[0]:
-        return text
-    if _INTEGER.fullmatch(text):
-        return int(text)
-    if _FLOAT.fullmatch(text):
-        return float(text)
-    return _WORDS.get(text.lower(), text)
+def _refusal(where: str, item: yaml.Event | yaml.Node, seen: str, needed: str) -> DataError:
+    place = f"{where}, line {_line(item)}"
+    return DataError(f"{place}: {seen}; {needed}.", culprits=[place])
+
+
+_BASE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_BASE):  # type: ignore[misc] # which of two is chosen when imported
+    """Loads plain values; `where` names the file in errors."""
+
+    where = ""
+
+    def mapping(self, node: yaml.MappingNode) -> object:
+        """Reads a mapping, or one of OpenCV's matrices."""
+        content: dict[str, object] = {}
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                seen = "a list or mapping as a key"
+                raise _refusal(self.where, key, seen, "a word is needed")
+            if key.value in content:
+                seen = f"the key {key.value[:60]!r} a second time"
+                raise _refusal(self.where, key, seen, "once is needed")
+            content[key.value] = self.construct_object(value, deep=True)
+        if node.tag.endswith("matrix"):
+            return matrix_from(content, f"{self.where}, line {_line(node)}")
+        return content
+
+    def refuse(self, node: yaml.Node) -> object:
+        """Refuses any other tag; raises DataError."""
+        seen = f"the tag {node.tag.removeprefix(_STANDARD)[:60]!r}"
+        raise _refusal(self.where, node, seen, "plain values are needed")
+
+
+_Loader.yaml_implicit_resolvers = {}
+_Loader.yaml_constructors = {
+    None: _Loader.refuse,
+    f"{_STANDARD}str": lambda _, node: node.value,
+    f"{_STANDARD}int": lambda _, node: int(node.value),
+    f"{_STANDARD}float": lambda _, node: float(node.value),
+    f"{_STANDARD}bool": lambda _, node: _CONSTANTS[node.value.lower()],
+    f"{_STANDARD}seq": lambda loader, node: loader.construct_sequence(node, deep=True),
+    **dict.fromkeys(
+        (f"{_STANDARD}{kind}" for kind in ("map", "opencv-matrix", "opencv-nd-matrix")),
+        _Loader.mapping,
+    ),
+}
+for _kind, _form in _FORMS.items():
+    _Loader.add_implicit_resolver(f"{_STANDARD}{_kind}", re.compile(_form), None)

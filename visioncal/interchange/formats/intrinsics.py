@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from visioncal.core.documents import (
-    Element,
     as_numbers,
     is_number,
     mapping,
@@ -65,7 +65,7 @@ def read_intrinsics(path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
         return intrinsics_from(read_npz(path), str(path))
     if path.suffix.lower() == ".xml":
         root = read_xml(path)
-        if root.child("camera") is not None:
+        if root.find("camera") is not None:
             return _visp(root, str(path)), ()
     return intrinsics_from(read_opencv(path), str(path))
 
@@ -166,9 +166,9 @@ def _kalibr(content: Mapping[str, Any], where: str) -> dict[str, Any]:
 def _visp(root: Element, where: str) -> dict[str, Any]:
     """Reads ViSP's camera XML (ViSP, vpCameraParameters)."""
     # Its k_ud maps undistorted to distorted points with 1 + k_ud r^2, which is OpenCV's k1.
-    camera = root.child("camera") or root
-    models = [child for child in camera.children if child.tag == "model"]
-    kinds = [(model.child("type") or model).text for model in models]
+    camera = next(root.iterfind("camera"), root)
+    models = camera.findall("model")
+    kinds = [model.findtext("type", "").strip() for model in models]
     chosen = [
         model for model, kind in zip(models, kinds, strict=True) if kind.endswith("WithDistortion")
     ]
@@ -177,10 +177,10 @@ def _visp(root: Element, where: str) -> dict[str, Any]:
     model = (chosen or models)[0]
 
     def read(element: Element, tag: str, default: float | None = None) -> float:
-        child = element.child(tag)
-        if child is None and default is not None:
+        found = element.findtext(tag)
+        if found is None and default is not None:
             return default
-        place, text = f"{where}: <{tag}>", child.text if child else ""
+        place, text = f"{where}: <{tag}>", (found or "").strip()
         return number(float(text) if is_number(text) else text, place)
 
     values = [read(model, name) for name in ("px", "py", "u0", "v0")]
