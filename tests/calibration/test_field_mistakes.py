@@ -159,7 +159,7 @@ def test_a_camera_that_was_bumped_midway_is_no_error_of_the_arm(tmp_path, monkey
     assert first.do.command == "visioncal calibrate SESSION -o NEW --views 0-8"
     assert run_command(*options, "--views", "0-8").status == 0
     alone = visioncal.Calibration.load(tmp_path / "before")
-    assert {cause.kind for cause in alone.verdict.causes} == {"few_stops", "empty_image"}
+    assert {cause.kind for cause in alone.verdict.causes} == {"few_stops"}
     assert [view.view for view in alone.views] == list(range(9))
     away = (FLANGE_FROM_CAM.inv() * alone.transforms["flange_from_cam"]).translation
     sigma_m = np.sqrt(np.trace(alone.covariance("flange_from_cam")[3:, 3:]))

@@ -18,7 +18,7 @@ from visioncal.core.codec import read, write
 from visioncal.core.quantiles import chi2_limit
 from visioncal.core.transforms import exp, invert
 from visioncal.core.types import Need
-from visioncal.core.verdict import EMPTY_IMAGE, GOOD_FOR, Finding, remarks
+from visioncal.core.verdict import EMPTY_IMAGE, GOOD_FOR, Finding, Remedy, remarks
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian, pose_basis
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.present.report.content import need_facts
@@ -300,14 +300,14 @@ def test_a_result_is_good_for_the_need_that_it_prints(sigma_mm: float) -> None:
         assert judge(replace(found, need=Need(float(shown.split()[0])))).status == "good"
 
 
-def test_a_part_of_the_image_without_corners_is_a_hint_where_a_need_is_met() -> None:
-    empty = Finding(EMPTY_IMAGE, "No corner was ever seen in the upper left.", until_mm=0.0)
-    found = replace(SOUND, warnings=(empty,), picks=(of_size(0.1),))
-    assert judge(found).status == "check"
-    assert judge(found).good_for_mm == pytest.approx(0.28, rel=0.01)
-    met = judge(replace(found, need=NEED))
-    assert met.status == "good"
-    assert met.reasons[-1] == empty.words
+@pytest.mark.parametrize("need", [None, NEED])
+def test_a_part_of_the_image_without_corners_is_a_hint_and_no_doubt(need) -> None:
+    empty = Finding(EMPTY_IMAGE, "No corner was ever seen in the upper left.", Remedy("Move it."))
+    verdict = judge(replace(SOUND, warnings=(empty,), picks=(of_size(0.1),), need=need))
+    assert verdict.status == "good"
+    assert verdict.good_for_mm == pytest.approx(0.28, rel=0.01)
+    assert not verdict.causes
+    assert empty.do in verdict.next_steps
 
 
 def test_the_worst_pair_counts_and_is_named() -> None:

@@ -24,8 +24,11 @@ AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
 # rest, and reported first.
 MISSING, EMPTY_ROWS, OTHER_SIZE = "missing_images", "empty_rows", "image_size"
 NOT_USABLE = (MISSING, EMPTY_ROWS, OTHER_SIZE)
-# A part of the image without corners: only a hint where the task states its need.
+# A part of the image without corners: few robots fill all of a fixed camera's image, and picks are
+# where the views looked.
 EMPTY_IMAGE = "empty_image"
+# Kinds of a step's warnings that are no doubts about the result.
+NO_DOUBTS = (*NOT_USABLE, EMPTY_IMAGE)
 # Kinds with a special rank among causes of at least the last probability.
 EXCHANGED, ARM_ERRORS, UNEXPLAINED, _SURE = "exchanged_views", "arm_errors", "unexplained", 0.99
 # Kinds of findings that state the size of errors, the most important first.
@@ -105,6 +108,8 @@ class Finding:
         do: Advice; None for none.
         views: The views concerned.
         probability: Probability that it is the cause of what is wrong; 0 for no cause.
+        by_limit: Whether this probability follows from the limit of its test (or comparison) alone,
+            the same in all sessions: it ranks causes, and is not stated.
         without_it: The result without it, as a sentence.
         is_fatal: Whether it alone makes a result bad.
         until_mm: The need of a task from which on it is no doubt [mm]: zero for findings on the
@@ -120,6 +125,7 @@ class Finding:
     do: Remedy | None = None
     views: tuple[int, ...] = ()
     probability: Annotated[float, DROPPED] = 0.0
+    by_limit: Annotated[bool, DROPPED] = False
     without_it: Annotated[str, DROPPED] = ""
     is_fatal: Annotated[bool, UNWRITTEN] = field(default=False, compare=False)
     until_mm: Annotated[float, UNWRITTEN] = field(default=np.inf, compare=False)
@@ -227,11 +233,11 @@ class Verdict:
         return tuple(map(self._line, self.ranked[_SHOWN:]))
 
     def _line(self, finding: Finding) -> str:
-        likely = f"({percent(finding.probability)})"
+        likely = "" if finding.by_limit else f" ({percent(finding.probability)})"
         how = "Also likely" if finding.probability >= _EVEN else "Possibly"
         how = "Most likely" if finding in self.causes[:1] else how
         is_likely = finding.probability >= _LEAST_LIKELY and finding.kind not in SOURCES
-        begin = f"{how} {likely}: " if is_likely else ""
+        begin = f"{how}{likely}: " if is_likely else ""
         return f"{begin}{finding.words} {finding.without_it}".strip()
 
     @property

@@ -37,9 +37,6 @@ from visioncal.results import Calibration, Edge, Frame, Observation
 from visioncal.robot import Robot
 
 TOUCH_KINDS = ("point", "z", "xz")
-# Probability that another reading that fits twenty times better, p < 0.001, is the right one
-# (Sellke, Bayarri and Berger 2001, as for sessions' readings).
-_MISREAD = 0.98
 # A tip nearer to the poses' origin than any tool is long: the poses are a tool's already [m].
 _NO_TOOL_M = 2e-3
 
@@ -175,7 +172,7 @@ def _findings(
         command = f"{AGAIN} {best.options}" if best.options else ""
         step = Remedy("If the columns are in that order, say so.", command)
         words = f"{_closing_words(best)}."
-        yield Finding("misread_poses", words, step, probability=_MISREAD, is_fatal=True)
+        yield Finding("misread_poses", words, step, probability=1.0, by_limit=True, is_fatal=True)
     rows = range(len(touches))
     yield from outlier_findings(
         [placed_name(f"Touch {touches.labels[row]}", places[row]) for row in rows],

@@ -11,6 +11,10 @@ The probability depends on the kind of finding:
   error.
 - Facts, such as an unconnected frame: probability one. Remarks without a test, and sigmas beyond
   their limits, are facts that are causes only where there is no other.
+
+A probability is stated if this session's data decide it. Facts, and findings of comparisons of
+which the limit alone is known (`Finding.by_limit`), are only ranked by it: the same figure would
+stand before each.
 """
 
 import math
@@ -173,13 +177,14 @@ def with_misread(verdict: Verdict, found: Finding) -> Verdict:
         if finding.kind not in (GOOD_FOR, *SOURCES, *_BY_THE_CHAIN)
         and finding.words not in found.words
     )
-    return replace(verdict, findings=(replace(found, probability=odds / (1.0 + odds)), *rest))
+    cause = replace(found, probability=odds / (1.0 + odds), by_limit=True)
+    return replace(verdict, findings=(cause, *rest))
 
 
 def with_other_board(verdict: Verdict, found: Finding) -> Verdict:
     """Verdict in which the finding that images show another board comes first."""
     odds = _odds(EVIDENCE[found.kind].chance)
-    cause = replace(found, probability=odds / (1.0 + odds))
+    cause = replace(found, probability=odds / (1.0 + odds), by_limit=True)
     rest = (finding for finding in verdict.findings if finding.kind != "lost_views")
     return replace(verdict, findings=(cause, *rest))
 
@@ -240,7 +245,7 @@ def _first_sigma(found: Sequence[Finding]) -> Finding | None:
 
 def _as_fact(found: Finding, more: Remedy | None) -> Finding:
     """A finding as a cause with the probability of a fact."""
-    return replace(found, probability=1.0 - _FACT, do=found.do or more)
+    return replace(found, probability=1.0 - _FACT, by_limit=True, do=found.do or more)
 
 
 def _with_facts(found: Sequence[Finding], more: Remedy | None) -> Sequence[Finding]:
@@ -315,7 +320,8 @@ def _with_probabilities(doubts: Sequence[Finding], left_out_mm: float) -> list[F
         )
         # "None of these" has odds one, unless `unexplained` stands for it as a finding of its own.
         none = float(name != "unexplained" and not (rivals and "unexplained" in first))
-        weighted.append(replace(doubt, probability=odds[name] / (none + odds[name] + rivals)))
+        probability = odds[name] / (none + odds[name] + rivals)
+        weighted.append(replace(doubt, probability=probability, by_limit=not doubt.mahalanobis_sq))
     return weighted
 
 

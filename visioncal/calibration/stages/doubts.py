@@ -18,7 +18,7 @@ from visioncal.calibration.stages.findings import Findings, JudgedArm, JudgedPai
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg
 from visioncal.core.types import Mount
-from visioncal.core.verdict import EXCHANGED, NOT_USABLE, REVIEW, Finding, Remedy, look_at, or_alone
+from visioncal.core.verdict import EXCHANGED, NO_DOUBTS, REVIEW, Finding, Remedy, look_at, or_alone
 from visioncal.results import Rms, ViewResult
 
 # Scatter below a nanometre or a micro-degree is rounding, so that ratios mean nothing.
@@ -73,7 +73,7 @@ def collect_findings(findings: Findings) -> list[Finding]:
         *(
             _warned(warning, findings)
             for warning in findings.warnings
-            if warning.kind not in NOT_USABLE
+            if warning.kind not in NO_DOUBTS
         ),
     ]
 

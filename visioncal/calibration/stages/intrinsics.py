@@ -223,8 +223,6 @@ def _warnings(stack: CornerStack, fit: BundleFit) -> Iterator[Finding]:
             f"No corner was ever seen in the {listed(empty)} of the image, so the lens is "
             "extrapolated there.",
             Remedy(f"In some views, move the target into the {listed(empty)} of the image."),
-            # Picks are where the views looked, or at a declared place.
-            until_mm=0.0,
         )
 
 

@@ -17,10 +17,9 @@ from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent, rounded_up
 from visioncal.core.verdict import (
     AGREEMENT,
-    EMPTY_IMAGE,
     GOOD_FOR,
     NEED,
-    NOT_USABLE,
+    NO_DOUBTS,
     NOTE,
     Finding,
     Remedy,
@@ -47,13 +46,10 @@ def judge(findings: Findings) -> Verdict:
     good_for_mm = _good_for_mm(findings.picks, doubts)
     met = need_met(findings.need, findings.picks)
     status: VerdictStatus = "good" if not doubts else "check"
-    hints: list[Finding] = []
     if met is None:
         status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
     elif met.probability >= NeedLimits.probability[0]:
         need_mm = met.need.mm or 0.0
-        # Picks may all avoid the part of the image where nothing was seen.
-        hints = [replace(doubt, kind=NOTE) for doubt in doubts if doubt.kind == EMPTY_IMAGE]
         doubts = [doubt for doubt in doubts if doubt.until_mm > need_mm]
         status = "check" if doubts else "good"
     else:
@@ -75,7 +71,7 @@ def judge(findings: Findings) -> Verdict:
         place = len(stated) * (met.probability >= NeedLimits.probability[0])
         stated.insert(place, Finding(NEED, _need_words(findings, met)))
     stated += [] if doubts else [_agreement(findings, is_enough=status == "good")]
-    stated += [*hints, *(warning for warning in findings.warnings if warning.kind in NOT_USABLE)]
+    stated += [warning for warning in findings.warnings if warning.kind in NO_DOUBTS]
     return Verdict(status, (*stated, *remarks(findings.notes, NOTE)), good_for_mm)
 
 
