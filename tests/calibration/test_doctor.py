@@ -27,6 +27,7 @@ from visioncal.simulation import BOARDS
 from visioncal.vision.camera import project
 from visioncal.vision.finders import find_target
 from visioncal.vision.finders.board import FINDERS
+from visioncal.vision.targets import load_target
 
 # Of each kind of finding one: what its first sentence is about, and the kind.
 NAMED = {
@@ -160,6 +161,25 @@ def test_another_board_is_named_though_blurred(shown, sigma_px, words):
     found = first_of_blurred(shown, sigma_px)
     assert found.kind == "other_board"
     assert f"than declared: {words}" in found.words
+
+
+@pytest.mark.parametrize(
+    ("shown", "advice"),
+    [
+        # It comes with visioncal; its size is not that of the declared board.
+        (charuco(9, 6), 'target = "charuco_9x6_30mm", if the side of a square is 30 mm'),
+        (circles(4, 7, asymmetric=True), "Measure the distance of neighbouring rows."),
+    ],
+)
+def test_the_declared_size_is_not_given_to_another_board(shown, advice):
+    image, _ = photograph(shown, Shot(square_px=28))
+    image = np.pad(image, 20, mode="edge")
+    declared = load_target("charuco_7x5_36mm")
+    session = Session.from_arrays([image] * 3, np.tile(np.eye(4), (3, 1, 1)), declared)
+    found = visioncal.doctor(session).findings[0]
+    assert found.kind == "other_board"
+    assert advice in found.do.words
+    assert "36" not in str(found.do)
 
 
 @pytest.mark.parametrize(

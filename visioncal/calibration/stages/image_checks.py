@@ -17,7 +17,7 @@ from visioncal.session.images import FolderImages
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.finders.identify import Identity, identify
-from visioncal.vision.finders.identify_text import describe
+from visioncal.vision.finders.identify_text import SIDES, describe
 from visioncal.vision.finders.imaging import blur_of_edges, decode_image, poor_image_reason
 from visioncal.vision.targets import board_words, load_target, marker_cells, target_names
 
@@ -37,6 +37,8 @@ _READ, _PLAIN, _ROUND, _WIDE = 0.4, 1.2, 0.9, 0.9
 _SHARP_PX = 1.2
 # Relative difference of square sizes by rounding.
 _SAME_SIZE = 0.01
+# Stands in a command for a size that has to be measured first.
+_MEASURED = "MEASURED"
 
 
 def pairing(session: Session) -> Iterator[Finding]:
@@ -298,19 +300,21 @@ def _matches(identity: Identity, target: Target) -> bool:
 
 def _other_board_finding(view: View, identity: Identity, declared: Target) -> Finding:
     shipped = (load_target(name) for name in target_names())
-    matching = [
-        target.name
-        for target in shipped
-        if _matches(identity, target)
-        and abs(target.square_m / declared.square_m - 1.0) < _SAME_SIZE
-    ]
+    matching = [target for target in shipped if _matches(identity, target)]
+    # The declared size is that of another board; only a print of the same squares confirms it.
+    matching.sort(key=lambda target: abs(target.square_m - declared.square_m))
+    side = SIDES[identity.kind]
     if matching:
-        step = Remedy(f'In session.toml, write target = "{matching[0]}".')
+        same = abs(matching[0].square_m / declared.square_m - 1.0) < _SAME_SIZE
+        size = f", if the {side} is {1e3 * matching[0].square_m:g} mm: measure it"
+        step = Remedy(
+            f'In session.toml, write target = "{matching[0].name}"{"" if same else size}.'
+        )
     else:
         step = Remedy(
-            'In session.toml, write target = "seen.toml", which this command makes; give it the '
-            "measured side of a square.",
-            _describe_command(view, declared),
+            f'Measure the {side}. In session.toml, write target = "seen.toml", which this command '
+            f"makes with the measured figure [mm] in the place of {_MEASURED}.",
+            _describe_command(view, _MEASURED),
         )
     words = (
         "The images show another board than declared: "
@@ -370,7 +374,7 @@ def _unread(
         step = Remedy(
             f"{step.words} Where all of it is in the images, it serves as a checkerboard: write "
             'target = "seen.toml" in session.toml, which this command makes.',
-            _describe_command(view, declared),
+            _describe_command(view, f"{1e3 * declared.square_m:g}"),
         )
     return Finding(
         _UNREAD,
@@ -381,11 +385,11 @@ def _unread(
     )
 
 
-def _describe_command(view: View, declared: Target) -> str:
+def _describe_command(view: View, square_mm: str) -> str:
     """The command that describes the board in a view's image."""
     return (
         f"visioncal target check SESSION/{shlex.quote(view.image)} "
-        f"--square-mm {1e3 * declared.square_m:g} -o SESSION/seen.toml"
+        f"--square-mm {square_mm} -o SESSION/seen.toml"
     )
 
 

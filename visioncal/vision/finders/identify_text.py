@@ -1,10 +1,21 @@
 """An identified target as a description to keep, as JSON, and in words."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from visioncal.core.files import one_line
+from visioncal.core.types import TargetKind
 from visioncal.vision.finders.identify import Identity
 from visioncal.vision.targets import board_words, target_document
+
+# The size that a picture cannot show, by kind.
+SIDES: Mapping[TargetKind, str] = {
+    "charuco": "side of a square",
+    "checkerboard": "side of a square",
+    "circles": "distance of neighbouring rows",
+    "aprilgrid": "side of a tag",
+    "marker": "side of the dark square",
+}
 
 
 def to_document(identity: Identity, square_m: float | None) -> dict[str, Any]:
@@ -51,13 +62,10 @@ def to_toml(identity: Identity, square_m: float | None, source: str) -> str:
     Without a measured side of a square, or of a single marker [m], sizes become comments on what to
     measure.
     """
-    size, what, where = "square_m", "side of a square", "measured over many squares"
-    if identity.kind == "marker":
-        size, what, where = "size_m", "side of the dark square", "measured"
-    if identity.kind == "aprilgrid":
-        size, what, where = "size_m", "side of a tag", "measured over many tags"
-    if identity.kind == "circles":
-        what, where = "distance of neighbouring rows", "measured over all of them"
+    size = "size_m" if identity.kind in ("marker", "aprilgrid") else "square_m"
+    what, where = SIDES[identity.kind], "measured"
+    if identity.kind != "marker":
+        where = "measured over many of them"
     lines = [f"# Seen in {one_line(source)}: {describe(identity)}."]
     lines += [f"# {note}" for note in identity.notes]
     if square_m is None:
