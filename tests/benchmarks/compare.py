@@ -1,115 +1,162 @@
-"""How often `visioncal diff` tells calibrations of one cell apart, with and without a change.
+"""Compares two checkouts world by world: accuracy, honesty, verdicts, causes and processor time.
 
-Each pair is one simulated cell of 40 views split in two, so that truth is shared and poses and
-noise are not; corners are simulated, not rendered. Then the second half's camera is moved, which
-moves its result alike.
+    PYTHONPATH=tests python tests/benchmarks/compare.py BEFORE[:PYTHON] AFTER[:PYTHON]
+        [--worlds NAME ...] [--minutes 10] [--seeds N] [--lanes 2] [--keep FOLDER]
 
-    python tests/benchmarks/compare.py
+Each session is written once, by this checkout's simulation or by the independent generator of
+`elsewhere.py`, and both checkouts work on the same folder: through commands and the results' files
+alone, each in a process of its own (`compare_worker.py`). All worlds get their first seed, then all
+their second, until the time is over. A row a world, with intervals of 95 % of the paired ratio or
+difference; the last line says what differs beyond chance, by a limit that counts all comparisons
+(Holm 1979). Exit status 1 where anything is worse.
 """
 
+import argparse
+import itertools
+import json
+import os
+import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from itertools import product
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from results import few, first, write_section
+from compare_worlds import WORLDS, Command, Made
+from support.paired import Outcome, Pair, report
 
-TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS), str(TESTS.parent)]
-
-from support.pairs import calibrated_cell, halves, with_moved_result  # noqa: E402
-
-from visioncal.core.types import FloatArray, Mount  # noqa: E402
-from visioncal.results.compare import EdgeChange, compare  # noqa: E402
-from visioncal.simulation import CellOptions, simulate  # noqa: E402
-
-PAIRS, SIGMAS = few(200, 1), 5.0
-MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
-# Repeatability of the robot [mm and mrad].
-NOISES = ((0.03, 0.05), (0.3, 0.5))
+WORKER = Path(__file__).parents[1] / "support" / "compare_worker.py"
+# A job that takes longer than any of the real sessions does on a loaded machine [s].
+PATIENCE_S = 300.0
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What one pair showed: whether unchanged halves differ, and which moves were found."""
+class Checkout:
+    """A process of one checkout that does jobs; one that is killed is started anew."""
 
-    false_alarm: bool
-    shift: bool
-    worst_shift: bool
-    turn: bool
-    camera_alone: bool
+    def __init__(self, text: str) -> None:
+        folder, _, python = text.partition(":")
+        self.folder, self.python = Path(folder).resolve(), python or sys.executable
+        self.process: subprocess.Popen[str] | None = None
+
+    def ask(self, **job: Any) -> dict[str, Any]:
+        """Has a job done: its status, output and processor time."""
+        if self.process is None or self.process.poll() is not None:
+            own = {"PYTHONPATH": str(self.folder), "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "300"}
+            self.process = subprocess.Popen(
+                [self.python, "-P", str(WORKER)], env=os.environ | own, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            )  # fmt: skip
+        into, out = self.process.stdin, self.process.stdout
+        if into is None or out is None:
+            raise RuntimeError("the pipes of a process are missing")
+        watch = threading.Timer(PATIENCE_S, self.process.kill)
+        watch.start()
+        into.write(json.dumps(job) + "\n")
+        into.flush()
+        line = out.readline()
+        watch.cancel()
+        return json.loads(line) if line else {"status": -1, "out": "", "seconds": PATIENCE_S}
+
+    def end(self) -> None:
+        """Ends the process."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
 
 
-def outcome(options: CellOptions) -> Outcome:
-    """Compares the halves of one cell as they are, and with the camera of one moved."""
-    first, second = halves(simulate(options))
-    one, other = calibrated_cell(first), calibrated_cell(second)
-    same = compare(one, other)
-    shift, worst_shift, turn = (
-        compare(one, with_moved_result(other, second, twist)).edges
-        for twist in _moves(same.edges[0], options.seed)
+def outcome(made: Made | Command, checkout: Checkout, out: Path) -> Outcome:
+    """What a checkout makes of a session; a result without what a world reads in it is a bug."""
+    try:
+        return made.run(checkout.ask, out)
+    except (AttributeError, LookupError, OSError, TypeError, ValueError) as error:
+        return Outcome("bug", repr(error)[:80])
+
+
+class Lane:
+    """Two processes, one of each checkout, that take sessions by turns."""
+
+    writing = threading.Lock()  # of sessions: the generators share this process
+
+    def __init__(self, before: str, after: str) -> None:
+        self.checkouts, self.is_warm = (Checkout(before), Checkout(after)), False
+
+    def compare(self, world: str, seed: int, folder: Path) -> Pair | None:
+        """Writes one session and has both work on it; None where the world has no more of them."""
+        with self.writing:
+            made = WORLDS[world](seed, folder)
+        if made is None:
+            return None
+        # What a process does first it does with imports, which are no part of the comparison.
+        for checkout in () if self.is_warm else self.checkouts:
+            outcome(made, checkout, folder / "first" / checkout.folder.name)
+        self.is_warm = True
+        # Neither is always the first to read the files.
+        sides = list(zip(("before", "after"), self.checkouts, strict=True))[:: (-1) ** seed]
+        return Pair(world, seed, **{name: outcome(made, checkout, folder / name)
+                                    for name, checkout in sides})  # fmt: skip
+
+
+def compared(asked: argparse.Namespace, names: Sequence[str], folder: Path) -> list[Pair]:
+    """All pairs that there is time for."""
+    every: Iterable[tuple[str, int]] = (
+        (name, seed)
+        for seed in (range(asked.seeds) if asked.seeds else itertools.count())
+        for name in names
     )
-    return Outcome(
-        same.is_change,
-        shift[0].is_change,
-        worst_shift[0].is_change,
-        turn[0].is_change,
-        shift[0].is_change and not shift[1].is_change,
-    )
+    until, rest, pairs, done = time.monotonic() + 60.0 * asked.minutes, iter(every), [], set()
 
+    def work() -> None:
+        lane = Lane(asked.before, asked.after)
+        while asked.seeds or time.monotonic() < until:
+            with Lane.writing:
+                # Worlds that have no more sessions leave the rest to others.
+                left = set(names) - done
+                job = next((job for job in rest if job[0] in left), None) if left else None
+            if job is None:
+                break
+            pair = lane.compare(*job, folder / f"{job[0]}, {job[1]}".replace("/", "_"))
+            if pair is None:
+                done.add(job[0])
+            else:
+                pairs.append(pair)
+        for checkout in lane.checkouts:
+            checkout.end()
 
-def _moves(edge: EdgeChange, seed: int) -> Iterator[FloatArray]:
-    """Moves of five sigma: a shift to anywhere, one along the worst direction, and a turn."""
-    anywhere = np.random.default_rng(seed).normal(size=3)
-    anywhere /= np.linalg.norm(anywhere)
-    worst = np.linalg.eigh(edge.covariance[3:, 3:])[1][:, -1]
-    shift_m = 1e-3 * SIGMAS * edge.sigma_mm
-    yield np.concatenate([np.zeros(3), shift_m * anywhere])
-    yield np.concatenate([np.zeros(3), shift_m * worst])
-    yield np.concatenate([np.deg2rad(SIGMAS * edge.sigma_deg) * anywhere, np.zeros(3)])
-
-
-def measured(mount: Mount, noise: tuple[float, float], *, given: bool) -> list[str]:
-    """One row of the table."""
-    options = CellOptions(
-        mount=mount,
-        views=40,
-        state_intrinsics=given,
-        robot_sigma_m=1e-3 * noise[0],
-        robot_sigma_rad=1e-3 * noise[1],
-    )
-    found = [outcome(replace(options, seed=seed)) for seed in range(PAIRS)]
-    counts = [
-        sum(getattr(item, name) for item in found)
-        for name in ("false_alarm", "shift", "worst_shift", "turn", "camera_alone")
-    ]
-    lens = "given" if given else "estimated"
-    return [mount, lens, f"{noise[0]:g}, {noise[1]:g}", *map(str, counts)]
+    with ThreadPoolExecutor(asked.lanes) as pool:
+        for lane in [pool.submit(work) for _ in range(asked.lanes)]:
+            lane.result()
+    return sorted(pairs, key=lambda pair: (pair.world, pair.seed))
 
 
 def main() -> None:
-    """Prints the table and keeps it."""
-    rows = [
-        measured(mount, noise, given=given)
-        for mount, given, noise in first(tuple(product(MOUNTS, (True, False), NOISES)))
-    ]
-    head = ["mount", "intrinsics", "robot [mm, mrad]", "unchanged, but told apart"]
-    head += ["shift found", "worst shift found", "turn found", "board left out of it"]
-    lines = [head, ["---"] * 3 + ["---:"] * 5, *rows]
-    table = "\n".join("| " + " | ".join(row) + " |" for row in lines)
-    text = (
-        f"Of {PAIRS} pairs of calibrations of 20 views, corner noise 0.05 px. At most 5 % of "
-        "unchanged pairs may be reported as changed. Then the camera of the second "
-        "calibration is moved: shifted by "
-        f"{SIGMAS:g} times the `sigma_mm` of the difference (the root of its covariance's trace) "
-        "in a random direction; by the same in the worst-determined direction; rotated by "
-        f"{SIGMAS:g} times its `sigma_deg`. The last column counts random shifts that were "
-        f"attributed to the camera's transform and not to the board's.\n\n{table}\n"
-    )
+    """Prints the table; keeps sessions, results and `pairs.json` where that is asked."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    for side in ("before", "after"):
+        parser.add_argument(side, nargs="?", default=str(Path(__file__).parents[2]))
+    parser.add_argument("--worlds", nargs="+", default=[""], help="beginnings of names")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--seeds", type=int, help="so many of each world, however long it takes")
+    parser.add_argument("--lanes", type=int, default=2, help="processes of each checkout")
+    parser.add_argument("--keep", type=Path, help="a folder for sessions and results")
+    parser.add_argument("--quick", action="store_true")
+    asked = parser.parse_args()
+    names = [name for name in WORLDS if name.startswith(tuple(asked.worlds))]
+    if asked.quick:
+        asked.seeds, names = 1, names[:2]
+    if not names:
+        sys.exit(f"no world begins so; there are: {', '.join(WORLDS)}")
+    with tempfile.TemporaryDirectory() as beside:
+        folder = asked.keep or Path(beside)
+        pairs = compared(asked, names, folder)
+        if asked.keep:
+            (folder / "pairs.json").write_text(json.dumps([asdict(pair) for pair in pairs]))
+    text, odd = report(pairs)
     print(text)
-    write_section("Telling a change from noise", "python tests/benchmarks/compare.py", text)
+    sys.exit(any(item.is_worse for item in odd))
 
 
 if __name__ == "__main__":

@@ -40,14 +40,22 @@ def told_frame(sheet):
 def error_m(cell, known, robot):
     """Root mean square error of what the arm carries, all over the workspace [m].
 
-    Seen from what stands still: the camera's place seen from the target, or that of the target's
-    middle seen from the camera. `robot` may be an `ArmModel`, which bends under its own weight.
+    `robot` may be an `ArmModel`, which bends under its own weight.
     """
     q = postures(getattr(robot, "nominal", robot))
-    mount, edges = cell.options.mount, known.assessment.state.edges
+    return away_m(cell, known.assessment.state.edges, q, robot.base_from_flange(q))
+
+
+def away_m(cell, edges, q, flanges):
+    """The same, of (2, 4, 4) edges and of (m, 4, 4) flanges at (m, n) joints [m].
+
+    Seen from what stands still: the camera's place seen from the target, or that of the target's
+    middle seen from the camera.
+    """
+    mount = cell.options.mount
     true = target_in_camera(mount, *cell.transforms.values(), cell.robot.flange_at(q))
     true = true @ told_frame(cell.board())
-    ours = target_in_camera(mount, *edges, robot.base_from_flange(q))
+    ours = target_in_camera(mount, *edges, flanges)
     if mount == "eye-in-hand":
         away = (invert(true) - invert(ours))[:, :3, 3]
     else:
