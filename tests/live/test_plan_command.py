@@ -204,6 +204,7 @@ def test_a_session_about_one_axis_is_pointed_here_and_gets_its_missing_stops(one
     ("source", "cell", "more", "words"),
     [
         ("ur55e", {}, (), "Did you mean ur5e"),
+        ("franka", {}, (), "Did you mean panda"),
         ("nowhere", {}, (), "no session and no calibration"),
         ("ur5e", {"cam": "1 2 3"}, (), "--cam is '1,2,3'; x,y,z,rx,ry,rz is needed"),
         ("ur5e", {"camera": "nofile.yaml"}, (), "nofile.yaml"),

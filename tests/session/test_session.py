@@ -150,7 +150,7 @@ def test_saving_keeps_everything(folder: Path, tmp_path: Path) -> None:
 
 def test_images_of_another_kind_are_to_be_converted(folder: Path) -> None:
     views = folder / "views.csv"
-    views.write_text(views.read_text().replace(".png", ".bmp"))
+    views.write_text(views.read_text().replace(".png", ".gif"))
     with pytest.raises(DataError) as refused:
         Session.load(folder)
     assert refused.value.next_step == "Convert the images without loss, to png."
@@ -235,6 +235,22 @@ def test_links_out_of_the_folder_are_not_followed(folder: Path, tmp_path: Path) 
     shutil.move(folder / "views.csv", tmp_path / "views.csv")
     (folder / "views.csv").symlink_to(tmp_path / "views.csv")
     assert "leads out of its folder" in str(refusal(folder))
+
+
+def test_a_folder_of_images_beside_the_session_may_be_linked(folder: Path, tmp_path: Path) -> None:
+    session = tmp_path / "sessions" / "cell"
+    shutil.copytree(folder, session)
+    shutil.move(session / "images", tmp_path / "sessions" / "shared")
+    (session / "images").symlink_to("../shared")
+    assert Session.load(session).images.read("images/b 2.png") == b"\x89PNG b"
+    # A link in the linked folder is refused, and so is a folder beyond the session's parent.
+    shutil.move(tmp_path / "sessions" / "shared" / "a.png", tmp_path / "sessions" / "a.png")
+    (tmp_path / "sessions" / "shared" / "a.png").symlink_to("../a.png")
+    assert not Session.load(session).images.exists("images/a.png")
+    shutil.move(tmp_path / "sessions" / "shared", tmp_path / "shared")
+    (session / "images").unlink()
+    (session / "images").symlink_to("../../shared")
+    assert "leads out" in Session.load(session).images.absence("images/b 2.png")
 
 
 def test_a_name_that_no_file_has_leaves_its_view_alone(folder: Path) -> None:
@@ -557,12 +573,12 @@ def test_many_rows_that_are_wrong_alike_are_counted(folder: Path) -> None:
 
 
 def test_what_is_wrong_alike_in_many_rows_is_said_once(folder: Path) -> None:
-    rows = [f"{k},,,images/{k}.bmp,1,,,,,,,,\n" for k in range(12)]
+    rows = [f"{k},,,images/{k}.gif,1,,,,,,,,\n" for k in range(12)]
     (folder / "views.csv").write_text(HEADER + "\n" + "".join(rows) + "x,,,a.png,1,,,,,,,,\n")
     error = refusal(folder)
     lines = error.message.splitlines()
     assert len(lines) == len(error.culprits) == 2
-    assert "line 2, column image: the image 'images/0.bmp'" in lines[0]
+    assert "line 2, column image: the image 'images/0.gif'" in lines[0]
     assert lines[0].endswith("And 11 more alike, up to views.csv, line 13.")
     assert "line 14, column view: 'x' is no whole number" in lines[1]
 

@@ -86,6 +86,20 @@ def test_centres_are_as_exact_as_the_image(target, shot, most_px):
     assert np.abs(error.mean(axis=0)).max() < 4 * most_px / np.sqrt(len(error))
 
 
+@pytest.mark.parametrize("table", [30, 220])
+def test_light_circles_on_dark_are_as_exact(table):
+    """A board printed in negative lies on a dark or a light table."""
+    shot = Shot(square_px=60, uneven=0.3)
+    for seed, target in enumerate((SHIFTED, EVEN)):
+        picture, px = photograph(target, shot, seed)
+        negative = np.pad(255 - picture, 200, constant_values=table)
+        found = find_target(negative, target)
+        assert isinstance(found, DetectedCorners)
+        # As for dark circles of such a picture below: twice the template's own noise.
+        assert np.sqrt(np.mean((numbered(found, px + 200) - px - 200) ** 2)) < 0.012
+        assert identify(negative).kind == "circles"
+
+
 def test_centres_are_exact_where_a_fisheye_sees_them_slanted():
     # 0.11 m before a board of 0.24 m it looks at circles from up to 66 degrees aside.
     cell = simulate(

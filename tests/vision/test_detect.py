@@ -282,11 +282,22 @@ def test_a_size_that_no_sensor_has_is_refused_before_it_is_decoded(charuco, monk
     assert len(decoded) == 2  # the good one, twice
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".tif", ".bmp"])
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".tif", ".bmp", ".webp"])
 @pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
 def test_the_size_stands_in_the_header(ending, shape):
     assert claimed_size(encoded(np.zeros(shape, np.uint8), ending)) == (64, 48)
     assert claimed_size(encoded(np.zeros(shape, np.uint8), ending)[:20]) is None
+
+
+@pytest.mark.parametrize("quality", [50, 101])
+@pytest.mark.parametrize("alpha", [False, True])
+def test_every_kind_of_webp_is_decoded(quality, alpha):
+    """With and without loss, and in the extended form that transparency needs."""
+    shape = (48, 64, 4) if alpha else (48, 64)
+    pixels = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
+    data = cv2.imencode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])[1].tobytes()
+    assert claimed_size(data) == (64, 48)
+    assert decode_image(data).shape == (48, 64)
 
 
 def test_an_image_that_is_no_picture_shows_no_board(charuco, checkerboard):

@@ -39,7 +39,7 @@ def locate_command(
     source: Annotated[
         Path | None,
         typer.Argument(
-            help="A session, or one image (png, jpg, tif); may be left out with --pixel."
+            help="A session, or one image (png, jpg, tif, bmp, webp); may be left out with --pixel."
         ),
     ] = None,
     calibration: Annotated[

@@ -181,7 +181,9 @@ def _pages(page: str | None, landscape: bool | None, *, larger: bool) -> "tuple[
 
 @target_app.command("check", cls=PlainCommand)
 def check_command(
-    image: Annotated[Path, typer.Argument(help="A photograph of the board: png, jpg or tif.")],
+    image: Annotated[
+        Path, typer.Argument(help="A photograph of the board: png, jpg, tif, bmp or webp.")
+    ],
     square_mm: Annotated[
         float | None,
         typer.Option(help="Measured side of a square; of a tag for an AprilGrid or a single one."),

@@ -335,6 +335,11 @@ def find_described(
     if name_or_path in shipped:
         return shipped[name_or_path]
     hint = did_you_mean(name_or_path, shipped)
+    if not hint:
+        # A maker's or another product's name is in the description of what it is called here.
+        word = name_or_path.lower()
+        near = [name for name, path in shipped.items() if word in read_text(path).lower()]
+        hint = f"Did you mean {near[0]}?" if len(near) == 1 and word else ""
     raise DataError(
         f"There is no {what} named {name_or_path!r}. {hint}".strip(),
         culprits=[name_or_path],

@@ -10,7 +10,7 @@ from pathlib import Path
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, absence, is_inside, read_bytes, sha256
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 class ImageStore(ABC):
@@ -39,7 +39,10 @@ class ImageStore(ABC):
 
 @dataclass(frozen=True)
 class FolderImages(ImageStore):
-    """Images in a session's folder; links that lead out of it are not followed."""
+    """Images in a session's folder, or in a folder beside it that one inside links to.
+
+    Other links that lead out of it are not followed: a session may be a stranger's.
+    """
 
     folder: Path
 
@@ -56,10 +59,13 @@ class FolderImages(ImageStore):
         why_not = absence(file)
         if why_not:
             return why_not.replace("does not exist", "is missing")
-        if not is_inside(file, self.folder):
+        beside = self.folder.resolve().parent
+        # Directly below the root, everything would be beside it.
+        is_beside = beside != beside.parent and is_inside(file.parent, beside)
+        if not is_inside(file, file.parent if is_beside else self.folder):
             return (
                 "is a link that leads out of the session's folder, and is not followed: copy the "
-                "images into the folder"
+                "images into the folder, or link to a folder beside the session's"
             )
         if file.stat().st_size > MOST_IMAGE_BYTES:
             return f"has more than {MOST_IMAGE_BYTES / 1e6:.0f} MB, as no image has"
@@ -87,12 +93,13 @@ def image_path(path: str) -> str:
     """Checks the path of an image: inside the session's folder, with a known ending.
 
     Raises:
-        DataError: It leaves the folder, or its ending is none of `.png`, `.jpg`, `.tif`.
+        DataError: It leaves the folder, or its ending is none of `IMAGE_ENDINGS`.
     """
     inside = inside_path(path)
     if not inside.lower().endswith(IMAGE_ENDINGS):
         raise DataError(
-            f"the image {path!r} is of a kind that is not read; png, jpg or tif is needed.",
+            f"the image {path!r} is of a kind that is not read; png, jpg, tif, bmp or webp "
+            "is needed.",
             culprits=[path],
             next_step="Convert the images without loss, to png.",
         )

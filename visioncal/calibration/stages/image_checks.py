@@ -13,7 +13,7 @@ from visioncal.core.number_format import some_of
 from visioncal.core.types import Image, Target
 from visioncal.core.verdict import EMPTY_ROWS, LEAST_NEED_MM, MISSING, Finding, Remedy
 from visioncal.session import Session, View
-from visioncal.session.images import FolderImages
+from visioncal.session.images import IMAGE_ENDINGS, FolderImages
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading
 from visioncal.session.selecting import is_whole_cell
 from visioncal.vision.finders.identify import Identity, identify
@@ -23,7 +23,6 @@ from visioncal.vision.targets import board_words, load_target, marker_cells, tar
 
 # Names that are listed, and images that are searched for any board.
 _LISTED, _LOOKED_AT = 6, 3
-_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # Properties of a board that an image shows, beside its markers' dictionary.
 _COMPARED = ("kind", "columns", "rows", "legacy", "marker_id", "asymmetric")
 # Least share of a board's corners in an image that identifies it.
@@ -124,7 +123,7 @@ def _renamed(session: Session, names: Sequence[str]) -> tuple[str, str]:
     if not isinstance(store, FolderImages):
         return "", ""
     first = Path(names[0])
-    pairs = [(first.suffix, item) for item in (*_ENDINGS, *(ending.upper() for ending in _ENDINGS))]
+    pairs = [(first.suffix, item) for item in (*IMAGE_ENDINGS, *map(str.upper, IMAGE_ENDINGS))]
     others = sorted(f"{path.name}/" for path in store.folder.iterdir() if path.is_dir())
     folder = "" if first.parent == Path() else f"{first.parent.as_posix()}/"
     pairs += [(folder, other) for other in (*others, "")]
@@ -166,7 +165,9 @@ def _unnamed_paths(session: Session) -> list[str]:
     named = {view.image for view in session.views if view.image}
     folders = {Path(name).parent for name in named} - {Path()}
     files = (file for folder in folders for file in (store.folder / folder).glob("*"))
-    paths = (path.relative_to(store.folder).as_posix() for path in files if path.suffix in _ENDINGS)
+    paths = (
+        path.relative_to(store.folder).as_posix() for path in files if path.suffix in IMAGE_ENDINGS
+    )
     return sorted(set(paths) - named)
 
 

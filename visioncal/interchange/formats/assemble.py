@@ -370,7 +370,7 @@ def _image_bytes(file: Path) -> bytes:
     # A failed camera leaves empty files, which are kept; anything else that is no image is refused.
     if data and not looks_like_image(data):
         raise DataError(
-            f"{file} is no image (png, jpg, tif, bmp).",
+            f"{file} is no image (png, jpg, tif, bmp, webp).",
             culprits=[str(file)],
             next_step="Name each row's image with --image-column, or the folder with --images.",
         )

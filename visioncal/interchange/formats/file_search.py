@@ -8,8 +8,8 @@ from pathlib import Path
 from visioncal.core.errors import DataError
 from visioncal.core.files import is_inside, natural
 from visioncal.core.number_format import some_of
+from visioncal.session.images import IMAGE_ENDINGS
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # Length that suffices to recognise a text file.
 _HEAD_BYTES = 16_384
 
@@ -44,7 +44,7 @@ def _images_in(folder: Path) -> tuple[Path, ...]:
     if not images:
         is_folder = folder.is_dir()
         raise DataError(
-            f"{folder} has no images (png, jpg, tif)."
+            f"{folder} has no images (png, jpg, tif, bmp, webp)."
             if is_folder
             else f"{folder} {'is no folder' if folder.exists() else 'does not exist'}; the folder "
             "of the images is needed.",
@@ -89,7 +89,8 @@ def images_named(
     for name, path in zip(names, paths, strict=True):
         if path is not None and not is_image_name(path.name):
             raise DataError(
-                f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif or bmp is needed.",
+                f"{base}: an image is named {str(name)[:80]!r}; a png, jpg, tif, bmp or "
+                "webp is needed.",
                 culprits=[str(name)[:80]],
                 next_step="Correct it, or name the column of the images with --image-column.",
             )

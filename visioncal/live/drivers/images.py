@@ -9,9 +9,8 @@ from visioncal.core.errors import DataError, DriverError
 from visioncal.core.files import natural
 from visioncal.core.types import Camera
 from visioncal.live.drivers.protocols import Frame
+from visioncal.session.images import IMAGE_ENDINGS
 from visioncal.vision.finders.imaging import read_image
-
-_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
 class FolderCamera:
@@ -32,11 +31,11 @@ class FolderCamera:
         if not folder.is_dir():
             raise DataError(f"There is no folder {folder}.", culprits=[str(folder)])
         self._files = sorted(
-            (path for path in folder.iterdir() if path.suffix.lower() in _ENDINGS), key=natural
+            (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS), key=natural
         )
         if not self._files:
             raise DataError(
-                f"{folder} holds no images ({', '.join(_ENDINGS)}).", culprits=[str(folder)]
+                f"{folder} holds no images ({', '.join(IMAGE_ENDINGS)}).", culprits=[str(folder)]
             )
         self.name = f"images of {folder.name}"
         self.settings: Mapping[str, str | float] = MappingProxyType({"folder": folder.name})

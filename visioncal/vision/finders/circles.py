@@ -100,8 +100,14 @@ def _article(asymmetric: bool) -> str:
 def seen_grids(image: Image) -> tuple[Circles, ...]:
     """A grid of circles in a (h, w) grey image, in each order that forms a grid, or nothing.
 
-    The least rotated order comes first.
+    Circles are dark on light or, where no such grid is seen, light on dark. The least rotated order
+    comes first.
     """
+    return _seen_grids(image) or _seen_grids(255 - image)
+
+
+def _seen_grids(image: Image) -> tuple[Circles, ...]:
+    """The orders of a grid of dark circles."""
     blobs = _blobs(image)
     if len(blobs.px) < _LEAST:
         return ()

@@ -15,8 +15,13 @@ _SCAN = 0xDA
 _WIDTH, _HEIGHT, _PACKED = 256, 257, {1: "B", 3: "H", 4: "I"}
 
 
+def is_webp(data: bytes) -> bool:
+    """Whether a file starts as a webp: RIFF, its length, and the kind of the first chunk."""
+    return data.startswith(b"RIFF") and data[8:15] == b"WEBPVP8"
+
+
 def claimed_size(data: bytes) -> tuple[int, int] | None:
-    """Size (width, height) [px] in the header of a png, jpg, tif or bmp; None without one."""
+    """Size (width, height) [px] in the header of a png, jpg, tif, bmp or webp; None without one."""
     try:
         if data.startswith(_PNG):
             return struct.unpack_from(">II", data, 16)
@@ -25,6 +30,8 @@ def claimed_size(data: bytes) -> tuple[int, int] | None:
         if data.startswith(_BMP):
             width, height = struct.unpack_from("<ii", data, 18)
             return width, abs(height)
+        if is_webp(data):
+            return _size_of_webp(data)
         return _size_of_tiff(data, _TIFF[data[:4]]) if data[:4] in _TIFF else None
     except struct.error:
         return None
@@ -51,6 +58,20 @@ def _size_of_jpeg(data: bytes) -> tuple[int, int] | None:
         return None
     height, width = struct.unpack_from(">HH", data, offset + 5)
     return width, height
+
+
+def _size_of_webp(data: bytes) -> tuple[int, int] | None:
+    match data[15:16]:
+        case b" ":
+            width, height = struct.unpack_from("<HH", data, 26)
+            return width & 0x3FFF, height & 0x3FFF
+        case b"L":
+            (packed,) = struct.unpack_from("<I", data, 21)
+            return (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
+        case b"X" if len(data) >= 30:
+            width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+            return width, height
+    return None
 
 
 def _size_of_tiff(data: bytes, order: str) -> tuple[int, int] | None:

@@ -12,7 +12,13 @@ from scipy.special import ndtri
 from visioncal.core.errors import DataError
 from visioncal.core.files import MOST_IMAGE_BYTES, read_bytes
 from visioncal.core.types import FloatArray, Image, Image16
-from visioncal.vision.finders.headers import MOST_PIXELS, SIGNATURES, claimed_size, start_of_scan
+from visioncal.vision.finders.headers import (
+    MOST_PIXELS,
+    SIGNATURES,
+    claimed_size,
+    is_webp,
+    start_of_scan,
+)
 
 # Half-widths of the window around a corner in which the edge width is measured [px].
 _REACH_PX = (4, 12)
@@ -27,12 +33,12 @@ GREY = "Give its grey levels: cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)."
 
 
 def looks_like_image(data: bytes) -> bool:
-    """Whether a file starts as png, jpg, tif or bmp; later damage does not matter."""
-    return data.startswith(SIGNATURES)
+    """Whether a file starts as png, jpg, tif, bmp or webp; later damage does not matter."""
+    return data.startswith(SIGNATURES) or is_webp(data)
 
 
 def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
-    """Decodes a png, jpg or tif file to a (h, w) grey or (h, w, 3) BGR image, or says why not.
+    """Decodes an image file to a (h, w) grey or (h, w, 3) BGR image, or says why not.
 
     EXIF rotation for viewers is ignored: the camera matrix refers to the sensor's orientation.
     """
@@ -44,7 +50,7 @@ def decode_image(data: bytes, *, colour: bool = False) -> Image | str:
         return "unreadable: the file is damaged"
     size = claimed_size(data)
     if size is None:
-        return "unreadable: not an image that can be decoded (png, jpg or tif is needed)"
+        return "unreadable: not an image that can be decoded (png, jpg, tif, bmp or webp is needed)"
     if size[0] * size[1] > MOST_PIXELS:
         return (
             f"too large: its header claims {size[0]} x {size[1]} px, and up to "
@@ -101,8 +107,8 @@ def read_image(path: Path) -> Image:
         raise DataError(
             f"{path} is {image}.",
             culprits=[str(path)],
-            next_step="A photograph is needed, as png, jpg or tif; a page of a PDF has to be saved "
-            "as one.",
+            next_step="A photograph is needed, as png, jpg, tif, bmp or webp; a page of a PDF has "
+            "to be saved as one.",
         )
     return image
 
