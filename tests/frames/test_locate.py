@@ -399,6 +399,11 @@ def test_what_may_mislead_is_told(in_hand):
     bad = replace(calibration, verdict=Verdict.of("bad", "The views disagree."))
     (found,) = locate(bad, px, straight, at.base_from_flange)
     assert "verdict is bad: The views disagree." in found.warnings[0]
+    least_m, most_m = calibration.budget.distances_m
+    ahead = at.base_from_cam[:3, 2]
+    far = Plane.through(ahead, at.base_from_cam[:3, 3] + 3.0 * most_m * ahead)
+    (found,) = locate(calibration, px, far, at.base_from_flange)
+    assert f"from {least_m:.2f} to {most_m:.2f} m" in found.warnings[0]
 
 
 def test_corners_that_do_not_fit_are_left_out_refused_or_counted(in_hand):

@@ -95,6 +95,7 @@ class CalibratedCamera:
         pixel_px: Noise of a corner's coordinate [px]; None where unknown.
         noise_dof: Degrees of freedom of the noise estimate; infinite where unknown.
         warnings: Reasons not to trust the camera, in sentences.
+        distances_m: (2,) least and greatest distance at which its views looked; None where unknown.
     """
 
     mount: Mount
@@ -107,6 +108,7 @@ class CalibratedCamera:
     pixel_px: float | None
     noise_dof: float
     warnings: tuple[str, ...]
+    distances_m: FloatArray | None
 
     @classmethod
     def of(cls, calibration: Calibration) -> Self:
@@ -137,6 +139,7 @@ class CalibratedCamera:
             calibration.noise.get("pixel_px"),
             calibration.noise_dof,
             (bad,) if verdict.status == "bad" else (),
+            None if calibration.budget is None else calibration.budget.distances_m,
         )
 
     @property

@@ -25,6 +25,9 @@ from visioncal.session.choosing import EYE, Choice
 from visioncal.vision.camera import normalise
 from visioncal.vision.targets import load_target
 
+# Factor beyond the distances of the views that is named: a board of a third of the image reaches
+# that much nearer or farther than its middle where it is steeply tilted.
+_BEYOND = 1.5
 # Smallest angle between a ray and the plane [rad].
 _PARALLEL = 1e-6
 
@@ -146,7 +149,7 @@ def _on_plane(
         "plane": _mapped(by_plane, plane.covariance),
         **_camera_parts(eye, cam_pose, by_camera, by_cam @ by_lens),
     }
-    return _located(eye, p_base, parts, ())
+    return _located(eye, p_base, parts, _distance_warning(eye, point_cam))
 
 
 _LOOK_AT_PLANE = (
@@ -192,6 +195,21 @@ def _located(
         f"{1e3 * SIGMA_LIMIT_M:g}), mostly because of the {_SOURCES[located.largest]}."
     )
     return Located(p_base, nonzero, located.freedom, (*located.warnings, warning))
+
+
+def _distance_warning(eye: CalibratedCamera, point_cam: FloatArray) -> tuple[str, ...]:
+    """Warns of a point far nearer or farther than anything that the calibration's views showed."""
+    distance_m = float(np.linalg.norm(point_cam))
+    if eye.distances_m is None:
+        return ()
+    least_m, most_m = eye.distances_m.tolist()
+    if least_m / _BEYOND <= distance_m <= _BEYOND * most_m:
+        return ()
+    return (
+        f"The place is {distance_m:.2f} m from the camera, and the calibration's views looked from "
+        f"{least_m:.2f} to {most_m:.2f} m: its sigma goes by the lens's model there, which nothing "
+        "has checked. Calibrate with views at this distance.",
+    )
 
 
 def _freedom(eye: CalibratedCamera, parts: Mapping[str, FloatArray]) -> float:
@@ -270,7 +288,8 @@ def locate_target(
             eye, cam_pose, cam_pose.camera_jacobian(point_cam), by_cam @ view.by_lens[0]
         ),
     }
-    located = _located(eye, cam_pose.point(point_cam), parts, view.warnings)
+    warnings = (*view.warnings, *_distance_warning(eye, point_cam))
+    located = _located(eye, cam_pose.point(point_cam), parts, warnings)
     warning = _ambiguity_warning(view, candidates_cam, located)
     if not warning:
         return located

@@ -301,6 +301,13 @@ def _findings(
             "Both come from the same session and share its noise: their sigmas say nothing about "
             "the difference."
         )
+    doubts = {
+        f"The {name} has the verdict {verdict.status}, to be cleared up before anything is made "
+        f"of the difference: {next(iter(verdict.reasons), verdict.headline)}": verdict.status
+        for name, verdict in (("first", a.verdict), ("second", b.verdict))
+        if verdict.status != "good"
+    }
+    yield from (words for words, status in doubts.items() if status == "bad")
     changed = [edge.name for edge in edges if edge.is_change]
     ratio = 1.0 if lens is None else float(lens.b[0] / lens.a[0])
     is_other_lens = abs(ratio - 1.0) > _OTHER_LENS
@@ -309,7 +316,9 @@ def _findings(
             f"The focal length differs by {100.0 * abs(ratio - 1.0):.0f} %: another camera, lens "
             "or zoom. Where they are is then compared below, and nothing need have moved."
         )
-    if a.cell is not None:
+    if "bad" in doubts.values():
+        yield "Whether camera or board moved, a bad result does not tell."
+    elif a.cell is not None:
         yield _whole_finding(changed)
     elif a.mount != b.mount:
         yield f"The mounts differ ({a.mount}, {b.mount}): no transform is in both."
@@ -323,12 +332,7 @@ def _findings(
         )
     if lens is None and a.camera is not None and b.camera is not None:
         yield "The cameras differ in model or resolution; their intrinsics were not compared."
-    for name, calibration in (("first", a), ("second", b)):
-        if calibration.verdict.status != "good":
-            yield (
-                f"The {name} has the verdict {calibration.verdict.status}: see its report before "
-                "anything is made of the difference."
-            )
+    yield from (words for words, status in doubts.items() if status != "bad")
 
 
 _CAMERA_MOVED = {

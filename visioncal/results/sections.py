@@ -143,6 +143,8 @@ class UncertaintyResult(Section):
 
     Attributes:
         point_cam_m: (3,) the point in the camera's frame [m].
+        distances_m: (2,) least and greatest distance from the camera at which views looked [m];
+            absent in older files.
         budget_mm: Standard deviation by source, and their `total` [mm].
         radius95_mm: Radius that 95 % of errors do not exceed [mm].
         noise_95: 95 % intervals of the noise levels, by their names in `Calibration.noise`.
@@ -157,6 +159,7 @@ class UncertaintyResult(Section):
     noise_95: Intervals
     spectrum: Vector
     inflation: float = 1.0
+    distances_m: Annotated[FloatArray, Array((2,))] | None = None
 
     def __post_init__(self) -> None:
         if "total" not in self.budget_mm or len(self.budget_mm) < 2:

@@ -80,6 +80,7 @@ class WorkAccuracy:
 
     Attributes:
         point_cam: (3,) the target's middle in the camera's frame, mean over the views [m].
+        distances_m: (2,) least and greatest distance of the middle from the camera [m].
         budget_mm: Standard deviation of that point's position, by source and as a `total` [mm].
         radius95_mm: 95 % error radius of its position [mm].
         spectrum: (12,) standard deviations along the principal directions of both edges, ascending,
@@ -87,6 +88,7 @@ class WorkAccuracy:
     """
 
     point_cam: FloatArray
+    distances_m: FloatArray
     budget_mm: Mapping[str, float]
     radius95_mm: float
     spectrum: FloatArray
@@ -107,7 +109,8 @@ def work_accuracy(
     target_points = np.array(
         [middles.get(name, np.zeros(3)) for name in part.observations.observed]
     )
-    point_cam = apply_each(part.measured(state), target_points).mean(axis=0)
+    points_cam = apply_each(part.measured(state), target_points)
+    distances_m, point_cam = np.linalg.norm(points_cam, axis=1), points_cam.mean(axis=0)
     covariances = {
         name: point_covariance(state.edges[0], edge[:6, :6], point_cam)
         for name, edge in _covariances_of_edges(solved, beside).items()
@@ -116,6 +119,7 @@ def work_accuracy(
     values = np.linalg.eigvalsh(covariance[:12, :12] / np.outer(limits, limits))
     return WorkAccuracy(
         point_cam,
+        np.array([distances_m.min(), distances_m.max()]),
         {name: 1e3 * _root_trace(covariance) for name, covariance in covariances.items()},
         1e3 * radius95(covariances["total"]),
         np.sqrt(np.maximum(values, 0.0)),

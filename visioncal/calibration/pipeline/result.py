@@ -208,6 +208,7 @@ def _uncertainty(run: RunState) -> UncertaintyResult:
     alike = [test.factor for test in tests if test is not None and test.is_significant]
     return UncertaintyResult(
         point_cam_m=work.point_cam,
+        distances_m=work.distances_m,
         budget_mm=work.budget_mm,
         radius95_mm=work.radius95_mm,
         noise_95=_of_robot(run, noise_intervals(run)),
