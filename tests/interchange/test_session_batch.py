@@ -1,8 +1,13 @@
 """Many sessions at once: what a worker gives, what its death costs, and what is kept."""
 
+import html
 import os
+import shutil
 import signal
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
+from itertools import product
 
 import pytest
 from pyarrow import parquet
@@ -10,7 +15,7 @@ from support.commands import visioncal
 
 from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError
-from visioncal.interchange.batch import Options, batch, jobs_of, workers
+from visioncal.interchange.batch import Options, batch, executors, jobs_of
 from visioncal.interchange.batch import run as batch_run
 from visioncal.interchange.batch.work import work
 from visioncal.interchange.outputs import RECORDING, REPORT
@@ -32,12 +37,6 @@ def fleet(tmp_path_factory):
     table = broken / "views.csv"
     table.write_text(table.read_text().replace("0.", "zero.", 1))
     return folder
-
-
-@pytest.fixture
-def processes(monkeypatch):
-    """Works without Dask, whether it is there or not."""
-    monkeypatch.setattr(workers, "find_spec", lambda _: None)
 
 
 @pytest.fixture
@@ -66,15 +65,19 @@ def expect_results_of_calibrate(fleet, out, rows):
     assert {value.error for value in failed.values()} == {"DataError"}
 
 
-@pytest.mark.usefixtures("processes")
 def test_results_are_those_of_calibrate_and_errors_are_rows(fleet, tmp_path):
-    found = batch(fleet / "*", tmp_path, workers=2, without=BARE)
+    told = []
+    found = batch(
+        fleet / "*", tmp_path, workers=2, without=BARE, progress=lambda *step: told.append(step)
+    )
+    assert told == [("batch", done, 6) for done in range(7)]
     expect_results_of_calibrate(fleet, tmp_path, found.rows)
     table = parquet.read_table(found.table).to_pylist()
     assert [value["name"] for value in table] == [row.name for row in found.rows]
     assert {value["residual_mm"] for value in table} == {row.residual_mm for row in found.rows}
     page = found.page.read_text()
-    assert all(row.name in page for row in found.rows)
+    assert all(page.count(f'<th scope="row">{end}') == 1 for end in ("broken<", "empty<"))
+    assert all(row.words in html.unescape(page) for row in found.rows)
 
 
 @pytest.mark.usefixtures("here")
@@ -97,20 +100,20 @@ def test_what_was_done_is_kept(fleet, tmp_path):
     assert [row.state for row in asked.rows] == 4 * ["done"]
 
 
-@pytest.mark.usefixtures("processes")
+def fatal(job):
+    """Works, but dies on one session, and on another one the first time."""
+    once = job.folder.parent / "died"
+    if job.name == "robot_1/week_0" or (job.name == "robot_0/week_0" and not once.exists()):
+        once.parent.mkdir(parents=True, exist_ok=True)
+        once.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return work(job)
+
+
 def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
-    asked, died = workers._run_job, []
-
-    def mortal(worker, job):
-        if job.name.endswith("week_0") and ("robot_1" in job.name or not died):
-            died.append(job.name)
-            worker.kill()
-        return asked(worker, job)
-
-    monkeypatch.setattr(workers, "_run_job", mortal)
-    rows = batch([fleet / "robot_0", fleet / "robot_1"], tmp_path, workers=1, without=BARE).rows
+    monkeypatch.setattr(executors, "work", fatal)
+    rows = batch([fleet / "robot_0", fleet / "robot_1"], tmp_path, workers=2, without=BARE).rows
     states = {row.name: row.state for row in rows}
-    assert died == ["robot_0/week_0", *3 * ["robot_1/week_0"]]
     assert states == {
         "robot_0/week_0": "done",
         "robot_0/week_1": "done",
@@ -119,7 +122,7 @@ def test_a_worker_that_dies_loses_nothing(fleet, tmp_path, monkeypatch):
     }
     (lost,) = (row for row in rows if row.state == "failed")
     assert lost.error == "WorkerDied"
-    assert "died 3 times" in lost.words
+    assert "died twice" in lost.words
 
 
 def test_sessions_are_found_and_named(fleet, tmp_path):
@@ -160,8 +163,8 @@ def test_a_changed_result_is_told(fleet, tmp_path):
     assert "session.toml does not exist" in nothing.out
 
 
-@pytest.mark.usefixtures("processes")
-def test_a_scheduler_needs_the_extra(fleet, tmp_path):
+def test_a_scheduler_needs_the_extra(fleet, tmp_path, monkeypatch):
+    monkeypatch.setattr(executors, "find_spec", lambda _: None)
     done = visioncal("batch", fleet / "robot_0", "-o", tmp_path, "--scheduler", "tcp://x:1")
     assert done.status == 2
     assert "visioncal[cluster]" in done.err
@@ -177,44 +180,99 @@ def test_the_page_shows_a_picture_of_each_session(tmp_path):
     assert row.camera == "1280 x 800"
 
 
-@pytest.mark.slow
-def test_a_scheduler_and_its_workers_do_the_same(fleet, tmp_path):
-    """Two workers in processes of their own, of which one is killed when the first row is there."""
+@contextmanager
+def cluster(workers):
+    """A Dask cluster of programs of their own, with the process ids of scheduler and workers."""
     distributed = pytest.importorskip("distributed")
     from distributed.deploy.subprocess import SubprocessCluster
 
     with SubprocessCluster(
-        n_workers=2,
+        n_workers=workers,
         threads_per_worker=1,
         dashboard_address=None,
         worker_kwargs={"memory_limit": 0, "dashboard": False},
-    ) as cluster:
-        assert cluster.scheduler_address.startswith("tcp://127.0.0.1:")
-        with distributed.Client(cluster, set_as_default=False) as client:
-            client.wait_for_workers(2)
-            pids = sorted(client.run(os.getpid).values())
+    ) as made:
+        assert made.scheduler_address.startswith("tcp://127.0.0.1:")
+        with distributed.Client(made, set_as_default=False) as client:
+            client.wait_for_workers(workers)
+            pids = [*client.run(os.getpid).values()]
+            yield made.scheduler_address, client.run_on_scheduler(os.getpid), pids
+
+
+@pytest.mark.slow
+def test_a_scheduler_and_its_workers_do_the_same(fleet, tmp_path):
+    """Of two workers one is killed when the first row is there."""
+    with cluster(2) as (address, _, pids):
 
         def killing(_, done, __):
             if done == 1:
                 os.kill(pids[0], signal.SIGKILL)
 
-        found = batch(
-            fleet / "*",
-            tmp_path,
-            scheduler=cluster.scheduler_address,
-            without=BARE,
-            progress=killing,
-        )
-    expect_results_of_calibrate(fleet, tmp_path, found.rows)
-
-
-@pytest.mark.slow
-def test_a_local_cluster_does_the_same(fleet, tmp_path):
-    pytest.importorskip("distributed")
-    found = batch(fleet / "*", tmp_path, workers=2, without=BARE)
+        found = batch(fleet / "*", tmp_path, scheduler=address, without=BARE, progress=killing)
     expect_results_of_calibrate(fleet, tmp_path, found.rows)
     with pytest.raises(DataError, match=r"no scheduler answers at tcp://127.0.0.1:1"):
-        batch(fleet / "*", tmp_path, scheduler="tcp://127.0.0.1:1")
+        batch(fleet / "*", tmp_path / "other", scheduler="tcp://127.0.0.1:1")
+
+
+def test_a_lost_scheduler_leaves_what_is_finished(fleet, tmp_path, monkeypatch):
+    """Dask cancels what it cannot ask for any more."""
+
+    class Lost(ThreadPoolExecutor):
+        def submit(self, function, job):
+            future = super().submit(function, job)
+            if not job.name.endswith("week_0"):
+                future = Future()
+                future.cancel()
+                future.set_running_or_notify_cancel()
+            return future
+
+    monkeypatch.setattr(executors, "_cluster", lambda _: Lost(1))
+    done = visioncal("batch", fleet / "robot_0", "-o", tmp_path, "--scheduler", "tcp://x:1")
+    assert done.status == 2
+    assert "1 of 2 sessions" in done.err
+    assert "1 good, 1 failed" in done.out
+    assert "went away" in (tmp_path / "index.html").read_text()
+    states = {
+        row["name"]: row["state"]
+        for row in parquet.read_table(tmp_path / "batch.parquet").to_pylist()
+    }
+    assert states == {"week_0": "done", "week_1": "failed"}
+
+
+@pytest.mark.usefixtures("here")
+def test_poses_in_millimetres_are_named_without_a_fleet_to_compare_with(fleet, tmp_path):
+    wrong = tmp_path / "sessions" / "millimetres"
+    shutil.copytree(fleet / "robot_0" / "week_0", wrong)
+    lines = (wrong / "views.csv").read_text().splitlines()
+    columns = lines[0].split(",")
+    rows = [line.split(",") for line in lines[1:]]
+    for row, column in product(rows, ("x_m", "y_m", "z_m")):
+        row[columns.index(column)] = repr(1e3 * float(row[columns.index(column)]))
+    (wrong / "views.csv").write_text("\n".join([lines[0], *map(",".join, rows)]) + "\n")
+    found = batch([wrong, fleet / "robot_0" / "week_0"], tmp_path / "out", without=BARE)
+    first, sound = found.rows
+    assert first.name.endswith("millimetres")
+    assert first.score > 0.0
+    assert sound.score == 0.0
+    assert "no robot has more than 5 mm" in first.stands_out
+    page = html.unescape(found.page.read_text())
+    assert first.words in page
+    assert "What stands out of the fleet" in page
+    # Its difference from the sound result is no movement.
+    told = visioncal("diff", *(tmp_path / "out" / row.name for row in (sound, first)))
+    findings = [line for line in told.out.splitlines() if line.startswith("- ")]
+    assert findings[0].startswith("- The second has the verdict bad")
+    assert " mm" in findings[0]
+    assert "moved on the flange" not in told.out
+
+
+def test_a_finished_batch_starts_no_process(fleet, tmp_path, monkeypatch):
+    batch(fleet / "robot_0", tmp_path, workers=1, without=BARE)
+    monkeypatch.setattr(executors, "_pool", None)
+    monkeypatch.setattr(executors, "_cluster", None)
+    for scheduler in (None, "tcp://x:1"):
+        again = batch(fleet / "robot_0", tmp_path, scheduler=scheduler, without=BARE)
+        assert again.counts["kept"] == 2
 
 
 @pytest.mark.usefixtures("here")

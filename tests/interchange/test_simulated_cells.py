@@ -6,7 +6,7 @@ from support.commands import visioncal
 
 from visioncal.core.errors import DataError
 from visioncal.interchange.batch import run as batch_run
-from visioncal.interchange.batch.run import write_cells
+from visioncal.interchange.batch.cells import write_cells
 from visioncal.interchange.batch.work import work
 from visioncal.results import Calibration
 from visioncal.simulation import read_truth

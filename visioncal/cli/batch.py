@@ -9,6 +9,7 @@ from rich.markup import escape
 from visioncal.cli.console import EXIT_NO_RESULT, answers
 from visioncal.cli.options import NeedOptions
 from visioncal.cli.progress import shown_progress
+from visioncal.core.errors import DataError
 from visioncal.interchange.outputs import RECORDING, REPORT
 
 # For type hints only, so that --help stays fast.
@@ -89,6 +90,14 @@ def batch_command(
             progress=progress,
         )
     _report(found)
+    if found.is_cut_short:
+        done = sum(row.state != "failed" for row in found.rows)
+        raise DataError(
+            f"the scheduler at {scheduler} went away; {done} of {len(found.rows)} sessions have "
+            "their result.",
+            culprits=["--scheduler"],
+            next_step="Start it and the same command again: what is finished is kept.",
+        )
     if all(row.state == "failed" for row in found.rows):
         raise typer.Exit(EXIT_NO_RESULT)
 

@@ -10,12 +10,13 @@ import numpy as np
 
 from visioncal.core.number_format import figure
 from visioncal.core.transforms import pose_difference
+from visioncal.estimation.observability import SIGMA_LIMIT_M, SIGMA_LIMIT_RAD
 from visioncal.results.result import Calibration
 
 State: TypeAlias = Literal["done", "kept", "failed"]
 
 # Smallest number of results that are compared with each other.
-_FEWEST = 5
+FEWEST = 5
 # Robust standard score beyond which a value is an outlier (Iglewicz and Hoaglin 1993).
 _LIMIT = 3.5
 # Smallest standard deviations of logarithms in the score: of noise levels, and of focal lengths of
@@ -212,17 +213,20 @@ class _Measure:
         unit: Its unit.
         spread: Smallest standard deviation of its logarithm.
         is_worse_above: Whether only large values are outliers.
+        most: Largest value that is possible, whatever the rest of the fleet has.
     """
 
     words: str
     unit: str
     spread: float = _SPREAD
     is_worse_above: bool = True
+    most: float = math.inf
 
 
 _MEASURES: Mapping[str, _Measure] = {
-    "noise_mm": _Measure("noise of the robot", "mm"),
-    "noise_deg": _Measure("noise of its rotation", "deg"),
+    # A robot with more than a refused result's sigma is one whose poses are misread.
+    "noise_mm": _Measure("noise of the robot", "mm", most=1e3 * SIGMA_LIMIT_M),
+    "noise_deg": _Measure("noise of its rotation", "deg", most=math.degrees(SIGMA_LIMIT_RAD)),
     "noise_px": _Measure("noise of the corners", "px"),
     "residual_mm": _Measure("residual", "mm"),
     "arm_mm": _Measure("errors of the arm", "mm"),
@@ -236,6 +240,7 @@ def with_outliers(rows: Sequence[FleetRow]) -> list[FleetRow]:
 
     Sessions of one robot model are compared (lenses also of one image size): the score is that of
     each figure's logarithm by median and median absolute deviation, robust to half of a fleet.
+    Noise that no robot has is an outlier in any fleet.
     """
     scores: dict[str, float] = defaultdict(float)
     words: dict[str, list[str]] = defaultdict(list)
@@ -254,7 +259,7 @@ def _model_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
         return []
     usual, most = counts.most_common(1)[0]
     total = sum(counts.values())
-    if total < _FEWEST or most < _MOST * total:
+    if total < FEWEST or most < _MOST * total:
         return []
     return [
         (row.name, _MODEL_SCORE, f"its robot is a {row.robot}, where {most} of {total} are {usual}")
@@ -264,16 +269,20 @@ def _model_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
 
 
 def _figure_outliers(rows: Sequence[FleetRow]) -> list[tuple[str, float, str]]:
-    outliers = []
+    outliers: list[tuple[str, float, str]] = []
     for field, measure in _MEASURES.items():
         groups: dict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)
         for row in rows:
             value = getattr(row, field)
-            if value is not None and value > 0.0:
+            if value is not None and value > measure.most:
+                words = f"{measure.words} {figure(value)} {measure.unit}, where no robot has more "
+                reason = f"{words}than {figure(measure.most)} {measure.unit}: {row.words}"
+                outliers.append((row.name, _MODEL_SCORE * value / measure.most, reason))
+            elif value is not None and value > 0.0:
                 camera = row.camera if field == "focal_px" else ""
                 groups[row.robot, camera].append((row.name, value))
         for members in groups.values():
-            if len(members) >= _FEWEST:
+            if len(members) >= FEWEST:
                 outliers += _outliers(members, measure)
     return outliers
 

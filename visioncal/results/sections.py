@@ -144,7 +144,7 @@ class UncertaintyResult(Section):
     Attributes:
         point_cam_m: (3,) the point in the camera's frame [m].
         distances_m: (2,) least and greatest distance from the camera at which views looked [m];
-            absent in older files.
+            absent where unknown.
         budget_mm: Standard deviation by source, and their `total` [mm].
         radius95_mm: Radius that 95 % of errors do not exceed [mm].
         noise_95: 95 % intervals of the noise levels, by their names in `Calibration.noise`.

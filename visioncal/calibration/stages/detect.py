@@ -131,7 +131,7 @@ def detect(
     searches: list[Searched] = []
     others = {board for board in session.boards if _shows_another(session, board, views)}
     budget = _MemoryBudget()
-    with _ONE_OPENCV_THREAD.held(), ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+    with ONE_OPENCV_THREAD.held(), ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
 
         def search_view(view: View) -> Searched:
             quick = session.board_of(view) in others
@@ -222,7 +222,7 @@ def _one_opencv_thread() -> Iterator[None]:
 
 
 # OpenCV's own threads inside these would slow both down.
-_ONE_OPENCV_THREAD = SharedSetting(_one_opencv_thread)
+ONE_OPENCV_THREAD = SharedSetting(_one_opencv_thread)
 
 
 def image_of(session: Session, view: View) -> Image | Rejection:

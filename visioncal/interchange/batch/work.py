@@ -4,13 +4,13 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
-from visioncal.calibration.pipeline import run
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.files import natural, read_text, write_atomically
+from visioncal.core.threads import one_blas_thread
 from visioncal.core.version import __version__
 from visioncal.interchange.outputs import CALIBRATION, REPORT, Written, write_outputs
 from visioncal.results import Calibration
@@ -104,28 +104,24 @@ def _sessions_in(path: Path) -> Iterator[Path]:
 
 
 def work(job: Job) -> FleetRow:
-    """Calibrates one session into its folder, unless that has its result already.
+    """Calibrates one session into its folder, on one thread.
 
     Returns:
         The row of its result, or of its error.
     """
     begin = time.perf_counter()
     try:
-        row = _calibrated_row(job)
+        with one_blas_thread():
+            row = _calibrated_row(job)
     except VisioncalError as error:
-        row = _failed(job, type(error).__name__, error.message, error.next_step)
+        row = failed_row(job, type(error).__name__, error.message, error.next_step)
     except Exception as error:  # noqa: BLE001 - a bug in one of a thousand ends no batch
-        row = _failed(job, type(error).__name__, str(error), "Report this with the session.")
+        row = failed_row(job, type(error).__name__, str(error), "Report this with the session.")
     return replace(row, seconds=time.perf_counter() - begin)
 
 
-def died(job: Job, tries: int) -> FleetRow:
-    """The row of a session on which the worker processes died."""
-    words = f"its worker died {tries} times, without a word"
-    return _failed(job, "WorkerDied", words, "It may need more memory: calibrate it by itself.")
-
-
-def _failed(job: Job, error: str, words: str, next_step: str) -> FleetRow:
+def failed_row(job: Job, error: str, words: str, next_step: str) -> FleetRow:
+    """The row of a session without a result: the error's class, its words, and what to do."""
     return FleetRow(
         name=job.name,
         session=str(job.session),
@@ -136,34 +132,14 @@ def _failed(job: Job, error: str, words: str, next_step: str) -> FleetRow:
     )
 
 
-def _calibrated_row(job: Job) -> FleetRow:
-    session = Session.load(job.session).needing(job.options.need_mm, job.options.need_deg)
-    made_by = {
-        "session_sha256": session.digest(),
-        "visioncal": __version__,
-        # The need is not part of the digest, which is of the recorded facts.
-        "need": None if session.need is None else list(map(str, asdict(session.need).values())),
-        "options": asdict(job.options) | {"without": list(job.options.without)},
-    }
-    kept = _earlier_row(job, made_by)
-    if kept is not None:
-        return kept
-    calibration, written = _calibrated(job, session)
-    row = row_of(job.name, str(job.session), calibration, __version__)
-    has_report = job.folder / REPORT in written.files
-    row = replace(row, has_picture=_draw(job.folder, session, calibration), has_report=has_report)
-    # Written last: it marks the session as done.
-    write_atomically(job.folder / ROW, json.dumps({**made_by, "row": asdict(row)}, indent=1))
-    return row
-
-
-def _earlier_row(job: Job, made_by: Mapping[str, object]) -> FleetRow | None:
+def kept_row(job: Job) -> FleetRow | None:
     """The row of an earlier run with the same inputs; None where there is none."""
+    names = {field.name for field in fields(FleetRow)}
     try:
         document = json.loads(read_text(job.folder / ROW))
-    except (DataError, ValueError):
+        made_by = _made_by(job, _session(job))
+    except (VisioncalError, ValueError):
         return None
-    names = {field.name for field in fields(FleetRow)}
     if (
         not isinstance(document, dict)
         or {key: document.get(key) for key in made_by} != made_by
@@ -176,9 +152,42 @@ def _earlier_row(job: Job, made_by: Mapping[str, object]) -> FleetRow | None:
     )
 
 
+def _session(job: Job) -> Session:
+    return Session.load(job.session).needing(job.options.need_mm, job.options.need_deg)
+
+
+def _made_by(job: Job, session: Session) -> dict[str, object]:
+    """What a result depends on."""
+    return {
+        "session_sha256": session.digest(),
+        "visioncal": __version__,
+        # The need is not part of the digest, which is of the recorded facts.
+        "need": None if session.need is None else list(map(str, asdict(session.need).values())),
+        "options": asdict(job.options) | {"without": list(job.options.without)},
+    }
+
+
+def _calibrated_row(job: Job) -> FleetRow:
+    session = _session(job)
+    calibration, written = _calibrated(job, session)
+    row = row_of(job.name, str(job.session), calibration, __version__)
+    has_report = job.folder / REPORT in written.files
+    row = replace(row, has_picture=_draw(job.folder, session, calibration), has_report=has_report)
+    # Written last: it marks the session as done.
+    document = {**_made_by(job, session), "row": asdict(row)}
+    write_atomically(job.folder / ROW, json.dumps(document, indent=1))
+    return row
+
+
 def _calibrated(job: Job, session: Session) -> tuple[Calibration, Written]:
     """Calibrates on one thread, and writes the outputs of `visioncal calibrate`."""
-    result = run(session, level=job.options.level, threads=1).with_paths(job.session, job.folder)
+    # Imported late, since a finished batch needs none of it.
+    from visioncal.calibration.pipeline import run
+    from visioncal.calibration.stages.detect import ONE_OPENCV_THREAD
+
+    with ONE_OPENCV_THREAD.held():
+        result = run(session, level=job.options.level, threads=1)
+    result = result.with_paths(job.session, job.folder)
     written = write_outputs(job.folder, session, result, without=job.options.without)
     return result.calibration, written
 

@@ -1,20 +1,15 @@
 """The page of a batch: outstanding sessions, and the results of all."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
 from visioncal.core.number_format import significant
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
-from visioncal.results.fleet import CellFigures, FleetRow
+from visioncal.results.fleet import FEWEST, CellFigures, FleetRow
 
-_ERRORS = {
-    "DataError": "input",
-    "DegenerateError": "not determined",
-    "ConvergenceError": "not settled",
-}
 _ICONS = {"good": "good", "check": "check"}
 # Largest number of outstanding sessions listed per group.
 _MOST_NAMED = 6
@@ -42,19 +37,17 @@ def fleet_page(rows: Sequence[FleetRow], cells: Sequence[CellFigures] = ()) -> s
         rows=rows,
         cells=_cell_table(cells),
         odd=list(_odd(rows)),
-        states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
-        changes=_reasons((row.name, "", row.change, "look") for row in rows if row.changed),
-        is_compared=any(row.changed is not None for row in rows),
-        failures=_reasons(
-            (
-                row.name,
-                _ERRORS.get(row.error, row.error),
-                f"{row.words} {row.next_step}",
-                "rejected",
-            )
-            for row in rows
-            if row.state == "failed"
+        is_comparable=any(
+            count >= FEWEST
+            for count in Counter(row.robot for row in rows if row.state != "failed").values()
         ),
+        states=[(name, states[name]) for name in ("good", "check", "bad", "failed")],
+        changes=Table(
+            ("", ""),
+            tuple(TableRow((row.name, row.change), "look") for row in rows if row.changed),
+            (0, 1),
+        ),
+        is_compared=any(row.changed is not None for row in rows),
         icon_of=lambda value: _ICONS.get(value.verdict, "bad"),
         figure=_figure,
     )
@@ -76,12 +69,6 @@ def _cell_table(cells: Sequence[CellFigures]) -> Table:
         for cell in cells
     )  # fmt: skip
     return Table.of(titles, rows)
-
-
-def _reasons(rows: Iterable[tuple[str, str, str, str]]) -> Table:
-    """Sessions by name, with the kind, the text and the mark of each."""
-    marked = (TableRow((name, kind, words.strip()), mark) for name, kind, words, mark in rows)
-    return Table(("", "", ""), tuple(marked), (0, 1, 2))
 
 
 def _figure(value: float | None) -> str:
