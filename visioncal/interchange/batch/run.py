@@ -113,12 +113,12 @@ def batch(
     except OSError as error:
         raise DataError(f"{folder} cannot be written: {error.strerror}.") from error
     rows: list[FleetRow] = []
-    # Said before the first result, which may take minutes.
-    tell = progress or (lambda *_: None)
-    tell("batch", 0, len(jobs))
+    # Reported before the first result, which may take minutes.
+    report = progress or (lambda *_: None)
+    report("batch", 0, len(jobs))
     for row in _rows(jobs, workers, scheduler):
         rows.append(row)
-        tell("batch", len(rows), len(jobs))
+        report("batch", len(rows), len(jobs))
     if against is not None:
         earlier, failed = Path(against), {row.name for row in rows if row.state == "failed"}
         rows = with_changes(
