@@ -29,10 +29,9 @@ from visioncal.live.drivers.ur import UrArm
 from visioncal.live.planning.plan import PlanRequest, make_plan
 from visioncal.live.planning.plan_file import PlanFile, Stop
 from visioncal.live.planning.purposes import purpose_of
-from visioncal.live.rehearsal.camera import RehearsalCamera
-from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.machine import ControllerOptions
-from visioncal.live.rehearsal.truth import TruthClient
+from visioncal.live.simulated.arm import ControllerOptions
+from visioncal.live.simulated.camera import SimulatedCamera
+from visioncal.live.simulated.controller import SimulatedController, spawn
 from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate
 from visioncal.simulation.arms import ArmErrors
@@ -53,7 +52,7 @@ ON_THE_WAY_S = 1.5
 class Compared:
     """Compares the pose of each view with the truth at its exposure."""
 
-    truth: TruthClient
+    truth: SimulatedController
     off_m: list[float] = field(default_factory=list)
 
     def stepped(self, step: CaptureEvent) -> None:
@@ -69,8 +68,8 @@ class Faulty:
     """Lets a fault happen on the way to the second view."""
 
     fault: str
-    truth: TruthClient
-    camera: RehearsalCamera
+    truth: SimulatedController
+    camera: SimulatedCamera
     began_s: float = 0.0
 
     def stepped(self, step: CaptureEvent) -> None:
@@ -87,12 +86,11 @@ class Faulty:
 
 
 @contextmanager
-def live_cell() -> Iterator[tuple[LiveCell, RehearsalCamera, str]]:
-    """A simulated cell at work: its devices, and its controller's host."""
+def live_cell() -> Iterator[tuple[LiveCell, SimulatedCamera, SimulatedController]]:
+    """A simulated cell at work: its devices, and its controller."""
     with spawn(CONTROLLER) as controller, closing(UrArm(controller.host)) as arm:
-        truth = controller.truth
-        camera = RehearsalCamera(simulate(CELL), lambda at: truth.state(at.tolist()).q)
-        yield LiveCell(arm, camera), camera, controller.host
+        camera = SimulatedCamera(simulate(CELL), lambda at: controller.state(at.tolist()).q)
+        yield LiveCell(arm, camera), camera, controller
 
 
 def planned(stops: int) -> PlanFile:
@@ -128,7 +126,7 @@ def recorded(live: LiveCell, plan: PlanFile, folder: Path, watcher: Watcher) -> 
 def times_of_views(folder: Path) -> str:
     """Records planned views, and says what each took and how true its pose is."""
     plan = planned(STOPS)
-    with live_cell() as (live, _, host), closing(TruthClient(host)) as truth:
+    with live_cell() as (live, _, truth):
         compared, begun = Compared(truth), time.perf_counter()
         steps = recorded(live, plan, folder / "views", compared)
         took_s = time.perf_counter() - begun
@@ -149,14 +147,16 @@ def times_of_views(folder: Path) -> str:
 
 def time_of_fault(fault: str, plan: PlanFile, folder: Path) -> str:
     """Lets a fault happen, and says how long it took until it was told, and what was."""
-    with live_cell() as (live, camera, host), closing(TruthClient(host)) as truth:
+    with live_cell() as (live, camera, truth):
         faulty = Faulty(fault, truth, camera)
         try:
             recorded(live, plan, folder / fault, faulty)
         except VisioncalError as error:
             took_s = time.monotonic() - faulty.began_s
             views = len(Session.load(folder / fault).views)
-            words = error.message.replace(str(folder / fault), "SESSION").replace(host, "HOST")
+            words = error.message.replace(str(folder / fault), "SESSION").replace(
+                truth.host, "HOST"
+            )
             return f"| {fault} | {took_s:.2f} | {views} | {words} |"
     raise AssertionError(f"{fault} was not noticed")
 

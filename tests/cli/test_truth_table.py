@@ -1,4 +1,4 @@
-"""The table of errors against the truth, as demo and rehearse print it."""
+"""The table of errors against the truth, as demo prints it."""
 
 from dataclasses import replace
 

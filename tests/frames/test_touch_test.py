@@ -17,8 +17,8 @@ from visioncal.frames.touch_test import evaluate_gaps, touch_points, touch_test_
 from visioncal.interchange.merge_results import rewrite_result
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.machine import ControllerOptions
+from visioncal.live.simulated.arm import ControllerOptions
+from visioncal.live.simulated.controller import spawn
 from visioncal.results import Calibration, Edge
 from visioncal.results.frame import Frame
 from visioncal.session import Session

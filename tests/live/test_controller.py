@@ -1,4 +1,4 @@
-"""The simulated controller: motions, frames, the script's commands, the truth and the ports."""
+"""The simulated controller: motions, the script's commands, the truth and its process."""
 
 import subprocess
 import sys
@@ -8,19 +8,10 @@ import numpy as np
 import pytest
 
 from visioncal.core.errors import DriverError
-from visioncal.live.rehearsal.controller import main, spawn
-from visioncal.live.rehearsal.machine import (
-    ControllerOptions,
-    Machine,
-    believed_arm,
-    matrix_of,
-    pose_of,
-    tool_pose,
-)
-from visioncal.live.rehearsal.motion import Brake, Profile, joint_path
-from visioncal.live.rehearsal.rtde_wire import HEADER_BYTES, Kind, Recipe, read_header
-from visioncal.live.rehearsal.script import DONE, READY, ControlScript
-from visioncal.live.rehearsal.truth import TruthClient
+from visioncal.live.simulated.arm import ControllerOptions, Machine, Motion, matrix_of
+from visioncal.live.simulated.controller import _is_free, spawn
+from visioncal.live.simulated.script import DONE, READY, ControlScript
+from visioncal.live.simulated.server import PORTS
 from visioncal.simulation.arms import forward
 
 OPTIONS = ControllerOptions(seed=3)
@@ -33,75 +24,59 @@ def controller():
 
 
 @pytest.mark.parametrize("distance", [2.0, 0.05], ids=["trapezoid", "triangle"])
-def test_a_way_keeps_speed_and_acceleration_and_takes_the_shortest_time(distance):
-    profile = Profile(distance, speed=0.8, acceleration=1.5)
-    times = np.linspace(0.0, profile.duration_s, 2001)
-    place, speed = np.array([profile.at(value) for value in times]).T
-    assert place[0] == speed[0] == speed[-1] == 0.0
-    assert place[-1] == distance
+def test_a_motion_keeps_speed_and_acceleration_and_takes_the_shortest_time(distance):
+    goal = distance * np.array([0.5, -1.0, 0.0])
+    motion = Motion(np.zeros(3), goal, speed=0.8, acceleration=1.5)
+    times = np.linspace(0.0, motion.duration_s, 2001)
+    q, dq = (np.array(rows) for rows in zip(*map(motion.at, times), strict=True))
+    assert q[0] == pytest.approx(0.0)
+    assert q[-1] == pytest.approx(goal)
+    # All joints arrive together.
+    assert q[:, 0] == pytest.approx(-0.5 * q[:, 1])
+    place, speed = -q[:, 1], -dq[:, 1]
+    assert speed[0] == speed[-1] == 0.0
     assert speed.max() <= 0.8 + 1e-12
     assert np.abs(np.diff(speed) / np.diff(times)).max() <= 1.5 * (1 + 1e-9)
     # Central differences of a quadratic are exact but at the two kinks: a kink is off by a*dt/4.
     slope = np.gradient(place, times)
     assert np.abs(slope - speed).max() < 1.5 * times[1]
     shortest = distance / 0.8 + 0.8 / 1.5 if distance > 1 else 2 * np.sqrt(distance / 1.5)
-    assert profile.duration_s == pytest.approx(shortest)
-
-
-def test_all_joints_arrive_together_and_the_farthest_keeps_the_speed():
-    start, goal = np.zeros(6), np.array([0.5, -1.0, 0.0, 0.2, 0.1, 0.3])
-    way = joint_path(start, goal, speed=0.7, acceleration=1.0)
-    q, dq = way.at(0.5 * way.duration_s)
-    assert q == pytest.approx(0.5 * goal)
-    assert np.abs(dq).max() == pytest.approx(0.7)
-    assert way.at(way.duration_s)[0] == pytest.approx(goal)
+    assert motion.duration_s == pytest.approx(shortest)
 
 
 def test_no_way_at_all_is_over_at_once():
-    way = joint_path(np.ones(6), np.ones(6), speed=1.0, acceleration=1.0)
-    assert way.duration_s == 0.0
-    assert way.at(0.0)[0] == pytest.approx(np.ones(6))
+    motion = Motion(np.ones(6), np.ones(6))
+    assert motion.duration_s == 0.0
+    assert motion.at(0.0)[0] == pytest.approx(np.ones(6))
 
 
 def test_braking_goes_on_from_where_it_began():
-    brake = Brake(np.ones(6), np.array([0.5, -1.0, 0.0, 0.0, 0.0, 0.0]), 2.0)
-    assert brake.duration_s == 0.5
+    speeds = np.array([0.5, -1.0, 0.0, 0.0, 0.0, 0.0])
+    brake = Motion.braking(np.ones(6), speeds, 2.0)
+    assert brake.duration_s == pytest.approx(0.5)
+    assert brake.at(0.0)[0] == pytest.approx(np.ones(6))
+    assert brake.at(0.0)[1] == pytest.approx(speeds)
     q, dq = brake.at(0.5)
     # Half of speed times time.
     assert q[:2] == pytest.approx([1.125, 0.75])
     assert dq == pytest.approx(np.zeros(6))
 
 
-def test_a_frame_reads_back():
-    names = ("timestamp", "actual_q", "runtime_state", "joint_mode", "payload_cog", "flag", "bits")
-    types = ("DOUBLE", "VECTOR6D", "UINT32", "VECTOR6INT32", "VECTOR3D", "UINT8", "UINT64")
-    values = [1.5, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), 2, (1, -2, 3, 4, 5, 6), (7.0, 8.0, 9.0), 255]
-    values.append(1 << 60)
-    recipe = Recipe(9, names, types)
-    packed = recipe.pack(values)
-    kind, size = read_header(packed[:HEADER_BYTES])
-    assert (kind, size) == (Kind.DATA, len(packed) - HEADER_BYTES)
-    assert packed[HEADER_BYTES] == 9
-    assert recipe.unpack(packed[HEADER_BYTES:]) == dict(zip(names, values, strict=True))
-
-
 def test_poses_are_rotation_vectors_in_the_controllers_base():
     machine = Machine(ControllerOptions(), 0.0)
     q, _ = machine.joints(0.0)
-    expected = forward(machine.believed, q[None])[0] @ matrix_of(machine.tcp)
-    assert matrix_of(tool_pose(machine, q)) == pytest.approx(expected, abs=1e-12)
-    assert pose_of(matrix_of([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])) == pytest.approx(
-        [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
-    )
+    expected = forward(machine.believed, q[None])[0] @ matrix_of(machine.options.tcp)
+    assert matrix_of(machine.tool_pose(q)) == pytest.approx(expected, abs=1e-12)
 
 
-def answers(host):
-    """Whether a controller's port of the truth is open."""
-    try:
-        TruthClient(host).close()
-    except DriverError:
-        return False
-    return True
+def test_what_was_is_known_for_a_minute():
+    machine = Machine(ControllerOptions(), 0.0)
+    home, _ = machine.joints(0.0)
+    for number in range(200):
+        machine.start(Motion(machine.joints(float(number))[0], home + 0.1 * (number % 2)), number)
+    assert len(machine._history) == 61
+    assert machine.joints(150.5)[0][0] == pytest.approx(home[0] + 0.1, abs=0.1)
+    assert machine.joints(150.9)[0] == pytest.approx(home, abs=1e-12)
 
 
 class Client:
@@ -163,19 +138,6 @@ def test_an_asynchronous_motion_tells_of_its_begin_and_end():
     assert ended >> 16 != running >> 16
 
 
-def test_a_straight_motion_keeps_the_tool_on_the_line():
-    client = Client()
-    machine = client.machine
-    begin = tool_pose(machine, machine.joints(0.0)[0])
-    goal = begin + np.array([0.0, 0.2, -0.1, 0.0, 0.0, 0.0])
-    assert client.command(3, [*goal, 0.25, 1.0])
-    assert tool_pose(machine, machine.joints(client.now_s)[0]) == pytest.approx(goal, abs=1e-9)
-    halfway = tool_pose(machine, machine.joints(0.5 * client.now_s)[0])
-    direction = (goal - begin)[:3] / np.linalg.norm((goal - begin)[:3])
-    # Between 64 knots of 3.5 mm, a chord is off the line by a few micrometres.
-    assert np.linalg.norm(np.cross(halfway[:3] - begin[:3], direction)) < 2e-5
-
-
 def test_a_stop_brakes_and_the_script_goes_on():
     client = Client()
     q, _ = client.machine.joints(0.0)
@@ -211,7 +173,7 @@ def test_a_safety_stop_ends_the_motion_where_it_is():
     q, _ = client.machine.joints(0.0)
     client.command(1, [*(q + 1.0), 1.0, 2.0], asynchronous=True)
     client.tick(60)
-    client.machine.trip("protective-stop", client.now_s)
+    client.machine.apply_fault("protective-stop", client.now_s)
     client.tick(60)
     stood, speed = client.machine.joints(client.now_s)
     assert speed == pytest.approx(np.zeros(6))
@@ -220,36 +182,34 @@ def test_a_safety_stop_ends_the_motion_where_it_is():
 
 def test_the_truth_is_the_real_arm_and_stays_known(controller):
     began = time.monotonic()
-    before = controller.truth.state([began])
+    before = controller.state([began])
     goal = before.q[0] + 0.05
-    ends = controller.truth.guide(goal, speed=1.0, acceleration=4.0)
+    ends = controller.guide(goal, speed=1.0, acceleration=4.0)
     time.sleep(max(0.0, ends - time.monotonic()))
     times = np.linspace(began, ends, 50)
-    past = controller.truth.state(times.tolist())
+    past = controller.state(times.tolist())
     assert past.q[0] == pytest.approx(before.q[0])
     # 1e-5 rad is the joints' repeatability; five sigma.
     assert past.q[-1] == pytest.approx(goal, abs=1e-4)
     # Fixed errors of 0.3 mm and 0.5 mrad a joint move the flange by a millimetre or so.
-    believed = believed_arm(OPTIONS)
-    shift = past.base_from_flange[:, :3, 3] - forward(believed, past.q)[:, :3, 3]
+    shift = past.base_from_flange[:, :3, 3] - forward(OPTIONS.believed_arm, past.q)[:, :3, 3]
     assert 1e-4 < np.linalg.norm(shift, axis=1).max() < 1e-2
 
 
 def test_the_channel_of_the_truth_refuses_what_it_does_not_know(controller):
     with pytest.raises(DriverError, match="there is no fault 'earthquake'"):
-        controller.truth.inject("earthquake")
+        controller.inject("earthquake")
 
 
-def test_a_taken_address_is_told(controller, capfd):
-    with pytest.raises(DriverError, match="did not start"):
+def test_a_taken_address_is_told(controller):
+    with pytest.raises(DriverError, match="address already in use"):
         spawn(host=controller.host)
-    assert "address already in use" in capfd.readouterr().err
 
 
 def test_a_controller_ends_with_the_process_that_started_it():
     code = (
         "import os\n"
-        "from visioncal.live.rehearsal.controller import spawn\n"
+        "from visioncal.live.simulated.controller import spawn\n"
         "running = spawn()\n"
         "print(running.host, flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
@@ -261,11 +221,6 @@ def test_a_controller_ends_with_the_process_that_started_it():
     assert host
     # It ends within milliseconds; the limit is for a busy computer.
     ends_s = time.monotonic() + 20.0
-    while answers(host):
+    while not all(_is_free(host, port) for port in PORTS):
         assert time.monotonic() < ends_s
         time.sleep(0.01)
-
-
-def test_options_that_are_none_are_refused(capsys):
-    assert main(["--options", '{"robots": "ur10e"}']) == 2
-    assert "--options is not a table" in capsys.readouterr().err

@@ -10,8 +10,8 @@ from visioncal.core.errors import DriverError
 from visioncal.live.capture import motions
 from visioncal.live.capture.motions import record_motion
 from visioncal.live.drivers.protocols import JointSample
-from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.machine import ControllerOptions
+from visioncal.live.simulated.arm import ControllerOptions
+from visioncal.live.simulated.controller import spawn
 from visioncal.session import Session
 
 RATE_HZ = 100.0
@@ -75,7 +75,7 @@ def test_a_ur_is_recorded_through_its_client_library(tmp_path, monkeypatch):
             def sampled():
                 found = sample()
                 if next(rested) == 100:
-                    controller.truth.guide(home + 0.4, speed=0.4, acceleration=1.0)
+                    controller.guide(home + 0.4, speed=0.4, acceleration=1.0)
                 return found
 
             monkeypatch.setattr(joints, "sample", sampled)

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from contextlib import closing
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -15,8 +14,8 @@ import pytest
 from visioncal.core.errors import DriverError
 from visioncal.live.drivers.protocols import MovingArm
 from visioncal.live.drivers.ur import UrArm
-from visioncal.live.rehearsal.controller import spawn
-from visioncal.live.rehearsal.machine import ControllerOptions, believed_arm
+from visioncal.live.simulated.arm import ControllerOptions
+from visioncal.live.simulated.controller import spawn
 from visioncal.simulation.arms import forward
 
 pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
@@ -44,7 +43,7 @@ def wait_while(condition, limit_s=PATIENCE_S):
 
 
 def stands(controller):
-    return not controller.truth.state([time.monotonic()]).dq.any()
+    return not controller.state([time.monotonic()]).dq.any()
 
 
 @pytest.mark.usefixtures("patient")
@@ -74,7 +73,7 @@ def test_an_arm_moves_tells_where_it_is_and_stops(controller):
 def test_a_state_is_the_flange_in_the_controllers_base(controller):
     with closing(UrArm(controller.host)) as arm:
         state = arm.state()
-    believed = believed_arm(ControllerOptions())
+    believed = ControllerOptions().believed_arm
     # The pose went through rotation vectors and the tool offset: rounding alone is left.
     assert state.base_from_flange == pytest.approx(forward(believed, state.q[None])[0], abs=1e-9)
     assert state.flange_from_tool[:3, 3] == pytest.approx(TCP[:3])
@@ -100,7 +99,7 @@ def test_a_state_is_stamped_with_the_time_at_which_the_arm_was_there(controller)
         wait_while(arm.moving)
     stamps = [state.stamp_s for state in states]
     assert np.all(np.diff(stamps) > 0.0)
-    truth = controller.truth.state(stamps)
+    truth = controller.state(stamps)
     fast = [place for place, state in enumerate(states) if abs(state.dq[0]) > 0.3]
     assert len(fast) > 5
     late = [(truth.q[index, 0] - states[index].q[0]) / states[index].dq[0] for index in fast]
@@ -110,7 +109,7 @@ def test_a_state_is_stamped_with_the_time_at_which_the_arm_was_there(controller)
 
 @pytest.mark.usefixtures("patient")
 def test_watching_needs_no_remote_control_and_moves_nothing(controller):
-    controller.truth.inject("local-control")
+    controller.inject("local-control")
     try:
         with pytest.raises(DriverError, match="local control"):
             UrArm(controller.host)
@@ -120,14 +119,14 @@ def test_watching_needs_no_remote_control_and_moves_nothing(controller):
             assert not arm.moving()
             with pytest.raises(DriverError, match="only watched"):
                 arm.start_move(before.q, speed=1.0, acceleration=1.0)
-            ends = controller.truth.guide(before.q + 0.1, speed=SLOW, acceleration=1.0)
+            ends = controller.guide(before.q + 0.1, speed=SLOW, acceleration=1.0)
             wait_while(lambda: not arm.moving())
             time.sleep(max(0.0, ends - time.monotonic()))
             wait_while(arm.moving)
             assert arm.state().q == pytest.approx(before.q + 0.1)
             arm.halt()
     finally:
-        controller.truth.inject("remote-control")
+        controller.inject("remote-control")
 
 
 @pytest.mark.usefixtures("patient")
@@ -143,7 +142,7 @@ def test_a_motion_that_is_stopped_is_told_with_what_to_press(controller, fault, 
     with closing(UrArm(controller.host)) as arm:
         arm.start_move(arm.state().q + FAR, speed=SLOW, acceleration=1.0)
         assert arm.moving()
-        controller.truth.inject(fault)
+        controller.inject(fault)
         try:
             with pytest.raises(DriverError, match=message):
                 wait_while(arm.moving)
@@ -153,8 +152,8 @@ def test_a_motion_that_is_stopped_is_told_with_what_to_press(controller, fault, 
             arm.halt()
             wait_while(lambda: not stands(controller))
         finally:
-            controller.truth.inject("release")
-            controller.truth.inject("remote-control")
+            controller.inject("release")
+            controller.inject("remote-control")
         # Once it is freed, it goes on with no new connection.
         wait_while(lambda: arm.state().safety != "normal")
         arm.start_move(arm.state().q + 0.01, speed=SLOW, acceleration=1.0)
@@ -166,7 +165,7 @@ def test_a_controller_that_dies_in_a_motion_is_noticed():
     with spawn() as controller, closing(UrArm(controller.host)) as arm:
         arm.start_move(arm.state().q + FAR, speed=SLOW, acceleration=1.0)
         assert arm.moving()
-        controller.truth.inject("die")
+        controller.inject("die")
         with pytest.raises(DriverError, match=r"is lost: .*switched off, or its cable is out"):
             wait_while(arm.moving)
         with pytest.raises(DriverError, match="is lost"):
@@ -179,37 +178,10 @@ def test_a_controller_that_dies_in_a_motion_is_noticed():
 def test_a_controller_that_falls_silent_in_a_motion_is_noticed():
     with spawn() as controller, closing(UrArm(controller.host)) as arm:
         arm.start_move(arm.state().q + FAR, speed=SLOW, acceleration=1.0)
-        controller.truth.inject("freeze")
+        controller.inject("freeze")
         with pytest.raises(DriverError, match="has sent nothing for"):
             wait_while(arm.moving)
         arm.halt()
-
-
-@pytest.mark.usefixtures("patient")
-def test_what_the_driver_does_not_use_is_served_too(controller):
-    """The dashboard's and the outputs' clients, waiting motions, and straight ones."""
-    dashboard = import_module("dashboard_client").DashboardClient(controller.host)
-    dashboard.connect()
-    assert dashboard.isInRemoteControl()
-    assert dashboard.robotmode() == "Robotmode: RUNNING"
-    dashboard.disconnect()
-    outputs = import_module("rtde_io").RTDEIOInterface(controller.host)
-    assert outputs.setStandardDigitalOut(1, True)
-    # Its destructor ends the program where the controller has gone before.
-    outputs.disconnect()
-    states = import_module("rtde_receive").RTDEReceiveInterface(controller.host, 125.0)
-    control = import_module("rtde_control").RTDEControlInterface(controller.host, 125.0)
-    start, pose = np.array(states.getActualQ()), np.array(states.getActualTCPPose())
-    assert control.getForwardKinematics(start.tolist(), list(TCP)) == pytest.approx(pose)
-    above = pose + np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
-    assert control.moveL(above.tolist(), 0.25, 1.0)
-    assert control.isSteady()
-    near = control.getInverseKinematics(pose.tolist())
-    assert near == pytest.approx(start)
-    assert control.moveJ(near, 1.0, 2.0)
-    control.stopScript()
-    control.disconnect()
-    states.disconnect()
 
 
 WALKER = f"""

@@ -11,8 +11,8 @@ from visioncal.core.errors import DriverError
 from visioncal.live.drivers.ur import UrArm
 from visioncal.live.drivers.ur_net import check_states_come, connect, read_tool_offset, resolve
 from visioncal.live.drivers.ur_status import read_condition
-from visioncal.live.rehearsal.controller import free_host, spawn
-from visioncal.live.rehearsal.machine import ControllerOptions
+from visioncal.live.simulated.arm import ControllerOptions
+from visioncal.live.simulated.controller import free_host, spawn
 
 OPTIONS = ControllerOptions(seed=3, tcp=(0.01, -0.02, 0.15, 0.1, 0.2, -0.3))
 
@@ -43,25 +43,25 @@ FAULTS = [
 
 @pytest.mark.parametrize(("fault", "message"), FAULTS, ids=[name for name, _ in FAULTS])
 def test_what_keeps_an_arm_from_moving_is_said_with_what_to_press(controller, fault, message):
-    controller.truth.inject(fault)
+    controller.inject(fault)
     try:
         with pytest.raises(DriverError, match=message):
             read_condition(controller.host).check_moves()
     finally:
-        controller.truth.inject("release")
-        controller.truth.inject("remote-control")
+        controller.inject("release")
+        controller.inject("remote-control")
     read_condition(controller.host).check_moves()
 
 
 def test_a_frozen_controller_is_said_to_be_silent(controller):
-    controller.truth.inject("freeze")
+    controller.inject("freeze")
     try:
         with pytest.raises(DriverError, match="does not answer: timed out"):
             read_condition(controller.host)
         with pytest.raises(DriverError, match="sends no states"):
             check_states_come(controller.host)
     finally:
-        controller.truth.inject("thaw")
+        controller.inject("thaw")
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def _each(command: str, words: str, *inputs: str) -> tuple[Reading, ...]:
 
 # What reads no file of the user's, or only once a robot has answered.
 # `batch` reads sessions as `calibrate` does, in processes of its own.
-READS_NOTHING = ("batch", "demo", "rehearse", "simulate", "dynamics record")
+READS_NOTHING = ("batch", "demo", "simulate", "dynamics record")
 _FEW = "-o OUT --candidates 20"
 _PLAN = f"{_FEW} --stops 3 --guess-deg 2 --cam '0 -60 60 0 0 0' --board '500 0 5 180 0 0'"
 _LENS = "--camera 1000,1000,640,400 --resolution 1280,800"

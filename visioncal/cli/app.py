@@ -26,7 +26,6 @@ class _Commands(LazyGroup):
         "demo": "Simulate a UR cell, calibrate it from its images, and compare with the truth.",
         "plan": "Propose the most informative robot stops, or those to add to a session.",
         "record": "Record a session: drive the stops of a plan, or follow an arm guided by hand.",
-        "rehearse": "Plan, record and calibrate a simulated cell by the real client libraries.",
         "calibrate": "Turn a session into a hand-eye calibration, with reasons to trust it or not.",
         "doctor": "Say what is wrong with a session before it is calibrated, and what to type.",
         "batch": "Calibrate many sessions at once, and report which stand out of their fleet.",

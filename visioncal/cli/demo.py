@@ -1,42 +1,81 @@
 """`visioncal demo`."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
 from visioncal.cli.console import answers, report_written, say
 from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
+from visioncal.core.choices import Faults
 from visioncal.interchange.outputs import write_outputs
+from visioncal.live.drivers.extras import refuse_without
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
-    from visioncal.simulation import CellOptions
+    from visioncal.results import Calibration
+    from visioncal.simulation import Truth
+
+# Exit status where the error is larger than the sigmas explain.
+EXIT_WRONG = 3
+# False-alarm probability of that test, and factor on the sigmas: errors of one board's corners are
+# correlated by hundredths of a pixel, and joints deviate from their encoders, which a covariance of
+# independent noise underestimates.
+_CHANCE, _SIGMA_FACTOR = 1e-3, 1.5
 
 
 def demo_command(
     out: OutFolder = Path("demo"),
-    views: Annotated[int, typer.Option(min=3, help="Number of views.")] = 20,
+    views: Annotated[int, typer.Option(min=5, max=200, help="Number of views.")] = 20,
     seed: Seed = 0,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live",
+            help="Plan the stops and record them, with a UR's own client library and a simulated "
+            "controller.",
+        ),
+    ] = False,
+    fault: Annotated[
+        Faults | None,
+        typer.Option(
+            metavar="FAULT",
+            help=f"With --live, let this happen half way: {', '.join(get_args(Faults))}.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Simulate a UR cell, calibrate it from its images, and compare with the truth.
 
-    The camera's intrinsics are not given: they too are estimated from the images.
+    The camera's intrinsics are not given: they too are estimated from the images. With --live the
+    arm has joint offsets and the stops are planned from rough guesses; nothing real moves. Exit
+    status 0: the result is as near to the truth as it says; 3: it is not.
     """
     from visioncal.calibration.pipeline import run
     from visioncal.cli.summary import print_summary, truth_table
     from visioncal.session import Session
-    from visioncal.simulation import CellOptions, read_truth, truth_path
+    from visioncal.simulation import CellOptions, read_truth, simulate, truth_path, write_session
 
+    if fault is not None and not live:
+        raise typer.BadParameter("--fault belongs to --live.")
+    if live:
+        refuse_without("ur", {"ur": "rtde_control"})
     session, result = out / "session", out / "result"
-    options = CellOptions(views=views, seed=seed, state_intrinsics=False)
+    if truth_path(session).exists():
+        # An earlier demonstration's; nothing else is ever removed.
+        shutil.rmtree(session, ignore_errors=True)
+    if live:
+        from visioncal.cli.live_demo import record_simulated
+
+        record_simulated(session, out / "plan", views, seed, fault)
     with shown_progress(quiet=False) as progress:
-        _replace_session(
-            options, session, lambda share: progress("render", round(share * views), views)
-        )
+        if not live:
+            cell = simulate(CellOptions(views=views, seed=seed, state_intrinsics=False))
+            write_session(
+                cell, session, lambda share: progress("render", round(share * views), views)
+            )
         loaded = Session.load(session)
         done = run(loaded, progress=progress)
         progress("write", 0, 1)
@@ -44,18 +83,28 @@ def demo_command(
     print_summary(done.calibration, verbose=True)
     truth = read_truth(session)
     answers().print(truth_table(done.calibration, truth.transforms, truth.camera))
+    squared, limit = chi_square(done.calibration, truth)
+    verb = "is explained by" if squared <= limit else "is more than"
+    answers().print(
+        f"the error {verb} the sigmas: chi-square {squared:.1f}, and up to {limit:.0f} is believed"
+    )
     for file in (session, truth_path(session)):
         say(f"wrote {file}")
-    report_written(written)
     say(f"Open {result / 'report.html'} in a browser to see it all.")
+    report_written(written, status=0 if squared <= limit else EXIT_WRONG)
 
 
-def _replace_session(
-    options: "CellOptions", folder: Path, progress: Callable[[float], None]
-) -> None:
-    """Simulates a session in place of an earlier demo's; nothing else is ever removed."""
-    from visioncal.simulation import simulate, truth_path, write_session
+def chi_square(calibration: "Calibration", truth: "Truth") -> tuple[float, float]:
+    """Squared Mahalanobis distance of the errors of both transforms, and the limit of its test."""
+    import numpy as np
 
-    if folder.exists() and truth_path(folder).exists():
-        shutil.rmtree(folder)
-    write_session(simulate(options), folder, progress)
+    from visioncal.core.quantiles import chi2_limit
+    from visioncal.core.transforms import invert, log
+
+    errors = [
+        log(invert(truth.transforms[name]) @ edge.matrix)
+        for name, edge in calibration.edges.items()
+    ]
+    twists = np.concatenate(errors)
+    squared = float(twists @ np.linalg.solve(calibration.joint_covariance, twists))
+    return squared, _SIGMA_FACTOR**2 * float(chi2_limit(_CHANCE, twists.size))

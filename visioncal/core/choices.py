@@ -37,7 +37,7 @@ EXPORT_NAMES = (
 SIMULATED_ARMS = ("ur3e", "ur5e", "ur10e", "generic-6r-1800")
 SIMULATED_CELLS = ("camera-and-tracker", "two-arms", "two-cameras")
 
-# Faults that can be rehearsed; the last two are of the camera, at a stop.
+# Faults of a simulated live cell; the last two are of the camera, at a stop.
 Faults: TypeAlias = Literal[
     "protective-stop",
     "emergency-stop",

@@ -1,1 +1,1 @@
-"""At the cell: planning of stops, drivers of devices, capture, and rehearsal without a robot."""
+"""At the cell: planning of stops, drivers of devices, capture, and a simulated cell to record."""

@@ -1,10 +1,9 @@
-"""Camera of a rehearsal: pictures of a simulated cell with the arm's true joints.
+"""Camera that observes a simulated cell with the arm's true joints.
 
 It free-runs as a real camera does: exposures start at regular times, whether or not requested.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
@@ -23,23 +22,10 @@ _MOMENTS = 5
 # Dark, as the inside of a lens cap [grey level].
 _DARK = 12
 
-Fault = Literal["none", "unplugged", "frozen", "covered"]
+CameraFault = Literal["none", "unplugged", "covered"]
 
 
-@dataclass(frozen=True)
-class Pace:
-    """Timing of a camera.
-
-    Attributes:
-        rate_hz: Pictures per second.
-        exposure_s: Exposure time [s].
-    """
-
-    rate_hz: float = 15.0
-    exposure_s: float = 0.008
-
-
-class RehearsalCamera:
+class SimulatedCamera:
     """Camera device that observes a simulated cell.
 
     Args:
@@ -48,7 +34,8 @@ class RehearsalCamera:
         true_joints: Returns the arm's true joints, (k, n) [rad], at k past moments of the monotonic
             clock, (k,) [s]. After its DriverError the last known joints are used: a camera goes on
             working when a controller dies.
-        pace: Timing of the pictures.
+        rate_hz: Pictures per second.
+        exposure_s: Exposure time [s].
         clock: The clock.
     """
 
@@ -57,17 +44,18 @@ class RehearsalCamera:
         cell: SimulatedCell,
         true_joints: Callable[[FloatArray], FloatArray],
         *,
-        pace: Pace | None = None,
+        rate_hz: float = 15.0,
+        exposure_s: float = 0.008,
         clock: Clock | None = None,
     ) -> None:
         self._cell = cell
         self._view = LiveView(cell)
         self._true_joints = true_joints
-        self._pace = pace or Pace()
+        self._rate_hz, self._exposure_s = rate_hz, exposure_s
         self._clock = clock or HostClock()
         self._start = self._clock.now()
-        self._last: tuple[FloatArray, Image] | None = None
-        self.fault: Fault = "none"
+        self._last: FloatArray | None = None
+        self.fault: CameraFault = "none"
 
     @property
     def name(self) -> str:
@@ -87,8 +75,7 @@ class RehearsalCamera:
     @property
     def settings(self) -> Mapping[str, str | float]:
         """Its exposure and rate."""
-        pace = self._pace
-        return MappingProxyType({"exposure_us": 1e6 * pace.exposure_s, "rate_hz": pace.rate_hz})
+        return MappingProxyType({"exposure_us": 1e6 * self._exposure_s, "rate_hz": self._rate_hz})
 
     def frame(self, *, timeout_s: float = 1.0) -> Frame:
         """Returns a picture whose exposure began after the call.
@@ -97,7 +84,7 @@ class RehearsalCamera:
             DriverError: It is unplugged, or the next exposure ends after the timeout.
         """
         requested_at = self._clock.now()
-        exposure_s, rate_hz = self._pace.exposure_s, self._pace.rate_hz
+        exposure_s, rate_hz = self._exposure_s, self._rate_hz
         start = self._start + np.ceil((requested_at - self._start) * rate_hz) / rate_hz
         is_late = start + exposure_s > requested_at + timeout_s
         if is_late or self.fault == "unplugged":
@@ -114,17 +101,14 @@ class RehearsalCamera:
         """Holds no resources."""
 
     def _picture(self, start: float) -> Image:
-        if self.fault == "frozen" and self._last is not None:
-            return self._last[1].copy()
         if self.fault == "covered":
             return np.full(self.resolution[::-1], _DARK, dtype=np.uint8)
-        moments = np.linspace(start, start + self._pace.exposure_s, _MOMENTS)
+        moments = np.linspace(start, start + self._exposure_s, _MOMENTS)
         try:
             joints = self._true_joints(moments)
         except DriverError:
             if self._last is None:
                 raise
-            joints = self._last[0]
-        image = self._view.picture(joints)
-        self._last = (joints[-1:], image)
-        return image
+            joints = self._last
+        self._last = joints[-1:]
+        return self._view.picture(joints)

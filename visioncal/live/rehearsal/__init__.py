@@ -1,1 +1,0 @@
-"""A simulated cell that the real client libraries talk to."""

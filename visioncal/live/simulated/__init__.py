@@ -1,0 +1,1 @@
+"""A simulated UR controller, for the real client library, and a camera that observes its arm."""
