@@ -139,9 +139,9 @@ def test_the_transform_that_is_proposed_can_be_written():
     assert export(CELL, "text", Selection(edge))
 
 
-def test_a_bad_verdict_is_warned_of():
+def test_the_worst_verdict_counts():
     bad = replace(CELL, verdict=replace(CELL.verdict, status="bad"))
-    assert document(bad, "ros", Selection("all")).warnings
+    assert document(bad, "ros", Selection("all")).verdict.status == "bad"
     assert not document(CELL, "ros", Selection("all")).warnings
 
 

@@ -410,10 +410,15 @@ def test_the_command_writes_a_file_once(saved, tmp_path):
     assert np.array_equal(readers.plain(out.read_text()), SAMPLE.edges["flange_from_cam"].matrix)
 
 
-def test_a_bad_verdict_is_exported_with_a_warning(tmp_path):
+def test_a_bad_result_is_exported_by_force_alone_and_with_a_warning(tmp_path):
     verdict = Verdict.of("bad", "The views disagree by 14 mm.")
     replace(SAMPLE, verdict=verdict).save(tmp_path / "calibration.json")
-    done = exporting(tmp_path, "--to", "ur")
+    refused = exporting(tmp_path, "--to", "ur", "-o", tmp_path / "pose.script")
+    assert refused.status == 3
+    assert "14 mm" in refused.err
+    assert "--force" in refused.err
+    assert not (tmp_path / "pose.script").exists()
+    done = exporting(tmp_path, "--to", "ur", "--force")
     assert done.status == 0
     assert "14 mm" in done.err
     assert "# verdict bad; sigma" in done.out

@@ -379,10 +379,10 @@ def test_the_command_takes_a_load_and_warns_without_one(tmp_path):
     assert "--cog-mm" in done.err
 
 
-def test_the_verdict_of_the_frame_is_what_is_warned_of():
+def test_the_verdict_of_the_frame_is_what_counts():
     bad = Verdict.of("bad", "Touch 4 is off by 7 mm.")
     frames = tool(verdict=bad) | fixture()
     cell = replace(SAMPLE, frames=frames, verdict=Verdict.of("bad", "The views disagree."))
-    assert any("7 mm" in warning for warning in document(cell, "ur-tcp").warnings)
-    assert document(cell, "ur-feature").warnings == ()
-    assert any("views disagree" in warning for warning in document(cell, "ros").warnings)
+    assert document(cell, "ur-tcp").verdict == bad
+    assert document(cell, "ur-feature").verdict == cell.frames["base_from_fixture"].verdict
+    assert document(cell, "ros").verdict == cell.verdict

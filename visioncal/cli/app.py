@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, TextIO, cast
 import typer
 
 from visioncal.cli.lazy import LazyGroup
-from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.errors import DataError, VerdictError, VisioncalError
 from visioncal.core.version import __version__
 
 # As shells report a program ended by SIGPIPE.
@@ -75,7 +75,7 @@ def _options(
 
 
 def main() -> None:
-    """Runs the command line; an input error ends with status 2 and one message."""
+    """Runs the command line; an error ends with one message and status 2, a bad result with 3."""
     # Commands compute on one BLAS thread. Loaded by both numpy and scipy, BLAS would start one a
     # core, which takes as long as a small calibration's solve.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -117,10 +117,10 @@ class _WithoutPandas:
 
 def _refuse(error: VisioncalError) -> None:
     # Importing a console takes longer than `--version` itself.
-    from visioncal.cli.console import EXIT_NO_RESULT, report_error
+    from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, report_error
 
     report_error(error, as_json="--json" in sys.argv[1:])
-    sys.exit(EXIT_NO_RESULT)
+    sys.exit(EXIT_BAD if isinstance(error, VerdictError) else EXIT_NO_RESULT)
 
 
 @contextmanager

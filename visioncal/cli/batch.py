@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import EXIT_NO_RESULT, answers
+from visioncal.cli.console import EXIT_BAD, EXIT_NO_RESULT, answers
 from visioncal.cli.options import NeedOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -70,7 +70,8 @@ def batch_command(
 
     Each result goes into a folder of its own; batch.parquet has a row a session, index.html shows
     them, outliers among robots of the same model first. Existing results are kept: started again,
-    an interrupted batch continues. Exit status 0: there are results; 2: of no session.
+    an interrupted batch continues. Exit status 0: there are results, none of them bad; 3: one is
+    bad; 2: there is none.
     """
     from visioncal.interchange.batch import batch
 
@@ -100,6 +101,8 @@ def batch_command(
         )
     if all(row.state == "failed" for row in found.rows):
         raise typer.Exit(EXIT_NO_RESULT)
+    if any(row.verdict == "bad" for row in found.rows):
+        raise typer.Exit(EXIT_BAD)
 
 
 def _report(results: "Batch") -> None:

@@ -76,9 +76,10 @@ def calibrate_command(
     """Turn a session into a hand-eye calibration, with reasons to trust it or not.
 
     Writes calibration.json, report.html and recording.rrd. Tools and fixtures that had joined an
-    earlier result there are kept in frames.json. Exit status 0: there is a result, with a verdict;
-    2: the input or the motion cannot give one, and an existing folder stays as it was; 1: drawing
-    the report or the recording failed, and calibration.json is there. Several cameras or robots are
+    earlier result there are kept in frames.json. Exit status 0: there is a result to use, good or
+    check; 3: there is one, and its verdict is bad; 2: the input or the motion cannot give one, and
+    an existing folder stays as it was; 1: drawing the report or the recording failed, and
+    calibration.json is there. Several cameras or robots are
     solved together, in one frame; other commands take one of each out of that result (--camera,
     --robot, --target).
     """
@@ -86,7 +87,7 @@ def calibrate_command(
 
     from visioncal.calibration.pipeline import run, run_dense
     from visioncal.calibration.pipeline.running import CalibrationOptions
-    from visioncal.cli.console import report_written, say, with_run_paths
+    from visioncal.cli.console import exit_status, report_written, say, with_run_paths
     from visioncal.cli.parsing import views_in
     from visioncal.cli.progress import shown_progress
     from visioncal.cli.summary import print_summary
@@ -120,7 +121,7 @@ def calibrate_command(
         print_summary(result.calibration, verbose=verbose)
     if left is not None:
         say(left.words)
-    report_written(written, quiet=as_json)
+    report_written(written, quiet=as_json, status=exit_status(result.calibration.verdict))
 
 
 def _joined(sessions: Sequence["Session"], *, shared: bool) -> "Session":

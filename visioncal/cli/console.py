@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from visioncal.core.errors import DataError, VisioncalError
+from visioncal.core.errors import DataError, VerdictError, VisioncalError
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from visioncal.core.verdict import Verdict
     from visioncal.interchange.outputs import Written
 
-# 0: a result, with a verdict; 1: a bug of ours; 2: the input cannot give a result; 3: a check
-# failed (verify).
-_EXIT_BUG, EXIT_NO_RESULT = 1, 2
+# 0: a result to use; 1: a bug of ours; 2: the input cannot give a result; 3: the result's verdict
+# is bad, or a check failed (verify).
+_EXIT_BUG, EXIT_NO_RESULT, EXIT_BAD = 1, 2, 3
 _LISTED_CULPRITS = 10
 _SHORT = 12  # culprits of fewer characters share a line
 
@@ -95,6 +96,37 @@ def report_error(error: VisioncalError, *, as_json: bool) -> None:
         console.print(f"  - and {len(other_culprits) - _LISTED_CULPRITS} more")
     if next_step:
         console.print(escape(next_step))
+
+
+def exit_status(verdict: "Verdict") -> int:
+    """The exit status of a command that wrote a result with this verdict."""
+    return EXIT_BAD if verdict.status == "bad" else 0
+
+
+def check_usable(verdict: "Verdict", what: str, *, force: bool) -> tuple[str, ...]:
+    """Refuses to carry a bad result on to a robot.
+
+    Args:
+        verdict: The verdict of what is to be used.
+        what: What it is, such as `the calibration`.
+        force: Whether the user takes it all the same.
+
+    Returns:
+        Warnings: that it is bad, where it is taken all the same.
+
+    Raises:
+        VerdictError: It is bad.
+    """
+    if verdict.status != "bad":
+        return ()
+    words = f"The verdict of {what} is bad: {' '.join(verdict.reasons)}"
+    if force:
+        return (words,)
+    raise VerdictError(
+        words,
+        culprits=[what],
+        next_step=" ".join([*map(str, verdict.next_steps[:1]), "To use it as it is, say --force."]),
+    )
 
 
 def report_written(written: "Written", *, quiet: bool = False, status: int = 0) -> None:

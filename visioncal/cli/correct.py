@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from visioncal.cli.options import AsJson, Force, OutFile, PartOptions
+from visioncal.cli.options import AsJson, ForceBoth, OutFile, PartOptions
 from visioncal.core.choices import WIDEST_RAD
 
 
@@ -72,7 +72,7 @@ class CorrectOptions:
         bool,
         typer.Option("--skip-unreachable", help="Write the other targets where some are refused."),
     ] = False
-    force: Force = False
+    force: ForceBoth = False
     as_json: AsJson = False
 
     @property
@@ -84,7 +84,8 @@ class CorrectOptions:
 def correct_command(options: CorrectOptions) -> None:
     """Correct targets so that the arm reaches them by its nominal controller.
 
-    Exit status 2: nothing was written, for the reason given; targets out of reach are named.
+    Exit status 2: nothing was written, for the reason given; targets out of reach are named. Exit
+    status 3: nothing was, as the calibration's verdict is bad.
     """
     # Imported late, so that --help stays fast.
     from visioncal.cli.corrected_targets import correct_table

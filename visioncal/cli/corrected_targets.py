@@ -7,7 +7,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, messages, print_json, say, warn
+from visioncal.cli.console import answers, check_usable, messages, print_json, say, warn
 from visioncal.cli.correct import CorrectOptions
 from visioncal.cli.parsing import numbers_in
 from visioncal.core.errors import DataError
@@ -46,9 +46,11 @@ def correct_table(options: CorrectOptions) -> None:
 
     Raises:
         DataError: Something cannot be read or written, or targets are out of reach.
+        VerdictError: The calibration, or the tool, is bad.
     """
     needs = EYE if options.tool is not None and options.tool.removeprefix(_TOOLS) == "cam" else ARM
     loaded = load_calibration(options.calibration, options.part.choice, needs)
+    bad = check_usable(loaded.verdict, "the calibration", force=options.force)
     calibration = _at_temperatures(loaded, options.temperatures)
     arm = CalibratedArm.of(calibration)
     if options.file is not None:
@@ -76,7 +78,7 @@ def correct_table(options: CorrectOptions) -> None:
     base_from_tool = corrected.base_from_flange @ flange_from_tool
     columns = columns_to_send(targets, corrected, base_from_tool, sigma_mm)
     warnings = [
-        *_warn_verdict(calibration),
+        *bad,
         *_warn_payload(arm, options.payload_kg),
         *_warn_turns(arm, targets, corrected, options.widest_deg),
         *_warn_singular(arm, targets, corrected.q, rows),
@@ -179,12 +181,6 @@ def _refusal(unreachable: Sequence[tuple[str, str]], count: int) -> DataError:
         if len(unreachable) < count
         else "Targets are base_from_flange in metres; of a tool, name it with --tool.",
     )
-
-
-def _warn_verdict(calibration: Calibration) -> Iterator[str]:
-    verdict = calibration.verdict
-    if verdict.status == "bad":
-        yield f"The calibration's verdict is bad: {' '.join(verdict.reasons[:1])}"
 
 
 def _warn_turns(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
-from visioncal.cli.console import answers, report_written, say
+from visioncal.cli.console import EXIT_BAD, answers, exit_status, report_written, say
 from visioncal.cli.options import OutFolder, Seed
 from visioncal.cli.progress import shown_progress
 from visioncal.core.choices import Faults
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from visioncal.results import Calibration
     from visioncal.simulation import Truth
 
-# Exit status where the error is larger than the sigmas explain.
-EXIT_WRONG = 3
 # False-alarm probability of that test, and factor on the sigmas: errors of one board's corners are
 # correlated by hundredths of a pixel, and joints deviate from their encoders, which a covariance of
 # independent noise underestimates.
@@ -91,7 +89,8 @@ def demo_command(
     for file in (session, truth_path(session)):
         say(f"wrote {file}")
     say(f"Open {result / 'report.html'} in a browser to see it all.")
-    report_written(written, status=0 if squared <= limit else EXIT_WRONG)
+    agrees = squared <= limit
+    report_written(written, status=exit_status(done.calibration.verdict) if agrees else EXIT_BAD)
 
 
 def chi_square(calibration: "Calibration", truth: "Truth") -> tuple[float, float]:

@@ -6,16 +6,13 @@ from typing import TYPE_CHECKING
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, print_json, with_run_paths
+from visioncal.cli.console import EXIT_BAD, answers, print_json, with_run_paths
 from visioncal.cli.options import AsJson, SessionArgument
 from visioncal.cli.progress import shown_progress
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.calibration.pipeline.checkup import Checkup
-
-# Exit status where something is wrong.
-_EXIT_FINDINGS = 3
 
 
 def doctor_command(session: SessionArgument, as_json: AsJson = False) -> None:
@@ -34,7 +31,7 @@ def doctor_command(session: SessionArgument, as_json: AsJson = False) -> None:
     else:
         _print(found, session)
     if not found.is_sound:
-        raise typer.Exit(_EXIT_FINDINGS)
+        raise typer.Exit(EXIT_BAD)
 
 
 def _print(checkup: "Checkup", session: Path) -> None:

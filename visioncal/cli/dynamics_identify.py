@@ -55,7 +55,8 @@ class IdentifyOptions:
 def dynamics_identify_command(options: IdentifyOptions) -> None:
     """Identify an arm's inertias and friction from the torques of its motions.
 
-    Exit status 0: there is a result, with a verdict; 2: there is none, for the reason given.
+    Exit status 0: there is a result to use; 3: its verdict is bad; 2: there is none, for the reason
+    given.
     """
     # Imported late, so that --help stays fast.
     from visioncal.cli.identified_dynamics import identify_into

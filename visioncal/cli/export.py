@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import messages, say
-from visioncal.cli.options import Force, OutFile, PartOptions
+from visioncal.cli.console import check_usable, messages, say
+from visioncal.cli.options import ForceBoth, OutFile, PartOptions
 from visioncal.core.choices import EXPORT_NAMES, Convention
 from visioncal.core.errors import DataError
 from visioncal.core.files import check_free, write_atomically
@@ -87,7 +87,7 @@ def export_command(
             "joint-corrections; without it, those that leave the least alone.",
         ),
     ] = False,
-    force: Force = False,
+    force: ForceBoth = False,
     _list: Annotated[
         bool,
         typer.Option("--list", callback=_show_formats, is_eager=True, help="List the formats."),
@@ -96,7 +96,7 @@ def export_command(
     """Write a result, or the calibrated arm, in another program's or robot's format.
 
     The transform a_from_b is the pose of b in a: its parent is a, its child b. Exit status 2:
-    nothing was written, for the reason given.
+    nothing was written, for the reason given; 3: nothing was, as the result's verdict is bad.
     """
     from visioncal.interchange.exports import Selection, document
     from visioncal.interchange.result_files import load_exportable
@@ -117,7 +117,8 @@ def export_command(
         with_corrections,
     )
     written = document(load_exportable(source), to, selection)
-    for warning in written.warnings:
+    bad = check_usable(written.verdict, "what is exported", force=force)
+    for warning in (*bad, *written.warnings):
         messages().print(f"[bold red]warning:[/] {escape(warning)}")
     if out is None or out == Path("-"):
         typer.echo(written.text, nl=False)

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
-from visioncal.cli.console import answers, print_json, report_written, say
+from visioncal.cli.console import answers, exit_status, print_json, report_written, say
 from visioncal.cli.dynamics import StreamOptions, friction_terms, identified_of
 from visioncal.cli.dynamics_identify import FRICTION, IdentifyOptions
 from visioncal.cli.summary import print_verdict
@@ -18,7 +18,7 @@ from visioncal.dynamics.identify import SLOW_RAD_S, Options
 from visioncal.dynamics.judge import judge
 from visioncal.dynamics.run import identify_session, validate_session
 from visioncal.dynamics.validate import Prediction, validate
-from visioncal.interchange.outputs import write_dynamics
+from visioncal.interchange.outputs import Written, write_dynamics
 from visioncal.session import Session
 
 
@@ -41,15 +41,14 @@ def identify_into(options: IdentifyOptions) -> None:
     )
     run = identify_session(Session.load(options.session), request)
     identified = run.identified
-    written = None if options.output is None else write_dynamics(options.output, run)
+    written = Written(()) if options.output is None else write_dynamics(options.output, run)
     if options.as_json:
         print_json(to_document(identified))
     else:
         _report(identified, () if run.predicted is None else run.predicted.notes)
-    if written is not None:
-        report_written(written, quiet=options.as_json)
-    elif not options.as_json:
+    if options.output is None and not options.as_json:
         say("nothing was written: -o names a folder for it")
+    report_written(written, quiet=options.as_json, status=exit_status(judge(identified)))
 
 
 def print_predictions(

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from visioncal.cli.console import print_json, say, warn
-from visioncal.cli.options import AsJson, CameraName, RobotName
+from visioncal.cli.console import check_usable, print_json, say, warn
+from visioncal.cli.options import AsJson, CameraName, ForceBad, RobotName
 from visioncal.cli.parsing import FORMS, named_result, numbers_in, plane_of, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -90,12 +90,13 @@ def locate_command(
             help="Noise of a feature's coordinate; else that of the calibration's corners."
         ),
     ] = None,
+    force: ForceBad = False,
     as_json: AsJson = False,
 ) -> None:
     """Locate what an image shows in the robot's base, with its uncertainty.
 
     It is a target, or a pixel whose plane is known. Exit status 2: there is no place, for the
-    reason given.
+    reason given; 3: there is none, as the calibration's verdict is bad.
     """
     import numpy as np
 
@@ -119,6 +120,8 @@ def locate_command(
     # Names may be those of the session alone.
     is_session_name = several and result.cell is None
     calibrated = result if is_session_name else result.chosen(Choice(camera, robot), EYE)
+    # With --force, every place has the warning.
+    check_usable(calibrated.verdict, "the calibration", force=force)
     if session is not None:
         refuse_given({"--pose": pose}, "the session has the poses of its views")
     else:

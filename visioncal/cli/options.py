@@ -29,6 +29,19 @@ AsJson: TypeAlias = Annotated[
 Force: TypeAlias = Annotated[
     bool, typer.Option("--force", help="Replace what is there under the same name; never a folder.")
 ]
+ForceBad: TypeAlias = Annotated[
+    bool, typer.Option("--force", help="Use a result even if its verdict is bad.")
+]
+ForceBoth: TypeAlias = Annotated[
+    bool,
+    typer.Option("--force", help="Replace an existing file; and use a result that is bad."),
+]
+Yes: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        "--yes", help="Move the arm without asking: the cell is clear, a hand on the stop button."
+    ),
+]
 View: TypeAlias = Annotated[
     bool, typer.Option("--view", help="Show it in the rerun viewer as it goes.")
 ]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, say
+from visioncal.cli.console import EXIT_BAD, answers, say
 from visioncal.cli.parsing import refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
@@ -14,9 +14,6 @@ from visioncal.core.errors import DataError
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
     from visioncal.interchange.result_files import Stored
-
-# Exit status where the numbers differ.
-_EXIT_OTHERS = 3
 
 
 def report_command(
@@ -96,7 +93,7 @@ def _recompute(stored: "Stored") -> None:
         comparison = recompute(stored.calibration, stored.session, progress=progress)
     answers().print(escape(comparison.words))
     if not comparison.is_same:
-        raise typer.Exit(_EXIT_OTHERS)
+        raise typer.Exit(EXIT_BAD)
 
 
 def _pair(text: str) -> tuple[str, str]:

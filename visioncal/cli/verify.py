@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, report_written
+from visioncal.cli.console import EXIT_BAD, answers, report_written
 from visioncal.cli.options import AsJson, PartOptions
 from visioncal.cli.parsing import named_result
 from visioncal.cli.progress import shown_progress
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from visioncal.calibration.verification import Check, Outcome
     from visioncal.core.verdict import Verdict
 
-# Exit status of a failed check.
-_EXIT_FAILED = 3
 # Headings of the policy's triggers by state.
 _TRIGGERED = {
     "fired": "[bold yellow]calibrate again[/] because of",
@@ -90,7 +88,7 @@ def verify_command(
         typer.echo(document, nl=False)
     else:
         _report(check, fired, verdict)
-    report_written(written, quiet=True, status=0 if check.passed else _EXIT_FAILED)
+    report_written(written, quiet=True, status=0 if check.passed else EXIT_BAD)
 
 
 def _report(check: "Check", triggers: "Sequence[Outcome]", verdict: "Verdict") -> None:

@@ -59,5 +59,9 @@ class ConvergenceError(VisioncalError):
     """An iteration did not converge on valid data: report it with the session."""
 
 
+class VerdictError(VisioncalError):
+    """A result is there, but its verdict is bad: find the cause, or use it knowingly (--force)."""
+
+
 class DriverError(VisioncalError):
     """A device is absent or fails: check the cable or install the extra that is named."""

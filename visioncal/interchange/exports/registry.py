@@ -10,7 +10,7 @@ from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.transforms import adjoint, invert
-from visioncal.dynamics import Identified
+from visioncal.dynamics import Identified, judge
 from visioncal.interchange.exports.arm import ArmFormat, select_arm
 from visioncal.interchange.exports.armfiles import ARMS, write_dynamics
 from visioncal.interchange.exports.content import Content, ExportFormat, OfTransforms, Selection
@@ -28,6 +28,7 @@ from visioncal.interchange.exports.ros import (
 )
 from visioncal.interchange.exports.sources import (
     HAND_EYE,
+    WORST_FIRST,
     Kind,
     Placements,
     Source,
@@ -66,11 +67,13 @@ class Document:
     """A result in a foreign format.
 
     Attributes:
-        warnings: What its user should know before it is used, each in plain words.
+        verdict: The worst verdict of what was written.
+        warnings: What else its user should know before it is used, each in plain words.
     """
 
     text: str
-    warnings: tuple[str, ...]
+    verdict: Verdict
+    warnings: tuple[str, ...] = ()
 
 
 @typed
@@ -100,20 +103,19 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
     """
     form = _find(to)
     if isinstance(source, Identified):
-        return Document(write_dynamics(source, to, selection), ())
+        return Document(write_dynamics(source, to, selection), judge(source))
     source, selection = _robot_part(source, selection, form)
     if isinstance(form, ArmFormat):
         arm = select_arm(source, selection, form)
         omitted = tuple(f"{name}." for name in arm.omitted)
-        return Document(
-            form.write(arm), (*_verdict_warnings(arm.verdict), *form.warn(arm), *omitted)
-        )
+        return Document(form.write(arm), arm.verdict, (*form.warn(arm), *omitted))
     if selection.edge == _ALL:
         contents = _select_all(source, selection, form)
         written = "" if form.write_all is None else form.write_all(contents)
-        return Document(written, _verdict_warnings(contents[0].verdict))
+        verdicts = {content.verdict.status: content.verdict for content in contents}
+        return Document(written, next(verdicts[one] for one in WORST_FIRST if one in verdicts))
     content = select(source, selection, form)
-    return Document(form.write(content), (*_verdict_warnings(content.verdict), *form.warn(content)))
+    return Document(form.write(content), content.verdict, tuple(form.warn(content)))
 
 
 def _robot_part(
@@ -136,12 +138,6 @@ def _robot_part(
     choice = Choice(selection.camera, selection.robot, selection.target)
     part = source.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
     return part, replace(selection, camera=None, robot=None, target=None)
-
-
-def _verdict_warnings(verdict: Verdict) -> tuple[str, ...]:
-    if verdict.status != "bad":
-        return ()
-    return (f"the verdict on this result is bad. {' '.join(verdict.reasons)}",)
 
 
 def _find(name: str) -> ExportFormat | ArmFormat:

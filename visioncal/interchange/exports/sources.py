@@ -24,7 +24,7 @@ _PARENTS: Mapping[Kind, re.Pattern[str]] = {
     "tool": re.compile(r"flange(_\w+)?", re.ASCII),
     "fixture": re.compile(r"base(_\w+)?", re.ASCII),
 }
-_WORST_FIRST = ("bad", "check", "good")
+WORST_FIRST = ("bad", "check", "good")
 _COMMANDS: Mapping[Kind, str] = {"tool": "visioncal tcp", "fixture": "visioncal fixture"}
 
 
@@ -216,7 +216,7 @@ def _between(source: Calibration, first: str, second: str) -> Placement:
     tree = source.tree
     placement = _in_cell(source, tree.between(first, second))
     for parent, frame in filter(None, (tree.placement(first), tree.placement(second))):
-        if _WORST_FIRST.index(frame.verdict.status) < _WORST_FIRST.index(placement.verdict.status):
+        if WORST_FIRST.index(frame.verdict.status) < WORST_FIRST.index(placement.verdict.status):
             placement = replace(placement, verdict=frame.verdict)
         origin = f"{placement.origin}; {_of_frame(frame).origin}"
         placement = replace(placement, origin=origin)
