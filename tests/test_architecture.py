@@ -85,6 +85,16 @@ def test_packages_import_only_from_those_before():
             assert not wrong, (path, wrong)
 
 
+def test_an_arm_moves_through_the_gate_alone():
+    for word, home in ((".start_move(", "drive"), (" drive(", "gate")):
+        callers = {
+            path.relative_to(PACKAGE).as_posix()
+            for path in PACKAGE.rglob("*.py")
+            if any(word in line and "def " not in line for line in path.read_text().splitlines())
+        }
+        assert callers == {f"live/capture/{home}.py"}
+
+
 def test_the_simulation_has_a_forward_model_of_its_own():
     for path in (PACKAGE / "simulation").glob("*.py"):
         assert packages_imported(path) <= SIMULATION_MAY_USE, path.name

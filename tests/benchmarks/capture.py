@@ -20,6 +20,7 @@ from support.planned import true_cell
 from visioncal.core.errors import VisioncalError
 from visioncal.live.capture.core import CaptureEvent, Watcher
 from visioncal.live.capture.facts import CaptureFacts
+from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
@@ -120,7 +121,7 @@ def recorded(live: LiveCell, plan: PlanFile, folder: Path, watcher: Watcher) -> 
         plan.digest,
     )
     journal = Journal.begin(folder, facts, live.clock.unix_offset_s(), len(plan.stops))
-    return record(live, plan, journal, TAKING, [watcher], lens=camera.factory)
+    return record(live, plan, journal, TAKING, Consent(None), [watcher], lens=camera.factory)
 
 
 def times_of_views(folder: Path) -> str:

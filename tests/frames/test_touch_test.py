@@ -13,10 +13,18 @@ from support.pages import Page
 
 from visioncal.core.errors import DataError
 from visioncal.core.transforms import compose, invert
-from visioncal.frames.touch_test import evaluate_gaps, touch_points, touch_test_finding
+from visioncal.frames.measured_points import Tool
+from visioncal.frames.touch_test import (
+    evaluate_gaps,
+    flange_extent,
+    touch_targets,
+    touch_test_finding,
+)
 from visioncal.interchange.merge_results import rewrite_result
+from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.hover import Hovering
 from visioncal.live.drivers.ur import UrArm
+from visioncal.live.planning.cell import Limits, cell_of_calibration, touching_model
 from visioncal.live.simulated.arm import ControllerOptions
 from visioncal.live.simulated.controller import spawn
 from visioncal.results import Calibration, Edge
@@ -25,6 +33,8 @@ from visioncal.session import Session
 from visioncal.simulation import CellOptions, simulate, write_session
 from visioncal.vision.targets import corner_positions
 
+# Longer than the camera reaches beyond the flange.
+GAUGE = ("--tool", "none", "--clearance-mm", 150)
 CELL = replace(CellOptions(), views=12, seed=21)
 
 
@@ -41,9 +51,19 @@ def proved(tmp_path_factory):
     return folder, look, corners
 
 
-def test_the_tip_comes_as_near_as_predicted(proved):
-    folder, look, corners = proved
-    points = touch_points(Session.load(look), Calibration.load(folder / "out"))
+@pytest.fixture(scope="module")
+def known(proved):
+    return Calibration.load(proved[0] / "out")
+
+
+@pytest.fixture(scope="module")
+def located(proved, known):
+    """The points to touch by a gauge of 150 mm, longer than the camera on the flange reaches."""
+    return touch_targets(Session.load(proved[1]), known, clearance_m=0.15)
+
+
+def test_the_tip_comes_as_near_as_predicted(proved, located):
+    corners, points = proved[2], located.points
     assert len(points) == 5
     away_mm = [
         1e3 * np.linalg.norm(point.base_m - corners[int(point.name.split()[1])]) for point in points
@@ -51,9 +71,10 @@ def test_the_tip_comes_as_near_as_predicted(proved):
     # A ball of 95 % holds five points that share the camera's error, nineteen times of twenty.
     assert max(away_mm) < max(point.radius95_mm for point in points)
     for point in points:
-        # The flange stands on the point, its z into the board; above it, along that z.
-        np.testing.assert_allclose(point.base_from_flange[:3, 3], point.base_m)
-        step = invert(point.base_from_flange) @ point.above(0.05)
+        # The gauge stands on the point, the flange's z into the board; above it, along that z.
+        tip_m = (point.base_from_flange @ [0.0, 0.0, 0.15, 1.0])[:3]
+        np.testing.assert_allclose(tip_m, point.base_m)
+        step = invert(point.base_from_flange) @ located.above(point, 0.05)
         np.testing.assert_allclose(step[:3, 3], [0.0, 0.0, -0.05], atol=1e-12)
     assert evaluate_gaps(points, away_mm).passed
     assert not evaluate_gaps(points, [5.0] * 5).passed
@@ -61,10 +82,33 @@ def test_the_tip_comes_as_near_as_predicted(proved):
         evaluate_gaps(points, [0.1])
 
 
+def test_no_target_brings_what_the_flange_carries_into_the_board(proved, known):
+    look = Session.load(proved[1])
+    corners_m, extent_m = flange_extent(known)
+    lens_m = known.transforms["flange_from_cam"].translation[2]
+    # The lens, and what is before its centre: the box of a camera is 0.1 m long, 0.03 behind it.
+    assert lens_m < extent_m < lens_m + 0.1
+    with pytest.raises(DataError, match="which tool touches is not known"):
+        touch_targets(look, known)
+    for clearance_m in (0.0, extent_m - 1e-3):
+        with pytest.raises(DataError, match="would be in the board"):
+            touch_targets(look, known, clearance_m=clearance_m)
+    short = Edge(compose(np.eye(3), np.array([0.0, 0.0, 0.5 * extent_m])), np.zeros((6, 6)))
+    with pytest.raises(DataError, match="would be in the board"):
+        touch_targets(look, known, Tool("flange_from_stub", short, True, known.verdict))
+    lowest = touch_targets(look, known, clearance_m=extent_m)
+    board = lowest.board.edge.matrix
+    for point in lowest.points:
+        flange = point.base_from_flange
+        carried_m = corners_m @ flange[:3, :3].T + flange[:3, 3]
+        heights_m = (board[:3, 3] - carried_m) @ board[:3, 2]
+        # By rounding alone is anything in the board.
+        assert heights_m.min() > -1e-9
+
+
 @pytest.mark.parametrize(("ratio", "passed"), [(1.2, True), (2.0, False), (200.0, False)])
-def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(proved, ratio, passed):
-    folder, look, _ = proved
-    points = touch_points(Session.load(look), Calibration.load(folder / "out"))
+def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(located, ratio, passed):
+    points = located.points
     gaps_mm = [0.1, 0.1, 0.1, ratio * points[3].radius95_mm, 0.1]
     test = evaluate_gaps(points, gaps_mm)
     assert test.passed == passed
@@ -72,32 +116,46 @@ def test_one_gap_may_exceed_its_prediction_by_chance_but_not_by_much(proved, rat
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_driven_arm_hovers_above_each_point(proved, monkeypatch):
+def test_a_driven_arm_hovers_above_each_point(proved, known, located, monkeypatch):
     pytest.importorskip("rtde_control", reason="ur-rtde is not installed (the extra `ur`)")
     folder, look, _ = proved
-    known, session = Calibration.load(folder / "out"), Session.load(folder / "session")
-    start = session.views[0].joints_rad
-    points = touch_points(Session.load(look), known)
+    session = Session.load(folder / "session")
+    cell = replace(cell_of_calibration(known, session.target, Limits()), robot=known.robot)
+    clear = touching_model(cell, located.flange_from_tip.matrix, located.board.edge)
+    starts = [view.joints_rad for view in session.views]
+    # A posture in which the camera is far enough from the wrist.
+    start = next(q for q in starts if clear.first_contact(q[None])[0] < 0)
+    points, above = located.points, located.above
     # The controller believes in the data sheet, as the calibration's nominal arm does.
     with spawn(ControllerOptions(q=tuple(start), tcp=(0.0,) * 6)) as controller:
         with closing(UrArm(controller.host)) as arm:
+            hovering = Hovering.of(arm, known, session.target, located, 0.05, Consent(None))
             for point in points[:2]:
-                plane = point.base_m, point.normal
-                hovering = Hovering(arm, known.robot, np.zeros(3), *plane, 0.05)
-                hovering.bring(point.above(0.05))
-                away = invert(point.above(0.05)) @ arm.state().base_from_flange
+                hovering.bring(above(point, 0.05), point.name)
+                away = invert(above(point, 0.05)) @ arm.state().base_from_flange
                 # A tenth of the least gap that can be read.
                 assert np.linalg.norm(away[:3, 3]) < 1e-5
             # Through the board leads no way.
-            with pytest.raises(DataError, match="above the board"):
-                hovering.bring(points[1].above(-0.03))
-        typed = io.StringIO("y\n" + "0.1\n" * 5)
+            with pytest.raises(DataError, match=r"no clear way|above the board|mm apart"):
+                hovering.bring(above(points[1], -0.03), points[1].name)
+        drive = "touch-test", look, "-c", folder / "out", *GAUGE, "--drive", f"ur:{controller.host}"
+        monkeypatch.setattr("sys.stdin", io.StringIO("y\n" + "0.1\n" * 5))
+        refused = visioncal(*drive)
+        assert refused.status == 2
+        assert "stdin is no terminal" in refused.err
+        # A terminal whose input ends after the first motion and its gap.
+        typed = io.StringIO("y\ny\n0.1\n")
+        typed.isatty = lambda: True
         monkeypatch.setattr("sys.stdin", typed)
-        done = visioncal(
-            "touch-test", look, "-c", folder / "out", "--drive", f"ur:{controller.host}"
-        )
+        ended = visioncal(*drive)
+        assert ended.status == 2
+        assert "without consent" in ended.err
+        away = invert(above(points[0], 0.05)) @ _stands(controller, known)
+        assert np.linalg.norm(away[:3, 3]) < 2e-3
+        monkeypatch.setattr("sys.stdin", io.StringIO("0.1\n" * 5))
+        done = visioncal(*drive, "--yes")
         assert done.status == 0, done.err
-        away = invert(points[-1].above(0.05)) @ _stands(controller, known)
+        away = invert(above(points[-1], 0.05)) @ _stands(controller, known)
         assert np.linalg.norm(away[:3, 3]) < 2e-3
 
 
@@ -110,13 +168,13 @@ def _stands(controller, known):
 def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     folder, look, _ = proved
     out = folder / "out"
-    done = visioncal("touch-test", look, "-c", out)
+    done = visioncal("touch-test", look, "-c", out, *GAUGE)
     assert done.status == 0
     assert done.out.count("hover:") == done.out.count("touch:") == 5
-    targets = json.loads(visioncal("touch-test", look, "-c", out, "--json").out)["points"]
+    targets = json.loads(visioncal("touch-test", look, "-c", out, *GAUGE, "--json").out)["points"]
     lifted = np.array(targets[0]["hover"][:3]) - targets[0]["touch"][:3]
     assert np.linalg.norm(lifted) == pytest.approx(0.05)
-    done = visioncal("touch-test", look, "-c", out, "--gaps-mm", "0.1,0,0.1,0.1,0.05")
+    done = visioncal("touch-test", look, "-c", out, *GAUGE, "--gaps-mm", "0.1,0,0.1,0.1,0.05")
     assert done.status == 0
     known = Calibration.load(out)
     assert known.touch_test.passed
@@ -124,7 +182,7 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     words = Page((out / "report.html").read_text("utf-8")).words
     assert "Touch test Passed, with flange" in words
 
-    done = visioncal("touch-test", look, "-c", out, "--gaps-mm", "3,3,3,3,3")
+    done = visioncal("touch-test", look, "-c", out, *GAUGE, "--gaps-mm", "3,3,3,3,3")
     assert done.status == 3
     assert "Measure the tool's tip anew" in done.out
     assert not Calibration.load(out).touch_test.passed
@@ -132,12 +190,12 @@ def test_targets_are_printed_and_gaps_join_the_result(proved, monkeypatch):
     typed = io.StringIO("0.1\nnothing\n0,2\n-1\n0.1\n0.1\n0.1\n")
     typed.isatty = lambda: True
     monkeypatch.setattr("sys.stdin", typed)
-    done = visioncal("touch-test", look, "-c", out)
+    done = visioncal("touch-test", look, "-c", out, *GAUGE)
     assert done.status == 0
     assert done.err.count("gap [mm]:") == 7
     gaps_mm = [point.gap_mm for point in Calibration.load(out).touch_test.points]
     assert gaps_mm == [0.1, 0.2, 0.1, 0.1, 0.1]
-    ended = visioncal("touch-test", look, "-c", out)
+    ended = visioncal("touch-test", look, "-c", out, *GAUGE)
     assert ended.status == 2
     assert "nothing was kept" in ended.err
     done = visioncal("touch-test", look, "-c", out, "--tool", "gripper")
@@ -161,7 +219,7 @@ def test_what_touches_is_the_only_tool_or_the_flange(proved):
         return np.array(json.loads(done.out)["points"][0]["touch"][:3])
 
     # The flange stays behind by the tool's length.
-    assert np.linalg.norm(first() - first("--tool", "none")) == pytest.approx(0.12)
+    assert np.linalg.norm(first() - first(*GAUGE)) == pytest.approx(0.03)
     np.testing.assert_array_equal(first(), first("--tool", "grip"))
     refused = visioncal("touch-test", look, "-c", held, "--tool", "grib")
     assert "no tool 'grib'; it has flange_from_grip" in refused.err

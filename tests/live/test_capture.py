@@ -267,7 +267,7 @@ def test_a_plan_for_another_arm_is_not_driven(plan):
     moved = FakeArm(other.cell, arm.clock, plan.stops[0].q)
     state, offset = moved.state, compose(np.eye(3), np.array([0.3, 0.0, 0.0]))
     moved.state = lambda: replace(said := state(), base_from_flange=offset @ said.base_from_flange)
-    with pytest.raises(DataError, match=r"its flange is 300 mm and 0 deg from where the plan's"):
+    with pytest.raises(DataError, match=r"its flange is 300 mm and 0 deg from where the model"):
         motion_summary(LiveCell(moved, camera, arm.clock), plan, (), QUICK)
 
 

@@ -7,6 +7,7 @@ import re
 import signal
 import sys
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import patch
 
 import cv2
@@ -135,13 +136,35 @@ def test_nothing_moves_without_a_word(planned, cell, tmp_path):
     assert "stdin is no terminal" in done.err
     assert "--yes" in done.err
     assert arm.moves == 0
-    terminal = io.StringIO("n\n")
+    # Refused, and at the input's end.
+    for place, typed in (("other", "n\n"), ("third", "")):
+        done = _at_terminal(typed, tmp_path / place, "--plan", planned[0])
+        assert done.status == 2
+        assert "without consent" in done.err
+        assert arm.moves == 0
+
+
+def _at_terminal(typed: str, out: Path, *more: object) -> Done:
+    terminal = io.StringIO(typed)
     terminal.isatty = lambda: True
     with patch.object(sys, "stdin", terminal):
-        done = record(tmp_path / "other", "--plan", planned[0])
+        return record(out, *more)
+
+
+@pytest.mark.usefixtures("cell")
+def test_each_motion_has_its_consent(planned, tmp_path, monkeypatch):
+    done = _at_terminal("y\nwhat\ny\n", tmp_path / "live", "--plan", planned[0])
+    # Two motions were allowed, and then nobody answered.
     assert done.status == 2
-    assert "nothing moved" in done.err
-    assert arm.moves == 0
+    assert done.err.count("[y]es, [a]ll that follow, [n]o") == 4
+    assert "2 views are safe" in done.err
+    plan = read_plan(planned[0])
+    arm, camera = fake_devices(plan)
+    arm.q0 = plan.stops[2].q
+    _use(monkeypatch, arm, camera)
+    done = _at_terminal("a\n", tmp_path / "live", "--plan", planned[0], "--resume")
+    assert done.status == 0, done.err
+    assert done.err.count("[y]es, [a]ll that follow, [n]o") == 1
 
 
 def test_a_dry_run_moves_nothing_and_writes_nothing(planned, cell, tmp_path):

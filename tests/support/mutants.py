@@ -89,7 +89,7 @@ READINGS: tuple[Reading, ...] = (
     Reading("calibrate", "pairs", "IT -o OUT --json"),
     *_each("calibrate", "IT -o OUT", "network", "network", "pairs"),
     *_each("doctor", "IT", "board", "pairs", "arm"),
-    Reading("touch-test", "board", "IT -c [board_out]"),
+    Reading("touch-test", "board", "IT -c [board_out] --tool none --clearance-mm 300"),
     *_each("report", "IT -o OUT/report.html", "out", "board_out", "network_out", "warm_out"),
     Reading("report", "arm_out", "IT/calibration.json -o OUT/report.html"),
     Reading("verify", "pairs", "IT --against [out] -o NEW"),

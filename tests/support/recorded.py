@@ -8,6 +8,7 @@ from support.live_cell import FakeArm, FakeCamera, fake_devices, fake_plan
 
 from visioncal.live.capture.core import CaptureEvent, Watcher
 from visioncal.live.capture.facts import CaptureFacts
+from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions, Stillness
@@ -53,7 +54,7 @@ def recorded(
     facts = facts_of(plan, arm, camera)
     journal = begin(folder, facts, arm.clock.unix_offset_s(), len(plan.stops))
     cell = LiveCell(arm, camera, arm.clock)
-    return record(cell, plan, journal, options, watchers)
+    return record(cell, plan, journal, options, Consent(None), watchers)
 
 
 def errors_m(session: Session, camera: FakeCamera) -> list[float]:

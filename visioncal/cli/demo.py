@@ -49,7 +49,8 @@ def demo_command(
 
     The camera's intrinsics are not given: they too are estimated from the images. With --live the
     arm has joint offsets and the stops are planned from rough guesses; nothing real moves. Exit
-    status 0: the result is as near to the truth as it says; 3: it is not.
+    status 0: the result is as near to the truth as it says; 3: it is not, or its verdict is
+    bad.
     """
     from visioncal.calibration.pipeline import run
     from visioncal.cli.summary import print_summary, truth_table

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from visioncal.cli.console import asked, say
-from visioncal.cli.options import AsJson, View
+from visioncal.cli.options import AsJson, View, Yes
 from visioncal.cli.record_options import DeviceOptions, RecordCellOptions, TakingOptions
 from visioncal.core.interrupts import signals_as_interrupts
 from visioncal.live.capture.options import CaptureOptions
@@ -60,7 +60,7 @@ def record_command(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say what would be driven; nothing moves.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Begin to move without asking.")] = False,
+    yes: Yes = False,
     view: View = False,
     as_json: AsJson = False,
 ) -> None:
@@ -84,6 +84,7 @@ def record_command(
         shown_in,
     )
     from visioncal.live.capture.devices import ArmSetup, is_folder
+    from visioncal.live.capture.gate import Consent
     from visioncal.live.capture.journal import Journal
     from visioncal.live.capture.record import motion_summary
 
@@ -103,6 +104,7 @@ def record_command(
             report_departure(motion_summary(cell, scene.planned, (), taking), cell, taking)
             say("Nothing was moved (--dry-run).")
             return
+        consent = Consent.of("record", asked, yes=yes or not drives)
         start = Journal.resume if resume else Journal.begin
         count = len(scene.planned.stops) if drives else views
         facts = facts_of(scene, cell, out.name)
@@ -112,7 +114,7 @@ def record_command(
         with shown_in(scene, cell, wanted=view) as viewers:
             watchers = [ViewLines(), *viewers]
             if drives:
-                steps = record_driven(cell, scene, journal, taking, watchers, asks=not yes)
+                steps = record_driven(cell, scene, journal, taking, watchers, consent)
             else:
                 ask = asked if answers else None
                 steps = record_guided(cell, scene, journal, taking, watchers, views, ask)

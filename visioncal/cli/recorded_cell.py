@@ -2,14 +2,12 @@
 
 import math
 import shlex
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
 from rich.markup import escape
 
 from visioncal.cli.console import messages, print_json, say
@@ -30,6 +28,7 @@ from visioncal.live.capture.core import (
 from visioncal.live.capture.devices import ArmSetup, open_arm, open_camera
 from visioncal.live.capture.facts import CaptureFacts
 from visioncal.live.capture.follow import ask_and_take, follow
+from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import HostClock, LiveCell
@@ -283,17 +282,14 @@ def record_driven(
     journal: Journal,
     taking: CaptureOptions,
     watchers: Sequence[Watcher],
-    *,
-    asks: bool,
+    consent: Consent,
 ) -> list[CaptureEvent]:
-    """Drives the plan's stops, after the user's confirmation."""
+    """Drives the plan's stops, each with the user's consent."""
     leaving = motion_summary(cell, scene.planned, [view.number for view in journal.views], taking)
     report_departure(leaving, cell, taking)
     if not leaving.stops:
         return []
-    if asks:
-        _confirm(cell)
-    return record(cell, scene.planned, journal, taking, watchers, lens=cell.camera.factory)
+    return record(cell, scene.planned, journal, taking, consent, watchers, lens=cell.camera.factory)
 
 
 def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOptions) -> None:
@@ -321,18 +317,6 @@ def report_departure(leaving: MotionSummary, cell: LiveCell, taking: CaptureOpti
         f"{figure(math.degrees(leaving.turn_rad))} deg; the way is clear of all that was declared "
         "to the plan"
     )
-
-
-def _confirm(cell: LiveCell) -> None:
-    if not sys.stdin.isatty():
-        raise DataError(
-            "record: nobody can be asked whether the arm may move: stdin is no terminal.",
-            culprits=["--yes"],
-            next_step="Say --yes where the cell is clear and somebody holds the stop button.",
-        )
-    sentence = f"{cell.arm.name} will move. Is the cell clear, and a hand on the stop button?"
-    if not typer.confirm(sentence, err=True):
-        raise DataError("record: not begun; nothing moved.", next_step="Look with --dry-run.")
 
 
 def check_all(journal: Journal, steps: Sequence[CaptureEvent]) -> None:

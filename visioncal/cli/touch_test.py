@@ -13,29 +13,31 @@ from rich.console import Console
 from rich.markup import escape
 
 from visioncal.cli.console import (
+    EXIT_BAD,
     answers,
     asked,
+    check_usable,
     messages,
     print_json,
     report_error,
     report_written,
     say,
+    warn,
 )
-from visioncal.cli.options import AsJson, SessionArgument
-from visioncal.cli.parsing import named_result, numbers_in
+from visioncal.cli.options import AsJson, ForceBad, SessionArgument, Yes
+from visioncal.cli.parsing import named_result, numbers_in, refuse_given
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError, DriverError
 from visioncal.core.number_format import figure
 
 # For type hints only, so that --help stays fast.
 if TYPE_CHECKING:
-    from visioncal.core.types import FloatArray
-    from visioncal.frames.touch_test import TouchPoint
+    from visioncal.core.types import FloatArray, Target
+    from visioncal.frames.measured_points import Tool
+    from visioncal.frames.touch_test import TouchPoint, TouchTargets
     from visioncal.live.capture.hover import Hovering
     from visioncal.results import Calibration
 
-# Exit status where gaps are larger than predicted.
-_EXIT_LARGER = 3
 _FORM = "Flange targets: x, y, z \\[mm], rotation vector \\[rad]; hover first, then touch."
 
 
@@ -47,8 +49,17 @@ def touch_test_command(
     tool: Annotated[
         str | None,
         typer.Option(
-            help="Which tool of the calibration has the tip, see tcp; none: the flange itself. "
-            "Without this its only tool, or the flange where it has none."
+            help="Which tool of the calibration has the tip, see tcp; its only tool need not be "
+            "named. none: a gauge of --clearance-mm before the flange."
+        ),
+    ] = None,
+    clearance_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            max=2000.0,
+            help="With --tool none: the flange comes no nearer to the board, and a gauge of this "
+            "length has the tip; longer than all that the flange carries.",
         ),
     ] = None,
     height_mm: Annotated[
@@ -65,9 +76,8 @@ def touch_test_command(
             help="Bring the tip above each point by this arm, slowly; the rest is by hand.",
         ),
     ] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="With --drive: begin to move without asking.")
-    ] = False,
+    yes: Yes = False,
+    force: ForceBad = False,
     as_json: AsJson = False,
 ) -> None:
     """Prove a calibration: touch what the camera locates, and enter the gaps.
@@ -75,10 +85,9 @@ def touch_test_command(
     The session has one image or more of a board as it lies now. Prints where to send the robot,
     hovering first, corrected where the arm is calibrated; at a terminal it asks for each gap. With
     all gaps, they are compared with what was predicted, and kept in the result and its report. Exit
-    status 3: they are larger.
+    status 3: they are larger, or nothing was done as the calibration or the tool is bad.
     """
-    from visioncal.frames.measured_points import Tool
-    from visioncal.frames.touch_test import evaluate_gaps, touch_points, touch_test_finding
+    from visioncal.frames.touch_test import evaluate_gaps, touch_targets, touch_test_finding
     from visioncal.interchange.merge_results import rewrite_result
     from visioncal.interchange.result_files import load_result
     from visioncal.results import to_document
@@ -95,24 +104,30 @@ def touch_test_command(
             f"-c {shlex.quote(str(calibration))} --camera NAME --robot NAME say where the board "
             "is, touch it there, and compare.",
         )
-    has_tools = any(frame.startswith("flange_from_") for frame in result.frames)
-    is_bare = tool == "none" or (tool is None and not has_tools)
-    if not (is_bare or has_tools):
-        raise DataError(
-            f"--tool is {tool!r}, and the calibration has no tool.",
-            culprits=["--tool"],
-            next_step="Find the tip first, and let it join the calibration: "
-            f"visioncal tcp TOUCHES -c {shlex.quote(str(calibration))} --name gripper",
-        )
-    touching = None if is_bare else Tool.among(result.frames, "The calibration", tool)
+    touching = _touching(result, calibration, tool)
+    misplaced_mm = None if tool == "none" else clearance_mm
+    refuse_given({"--clearance-mm": misplaced_mm}, "it is for --tool none")
+    if drive is not None:
+        refuse_given({"--gaps-mm": gaps_mm}, "with --drive, gaps are asked for")
     with shown_progress(quiet=as_json):
-        points = touch_points(loaded, result, touching)
-    targets = [_target(result, point, 1e-3 * height_mm) for point in points]
+        clearance_m = None if clearance_mm is None else 1e-3 * clearance_mm
+        located = touch_targets(loaded, result, touching, clearance_m)
+    used = {
+        "the calibration": result.verdict,
+        "where the board lies": located.board.verdict,
+        **({} if touching is None else {touching.name: touching.verdict}),
+    }
+    for what, verdict in used.items():
+        for warning in check_usable(verdict, what, force=force):
+            warn(warning)
+    points = located.points
+    targets = [_target(result, located, point, 1e-3 * height_mm) for point in points]
     if gaps_mm is not None:
         count = gaps_mm.count(",") + 1
         gaps = [*numbers_in(gaps_mm, "--gaps-mm", ",".join("abcdefghij"[:count]))]
     elif drive is not None:
-        gaps = _drive(drive, result, points, targets, 1e-3 * height_mm, asks=not yes)
+        board = next(iter(loaded.boards.values()))
+        gaps = _drive(drive, result, board, located, targets, 1e-3 * height_mm, yes=yes)
     elif sys.stdin.isatty() and not as_json:
         gaps = _ask_gaps(points, targets)
     else:
@@ -125,14 +140,32 @@ def touch_test_command(
         print_json({"points": targets, "touch_test": to_document(extended)["touch_test"]})
     else:
         answers().print(escape(touch_test_finding(test).reason))
-    report_written(written, quiet=as_json, status=0 if test.passed else _EXIT_LARGER)
+    report_written(written, quiet=as_json, status=0 if test.passed else EXIT_BAD)
 
 
-def _target(calibration: "Calibration", point: "TouchPoint", height_m: float) -> dict[str, Any]:
+def _touching(calibration: "Calibration", path: Path, tool: str | None) -> "Tool | None":
+    """The tool that touches; None where there is none."""
+    from visioncal.frames.measured_points import Tool
+
+    if any(frame.startswith("flange_from_") for frame in calibration.frames):
+        return None if tool == "none" else Tool.among(calibration.frames, "The calibration", tool)
+    if tool not in (None, "none"):
+        raise DataError(
+            f"--tool is {tool!r}, and the calibration has no tool.",
+            culprits=["--tool"],
+            next_step="Find the tip first, and let it join the calibration: "
+            f"visioncal tcp TOUCHES -c {shlex.quote(str(path))} --name gripper",
+        )
+    return None
+
+
+def _target(
+    calibration: "Calibration", located: "TouchTargets", point: "TouchPoint", height_m: float
+) -> dict[str, Any]:
     """Targets of the robot for its own controller."""
     from visioncal.results.compensation import correct
 
-    touch, hover = point.base_from_flange, point.above(height_m)
+    touch, hover = point.base_from_flange, located.above(point, height_m)
     document: dict[str, Any] = {
         "name": point.name,
         "base_m": point.base_m.tolist(),
@@ -191,44 +224,37 @@ def _ask_gaps(points: "Sequence[TouchPoint]", targets: Sequence[dict[str, Any]])
 def _drive(
     words: str,
     calibration: "Calibration",
-    points: "Sequence[TouchPoint]",
+    board: "Target",
+    located: "TouchTargets",
     targets: Sequence[dict[str, Any]],
     height_m: float,
     *,
-    asks: bool,
+    yes: bool,
 ) -> list[float]:
     """Drives the tip above each point, and asks for its gap."""
-    from visioncal.core.transforms import invert
     from visioncal.live.capture.devices import ArmSetup, open_arm
+    from visioncal.live.capture.gate import Consent
     from visioncal.live.capture.hover import Hovering
     from visioncal.live.drivers.protocols import MovingArm
 
-    if calibration.robot is None:
-        raise DataError(
-            "--drive: the calibration has no model of the robot.",
-            culprits=["--drive"],
-            next_step="Name it as [robot] model in session.toml, and calibrate again.",
-        )
-    if asks and not typer.confirm("The arm will move. Is the cell clear?", err=True):
-        raise DataError("touch-test: not begun; nothing moved.", culprits=["--drive"])
+    consent = Consent.of("touch-test", asked, yes=yes)
     gaps = []
     with closing(open_arm(words, ArmSetup("", watch_only=False, ask=_line))) as arm:
         if not isinstance(arm, MovingArm):
             raise DataError(f"{arm.name} cannot be driven.", culprits=["--drive"])
-        for point, target in zip(points, targets, strict=True):
-            tip_m = (invert(point.base_from_flange) @ [*point.base_m, 1.0])[:3]
-            hovering = Hovering(arm, calibration.robot, tip_m, point.base_m, point.normal, height_m)
-            _bring(hovering, _pose(target["hover"]))
+        hovering = Hovering.of(arm, calibration, board, located, height_m, consent)
+        for point, target in zip(located.points, targets, strict=True):
+            _bring(hovering, _pose(target["hover"]), point.name)
             _report_point(point, target, messages())
             gaps.append(_gap())
     return gaps
 
 
-def _bring(hovering: "Hovering", base_from_flange: "FloatArray") -> None:
+def _bring(hovering: "Hovering", base_from_flange: "FloatArray", name: str) -> None:
     """Drives the tip above a point; retries while the arm refuses, as in local control."""
     while True:
         try:
-            hovering.bring(base_from_flange)
+            hovering.bring(base_from_flange, name)
         except DriverError as error:
             report_error(error, as_json=False)
             if _line("Enter tries again, q ends: ").strip().lower() == "q":

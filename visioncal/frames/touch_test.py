@@ -18,8 +18,9 @@ from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.budget import point_covariance, radius95
 from visioncal.frames.frame_from_images import seen_frame
 from visioncal.frames.measured_points import Tool
-from visioncal.results import Calibration, Edge
+from visioncal.results import Calibration, Edge, Frame
 from visioncal.results.sections import TouchedPoint, TouchTest
+from visioncal.robot.bodies import camera_body
 from visioncal.session import Session
 from visioncal.vision.targets import corner_positions
 
@@ -41,7 +42,6 @@ class TouchPoint:
         base_m: (3,) position in the base by the camera [m].
         base_from_flange: (4, 4) flange pose with the tip on it and the tool's z into the board.
         radius95_mm: Predicted gap that 95 % do not exceed [mm].
-        normal: (3,) of the board in the base, into the board.
     """
 
     name: str
@@ -49,25 +49,87 @@ class TouchPoint:
     base_m: FloatArray
     base_from_flange: FloatArray
     radius95_mm: float
-    normal: FloatArray
 
-    def above(self, height_m: float) -> FloatArray:
-        """(4, 4) flange pose with the tip `height_m` above the point along the board's normal."""
-        lifted = self.base_from_flange.copy()
-        lifted[:3, 3] -= height_m * self.normal
+
+@dataclass(frozen=True, eq=False)
+class TouchTargets:
+    """Points of a board, and what the flange carries to them.
+
+    Attributes:
+        board: The board in the base, its z into it.
+        flange_from_tip: The tip.
+        parts_m: (k, 3) all that is known beyond the flange, in its frame, the tip first [m].
+    """
+
+    points: tuple[TouchPoint, ...]
+    board: Frame
+    flange_from_tip: Edge
+    parts_m: FloatArray
+
+    def above(self, point: TouchPoint, height_m: float) -> FloatArray:
+        """(4, 4) flange pose with the tip `height_m` above a point along the board's normal."""
+        lifted = point.base_from_flange.copy()
+        lifted[:3, 3] -= height_m * self.board.edge.matrix[:3, 2]
         return lifted
 
 
-def touch_points(
-    session: Session, calibration: Calibration, tool: Tool | None = None
-) -> tuple[TouchPoint, ...]:
+def flange_extent(calibration: Calibration, tool: Tool | None = None) -> tuple[FloatArray, float]:
+    """What is known to be beyond the flange: the camera on it, and the tool.
+
+    Without a tool, any tool of the calibration may be mounted.
+
+    Returns:
+        (k, 3) its points in the flange frame, and the farthest along the flange's z, or the tool's
+        [m].
+    """
+    frames = calibration.frames.items()
+    tools = [frame.edge for name, frame in frames if name.startswith("flange_from_")]
+    tips = tools if tool is None else [tool.edge]
+    parts = [np.zeros((1, 3)), *(tip.matrix[None, :3, 3] for tip in tips)]
+    if calibration.mount == "eye-in-hand":
+        parts.append(camera_body(0, calibration.edges["flange_from_cam"].matrix).corners())
+    direction = np.array([0.0, 0.0, 1.0]) if tool is None else tool.edge.matrix[:3, 2]
+    points = np.vstack(parts)
+    return points, float((points @ direction).max())
+
+
+def touch_targets(
+    session: Session,
+    calibration: Calibration,
+    tool: Tool | None = None,
+    clearance_m: float | None = None,
+) -> TouchTargets:
     """Locates five points of a session's board, with the flange poses that bring the tip onto each.
 
-    Without a tool, the tip is the flange's origin.
+    Without a tool, the tip is `clearance_m` before the flange along its z: a gauge of that length
+    closes the gap, and the flange comes no nearer.
 
     Raises:
-        DataError: No image is usable.
+        DataError: No image is usable; there is neither a tool nor a clearance; or something that is
+            known on the flange would be in the board when the tip touches it.
     """
+    parts_m, extent_m = flange_extent(calibration, tool)
+    if tool is None and clearance_m is None:
+        raise DataError(
+            "touch-test: which tool touches is not known, and without one the flange itself, with "
+            "all that it carries, would be sent onto the board.",
+            culprits=["--tool"],
+            next_step="Find the tip first (visioncal tcp TOUCHES -c OUT --name gripper), or keep "
+            "the flange away by more than all that it carries: --tool none --clearance-mm "
+            f"{_millimetres_from(extent_m):.0f} or more; so far are the parts that are known.",
+        )
+    pin = compose(np.eye(3), np.array([0.0, 0.0, clearance_m or 0.0]))
+    tip = Edge(pin, np.zeros((6, 6))) if tool is None else tool.edge
+    reach_m = float(tip.matrix[:3, 3] @ tip.matrix[:3, 2])
+    if reach_m < extent_m:
+        named = "--clearance-mm" if tool is None else tool.name
+        raise DataError(
+            f"touch-test: {named} is {1e3 * reach_m:.0f} mm before the flange, and what it carries "
+            f"(the camera and tools) reaches to {1e3 * extent_m:.0f} mm: it would be in the board.",
+            culprits=[named],
+            next_step="Touch with a longer tool, or with a gauge: --tool none --clearance-mm "
+            f"{_millimetres_from(extent_m):.0f} or more.",
+        )
     board = next(iter(session.boards.values()), None)
     if board is None:
         raise DataError(
@@ -76,7 +138,6 @@ def touch_points(
             next_step="Name it in session.toml.",
         )
     frame = seen_frame(session, calibration, "fixture")
-    tip = Edge(np.eye(4), np.zeros((6, 6))) if tool is None else tool.edge
     noise = calibration.noise
     turned = np.deg2rad(noise.get("robot_rotation_deg", 0.0)) * np.linalg.norm(tip.matrix[:3, 3])
     shifted = 1e-3 * noise.get("robot_translation_mm", 0.0)
@@ -90,8 +151,14 @@ def touch_points(
         covariance = located + rotation @ independent @ rotation.T
         flange = placed @ invert(tip.matrix)
         radius_mm = float(np.hypot(1e3 * radius95(covariance), READING_MM))
-        points.append(TouchPoint(name, at, placed[:3, 3], flange, radius_mm, rotation[:, 2]))
-    return tuple(points)
+        points.append(TouchPoint(name, at, placed[:3, 3], flange, radius_mm))
+    carried_m = np.vstack([tip.matrix[None, :3, 3], parts_m])
+    return TouchTargets(tuple(points), frame, tip, carried_m)
+
+
+def _millimetres_from(length_m: float) -> float:
+    """A length rounded up to whole millimetres."""
+    return float(np.ceil(1e3 * length_m))
 
 
 def evaluate_gaps(

@@ -17,6 +17,8 @@ Shape: TypeAlias = Literal["capsule", "cylinder", "box"]
 # Default radius of links over the length of all links: 0.065 m for a UR5e, 0.09 m for a UR10e; its
 # least is that of the motors [m].
 _THICKNESS, _THINNEST_M = 0.05, 0.045
+# Box around a camera with its lens and plug, and how far its centre is behind the lens [m].
+_CAMERA_M, _CAMERA_BEHIND_M = np.array([0.1, 0.1, 0.1]), 0.03
 # Shorter links are inside their neighbours, and get no body [m].
 _SHORTEST_M = 0.01
 
@@ -54,6 +56,18 @@ class Body:
         else:
             half = float(self.size_m[0] + 0.5 * self.size_m[1])
         return half + float(np.linalg.norm(self.link_from_body[:3, 3]))
+
+    def corners(self) -> FloatArray:
+        """(8, 3) corners of a box, in the frame of its link [m]."""
+        signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+        pose = self.link_from_body
+        return np.asarray((signs * self.size_m) @ pose[:3, :3].T + pose[:3, 3])
+
+
+def camera_body(link: int, link_from_cam: FloatArray, unsure_m: float = 0.0) -> Body:
+    """Builds the box that a camera with its lens and plug fits into."""
+    behind = compose(np.eye(3), np.array([0.0, 0.0, -_CAMERA_BEHIND_M]))
+    return Body("camera", link, "box", _CAMERA_M, link_from_cam @ behind, uncertainty_m=unsure_m)
 
 
 def capsule(

@@ -8,15 +8,14 @@ import numpy as np
 
 from visioncal.core.errors import DriverError
 from visioncal.core.types import FloatArray
-from visioncal.live.capture.live import Clock, LiveCell
+from visioncal.live.capture.live import Clock, LiveArm
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.drivers.protocols import MovingArm
 
 # Polling interval of the arm while it moves [s].
 _POLL_S = 0.02
-# Polling interval of camera and disk, and timeout of a picture [s]: a failure is noticed within a
-# second.
-_GLANCE_S, _FRAME_S = 0.3, 0.5
+# Polling interval of camera and disk [s]: a failure is noticed within a second.
+_GLANCE_S = 0.3
 # A motion has failed after this factor times its expected duration plus this [s].
 _DURATION_FACTOR, _DURATION_EXTRA_S = 1.5, 3.0
 # Largest joint error at the end of a motion [rad]; an arm that was stopped nearer to its goal gives
@@ -88,67 +87,50 @@ def wait_until_stopped(
 
 
 def drive(
-    cell: LiveCell,
+    live: LiveArm,
     arm: MovingArm,
     postures: Iterable[FloatArray],
-    options: CaptureOptions,
+    pace: JointPace,
     *,
     look: Callable[[], None],
 ) -> None:
     """Drives through postures (n,) [rad] and waits until the arm has arrived at the last.
 
-    The arm's state is monitored throughout, and `look` is called periodically. An exception leaves
-    the arm moving; `LiveCell.halting` around the recording stops it.
+    Only `Gate.move` calls it. The arm's state is monitored throughout, and `look` is called
+    periodically. An exception leaves the arm moving; `LiveArm.halting` around it stops it.
 
     Raises:
         DriverError: The arm was stopped, its connection is lost, it takes too long, or it did not
             reach its goal.
         VisioncalError: From `look`.
     """
-
-    def glance() -> None:
-        # A failure is reported now, not at the end of a long motion.
-        cell.camera.frame(timeout_s=_FRAME_S)
-        look()
-
-    for posture in postures:
-        _move(cell, arm, posture, options, glance)
-
-
-def _move(
-    cell: LiveCell,
-    arm: MovingArm,
-    goal: FloatArray,
-    options: CaptureOptions,
-    glance: Callable[[], None],
-) -> None:
-    pace = JointPace.of(options)
-    expected_s = pace.travel_s(joints_of(cell), goal)
-    arm.start_move(goal, speed=pace.speed, acceleration=pace.acceleration)
-    wait_until_stopped(arm, expected_s, cell.clock, cell.state, glance)
-    off_rad = np.abs(joints_of(cell) - goal)
-    if off_rad.max() > _ARRIVED_RAD:
-        joint = int(off_rad.argmax())
-        raise DriverError(
-            f"{arm.name}: the motion ended {np.rad2deg(off_rad[joint]):.1f} deg before its goal in "
-            f"joint {joint + 1}; within {np.rad2deg(_ARRIVED_RAD):.1f} deg is needed.",
-            culprits=[arm.name],
-            next_step="Was it stopped on the pendant? Start it again there, and go on with "
-            "--resume.",
-        )
+    for goal in postures:
+        expected_s = pace.travel_s(joints_of(live), goal)
+        arm.start_move(goal, speed=pace.speed, acceleration=pace.acceleration)
+        wait_until_stopped(arm, expected_s, live.clock, live.state, look)
+        off_rad = np.abs(joints_of(live) - goal)
+        if off_rad.max() > _ARRIVED_RAD:
+            joint = int(off_rad.argmax())
+            raise DriverError(
+                f"{arm.name}: the motion ended {np.rad2deg(off_rad[joint]):.1f} deg before its "
+                f"goal in joint {joint + 1}; within {np.rad2deg(_ARRIVED_RAD):.1f} deg is needed.",
+                culprits=[arm.name],
+                next_step="Was it stopped on the pendant? Start it again there, and go on with "
+                "--resume.",
+            )
 
 
-def joints_of(cell: LiveCell) -> FloatArray:
+def joints_of(live: LiveArm) -> FloatArray:
     """Present joint angles (n,) [rad].
 
     Raises:
         DriverError: The arm reports no state, or is stopped.
     """
-    q = cell.state().q
+    q = live.state().q
     if q is None:
         raise DriverError(
-            f"{cell.arm.name}: it does not report its joint angles, and cannot be driven by them.",
-            culprits=[cell.arm.name],
+            f"{live.arm.name}: it does not report its joint angles, and cannot be driven by them.",
+            culprits=[live.arm.name],
             next_step="Guide it by hand: --follow.",
         )
     return q

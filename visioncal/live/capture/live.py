@@ -50,11 +50,10 @@ class HostClock:
 
 
 @dataclass(frozen=True, eq=False)
-class LiveCell:
-    """An arm, a camera, and the clock by which they stamp."""
+class LiveArm:
+    """An arm, and the clock by which it stamps."""
 
     arm: Arm
-    camera: CameraDevice
     clock: Clock = field(default_factory=HostClock)
 
     def state(self) -> ArmState:
@@ -94,3 +93,25 @@ class LiveCell:
             if isinstance(self.arm, MovingArm):
                 self.arm.halt()
             raise
+
+
+@dataclass(frozen=True, eq=False)
+class LiveCell:
+    """An arm, a camera, and the clock by which they stamp."""
+
+    arm: Arm
+    camera: CameraDevice
+    clock: Clock = field(default_factory=HostClock)
+
+    @property
+    def live(self) -> LiveArm:
+        """The arm and its clock."""
+        return LiveArm(self.arm, self.clock)
+
+    def state(self) -> ArmState:
+        """Reads the arm's state.
+
+        Raises:
+            DriverError: See `LiveArm.state`.
+        """
+        return self.live.state()

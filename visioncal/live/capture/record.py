@@ -7,26 +7,23 @@ from functools import partial
 
 import numpy as np
 
-from visioncal.core.errors import DataError, DriverError, VisioncalError
-from visioncal.core.transforms import pose_difference
+from visioncal.core.errors import DriverError, VisioncalError
 from visioncal.core.types import Camera, FloatArray
 from visioncal.live.capture.coach import Coach
 from visioncal.live.capture.core import Capture, CaptureEvent, Watcher
-from visioncal.live.capture.drive import JointPace, drive, joints_of
+from visioncal.live.capture.drive import JointPace, joints_of
+from visioncal.live.capture.gate import Consent, Gate, check_same_arm, clear_path
 from visioncal.live.capture.joint_pose_check import JointPoseCheck
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.live import LiveCell
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.predict import PlannedAccuracy
-from visioncal.live.drivers.protocols import MovingArm
-from visioncal.live.planning.path import order_stops
 from visioncal.live.planning.plan_file import PlanFile, Stop
 
 # Typical duration of a stop besides the motion to it [s].
 _STOP_S = 1.5
-# Greatest flange difference between a nominal model and its own arm; beyond, the plan is for
-# another arm or another base.
-_SAME_ARM_MM = 50.0
+# Timeout of a picture while the arm moves [s].
+_FRAME_S = 0.5
 # Largest joint difference at which an arm counts as being at a posture [rad].
 _ARRIVED_RAD = 5e-3
 
@@ -57,8 +54,8 @@ def motion_summary(
         DriverError: The arm does not report its joints, or is stopped.
         DataError: The plan is for another arm, or no safe path to the first stop was found.
     """
-    here = joints_of(cell)
-    _check_model(cell, plan, here)
+    here = joints_of(cell.live)
+    check_same_arm(cell.live, plan.cell.robot, here)
     stops = tuple(stop for stop in plan.stops if stop.view not in done)
     if not stops:
         return MotionSummary((), (), 0.0, 0.0)
@@ -74,6 +71,7 @@ def record(
     plan: PlanFile,
     journal: Journal,
     options: CaptureOptions,
+    consent: Consent,
     watchers: Sequence[Watcher] = (),
     *,
     lens: Camera | None = None,
@@ -85,16 +83,9 @@ def record(
 
     Raises:
         DriverError: A device failed, the arm was stopped, or Ctrl-C was pressed.
-        DataError: A view cannot be written, no safe path leads to a stop, or three stops in a row
-            gave no view.
+        DataError: A view cannot be written, no safe path leads to a stop, consent is refused, or
+            three stops in a row gave no view.
     """
-    arm = cell.arm
-    if not isinstance(arm, MovingArm):
-        raise DriverError(
-            f"{arm.name} cannot be driven.",
-            culprits=[arm.name],
-            next_step="Guide it by hand: --follow.",
-        )
     capture = Capture(
         cell,
         plan.cell.target,
@@ -109,12 +100,17 @@ def record(
     done = {view.number for view in journal.views}
     remaining = [stop for stop in plan.stops if stop.view not in done]
     paths = CheckedPaths(plan)
+    gate = Gate(cell.live, plan.cell.robot, consent, JointPace.of(options))
+
+    def look() -> None:
+        # A failure is reported now, not at the end of a long motion.
+        cell.camera.frame(timeout_s=_FRAME_S)
+        journal.check_room()
+
     with closed_cleanly(cell, journal, options):
         for index, stop in enumerate(remaining):
-            start = cell.clock.now()
-            path = paths.to(stop, joints_of(cell))
-            drive(cell, arm, path, options, look=journal.check_room)
-            moved_s = cell.clock.now() - start
+            path = paths.to(stop, joints_of(cell.live))
+            moved_s = gate.move(path, f"to view {stop.view}", look)
             place = len(plan.stops) - len(remaining) + index + 1
             next_view = remaining[index + 1].view if index + 1 < len(remaining) else None
             advise = partial(capture.onward, next_view)
@@ -131,7 +127,7 @@ def closed_cleanly(cell: LiveCell, journal: Journal, options: CaptureOptions) ->
         DataError: The recording failed for another reason.
     """
     try:
-        with cell.halting():
+        with cell.live.halting():
             yield
     except KeyboardInterrupt:
         raise DriverError(
@@ -162,27 +158,6 @@ def _kept_words(journal: Journal) -> str:
     return f"{count} view{'s are' if count > 1 else ' is'} safe in {journal.folder}."
 
 
-def _check_model(cell: LiveCell, plan: PlanFile, q: FloatArray) -> None:
-    """Checks that the arm is the plan's, whose paths were checked for that arm and base."""
-    robot = plan.cell.robot
-    if len(q) != robot.joint_count:
-        raise DataError(
-            f"{cell.arm.name} has {len(q)} joints, and the plan is for {robot.name} with "
-            f"{robot.joint_count}.",
-            culprits=["--arm", "--plan"],
-            next_step="Plan for the arm that is connected.",
-        )
-    reported = cell.state().base_from_flange
-    off_mm, off_deg = pose_difference(robot.base_from_flange(q[None])[0], reported)
-    if off_mm > _SAME_ARM_MM:
-        raise DataError(
-            f"{cell.arm.name}: its flange is {off_mm:.0f} mm and {off_deg:.0f} deg from where the "
-            f"plan's {robot.name} has it at these joints (limit {_SAME_ARM_MM:.0f} mm).",
-            culprits=["--plan"],
-            next_step="Plan for the arm that is connected, in its controller's base.",
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class CheckedPaths:
     """Collision-checked paths: the plan's, or new ones where the arm is elsewhere."""
@@ -202,31 +177,7 @@ class CheckedPaths:
         planned = self.plan.stops[index - 1].q if index else self.plan.start_q
         if planned is not None and _is_at(q, planned):
             return (*stop.via, stop.q)
-        self._check_limits(q)
-        route = order_stops(self.plan.cell, q, stop.q[None])
-        if route.unreachable:
-            (obstacle,) = route.unreachable.values()
-            angles = ", ".join(f"{value:.0f}" for value in np.rad2deg(q))
-            raise DataError(
-                f"view {stop.view}: no clear way leads there from where the arm stands "
-                f"({angles} deg): in the way are {obstacle}.",
-                culprits=[f"view {stop.view}"],
-                next_step="Bring the arm near to the plan's first stop by hand, or plan anew with "
-                "--start-joints as it stands.",
-            )
-        return (*route.segments[0], stop.q)
-
-    def _check_limits(self, q: FloatArray) -> None:
-        robot = self.plan.cell.robot
-        outside = (q < robot.lower_rad) | (q > robot.upper_rad)
-        if outside.any():
-            joint = robot.joint_names[int(np.argmax(outside))]
-            raise DataError(
-                f"{joint} stands at {np.rad2deg(q[np.argmax(outside)]):.1f} deg, outside the "
-                f"limits of {robot.name}.",
-                culprits=[joint],
-                next_step="Turn it back by hand.",
-            )
+        return clear_path(self.plan.cell, q, stop.q, f"view {stop.view}")
 
 
 def _is_at(q: FloatArray, posture: FloatArray) -> bool:

@@ -149,7 +149,14 @@ class Route:
     unreachable: Mapping[int, str]
 
 
-def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed: int = 0) -> Route:
+def order_stops(
+    cell: PlanCell,
+    start_q: FloatArray | None,
+    q: FloatArray,
+    seed: int = 0,
+    *,
+    collisions: Collisions | None = None,
+) -> Route:
     """Orders stops for a short path of the joints, and finds collision-free segments.
 
     The order is that of nearest neighbours, improved by reversals (Croes 1958, 2-opt). Each segment
@@ -160,6 +167,7 @@ def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed:
         start_q: (n,) joint angles of the arm before [rad]; None to begin at any stop.
         q: (k, n) joint angles of the stops [rad], free of collisions as from `candidates`.
         seed: Random seed of the detours.
+        collisions: Distances of the cell's bodies; by default `collision_model`.
 
     Returns:
         The path. Stops that cannot be reached safely are left out and named.
@@ -167,7 +175,7 @@ def order_stops(cell: PlanCell, start_q: FloatArray | None, q: FloatArray, seed:
     Raises:
         DataError: The start violates the clearance.
     """
-    collisions = collision_model(cell)
+    collisions = collisions or collision_model(cell)
     if start_q is not None:
         _check_start(cell, collisions, start_q)
     detours = Detours(cell, collisions, seed)

@@ -1,0 +1,191 @@
+"""The gate that every command passes before it moves an arm: limits, collisions, consent."""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from visioncal.core.errors import DataError, DriverError
+from visioncal.core.transforms import pose_difference
+from visioncal.core.types import FloatArray
+from visioncal.live.capture.drive import JointPace, drive
+from visioncal.live.capture.live import LiveArm
+from visioncal.live.drivers.protocols import MovingArm
+from visioncal.live.planning.cell import PlanCell
+from visioncal.live.planning.path import order_stops
+from visioncal.robot import Robot
+from visioncal.robot.collision import Collisions
+
+# Greatest flange difference between a nominal model and its own arm; beyond, the paths were checked
+# for another arm or another base.
+_SAME_ARM_MM = 50.0
+
+
+@dataclass(eq=False)
+class Consent:
+    """A person's consent to motions: to all by `--yes`, else asked for at a terminal.
+
+    Attributes:
+        ask: Asks, and returns the typed line; None once all motions are allowed.
+    """
+
+    ask: Callable[[str], str] | None
+
+    @classmethod
+    def of(cls, command: str, ask: Callable[[str], str], *, yes: bool) -> Self:
+        """How a command gets consent.
+
+        Raises:
+            DataError: Nobody can be asked: stdin is no terminal, and there is no `--yes`.
+        """
+        if not (yes or sys.stdin.isatty()):
+            raise DataError(
+                f"{command}: nobody can be asked whether the arm may move: stdin is no terminal.",
+                culprits=["--yes"],
+                next_step="Say --yes where the cell is clear and somebody holds the stop button.",
+            )
+        return cls(None if yes else ask)
+
+    def to(self, motion: str) -> None:
+        """Asks for consent to one motion; `a` allows all that follow, too.
+
+        Raises:
+            DataError: It is refused, or the input has ended.
+        """
+        while self.ask is not None:
+            question = (
+                f"{motion}. Is the cell clear, and a hand on the stop button? "
+                "[y]es, [a]ll that follow, [n]o: "
+            )
+            try:
+                answer = self.ask(question).strip().lower()
+            except EOFError:
+                answer = "n"
+            if answer in ("n", "no", "q"):
+                raise DataError(
+                    f"not driven without consent: {motion}. The arm stands still.",
+                    culprits=["stdin"],
+                    next_step="Look at the cell, and run the command again.",
+                )
+            if answer in ("a", "all"):
+                self.ask = None
+            if answer in ("y", "yes"):
+                return
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """The one way by which a command moves an arm.
+
+    Attributes:
+        robot: The arm's model, as in its controller.
+    """
+
+    live: LiveArm
+    robot: Robot
+    consent: Consent
+    pace: JointPace
+
+    def move(
+        self, postures: Sequence[FloatArray], motion: str, look: Callable[[], None] = lambda: None
+    ) -> float:
+        """Drives through checked postures (n,) [rad], with consent; see `drive`.
+
+        Args:
+            postures: The postures, as from `clear_path`.
+            motion: What is about to happen, for the question.
+            look: Called periodically on the way.
+
+        Returns:
+            How long the arm moved [s].
+
+        Raises:
+            DataError: There is no consent, or a posture is beyond the joints' limits.
+            DriverError: As from `drive`.
+        """
+        for posture in postures:
+            check_limits(self.robot, posture)
+        self.consent.to(f"{self.live.arm.name} will move {motion}")
+        if not isinstance(self.live.arm, MovingArm):
+            raise DriverError(
+                f"{self.live.arm.name} cannot be driven.",
+                culprits=[self.live.arm.name],
+                next_step="Guide it by hand.",
+            )
+        start = self.live.clock.now()
+        drive(self.live, self.live.arm, postures, self.pace, look=look)
+        return self.live.clock.now() - start
+
+
+def check_same_arm(live: LiveArm, robot: Robot, q: FloatArray) -> None:
+    """Checks that an arm at joint angles (n,) is the one whose paths were checked, in that base.
+
+    Raises:
+        DataError: It has other joints, or its flange is elsewhere.
+    """
+    if len(q) != robot.joint_count:
+        raise DataError(
+            f"{live.arm.name} has {len(q)} joints, and its model {robot.name} has "
+            f"{robot.joint_count}.",
+            culprits=["--arm", "--plan"],
+            next_step="Name the arm that is connected; a plan is of one arm.",
+        )
+    reported = live.state().base_from_flange
+    off_mm, off_deg = pose_difference(robot.base_from_flange(q[None])[0], reported)
+    if off_mm > _SAME_ARM_MM:
+        raise DataError(
+            f"{live.arm.name}: its flange is {off_mm:.0f} mm and {off_deg:.0f} deg from where the "
+            f"model {robot.name} has it at these joints (limit {_SAME_ARM_MM:.0f} mm).",
+            culprits=["--plan"],
+            next_step="Name the arm that is connected, in its controller's base; a plan is of one "
+            "arm.",
+        )
+
+
+def check_limits(robot: Robot, q: FloatArray) -> None:
+    """Checks joint angles (n,) [rad] against the arm's limits.
+
+    Raises:
+        DataError: One is beyond them.
+    """
+    outside = (q < robot.lower_rad) | (q > robot.upper_rad)
+    if outside.any():
+        joint = robot.joint_names[int(np.argmax(outside))]
+        raise DataError(
+            f"{joint} stands at {np.rad2deg(q[np.argmax(outside)]):.1f} deg, outside the limits of "
+            f"{robot.name}.",
+            culprits=[joint],
+            next_step="Turn it back by hand.",
+        )
+
+
+def clear_path(
+    cell: PlanCell, q: FloatArray, goal: FloatArray, name: str, collisions: Collisions | None = None
+) -> tuple[FloatArray, ...]:
+    """Finds postures (n,) to a goal (n,) [rad], clear of everything declared; the goal is last.
+
+    Args:
+        cell: The cell.
+        q: (n,) where the arm stands [rad].
+        goal: (n,) where it shall go [rad].
+        name: What the goal is, for messages.
+        collisions: Distances of the cell; by default as it is planned for.
+
+    Raises:
+        DataError: There is none, or the arm stands too near to something or beyond its limits.
+    """
+    check_limits(cell.robot, q)
+    route = order_stops(cell, q, goal[None], collisions=collisions)
+    if route.unreachable:
+        (obstacle,) = route.unreachable.values()
+        angles = ", ".join(f"{value:.0f}" for value in np.rad2deg(q))
+        raise DataError(
+            f"{name}: no clear way leads there from where the arm stands ({angles} deg): in the "
+            f"way are {obstacle}.",
+            culprits=[name],
+            next_step="Bring the arm near to it by hand, or plan anew with --start-joints as it "
+            "stands.",
+        )
+    return (*route.segments[0], goal)
