@@ -418,3 +418,51 @@ def test_a_fixture_is_touched_with_the_calibrations_tool(out, tmp_path):
     exported = visioncal("export", out, "--to", "abb-wobjdata")
     assert exported.status == 0
     assert "PERS wobjdata" in exported.out
+
+
+def test_a_bad_tool_is_shown_and_does_not_join(out, tmp_path):
+    before = (out / "calibration.json").read_bytes()
+    touches = touched(Job(), 1).touches
+    # Of anything else: the flange is anywhere within centimetres.
+    scattered = replace(
+        touches, base_from_flange=touches.base_from_flange + _shifted(len(touches), 0.03)
+    )
+    done = tcp(tmp_path, scattered, "-c", out, "--name", "gripper")
+    assert done.status == 3
+    assert done.out.startswith("bad")
+    assert "does not join" in done.err
+    assert tcp(tmp_path, scattered, "-c", out, "--name", "gripper", "--json").status == 3
+    assert (out / "calibration.json").read_bytes() == before
+    # A file of frames keeps it, and what would use it refuses.
+    file = tmp_path / "frames.json"
+    assert tcp(tmp_path, scattered, "-o", file, "--name", "gripper").status == 3
+    assert visioncal("export", file, "--to", "ur-tcp").status == 3
+    assert visioncal("export", file, "--to", "ur-tcp", "--force").status == 0
+
+
+def _shifted(count, sigma_m):
+    shifts = np.zeros((count, 4, 4))
+    shifts[:, :3, 3] = sigma_m * np.random.default_rng(3).standard_normal((count, 3))
+    return shifts
+
+
+def test_a_tool_is_removed_by_its_name(out, tmp_path):
+    touches = touched(Job(axes=3), 1).touches
+    for name in ("gripper", "needle"):
+        assert tcp(tmp_path, touches, "-c", out, "--name", name).status == 0
+    refused(visioncal("export", out, "--to", "ur-tcp"), "flange_from_needle")
+    done = visioncal("tcp", "-c", out, "--remove", "needle")
+    assert done.status == 0
+    assert list(Calibration.load(out).frames) == ["flange_from_gripper"]
+    assert list(read_calibration(out / "recording.rrd").frames) == ["flange_from_gripper"]
+    assert visioncal("export", out, "--to", "ur-tcp").status == 0
+    refused(visioncal("tcp", "-c", out, "--remove", "needle"), "has no tool 'needle'")
+    refused(visioncal("fixture", "-c", out, "--remove", "gripper"), "has no fixture 'gripper'")
+    refused(visioncal("tcp", "-c", out), "touches of it")
+    refused(visioncal("tcp", "--remove", "gripper"), "from where")
+    both = visioncal("tcp", tmp_path / "touches.csv", "-c", out, "--remove", "gripper")
+    refused(both, "--remove measures nothing")
+    file = tmp_path / "frames.json"
+    assert tcp(tmp_path, touches, "-o", file, "--name", "gripper").status == 0
+    assert visioncal("tcp", "-o", file, "--remove", "gripper").status == 0
+    assert not FrameFile.load(file).frames

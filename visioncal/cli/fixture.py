@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 
 def fixture_command(
+    goes: FrameOptions,
+    written: TouchOptions,
+    part: PartOptions,
     touches: Annotated[
-        Path,
+        Path | None,
         typer.Argument(
             help="A table with a row a touch: the columns of views.csv, and kind (origin, x or xy) "
             "or, with --cad, point. Or a session whose images show a target on the fixture."
         ),
-    ],
-    goes: FrameOptions,
-    written: TouchOptions,
-    part: PartOptions,
+    ] = None,
     cad: Annotated[
         Path | None,
         typer.Option(
@@ -52,18 +52,16 @@ def fixture_command(
     xy, in its xy plane on the side of positive y: one of each at least. With --cad, three points or
     more that the drawing has, by their names. In images a target on the fixture gives its frame, or
     with --cad several markers, by the camera that -c names. Exit status 2: nothing was written, for
-    the reason given.
+    the reason given; 3: the fixture is bad, and joins no calibration.
     """
     from visioncal.frames.fixture import touched_fixture
     from visioncal.interchange.formats.touches import read_nominal, read_touches
 
     drawing = None if cad is None else read_nominal(cad, cad_unit)
 
-    def by_touches(robot_calibration: "Calibration | None") -> "Frame":
+    def by_touches(source: Path, robot_calibration: "Calibration | None") -> "Frame":
         touched_with = _tool(tool, robot_calibration, part.robot)
-        rows = read_touches(
-            touches, written.requested(), part.robot, positions=touched_with is None
-        )
+        rows = read_touches(source, written.requested(), part.robot, positions=touched_with is None)
         noise_m = written.noise_m
         return touched_fixture(
             rows, touched_with, drawing, robot_calibration, written.model, touch_noise_m=noise_m

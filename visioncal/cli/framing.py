@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 from rich.markup import escape
 
-from visioncal.cli.console import answers, print_json, report_written, say
+from visioncal.cli.console import answers, exit_status, print_json, report_written, say
 from visioncal.cli.options import Force, PartOptions
 from visioncal.cli.parsing import numbers_in, refuse_given
 from visioncal.cli.pose_options import RobotPoseOptions
 from visioncal.cli.progress import shown_progress
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure, mm_and_deg
+from visioncal.core.number_format import did_you_mean, figure, mm_and_deg, some_of
 from visioncal.frames.naming import FrameKind, transform_name
 from visioncal.interchange.outputs import RECORDING, Written
 
@@ -57,6 +57,10 @@ class FrameOptions:
         ),
     ] = None
     name: Annotated[str | None, typer.Option(help="Name of the frame: gripper, jig_2.")] = None
+    remove: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Remove one from the calibration, or from -o's file."),
+    ] = None
     force: Force = False
 
 
@@ -178,17 +182,52 @@ class FrameLocation:
                 )
 
     def keep(self, frame: "Frame") -> Written:
-        """Writes the frame to its destination, if any."""
+        """Writes the frame to its destination, if any; a bad one joins no result."""
+        if frame.verdict.status == "bad" and self.file is None:
+            return Written(())
+        return self._write({**self._frames(), self.name: frame})
+
+    def _write(self, frames: "dict[str, Frame]") -> Written:
         from visioncal.interchange.merge_results import rewrite_result
         from visioncal.results import FrameFile
 
         if self.file is not None:
-            FrameFile(self._frames() | {self.name: frame}).save(self.file)
+            FrameFile(frames).save(self.file)
             return Written((self.file,))
         if self.folder is None or self.result is None:
             return Written(())
-        frames = {**self.result.frames, self.name: frame}
         return rewrite_result(self.folder, replace(self.result, frames=frames))
+
+    @classmethod
+    def remove(cls, options: FrameOptions, kind: FrameKind, name: str) -> Written:
+        """Removes a frame from a result or a file of frames.
+
+        Raises:
+            DataError: No place is named, or it has no such frame.
+        """
+        from visioncal.interchange.result_files import load_result
+
+        path, file = options.calibration, options.out
+        if path is None and file is None:
+            raise DataError(
+                "--remove: from where is not said.",
+                culprits=["--remove"],
+                next_step="Name the calibration (-c) or the file of frames (-o) that has it.",
+            )
+        result = None if path is None or file is not None else load_result(path)
+        folder = None if path is None or file is not None else _folder(path)
+        frames = cls(name, None, result, folder, file)._frames()
+        lead = transform_name(kind, "x").removesuffix("x")
+        there = [known for known in frames if known.startswith(lead)]
+        found = [known for known in there if known in (name, f"{lead}{name}")]
+        if not found:
+            raise DataError(
+                f"{file or folder} has no {kind} {name!r}; it has {some_of(there) or 'none'}.",
+                culprits=[name],
+                next_step=did_you_mean(f"{lead}{name}", there),
+            )
+        kept = {known: frame for known, frame in frames.items() if known not in found}
+        return cls(name, None, result, folder, file)._write(kept)
 
 
 def _folder(path: Path) -> Path:
@@ -216,9 +255,10 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
     from visioncal.cli.summary import print_verdict
     from visioncal.results.frame import frames_document
 
+    status = exit_status(frame.verdict)
     if as_json:
         print_json(frames_document({place.name: frame}))
-        report_written(written, quiet=True)
+        report_written(written, quiet=True, status=status)
         return
     console = answers()
     print_verdict(frame.verdict, place.name)
@@ -234,6 +274,11 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
     console.print(f"{place.name}: {position}; {rotation}")
     fit = f"rms {figure(frame.rms_mm)} mm, noise {figure(frame.noise_mm)} mm per axis"
     console.print(escape(f"{frame.method}: {fit}"))
+    joins = place.file is not None or place.folder is not None
+    if joins and not written.files:
+        say(f"nothing was written: a bad {place.name} does not join {place.folder}")
+        report_written(written, status=status)
+        return
     _report_before(place, frame)
     undrawn = [undrawn.file for undrawn in written.failed_drawings]
     recording = None if place.folder is None else place.folder / RECORDING
@@ -241,7 +286,7 @@ def report(place: FrameLocation, frame: "Frame", written: Written, *, as_json: b
         say(f"{recording} was not renewed: it is missing or of another result")
     if not written.files:
         say("nothing was written: -c joins it to a calibration, -o puts it into a file")
-    report_written(written)
+    report_written(written, status=status)
 
 
 def _report_before(place: FrameLocation, frame: "Frame") -> None:
@@ -258,13 +303,13 @@ class FrameRequest:
     """Request of `tcp` or `fixture`.
 
     Attributes:
-        source: Touches, as a table or a session, or a session of images.
+        source: Touches, as a table or a session, or a session of images; None to remove a frame.
         written: Convention of the touches.
         point_mm: For images: the frame's origin in the target's frame, as typed.
     """
 
     kind: FrameKind
-    source: Path
+    source: Path | None
     goes: FrameOptions
     written: TouchOptions
     part: PartOptions
@@ -274,7 +319,7 @@ class FrameRequest:
 
 def place_frame(
     request: FrameRequest,
-    by_touches: "Callable[[Calibration | None], Frame]",
+    by_touches: "Callable[[Path, Calibration | None], Frame]",
     drawing: "NominalPoints | None" = None,
     tool: str | None = None,
 ) -> None:
@@ -282,7 +327,7 @@ def place_frame(
 
     Args:
         request: The request.
-        by_touches: Places it by touches, given the calibration if there is one.
+        by_touches: Places it by the touches of a file, given the calibration if there is one.
         drawing: Points or markers on a fixture; None where none are given.
         tool: The tool that touched a fixture, as typed.
 
@@ -293,18 +338,21 @@ def place_frame(
     from visioncal.interchange.formats.touches import robots_of
     from visioncal.session.choosing import ARM, EYE, Choice
 
-    kind, part = request.kind, request.part
-    session = _image_session(request.source, {"--tool": tool, **request.written.given()})
+    kind, part, source = request.kind, request.part, request.source
+    if source is None or request.goes.remove is not None:
+        report_written(_removed(request))
+        return
+    session = _image_session(source, {"--tool": tool, **request.written.given()})
     if session is None:
         origin = "the tool's point" if kind == "tool" else "the fixture's origin"
         refuse_given({"--point-mm": request.point_mm}, f"touches say where {origin} is")
         refuse_given({"--camera": part.camera, "--target": part.target}, "touches need no camera")
-        robots = robots_of(request.source)
+        robots = robots_of(source)
         if request.goes.calibration is None and not robots and tool in (None, "none"):
             refuse_given({"--robot": part.robot}, "neither touches nor a calibration name robots")
         touched_by = robots[0] if len(robots) == 1 else None
         location = FrameLocation.of(request.goes, kind, Choice(robot=part.robot), ARM, touched_by)
-        frame = by_touches(location.calibration)
+        frame = by_touches(source, location.calibration)
     else:
         location = FrameLocation.of(request.goes, kind, replace(part.choice, target=None), EYE)
         if location.calibration is None:
@@ -315,7 +363,27 @@ def place_frame(
                 next_step="Name the output folder of visioncal calibrate.",
             )
         frame = _by_images(request, session, location.calibration, drawing)
-    keep_and_report(location, frame, request.source, as_json=request.as_json)
+    keep_and_report(location, frame, source, as_json=request.as_json)
+
+
+def _removed(request: FrameRequest) -> Written:
+    """Removes a frame, where no touches are given.
+
+    Raises:
+        DataError: There are touches too, or there is neither.
+    """
+    command = "tcp" if request.kind == "tool" else "fixture"
+    name = request.goes.remove
+    if name is None:
+        raise DataError(
+            f"{command}: touches of it, or a session that shows it, are needed.",
+            culprits=["TOUCHES"],
+            next_step=f"Name them: visioncal {command} TOUCHES -c OUT; or --remove NAME.",
+        )
+    refuse_given(
+        {"TOUCHES": request.source, "--name": request.goes.name}, "--remove measures nothing"
+    )
+    return FrameLocation.remove(request.goes, request.kind, name)
 
 
 def _image_session(source: Path, for_touches: Mapping[str, object]) -> "Session | None":
