@@ -116,14 +116,14 @@ def _use(done: Walk, item: Cell, rng: np.random.Generator, folder: Path, out: Pa
     edge = str(rng.choice(list(item.truth)))
     for at, name in enumerate(formats):
         chosen = ["--edge", edge] if at == 0 else []
-        _run(done, "export", out, "--to", name, *chosen, "-o", beside / f"export {at}")
+        _run(done, "export", out, "--to", name, *chosen, "--force", "-o", beside / f"export {at}")
     if whole or rng.random() < 0.25:
         (beside / "second").mkdir()
         begun = time.perf_counter()
         fresh = write(item, beside / "second", visit=1)
         done.drawn_s += time.perf_counter() - begun
         _run(done, "verify", fresh.folder, "--against", out, "-o", beside / "check")
-        _run(done, "locate", fresh.folder, "-c", out)
+        _run(done, "locate", fresh.folder, "-c", out, "--force")
     if whole or rng.random() < 0.2:
         add = ["plan", folder, "--add", 3, "-o", beside / "plan", "--candidates", 200]
         _run(done, *add)
