@@ -25,6 +25,7 @@ from visioncal.core.transforms import invert, pose_difference
 from visioncal.core.types import FloatArray
 from visioncal.interchange.outputs import write_plan
 from visioncal.live.capture.core import CaptureEvent, Watcher
+from visioncal.live.capture.gate import Consent
 from visioncal.live.capture.journal import Journal
 from visioncal.live.capture.options import CaptureOptions
 from visioncal.live.capture.take import TakenView
@@ -146,5 +147,7 @@ def _drive(
         begin = Journal.resume if resume else Journal.begin
         facts = facts_of(scene, cell, session.name)
         journal = begin(session, facts, cell.clock.unix_offset_s(), len(scene.planned.stops))
-        steps = record_driven(cell, scene, journal, _TAKING, [ViewLines(), *watchers], asks=False)
+        steps = record_driven(
+            cell, scene, journal, _TAKING, [ViewLines(), *watchers], Consent(None)
+        )
         check_all(journal, steps)
