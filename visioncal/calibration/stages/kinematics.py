@@ -1,13 +1,13 @@
 """Selection of the arm's error model: none, offsets, links, eccentric gears, joint functions."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, listed
 from visioncal.core.threads import one_blas_thread
 from visioncal.core.types import FloatArray, Mask
 from visioncal.core.verdict import CALIBRATE, Finding, Remedy
@@ -60,6 +60,7 @@ class SelectedArmLevel:
         was_asked: Whether the user named the level.
         views: (m,) the view of each residual of these.
         functions: Functions of the joints; None where these are not significant.
+        diverged: Levels whose fits diverged, so that they were not compared.
     """
 
     level: str
@@ -67,6 +68,7 @@ class SelectedArmLevel:
     was_asked: bool
     views: tuple[int, ...] = ()
     functions: JointFunctions | None = None
+    diverged: tuple[str, ...] = ()
 
     @property
     def nominal(self) -> LevelFit:
@@ -136,20 +138,37 @@ def choose_level(
             corrected; None without one. Then offsets are the least level.
         noise: The noise's levels to start from; those from above where None.
     """
+    diverged: list[str] = []
+
+    def converged(name: str, fit: Callable[[], LevelFit | None]) -> LevelFit | None:
+        """The fit of a level; None, and noted, where it diverges."""
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return fit()
+        except np.linalg.LinAlgError:
+            diverged.append(name)
+            return None
+
     with one_blas_thread():
         arm = ArmTrials(problem, state, robot, bases, noise)
         fits = {NOMINAL: fit_level(arm)}
-        fits |= {name: fit_level(arm, blocks) for name, blocks in LEVELS.items()}
+        for name, blocks in LEVELS.items():
+            fits[name] = converged(name, partial(fit_level, arm, blocks))
         if stated is not None:
             nominal = fit_level(ArmTrials(stated, state, robot, bases, noise))
             fits = _with_shifted_zero(fits, problem, stated, nominal, bases)
     possible = {name: fit for name, fit in fits.items() if fit is not None}
     always = (NOMINAL,) if stated is None else (NOMINAL, "offsets")
     allowed = (*always, *ASKED[asked])
-    best = _best({name: fit for name, fit in possible.items() if name in allowed})
-    with one_blas_thread():
-        possible[best] = resized(arm, possible[best])
-    return SelectedArmLevel(best, possible, asked not in _AUTOMATIC)
+    final = None
+    while final is None:
+        best = _best({name: fit for name, fit in possible.items() if name in allowed})
+        # The nominal arm has nothing to resize, and ends this at the latest.
+        with one_blas_thread():
+            final = converged(best, partial(resized, arm, possible.pop(best)))
+    fits = {name: final if name == best else possible.get(name) for name in fits}
+    compared = {name: fit for name, fit in fits.items() if fit is not None}
+    return SelectedArmLevel(best, compared, asked not in _AUTOMATIC, diverged=tuple(diverged))
 
 
 def with_functions(
@@ -312,6 +331,11 @@ def findings(kinematics: SelectedArmLevel) -> Iterator[str]:
         yield (
             "The arm stays as stated: what was asked to be found of it explains the views no "
             "better than chance, or there are too few stops to show it."
+        )
+    if kinematics.diverged:
+        yield (
+            f"The arm's level {listed(kinematics.diverged)} was not compared: a fit with these "
+            "errors diverges."
         )
     result = kinematics.result
     if result.is_calibrated:
