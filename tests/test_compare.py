@@ -56,7 +56,7 @@ def test_a_loss_of_a_tenth_is_found_and_is_a_gain_the_other_way(planted, what):
 
 
 def test_no_loss_is_no_finding():
-    # One in twenty comparisons may find something; of forty, more than six do by chance in 1 of 300.
+    # One in twenty comparisons may find something; of forty, more than six by chance in 1 of 300.
     alarms = sum(bool(report(pairs(np.random.default_rng(seed)))[1]) for seed in range(40))
     assert alarms <= 6
     text, odd = report(pairs(np.random.default_rng(0), spread=0.0))
