@@ -1,16 +1,18 @@
-"""Several images of one stop share the robot's error: they are not as good as so many stops."""
+"""Several images of one stop share the robot's error, and copies of a row are no new reading."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.copied import KINDS, copied, session_of_kind
 from support.marks import slow
 from support.whole_cells import misfit
 
 from visioncal import calibrate
+from visioncal.calibration.stages.repeats import repeated_rows
 from visioncal.core.transforms import exp, invert
 from visioncal.session import MemoryImages, Session, target_document
-from visioncal.session.columns import pose_row
+from visioncal.session.columns import MEASURED_CAM_POSE, POSE, pose_row
 from visioncal.session.corners import CornerTable
 from visioncal.simulation import BOARDS, CellOptions, cell_session, read_cell, simulate
 
@@ -170,3 +172,64 @@ def test_a_lens_is_not_moved_by_what_repeated_views_have_wrong_alike(seed):
     assert not any(camera.estimated for camera in found.cell.cameras.values())
     for name in found.edges:
         assert off(cell, found, name) < 22.5, name
+
+
+def count_once(seed, times, jitter_m, *, interleaved):
+    _, session = session_of_kind(seed)
+    before = calibrate(session)
+    more = copied(session, times, jitter_m, seed=seed, interleaved=interleaved)
+    after = calibrate(more)
+    assert before.edges.keys() == after.edges.keys()
+    for name, edge in before.edges.items():
+        assert np.array_equal(after.edges[name].covariance, edge.covariance)
+    assert sum(view.used for view in after.views) == sum(view.used for view in before.views)
+    (found,) = (finding for finding in after.verdict.findings if finding.kind == "repeated_views")
+    originals = {view.number for view in session.views}
+    assert originals.isdisjoint(found.views)
+    assert originals.union(found.views) >= {view.view for view in after.views}
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 18])
+@pytest.mark.parametrize("jitter_m", [0.0, 1e-4])
+def test_copies_of_rows_change_nothing(seed, jitter_m):
+    """Poses with joints, poses alone, corners, points of a tracker."""
+    count_once(seed, 2, jitter_m, interleaved=bool(seed))
+
+
+@slow
+@pytest.mark.parametrize("seed", range(2 * len(KINDS)))
+def test_copies_of_rows_of_all_kinds_change_nothing(seed):
+    count_once(seed, 3, 1e-5, interleaved=bool(seed % 2))
+
+
+def measured(rows):
+    """A session of measured poses: where the robot stood along x, when, and what was read."""
+
+    def cells(along_m):
+        return [repr(value) for value in pose_row(exp(np.array([0, 0, 0, along_m, 0, 0]))).values()]
+
+    return Session.assemble(
+        {"schema": 1, "name": "near", "mount": "eye-in-hand"},
+        ["view", "stamp_s", *POSE, *MEASURED_CAM_POSE],
+        [
+            [str(view), "" if stamp_s is None else str(stamp_s), *cells(stood_m), *cells(read_m)]
+            for view, (stood_m, stamp_s, read_m) in enumerate(rows)
+        ],
+        MemoryImages({}),
+    )
+
+
+@pytest.mark.parametrize(
+    ("rows", "repeated"),
+    [
+        ([(0.1, None, 0.0), (0.2, None, 0.0), (0.1, None, 1e-5)], {2: 0}),
+        ([(0.1, 1.0, 0.0), (0.2, 2.0, 0.0), (0.1, 3.0, 1e-5)], {}),
+        ([(0.1, 1.0, 0.0), (0.2, 2.0, 0.0), (0.1, 1.0, 1e-5)], {2: 0}),
+        # No sensor repeats to the last digit.
+        ([(0.1, 1.0, 0.0), (0.2, 2.0, 0.0), (0.1, 3.0, 0.0)], {2: 0}),
+        # Farther away than rows of one stop are.
+        ([(0.1, None, 0.0), (0.2, None, 0.0), (0.102, None, 0.0)], {}),
+    ],
+)
+def test_near_readings_are_copies_where_no_time_tells_them_apart(rows, repeated):
+    assert repeated_rows(measured(rows), {}) == repeated

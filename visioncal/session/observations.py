@@ -15,7 +15,7 @@ from visioncal.session.kinds import has_robot_state, name_of
 from visioncal.session.table import View
 
 # Largest difference between reports of one robot's pose at one stop [mm, deg, rad].
-_APART_MM, _APART_DEG, _APART_RAD = 1.0, 0.1, 2e-3
+APART_MM, APART_DEG, APART_RAD = 1.0, 0.1, 2e-3
 # Largest difference between reports of a robot that stands still, by noise of its readings.
 _STILL_M, _STILL_RAD = 1e-4, 1e-4
 # Views of one pose that are farther apart in time are of different stops [s].
@@ -188,8 +188,8 @@ def _differ(first: View, second: View) -> bool:
     poses = first.base_from_flange(), second.base_from_flange()
     if poses[0] is not None and poses[1] is not None:
         mm, deg = pose_difference(poses[0].as_matrix(), poses[1].as_matrix())
-        return mm > _APART_MM or deg > _APART_DEG
+        return mm > APART_MM or deg > APART_DEG
     joints = first.joints_rad, second.joints_rad
     if joints[0] is None or joints[1] is None or joints[0].shape != joints[1].shape:
         return False
-    return bool(np.abs(joints[0] - joints[1]).max() > _APART_RAD)
+    return bool(np.abs(joints[0] - joints[1]).max() > APART_RAD)

@@ -142,7 +142,7 @@ def _reported(run: RunState) -> RunState:
 def _readings(run: RunState) -> RunState:
     """Reads the instruments' readings."""
     if run.mount == "instrument":
-        readings = read_instrument(run.session)
+        readings = read_instrument(run.session).without(run.repeats)
         run = replace(run, readings=readings).noting(readings.rejections)
         check_read_joints(run, probe_poses(run.session, readings))
         if not readings.are_poses:
@@ -153,7 +153,8 @@ def _readings(run: RunState) -> RunState:
                 )
             run = run.noting(exchanged_points(run, readings))
     read = read_instruments(run.session).items()
-    poses = {view: pose for view, pose in read if view not in run.reasons}
+    not_used = run.reasons.keys() | run.repeats.keys()
+    poses = {view: pose for view, pose in read if view not in not_used}
     return replace(run, poses={**run.poses, **poses})
 
 
@@ -189,8 +190,8 @@ def _judge(run: RunState) -> RunState:
 
 STAGES: tuple[Stage, ...] = (
     Stage("robot", _read_robot),
-    Stage("readings", _readings),
     Stage("detect", lambda run: detect_targets(run, run.given_corners)),
+    Stage("readings", _readings),
     Stage("intrinsics", estimate_lenses),
     Stage("pnp", locate_targets),
     Stage("clock", _clock),

@@ -1,7 +1,7 @@
 """Corners, intrinsics and target poses of each camera."""
 
 from collections import defaultdict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TypeVar
@@ -14,11 +14,12 @@ from visioncal.calibration.stages.image_size import other_images
 from visioncal.calibration.stages.intrinsics import Intrinsics, estimate_intrinsics
 from visioncal.calibration.stages.observed import CameraObservations, Observed, nothing_seen
 from visioncal.calibration.stages.pnp import Poses, estimate_poses, measure_poses, stated_poses
+from visioncal.calibration.stages.repeats import listed, without_repeats
 from visioncal.calibration.stages.rig_points import leave_out_wrong_points
 from visioncal.core.errors import DataError, VisioncalError
 from visioncal.core.number_format import figure, some_of
 from visioncal.core.types import Camera, Corners
-from visioncal.core.verdict import EMPTY_IMAGE, LEAST_NEED_MM, OTHER_SIZE, Finding, Remedy
+from visioncal.core.verdict import EMPTY_IMAGE, OTHER_SIZE, Finding, Remedy
 from visioncal.results import CameraResult
 from visioncal.session import Session, View, frame_name
 from visioncal.session.kinds import name_of
@@ -44,7 +45,7 @@ COUNTED_BACKWARDS = (
 
 
 def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
-    """Finds the targets in the images of all cameras.
+    """Finds the targets in the images of all cameras, and rows that repeat others.
 
     Args:
         seen: The run's observations.
@@ -74,12 +75,8 @@ def detect_targets(seen: T, given: Mapping[int, Corners] | None = None) -> T:
                 corners, dense = fit_densely(session, views, corners, seen.dense, seen.progress)
                 seen = replace(seen, dense=dense)
         numbered = _numbered_through(session, views, corners)
-        repeated = _repeated(views, numbered)
-        unique = {view: corners for view, corners in numbered.items() if view not in repeated}
-        repeats = {view: f"repeats view {earlier}" for view, earlier in repeated.items()}
-        look = CameraObservations(table, unique, resolution, repeats=repeats)
-        seen = seen.noting((), _repeat_findings(repeated)).with_camera(frame, look)
-    return seen
+        seen = seen.with_camera(frame, CameraObservations(table, numbered, resolution))
+    return without_repeats(seen)
 
 
 def estimate_lenses(seen: T) -> T:
@@ -133,7 +130,8 @@ def locate_targets(seen: T) -> T:
     """
     seen = leave_out_wrong_points(seen)
     session, targets = seen.session, tuple(seen.session.boards.values())
-    poses = {**seen.poses, **stated_poses(session)}
+    stated = stated_poses(session).items()
+    poses = {**seen.poses, **{view: pose for view, pose in stated if view not in seen.repeats}}
     for frame in seen.cameras:
         look = seen.cameras[frame]
         corners = {view: px for view, px in look.corners.items() if view not in seen.reasons}
@@ -271,21 +269,6 @@ def _numbered_through(
     }
 
 
-def _repeated(views: Sequence[View], corners: Mapping[int, Corners]) -> dict[int, int]:
-    """The earlier view that each repeated one equals: no camera gives the same corners twice."""
-    first: dict[Hashable, int] = {}
-    repeated: dict[int, int] = {}
-    for view in views:
-        numbers = tuple(number for number in view.numbers.items() if number[0] != "stamp_s")
-        if numbers and view.number in corners:
-            found = corners[view.number]
-            key = (numbers, found.ids.tobytes(), found.px.tobytes())
-            earlier = first.setdefault(key, view.number)
-            if earlier != view.number:
-                repeated[view.number] = earlier
-    return repeated
-
-
 def _other_size_findings(session: Session, detections: Detections) -> Iterator[Finding]:
     """Finding about images of another size than the camera's."""
     if not detections.other_sizes:
@@ -300,35 +283,11 @@ def _other_size_findings(session: Session, detections: Detections) -> Iterator[F
         f"{'turned by 90 degrees' if is_turned else 'of another size'}, and not used: "
         f"{some_of(shown)}; the camera's are {wide} x {high} px."
     )
-    rows = f"the row{'' if one else 's'} of view{'' if one else 's'} {_listed(views)}"
+    rows = f"the row{'' if one else 's'} of view{'' if one else 's'} {listed(views)}"
     these = names[views[0]] if one else "these images"
     mend = f"Turn {these} back" if is_turned else f"Take {these} again at the camera's full size"
     step = Remedy(f"{mend}; or in views.csv, delete {rows}.")
     yield Finding(OTHER_SIZE, words, step, views, until_mm=0.0)
-
-
-def _repeat_findings(repeated: Mapping[int, int]) -> Iterator[Finding]:
-    """Finding about views that repeat earlier ones."""
-    if not repeated:
-        return
-    copies, originals = list(repeated), list(dict.fromkeys(repeated.values()))
-    rows, repeat = ("row", "repeats") if len(repeated) == 1 else ("rows", "repeat")
-    views = "View" if len(repeated) == 1 else "Views"
-    yield Finding(
-        "repeated_views",
-        f"{views} {_listed(copies)} {repeat} {_listed(originals)}: poses and corners are the same "
-        "to the last digit. They count once.",
-        Remedy(f"In views.csv, delete the {rows} of {views.lower()} {_listed(copies)}."),
-        tuple(copies),
-        until_mm=LEAST_NEED_MM,
-    )
-
-
-def _listed(views: Sequence[int]) -> str:
-    """View numbers in words; consecutive ones as a range."""
-    if len(views) > 2 and list(views) == list(range(views[0], views[-1] + 1)):
-        return f"{views[0]} to {views[-1]}"
-    return some_of([str(view) for view in views])
 
 
 @contextmanager

@@ -219,7 +219,10 @@ def _poses(seen: Observed, observations: Sequence[Observation]) -> dict[str, Flo
     """Pose (s, 4, 4) of every robot at every station; NaN where unknown."""
     count = 1 + max(observation.station for observation in observations)
     poses = {robot_key(name): np.full((count, 4, 4), np.nan) for name in seen.robots}
+    # Stations of copies alone have none: errors of the arm are those of stops that were observed.
     for observation in observations:
+        if observation.view.number in seen.repeats:
+            continue
         for name, row in observation.robots.items():
             reported = seen.robots[name].base_from_flange
             # The stop's row, which most of its rows agree with, precedes the view's own.

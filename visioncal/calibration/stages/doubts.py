@@ -518,9 +518,9 @@ def _robot_doubts(findings: Findings, limits: CalibrationLimits) -> Iterator[Fin
                 "from stop to stop; arms repeat to 0.1 mm."
             )
             step = Remedy(
-                "Read a few stops twice to see how well readings repeat; more likely than the "
-                "arm's noise are an instrument that reads worse than stated or was moved, or a "
-                "model of the arm that is off by as much."
+                "Read a few stops twice, with the times in stamp_s, to see how well readings "
+                "repeat; more likely than the arm's noise are an instrument that reads worse than "
+                "stated or was moved, or a model of the arm that is off by as much."
                 if findings.mount == "instrument"
                 else "Look for what is likelier than noise of the arm: a board of another size "
                 "than stated (measure it over many squares) or warped, intrinsics that are not "

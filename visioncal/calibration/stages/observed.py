@@ -37,7 +37,6 @@ class CameraObservations:
         resolution: Size of its images [px].
         lens: Its intrinsics; None where no view determines them.
         pixel_px: Noise of a corner's coordinate [px].
-        repeats: Why views that repeat others are not needed, by view.
     """
 
     table: CameraTable
@@ -45,7 +44,6 @@ class CameraObservations:
     resolution: tuple[int, int] | None = None
     lens: CameraResult | None = None
     pixel_px: float | None = None
-    repeats: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +57,7 @@ class Observed:
         cameras: Observations of each camera with images, by its frame.
         poses: The target's pose by view; several candidates until one is chosen.
         reasons: Why a view cannot be used, by view.
+        repeats: Why views that repeat others are not needed, by view.
         robots: Reported poses and joints of each robot, by the name that rows give it.
         clocks: Relations of the clocks of cameras and robots, where robots' streams are used.
         warnings: Findings for the user.
@@ -76,6 +75,7 @@ class Observed:
     cameras: Mapping[str, CameraObservations] = field(default_factory=dict)
     poses: Mapping[int, ViewPoses] = field(default_factory=dict)
     reasons: Mapping[int, str] = field(default_factory=dict)
+    repeats: Mapping[int, str] = field(default_factory=dict)
     robots: Mapping[str, RobotReport] = field(default_factory=dict)
     clocks: Mapping[ClockPair, ClockedViews] = field(default_factory=dict)
     warnings: tuple[Finding, ...] = ()
@@ -121,8 +121,7 @@ class Observed:
     def spared(self) -> Mapping[int, str]:
         """Why views of sweeps, and those that repeat others, are not needed, by view."""
         of_sweeps = (clock.spared for clock in self.clocks.values())
-        of_cameras = (camera.repeats for camera in self.cameras.values())
-        return {view: why for sweep in (*of_sweeps, *of_cameras) for view, why in sweep.items()}
+        return {view: why for spared in (*of_sweeps, self.repeats) for view, why in spared.items()}
 
     @property
     def lenses(self) -> Mapping[str, CameraResult]:

@@ -1,9 +1,10 @@
 """Readings of a measuring instrument: positions of points on the flange, or poses of a probe."""
 
 from collections import defaultdict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from visioncal.estimation.procrustes import align
 from visioncal.session import Session, View
 from visioncal.session.instruments import Instrument, instrument_names, stated_instrument
 from visioncal.session.kinds import is_camera_observation, is_instrument_reading, name_of
+
+_V = TypeVar("_V")
 
 # Largest distance that a tracker reads [m].
 _FARTHEST_M = 160.0
@@ -59,6 +62,15 @@ class Readings:
     def sigma_m(self) -> float:
         """Median noise of a coordinate [m]."""
         return float(np.median(self.instrument.sigmas_m(np.array(list(self.read_m.values())))))
+
+    def without(self, views: Collection[int]) -> Self:
+        """Removes the readings of some views."""
+
+        def kept(items: Mapping[int, _V]) -> dict[int, _V]:
+            return {view: item for view, item in items.items() if view not in views}
+
+        probes = None if self.probes is None else kept(self.probes)
+        return replace(self, read_m=kept(self.read_m), points=kept(self.points), probes=probes)
 
     def places(
         self, views: Sequence[int], base_from_flange: Mapping[int, FloatArray], stops: IntArray
