@@ -141,7 +141,7 @@ def _network(_: Inputs, path: Path) -> None:
                 "plate_b", "b", target=replace(BOARDS["charuco"], name="5x4", columns=5, rows=4)
             ),
         ),
-        stops=6,
+        stops=12,
     )
     write_session(simulate(options), path)
     path.with_name(path.name + ".truth.json").unlink()
