@@ -60,7 +60,6 @@ def test_what_is_stated_comes_before_the_table():
         (("leica-at96", None, None, None), "not in the table .* Did you mean leica-at960"),
         (("ours", None, 1e-6, None), "noise is not stated. State sigma_m .*zeiss-contura"),
         (("renishaw-xl80", 1e-6, None, None), "measures lengths along its beam; readings of pl"),
-        (("ours", 0.0, None, None), "instrument.sigma_m is 0; no instrument is exact"),
     ],
 )
 def test_an_unknown_instrument_is_refused(arguments, words):

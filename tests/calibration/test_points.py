@@ -315,7 +315,7 @@ def test_a_rig_is_not_looked_for_in_images(cube):
     [
         ("99,700,10,10", "column view: views.csv has no view 99"),
         ("0,5,10,10", "has no point 5; its 37 points have the numbers 592 to 700"),
-        ("0,700,10,10", "point 700 of view 0 is there twice, first in line"),
+        ("0,700,10,10", "point 700 of view 0 is there twice, first in corners.csv, line"),
         ("0,x,10,10", "column point: 'x' is no whole number"),
         ("0,700,nan,10", "column u_px: 'nan' is no finite number"),
         ("0,700,10", "it has 3 fields, but the header has 4 columns"),
@@ -325,6 +325,23 @@ def test_wrong_rows_are_named(line, said, cube):
     with pytest.raises(DataError, match=r"corners\.csv, line 557") as error:
         Session.load(with_line(cube, line))
     assert said in error.value.message
+
+
+@pytest.mark.parametrize("line_end", [b"\r\n", b"\r\r\n", b"\n\n"])
+@pytest.mark.parametrize("marks", [0, 1, 2])
+def test_line_ends_and_marks_of_other_programs_change_nothing(marks, line_end, cube):
+    file = cube / "corners.csv"
+    expected = Session.load(cube).corner_table
+    plain = file.read_bytes()
+    file.write_bytes(marks * b"\xef\xbb\xbf" + plain.replace(b"\n", line_end))
+    assert Session.load(cube).corner_table.fact() == expected.fact()
+    # The line that a message names is the file's, also after blank ones.
+    wrong = [*plain.splitlines()[:3], b"0,x,10,10"]
+    file.write_bytes(marks * b"\xef\xbb\xbf" + line_end.join([*wrong, b""]))
+    text = file.read_text(encoding="utf-8-sig")
+    (line,) = (at for at, words in enumerate(text.splitlines(), 1) if words.startswith("0,x"))
+    with pytest.raises(DataError, match=rf"corners\.csv, line {line}, column point"):
+        Session.load(cube)
 
 
 @pytest.mark.parametrize(("kind", "first"), [("checkerboard", 1), ("cube", 0)])
@@ -356,6 +373,9 @@ def test_points_that_count_from_another_number_are_named_at_once(tmp_path, kind,
     [
         ("view,point,u_px,v_px,sigma_px", ",0", "column sigma_px: 0 px is no standard deviation"),
         ("view,point,u_px,v_px,sigma_px", ",-0.1", "-0.1 px is no standard deviation"),
+        # Their squares overflow.
+        ("view,point,u_px,v_px,sigma_px", ",1e150", "1e+150 px is no standard deviation"),
+        ("view,point,u_px,v_px,sigma_px", ",1e-300", "1e-300 px is no standard deviation"),
         ("view,point,u_px,v_px,score", ",1", "others are not read"),
         ("view,point,u_px,sigma_px", "", "view, point, u_px, v_px are needed"),
     ],
@@ -396,6 +416,10 @@ def test_corners_without_images_need_a_resolution(cube):
         (
             "point,x_m,y_m,z_m,sigma_m\n0,0,0,0,1\n1,1,0,0,1\n2,0,1,0,1\n3,0,1,1,0\n",
             "has 0 as sigma_m of row 4",
+        ),
+        (
+            "point,x_m,y_m,z_m,sigma_m\n0,0,0,0,1e-300\n1,1,0,0,1\n2,0,1,0,1\n3,0,1,1,1\n",
+            "has 1e-300 as sigma_m of row 1",
         ),
         ("point,x_m,y_m,z_m\n0,0,0,0\n1,1,0,0\n2,2,0,0\n3,5,0,0\n", "all points on one line"),
         ("point,x_m,y_m,z_m\n0,1,0,0\n1,1,0,0\n2,1,0,0\n3,1,0,0\n", "all points in one place"),

@@ -1,5 +1,6 @@
 """Lens and board as unknowns of all views: derivatives, and what is set free when."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,14 @@ from support.marks import slow
 
 from visioncal.core.transforms import invert, log
 from visioncal.core.types import Target
-from visioncal.estimation.appearance import BOARD_NAMES, SCALE, Appearance, board_basis, compress
+from visioncal.estimation.appearance import (
+    BOARD_NAMES,
+    SCALE,
+    Appearance,
+    board_basis,
+    boards_basis,
+    compress,
+)
 from visioncal.estimation.corners import CornerStack
 from visioncal.estimation.poses import reproject
 from visioncal.simulation import CellOptions, fine_camera, simulate
@@ -317,3 +325,24 @@ def test_too_few_corners_leave_the_lens_alone():
         '"refine" was not done: 60 corners in 15 views' in warning.reason
         for warning in known.warnings
     )
+
+
+def test_memory_is_linear_in_the_points_of_an_exact_rig():
+    places = np.random.default_rng(0).normal(size=(3000, 3))
+    rig = Target(
+        "rig",
+        "points",
+        len(places),
+        1,
+        8.0,
+        0.0,
+        points_m=tuple(map(tuple, places.tolist())),
+        point_numbers=tuple(range(len(places))),
+    )
+    tracemalloc.start()
+    basis = boards_basis([rig])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert basis.shape == (3000, 3, 0)
+    # A few copies of the places; a square of all coordinates has 9,000 numbers for each of them.
+    assert peak < 100 * places.nbytes

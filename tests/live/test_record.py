@@ -323,6 +323,8 @@ def test_typed_poses_and_pictures_in_a_folder_make_a_session(planned, tmp_path):
     with patch.object(sys, "stdin", answers):
         done = visioncal("record", *words)
     assert done.status == 0, done.err
+    # A pipe that gives nothing yet is waited for, which has to be said first.
+    assert done.err.startswith("Poses are read from stdin")
     session = Session.load(tmp_path / "live")
     assert len(session.views) == len(plan.stops)
     for view, stop in zip(session.views, plan.stops, strict=True):

@@ -453,6 +453,17 @@ def test_pictures_lie_as_their_pixels_are_stored() -> None:
     assert (picture.width, picture.height) == (64, 40)
 
 
+@pytest.mark.parametrize("size", [(65_000, 1), (1, 70_000), (20_000, 3)])
+def test_pictures_of_one_row_are_drawn(size: tuple[int, int]) -> None:
+    """Reduced by their width they have no row left, and a JPEG has a longest side."""
+    width, height = size
+    encoded = cv2.imencode(".png", np.full((height, width), 200, np.uint8))[1].tobytes()
+    picture = thumbnail(encoded, None, "", 0, 1)
+    assert picture is not None
+    assert (picture.width, picture.height) == size
+    assert picture.jpeg_uri.startswith("data:image/jpeg;base64,/9j/")
+
+
 def test_one_used_view_and_no_residuals_still_give_a_report(sample: Sample) -> None:
     views = tuple(
         replace(view, residual_mm=0.0, residual_deg=None, rms_px=None)

@@ -450,7 +450,17 @@ TOML_REFUSALS = [
         "[prior.base_from_target]\nx_m = 520\nsigma_m = 1e-3\n[robot]",
         r"target\.x_m is 520, .* metres, at most 100 in a cell: write 0\.52 for 520 mm",
     ),
-    ("[robot]", "[instrument]\nsigma_m = -1\n[robot]", "instrument.sigma_m is -1, .*at least 0"),
+    # Their squares are no numbers, or leave nothing of the images' information.
+    *(
+        ("[robot]", f"[{table}\n{key} = {value}\n[robot]", rf"{key} is {value}, .* at least 1e-07")
+        for table, key in (
+            ("prior.flange_from_cam]\nz_m = 0.1", "sigma_m"),
+            ("prior.flange_from_cam]\nquaternion_xyzw = [0.0, 0.0, 0.0, 1.0]", "sigma_rad"),
+            ("instrument]", "sigma_m"),
+            ("instrument]", "sigma_rad"),
+        )
+        for value in ("1e-300", "1e-09", "0", "-1")
+    ),
     ("[robot]\nmodel = ", "robot = ", "robot is 'ur10e', but must be a table"),
     ("[robot]", "[need]\nmm = 0\n[robot]", "need.mm is 0, but must be a number above 0"),
     ("[robot]", '[need]\nat = "views"\n[robot]', "need says neither mm nor deg: give how near"),

@@ -215,6 +215,8 @@ def record_guided(
     )
     try:
         if not isinstance(cell.arm, MovingArm):
+            if ask is None:
+                say("Poses are read from stdin, one a line, and no question is asked; q ends.")
             return ask_and_take(capture, cell.arm, views, ask)
         say("Guide the arm: a view is taken wherever it rests at a new place; Ctrl-C ends.")
         return follow(capture, views)

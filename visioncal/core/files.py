@@ -208,9 +208,10 @@ def read_text(path: Path | str, most: int = MOST_BYTES) -> str:
 
 
 def decode_text(data: bytes, label: str) -> str:
-    """Decodes UTF-8 with or without a byte-order mark; `label` names its origin in DataErrors."""
+    """Decodes UTF-8 with or without byte-order marks; `label` names its origin in DataErrors."""
     try:
-        return data.decode("utf-8-sig")
+        # Programs that mark a text which is marked already leave two.
+        return data.decode("utf-8").lstrip("\ufeff")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise DataError(

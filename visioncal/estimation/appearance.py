@@ -80,7 +80,7 @@ def shape_basis(target: Target) -> FloatArray:
     if target.kind != "points":
         return board_basis(positions)
     size = len(board_prior(target))
-    return np.eye(3 * len(positions))[:, :size].reshape(len(positions), 3, size)
+    return np.eye(3 * len(positions), size).reshape(len(positions), 3, size)
 
 
 def boards_basis(targets: Sequence[Target]) -> FloatArray:

@@ -15,6 +15,7 @@ from visioncal.core.codec import (
     write,
 )
 from visioncal.core.errors import DataError
+from visioncal.core.files import one_line
 from visioncal.core.types import Mount
 from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
@@ -190,7 +191,8 @@ def fields_from_document(document: Mapping[str, Any]) -> dict[str, Any]:
 def _head_fields(form: CalibrationForm | CellForm) -> dict[str, Any]:
     """Inverse of `_head`."""
     return {
-        "session_name": form.session.name,
+        # As a session's: nothing in it may steer a terminal.
+        "session_name": one_line(form.session.name),
         "session_sha256": form.session.sha256,
         "joint_covariance": form.joint_covariance.matrix,
     }

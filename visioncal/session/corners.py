@@ -24,6 +24,9 @@ _NEEDED = ("view", "point", "u_px", "v_px")
 _SIGMA = "sigma_px"
 # Largest number of rows: 500 corners in 2000 views take a gigabyte of memory.
 _MOST_CORNERS = 1_000_000
+# Standard deviations of corners [px]: the finest templates reach a hundredth, and few images are
+# larger than the upper limit. Squares of others overflow, or leave nothing of the other corners.
+_LEAST_PX, _MOST_PX = 1e-4, 1e4
 # Smallest number of corners that determine a pose.
 _FEWEST = 4
 
@@ -39,6 +42,7 @@ class CornerTable:
         targets: (n,) names of the targets; empty where not stated.
         sigmas_px: (n,) standard deviation per axis [px]; None where not stated.
         is_file: Whether they are lines of a corners.csv; else they are arrays of a program.
+        lines: (n,) line of each row in its file; None where rows follow the header.
     """
 
     views: IntArray
@@ -47,6 +51,7 @@ class CornerTable:
     targets: tuple[str, ...]
     sigmas_px: FloatArray | None = None
     is_file: bool = True
+    lines: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.views)
@@ -54,7 +59,7 @@ class CornerTable:
     def place(self, row: int) -> str:
         """Place of a row, for messages."""
         if self.is_file:
-            return f"{FILE}, line {row + 2}"
+            return f"{FILE}, line {row + 2 if self.lines is None else self.lines[row]}"
         view = int(self.views[row])
         return f"corners[{view}], ids[{int(np.sum(self.views[:row] == view))}]"
 
@@ -68,6 +73,7 @@ class CornerTable:
             tuple(self.targets[at] for at in rows),
             None if self.sigmas_px is None else self.sigmas_px[rows],
             self.is_file,
+            None if self.lines is None else self.lines[rows],
         )
 
     def without_targets(self) -> "CornerTable":
@@ -98,8 +104,7 @@ def parse_corners(text: str) -> CornerTable:
     Raises:
         DataError: A column is missing or a cell is wrong.
     """
-    # Row numbers are line numbers: no blank lines between rows.
-    rows = numbered_rows(text.rstrip(), FILE, 1, separator_of(text.partition("\n")[0]))
+    rows = numbered_rows(text, FILE, 1, separator_of(text.partition("\n")[0]))
     columns = [name.strip() for name in next(rows, (1, []))[1]]
     known = (*_NEEDED, COLUMN, _SIGMA)
     missing = [name for name in _NEEDED if name not in columns]
@@ -115,13 +120,18 @@ def parse_corners(text: str) -> CornerTable:
         )
     problems: list[TableProblem] = []
     lines: list[_Line] = []
+    numbers: list[int] = []
     for number, cells in rows:
+        # A program that writes "\r\n" as text on Windows leaves a blank line after each row.
+        if not any(cell.strip() for cell in cells):
+            continue
         if len(lines) == _MOST_CORNERS:
             raise DataError(
                 f"{FILE} has more than {_MOST_CORNERS:,} rows.",
                 culprits=[FILE],
                 next_step="Take fewer views, or fewer points of each.",
             )
+        numbers.append(number)
         lines.append(_line(columns, cells, f"{FILE}, line {number}", problems))
     stated = [line.sigma_px is not None for line in lines]
     if any(stated) and not all(stated) and not problems:
@@ -136,6 +146,7 @@ def parse_corners(text: str) -> CornerTable:
         np.array([line.px for line in lines], dtype=float).reshape(-1, 2),
         tuple(line.target for line in lines),
         np.array(sigmas, dtype=float) if sigmas else None,
+        lines=np.array(numbers, dtype=np.int64),
     )
 
 
@@ -168,8 +179,11 @@ def _line(
         except DataError as error:
             problems.append(TableProblem(f"{place}, column {name}", error.message.rstrip(".")))
     sigma_px = numbers.get(_SIGMA)
-    if sigma_px is not None and sigma_px <= 0.0:
-        words = f"{sigma_px:g} px is no standard deviation; a number above 0 is needed"
+    if sigma_px is not None and not _LEAST_PX <= sigma_px <= _MOST_PX:
+        words = (
+            f"{sigma_px:g} px is no standard deviation of a corner, which lies between "
+            f"{_LEAST_PX:g} and {_MOST_PX:g} px; leave out the rows of corners that do not count"
+        )
         problems.append(TableProblem(f"{place}, column {_SIGMA}", words))
     view, point, u_px, v_px = (numbers.get(name, 0.0) for name in _NEEDED)
     return _Line(place, int(view), int(point), (u_px, v_px), row.get(COLUMN, ""), sigma_px)
@@ -292,7 +306,7 @@ def _target_problems(
         place = f"{table.place(int(own_rows[0]))}{more}, column view"
         yield TableProblem(place, f"views.csv has no view {view}")
     for at, (view, target) in enumerate(zip(table.views.tolist(), table.targets, strict=True)):
-        place = f"{FILE}, line {at + 2}"
+        place = table.place(at)
         if view not in rows:
             continue
         if not names and target not in ("", first):
@@ -322,29 +336,29 @@ def check_points(table: CornerTable, names: Sequence[str], targets: Mapping[str,
     Raises:
         DataError: A point is unknown or duplicate.
     """
-    boards, file = [targets[name] for name in names], FILE if table.is_file else "corners"
-    numbers = {board: frozenset(point_numbers(board)) for board in dict.fromkeys(boards)}
-    for target, known in numbers.items():
-        used = {
-            point for point, of in zip(table.points.tolist(), boards, strict=True) if of is target
-        }
-        _check_first_number(used, known, target, file)
+    file = FILE if table.is_file else "corners"
     by_name: dict[str, set[int]] = {}
     for name, point in zip(names, table.points.tolist(), strict=True):
         by_name.setdefault(name, set()).add(point)
-    _check_exchanged(by_name, {name: numbers[targets[name]] for name in by_name}, file)
+    numbers = {name: frozenset(point_numbers(targets[name])) for name in by_name}
+    for name, used in by_name.items():
+        _check_first_number(used, numbers[name], targets[name], file)
+    _check_exchanged(by_name, numbers, file)
     problems: list[TableProblem] = []
     seen: dict[tuple[int, int], int] = {}
     for at, key in enumerate(zip(table.views.tolist(), table.points.tolist(), strict=True)):
-        place, target = table.place(at) + (", column point" if table.is_file else ""), boards[at]
         earlier = seen.setdefault(key, at)
-        if key[1] not in numbers[target]:
+        if key[1] not in numbers[names[at]]:
+            target = targets[names[at]]
             words = f"target {target.name} has no point {key[1]}; {_range(target)}"
-            problems.append(TableProblem(place, words))
         elif earlier != at:
-            first = f"line {earlier + 2}" if table.is_file else table.place(earlier)
-            words = f"point {key[1]} of view {key[0]} is there twice, first in {first}"
-            problems.append(TableProblem(place, words))
+            words = (
+                f"point {key[1]} of view {key[0]} is there twice, first in {table.place(earlier)}"
+            )
+        else:
+            continue
+        place = table.place(at) + (", column point" if table.is_file else "")
+        problems.append(TableProblem(place, words))
     if problems:
         raise problems_error(problems)
 
@@ -411,10 +425,9 @@ def corners_by_view(
     }
     corners = {}
     for view in (view.number for view in views if view.number in rows_of):
-        rows = rows_of[view]
-        ids = np.array(
-            [index_of[board_of[view]][int(point)] for point in table.points[rows]], np.int64
-        )
+        # A rig's hash is one of all its points: once a view.
+        rows, index = rows_of[view], index_of[board_of[view]]
+        ids = np.array([index[point] for point in table.points[rows].tolist()], np.int64)
         order = np.argsort(ids)
         rows, stated_px = rows[order], medians_px.get(camera_of[view])
         sigmas = table.sigmas_px

@@ -72,7 +72,7 @@ def stated_instrument(
     """Instrument of a session: stated values, with those of the table for the others.
 
     Raises:
-        DataError: The name is unknown and no noise is stated, or the stated noise is not positive.
+        DataError: The name is unknown and no noise is stated.
     """
     in_table = known_instrument(name)
     if sigma_m is None and in_table is None:
@@ -84,20 +84,12 @@ def stated_instrument(
             f"in [instrument], or name one of {', '.join(instrument_names())}.".strip(),
         )
     base = Instrument(name, 0.0) if in_table is None else in_table
-    stated = Instrument(
+    return Instrument(
         base.words,
         base.sigma_m if sigma_m is None else sigma_m,
         base.sigma_per_m if sigma_per_m is None else sigma_per_m,
         base.sigma_rad if sigma_rad is None else sigma_rad,
     )
-    for field, value in (("sigma_m", stated.sigma_m), ("sigma_rad", stated.sigma_rad)):
-        if value is not None and not value > 0.0:
-            raise DataError(
-                f"session.toml: instrument.{field} is {value:g}; no instrument is exact, and a "
-                "number above 0 is needed.",
-                culprits=[f"session.toml: instrument.{field}"],
-            )
-    return stated
 
 
 @cache

@@ -13,7 +13,7 @@ import tomli_w
 
 from visioncal.core.arguments import typed
 from visioncal.core.errors import DataError
-from visioncal.core.files import MOST_TOML_BYTES, parse_toml, read_text_inside
+from visioncal.core.files import MOST_TOML_BYTES, one_line, parse_toml, read_text_inside
 from visioncal.core.summaries import html_card, text_card
 from visioncal.core.types import Camera, Corners, Image, Image16, Mount, Need, Target
 from visioncal.session import columns as cols
@@ -431,8 +431,8 @@ class Session:
 
     @property
     def name(self) -> str:
-        """The session's name."""
-        return self.declaration.name
+        """The session's name, on one line: nothing in it may steer a terminal."""
+        return one_line(self.declaration.name)
 
     @property
     def mount(self) -> Mount:

@@ -13,6 +13,9 @@ Number = Annotated[FiniteFloat, Field(ge=-_LARGEST, le=_LARGEST)]
 Positive = Annotated[FiniteFloat, Field(gt=0, le=_LARGEST)]
 # Plausible standard deviations of a focal length [px].
 PixelSigma = Annotated[FiniteFloat, Field(ge=1e-3, le=1e4)]
+# Standard deviations of measured lengths [m] and angles [rad]: the least is a tenth of what the
+# best measuring machines reach. Beside smaller ones nothing is left of the images' information.
+MeasuredSigma = Annotated[FiniteFloat, Field(ge=1e-7, le=_LARGEST)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0, le=_LARGEST)]
 # Largest side of an image: four times that of the largest sensors [px].
 Side = Annotated[int, Field(gt=0, le=65_535)]
@@ -71,9 +74,9 @@ class InstrumentTable(TableModel):
     """`[instrument]`. Standard deviations of its readings [m], [m/m], [rad]; see `instruments`."""
 
     name: str = "instrument"
-    sigma_m: NotNegative | None = None
+    sigma_m: MeasuredSigma | None = None
     sigma_per_m: NotNegative | None = None
-    sigma_rad: NotNegative | None = None
+    sigma_rad: MeasuredSigma | None = None
 
 
 class ClockTable(TableModel):
@@ -124,9 +127,9 @@ class PriorTable(TableModel):
     x_m: Number | None = None
     y_m: Number | None = None
     z_m: Number | None = None
-    sigma_m: Positive | None = None
+    sigma_m: MeasuredSigma | None = None
     quaternion_xyzw: Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)] | None = None
-    sigma_rad: Positive | None = None
+    sigma_rad: MeasuredSigma | None = None
 
 
 class TargetTable(TableModel):

@@ -6,6 +6,7 @@ of the tag at the upper left, for a single marker its centre. x runs along colum
 (down the printed page), and z into the board. A rig of points has the frame of its table.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from functools import lru_cache
@@ -375,9 +376,10 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
     numbers, places_m = values[0].tolist(), values[1:4].T
     if len(numbers) < _FEWEST_POINTS:
         yield f"has {len(numbers)} points", "Give four points or more, which a camera needs."
+    first: dict[float, int] = {}
     for row, number in enumerate(numbers):
-        if number != round(number) or number in numbers[:row]:
-            again = " again" if number in numbers[:row] else ""
+        if number != round(number) or first.setdefault(number, row) != row:
+            again = " again" if first.get(number, row) != row else ""
             yield (
                 f"has {number:g}{again} as point of row {row + 1}",
                 "Give each point a whole number of its own.",
@@ -396,10 +398,11 @@ def _rig_problems(names: Sequence[str], values: FloatArray) -> Iterator[tuple[st
             "It looks like millimetres: multiply x_m, y_m, z_m and sigma_m by 0.001.",
         )
     for row, sigma_m in enumerate(values[4].tolist() if "sigma_m" in names else ()):
-        if sigma_m <= 0.0:
+        if not LEAST_SIGMA_M <= sigma_m <= extent_m:
             yield (
-                f"has {sigma_m:g} as sigma_m of row {row + 1}",
-                "Write metres above 0, or leave the column out where they are not known.",
+                f"has {sigma_m:g} as sigma_m of row {row + 1}, and not {LEAST_SIGMA_M:g} m to the "
+                f"rig's own {extent_m:g} m",
+                "Write metres in this range, or leave the column out where they are not known.",
             )
 
 
@@ -415,11 +418,12 @@ def _tags_of_rig(table: DocumentTable, columns: Mapping[str, Any]) -> dict[str, 
     dictionary = table.text("dictionary", APRILGRID_DICTIONARY)
     markers = _dictionary_size(table, dictionary)
     pairs = list(zip(columns["tag"], columns["corner"], strict=True))
+    counts = Counter(pairs)
     for tag, corner in pairs:
         if tag not in range(markers) or corner not in range(4):
             given_here = f"a table with tag {tag}, corner {corner}"
             raise table.refuse("points", given_here, f"tags 0 to {markers - 1}, corners 0 to 3,")
-        if pairs.count((tag, corner)) > 1:
+        if counts[tag, corner] > 1:
             twice = f"a table with corner {corner} of tag {tag} twice"
             raise table.refuse("points", twice, "each corner once,")
     return {

@@ -11,7 +11,7 @@ from visioncal.results.evidence import ViewEvidence
 from visioncal.vision.finders.imaging import decode_image
 
 _WIDTH_PX, _SMALL_PX = 720, 240
-_JPEG_QUALITY = 78
+_JPEG_QUALITY, _JPEG_SIDE_PX = 78, 65_500
 # Size of a crop: factor on the corners' extent, plus a share of the image.
 _ROOM, _LEAST_SHARE = 1.25, 0.05
 
@@ -132,5 +132,8 @@ def small_picture(image_bytes: bytes) -> bytes | None:
 
 
 def _jpeg(image: Image, scale: float) -> bytes:
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    height, width = image.shape[:2]
+    # A line scan of one row keeps a row, and a JPEG has no longer side.
+    size = [min(max(round(scale * side), 1), _JPEG_SIDE_PX) for side in (width, height)]
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
