@@ -209,7 +209,7 @@ READINGS: tuple[Reading, ...] = (
     Reading("dynamics gains", "currents/loaded", f"[currents/empty] --loaded IT {_BODY}"),
 )
 # What a sound input may be exchanged with.
-EXCHANGED = ("pairs", "out", "board.rrd", "another.rrd", "old.rrd", "touches.csv", "frames.json",
+EXCHANGED = ("pairs", "out", "board.rrd", "another.rrd", "touches.csv", "frames.json",
              "target.toml", "photo.png", "arm.toml", "plan", "policy.toml", "dynamics_out",
              "network_out", "arm.json")  # fmt: skip
 
@@ -298,7 +298,7 @@ def run_mutant(
 
 def exchanged(readings: Sequence[Reading]) -> list[str]:
     """Names what a broken input may be exchanged with, of what is there anyhow."""
-    there = {reading.input for reading in readings} | {"another.rrd", "old.rrd"}
+    there = {reading.input for reading in readings} | {"another.rrd"}
     return [name for name in EXCHANGED if name in there]
 
 
