@@ -379,9 +379,7 @@ def test_other_cells_are_refused_by_what_differs():
 def test_triggers_fire_by_their_limits_and_say_what_is_not_known(tmp_path):
     place = usual("eye-in-hand")
     created = datetime(2026, 1, 1, tzinfo=UTC)
-    calibration = replace(
-        place.calibration, conditions={"ambient_c": 21.0}, created=created.isoformat()
-    )
+    calibration = replace(place.calibration, means={"ambient_c": 21.0}, created=created.isoformat())
     session = session_of(place.cell.only(range(5)))
     warm = tuple(replace(view, numbers={"ambient_c": 33.0}) for view in session.views)
     facts = facts_of(
@@ -429,7 +427,7 @@ def pairs(tmp_path_factory):
 
 def test_the_command_says_pass_or_fail_by_its_status(pairs, tmp_path):
     out = pairs / "out"
-    assert Calibration.load(out).conditions == {"ambient_c": 20.0}
+    assert Calibration.load(out).means == {"ambient_c": 20.0}
     done = visioncal("verify", pairs / "later", "--against", out, "-o", tmp_path / "check")
     assert done.status == 0
     assert done.out.startswith("pass")

@@ -65,12 +65,19 @@ UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "i
 
 @dataclass(frozen=True)
 class PoseForm:
-    """Pose notation of a robot manufacturer or a library: length unit and rotation form."""
+    """Pose notation of a robot manufacturer or a library.
+
+    Attributes:
+        unit: Length unit.
+        rotation: Rotation form, a name among `conventions.ROTATION_FORMS`.
+        models: Pattern of the beginning of its robots' names; empty for a library.
+    """
 
     name: str
     words: str
     unit: str
     rotation: str
+    models: str = ""
 
 
 # Universal Robots, "Script manual": p[x, y, z, rx, ry, rz]. KUKA, "System variables": FRAME X, Y,
@@ -81,13 +88,23 @@ class PoseForm:
 POSE_FORMS: Mapping[str, PoseForm] = {
     pose_form.name: pose_form
     for pose_form in (
-        PoseForm("ur", "Universal Robots p[...]", "m", "rotation-vector"),
-        PoseForm("kuka", "KUKA X, Y, Z, A, B, C", "mm", "euler-ZYX-deg"),
-        PoseForm("fanuc", "FANUC X, Y, Z, W, P, R", "mm", "euler-xyz-deg"),
-        PoseForm("yaskawa", "Yaskawa X, Y, Z, Rx, Ry, Rz", "mm", "euler-xyz-deg"),
-        PoseForm("abb", "ABB pos and orient", "mm", "quaternion-wxyz"),
-        PoseForm("staubli", "Staubli X, Y, Z, Rx, Ry, Rz", "mm", "euler-XYZ-deg"),
-        PoseForm("doosan", "Doosan X, Y, Z, A, B, C", "mm", "euler-ZYZ-deg"),
+        PoseForm("ur", "Universal Robots p[...]", "m", "rotation-vector", r"ur\d"),
+        PoseForm("kuka", "KUKA X, Y, Z, A, B, C", "mm", "euler-ZYX-deg", r"kuka|kr\d|lbr|iiwa"),
+        PoseForm(
+            "fanuc", "FANUC X, Y, Z, W, P, R", "mm", "euler-xyz-deg", r"fanuc|lrmate|crx|m\d+i"
+        ),
+        PoseForm(
+            "yaskawa",
+            "Yaskawa X, Y, Z, Rx, Ry, Rz",
+            "mm",
+            "euler-xyz-deg",
+            r"yaskawa|motoman|gp\d|hc\d",
+        ),
+        PoseForm("abb", "ABB pos and orient", "mm", "quaternion-wxyz", r"abb|irb|gofa|yumi"),
+        PoseForm(
+            "staubli", "Staubli X, Y, Z, Rx, Ry, Rz", "mm", "euler-XYZ-deg", r"staubli|tx2?\d|ts2"
+        ),
+        PoseForm("doosan", "Doosan X, Y, Z, A, B, C", "mm", "euler-ZYZ-deg", r"doosan|[ahm]\d{4}"),
         PoseForm("rpy", "URDF xyz and rpy", "m", "euler-xyz-rad"),
         PoseForm("ros", "ROS position and orientation", "m", "quaternion-xyzw"),
     )

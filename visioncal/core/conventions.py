@@ -1,5 +1,6 @@
 """Pose notations: units, rotation forms, and those of robot manufacturers, for both directions."""
 
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -269,6 +270,13 @@ class PoseNumbers:
 
     def _places_of(self, rows: Mask) -> list[str]:
         return [self.places[index] for index in np.flatnonzero(rows)]
+
+
+def controller_form(robot: str) -> PoseForm | None:
+    """The notation of a robot's own controller, by the name of its model; None where unknown."""
+    name = re.sub(r"[^a-z0-9]", "", robot.lower())
+    forms = (form for form in POSE_FORMS.values() if form.models)
+    return next((form for form in forms if re.match(form.models, name)), None)
 
 
 def write_pose(pose: FloatArray, form: PoseForm) -> FloatArray:

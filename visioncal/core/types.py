@@ -36,11 +36,13 @@ class Need:
         mm: Greatest position error [mm]; None for no limit.
         deg: Greatest rotation error [deg]; None for no limit.
         at: Where it applies: at the views' targets, or at a point (x, y, z) in the base frame [m].
+        corrected: Whether targets are corrected for a calibrated arm before they are sent.
     """
 
     mm: float | None = None
     deg: float | None = None
     at: Literal["views"] | tuple[float, float, float] = "views"
+    corrected: bool = False
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ VerdictStatus: TypeAlias = Literal["good", "check", "bad"]
 _SHOWN, _LEAST_LIKELY, _LIKELY, _EVEN = 3, 0.05, 0.2, 0.5
 # Kinds of findings that are not doubts.
 AGREEMENT, NEED, GOOD_FOR, NOTE = "agreement", "need", "good_for", "note"
+# The arm was calibrated: what a result is good for depends on how its targets are sent.
+CALIBRATED_ARM = "calibrated_arm"
 # Missing images, images of another size than the camera's, and empty rows: no doubts about the
 # rest, and reported first.
 MISSING, EMPTY_ROWS, OTHER_SIZE = "missing_images", "empty_rows", "image_size"
@@ -43,7 +45,13 @@ _HEADLINES = {
     "bad": "Bad: do not use",
 }
 # Kinds of findings on sources of errors, whose probability is their share.
-SOURCES = ("calibration", "unmeasured_board", "robot_noise", "robot_noise_of_pick")
+SOURCES = (
+    "calibration",
+    "unmeasured_board",
+    "robot_noise",
+    "robot_noise_of_pick",
+    "uncorrected_targets",
+)
 # Commands of remedies.
 CALIBRATE, PLAN = "visioncal calibrate SESSION -o OUT", "visioncal plan SESSION --add 5"
 GUESS = "visioncal convert SESSION FIXED --guess --yes"
@@ -157,11 +165,14 @@ class Verdict:
         status: The judgement.
         findings: The reasons: doubts, fatal ones first, findings on needs, then notes.
         good_for_mm: The least need for which it is good [mm]; None where errors are unexplained.
+        good_for_mm_uncorrected: The same by the controller's own poses, where the arm was
+            calibrated; `good_for_mm` then is for corrected targets.
     """
 
     status: VerdictStatus
     findings: tuple[Finding, ...] = ()
     good_for_mm: float | None = None
+    good_for_mm_uncorrected: float | None = None
 
     @classmethod
     def of(cls, status: VerdictStatus, *sentences: str) -> Self:
@@ -219,7 +230,10 @@ class Verdict:
         causes = [cause for cause in self.causes if cause.probability >= _LEAST_LIKELY]
         costs = [finding for kind in _SIZES for finding in self.findings if finding.kind == kind]
         missing = [finding for finding in self.findings if finding.kind in NOT_USABLE]
-        ordered = [*missing, *causes[:1], *costs[:1], *causes[1:], *self.findings]
+        # Also where there are doubts, but not where the result is of no use.
+        of_use = [] if self.status == "bad" else self.findings
+        to_correct = [finding for finding in of_use if finding.kind == CALIBRATED_ARM]
+        ordered = [*missing, *to_correct, *causes[:1], *costs[:1], *causes[1:], *self.findings]
         return tuple({id(finding): finding for finding in ordered}.values())
 
     @property

@@ -1,14 +1,16 @@
 """Probability that a pose error stays within tolerances of position, rotation, or both.
 
-An error x = L z has the covariance L L^T. Written as x = r L w, w is a uniform direction on the
-unit sphere, and r^2 is chi-square of d degrees of freedom, independent of it. x lies within a ball
-of radius m, and its rotation part within another, where r^2 is below the smaller of the squared
-ratios of radius to length of L w. So the probability is the mean over all w of the chi-square
-distribution there (Deak 1980; Genz and Bretz 2009, chapter 4): one smooth integral over a sphere,
-exact in r, also for correlated errors of position and rotation. It is evaluated at 4,096 evenly
-distributed points of the sphere. For a covariance whose scale was estimated with n degrees of
-freedom, r^2 / d is F of (d, n).
+An error x = o + L z has the known part o and the covariance L L^T. Written as x = o + r L w, w is a
+uniform direction on the unit sphere, and r^2 is chi-square of d degrees of freedom, independent of
+it. x lies within a ball of radius m, and its rotation part within another, where r is between the
+roots of two quadratic equations. So the probability is the mean over all w of the chi-square
+distribution between them (Deak 1980; Genz and Bretz 2009, chapter 4): one smooth integral over a
+sphere, exact in r, also for correlated errors of position and rotation. It is evaluated at 4,096
+evenly distributed points of the sphere. For a covariance whose scale was estimated with n degrees
+of freedom, r^2 / d is F of (d, n).
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import brentq
@@ -24,11 +26,15 @@ _FAR, _TOLERANCE = 1e3, 1e-9
 # So many times fewer points give them to this share.
 _FEW, _NEAR = 16, 0.03
 _ROUNDS = 40
-_EXACT, _FAR_WITHIN = 1e-60, 1e30
+_EXACT, _FAR_WITHIN = 1e-30, 1e15
 
 
 def chance_within(
-    spreads: FloatArray, turn_rad: float, shift_m: float, freedom: float = np.inf
+    spreads: FloatArray,
+    turn_rad: float,
+    shift_m: float,
+    freedom: float = np.inf,
+    offsets: FloatArray | None = None,
 ) -> float:
     """Probability that an error's rotation and position both stay within limits.
 
@@ -37,54 +43,79 @@ def chance_within(
         turn_rad: The limit of the rotation's angle; infinite for none.
         shift_m: The limit of the distance; likewise.
         freedom: Degrees of freedom of their scale; infinite where it is known.
+        offsets: (k, 6) known part of the error there; none by default.
     """
-    rotations_sq, positions_sq = _lengths(spreads)
-    squares = np.minimum(_ratio(turn_rad, rotations_sq), _ratio(shift_m, positions_sq))
-    return _mean_chance(squares, freedom)
+    errors, known = _errors(spreads, offsets)
+    return _mean_chance(
+        [
+            _crossings(errors[:, :3], known[:, :3], turn_rad),
+            _crossings(errors[:, 3:], known[:, 3:], shift_m),
+        ],
+        freedom,
+    )
 
 
-def radius_within(spreads: FloatArray, share: float, freedom: float = np.inf) -> float:
+def radius_within(
+    spreads: FloatArray,
+    share: float,
+    freedom: float = np.inf,
+    offsets: FloatArray | None = None,
+) -> float:
     """The least radius within which a share of the position errors stays [m].
 
     Other arguments are those of `chance_within`.
     """
-    positions_sq = _lengths(spreads)[1]
-    guess = float(np.sqrt(positions_sq.max()))
+    errors, known = (part[:, 3:] for part in _errors(spreads, offsets))
+    guess = float(np.linalg.norm(errors, axis=1).max() + np.linalg.norm(known, axis=1).max())
     if not guess > 0.0:
         return 0.0
 
-    def missing(logarithm: float, among: FloatArray) -> float:
-        return _mean_chance(_ratio(guess * float(np.exp(logarithm)), among), freedom) - share
+    def missing(logarithm: float, every: int) -> float:
+        limit = guess * float(np.exp(logarithm))
+        return _mean_chance([_crossings(errors[::every], known[::every], limit)], freedom) - share
 
     low, high = -np.log(_FAR), np.log(_FAR)
     # A few of the points bracket the root, all of them give it exactly.
-    about = brentq(missing, low, high, (positions_sq[::_FEW],), xtol=_NEAR)
+    about = brentq(missing, low, high, (_FEW,), xtol=_NEAR)
     low, high = (
-        limit if missing(near, positions_sq) * side < 0.0 else near
+        limit if missing(near, 1) * side < 0.0 else near
         for near, limit, side in ((about - _NEAR, low, -1.0), (about + _NEAR, high, 1.0))
     )
-    root = brentq(missing, low, high, (positions_sq,), xtol=_TOLERANCE)
+    root = brentq(missing, low, high, (1,), xtol=_TOLERANCE)
     # Rounded up, so that the share is reached at the radius.
     return guess * float(np.exp(root + 2.0 * _TOLERANCE))
 
 
-def _mean_chance(squares: FloatArray, freedom: float) -> float:
-    return float(np.mean(fdtr(_SIZE, min(freedom, _MOST_FREEDOM), squares / _SIZE)))
+def _mean_chance(crossings: Sequence[tuple[FloatArray, FloatArray]], freedom: float) -> float:
+    """Mean probability of an r between all lower and upper crossings (n,)."""
+    lowest = np.max([low for low, _ in crossings], axis=0)
+    highest = np.maximum(np.min([high for _, high in crossings], axis=0), lowest)
+    below, above = (
+        fdtr(_SIZE, min(freedom, _MOST_FREEDOM), radius**2 / _SIZE) for radius in (lowest, highest)
+    )
+    return float(np.mean(above - below))
 
 
-def _ratio(limit: float, squares: FloatArray) -> FloatArray:
-    """Squared limits over squared lengths, bounded for exact errors and infinite limits."""
-    return np.asarray(np.minimum(limit**2 / np.maximum(squares, _EXACT), _FAR_WITHIN))
+def _crossings(
+    errors: FloatArray, known: FloatArray, limit: float
+) -> tuple[FloatArray, FloatArray]:
+    """(n,) lower and upper r at which |known + r error| (n, 3) is the limit; equal for none."""
+    length = np.maximum(np.linalg.norm(errors, axis=1), _EXACT)
+    along = np.einsum("ni,ni->n", known, errors) / length
+    beside_sq = np.maximum(np.sum(known**2, axis=1) - along**2, 0.0)
+    half = np.sqrt(np.maximum(limit**2 - beside_sq, 0.0))
+    low, high = ((root - along) / length for root in (-half, half))
+    return np.clip(low, 0.0, _FAR_WITHIN), np.clip(high, 0.0, _FAR_WITHIN)
 
 
-def _lengths(spreads: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared lengths (n,) of rotation and position in even directions, cycling through poses."""
+def _errors(spreads: FloatArray, offsets: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """(n, 6) errors in even directions, cycling through poses, and the known parts there."""
     values, vectors = np.linalg.eigh(spreads)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     points = _directions()
-    errors = np.einsum("nij,nj->ni", roots[np.arange(len(points)) % len(roots)], points)
-    squares = errors**2
-    return squares[:, :3].sum(axis=1), squares[:, 3:].sum(axis=1)
+    at = np.arange(len(points)) % len(roots)
+    errors = np.einsum("nij,nj->ni", roots[at], points)
+    return errors, np.zeros_like(errors) if offsets is None else offsets[at]
 
 
 def _directions() -> FloatArray:

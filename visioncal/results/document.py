@@ -21,6 +21,7 @@ from visioncal.core.version import __version__
 from visioncal.estimation.chain import edge_names
 from visioncal.results.arm import StoredRobot
 from visioncal.results.cell import CellResult
+from visioncal.results.conditions import Condition
 from visioncal.results.edge import JointCovariance, StoredEdge
 from visioncal.results.frame import Frame
 from visioncal.results.lens import CameraResult, RayFrame
@@ -64,6 +65,7 @@ class CalibrationForm:
         rms: Residuals over the used views.
         validation: Residuals of views that were left out.
         verdict: Verdict with its reasons.
+        conditions: What it is valid for.
         need: Required accuracy of picks, and the probability of meeting it.
         frames: Tools and fixtures by transform name.
     """
@@ -84,6 +86,7 @@ class CalibrationForm:
     rms: Rms
     validation: Validation
     verdict: StoredVerdict
+    conditions: tuple[Condition, ...] = ()
     need: NeedMet | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
 
@@ -107,6 +110,7 @@ class CellForm:
         views: One entry for each observation.
         rms: Residuals over the used observations.
         verdict: Verdict with its reasons.
+        conditions: What it is valid for.
         need: Required accuracy of picks, and the probability of meeting it.
         validation: Residuals of left-out observations.
         frames: Tools and fixtures by transform name.
@@ -125,6 +129,7 @@ class CellForm:
     views: tuple[CellView, ...]
     rms: Rms
     verdict: StoredVerdict
+    conditions: tuple[Condition, ...] = ()
     need: NeedMet | None = None
     validation: Validation | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
@@ -135,8 +140,8 @@ class CellForm:
 
 # Fields of the forms that a calibration, or its cell, has under the same names.
 _CONVERTED = "schema visioncal session joint_covariance"
-_OF_PAIR = field_names_except(CalibrationForm, f"{_CONVERTED} ray_frame")
-_OF_CELL = field_names_except(CellForm, f"{_CONVERTED} views validation")
+_OF_PAIR = field_names_except(CalibrationForm, f"{_CONVERTED} ray_frame conditions")
+_OF_CELL = field_names_except(CellForm, f"{_CONVERTED} views validation conditions")
 
 
 def to_document(calibration: "Calibration") -> dict[str, Any]:
@@ -144,8 +149,9 @@ def to_document(calibration: "Calibration") -> dict[str, Any]:
     if calibration.cell is not None:
         return write(CellForm, _cell_form(calibration, calibration.cell))
     form = CalibrationForm(
-        # Derived from transform and camera; written for other readers.
+        # Derived from other sections; written for other readers.
         ray_frame=calibration.ray_frame,
+        conditions=calibration.conditions,
         **_head(calibration),
         **{name: getattr(calibration, name) for name in _OF_PAIR},
     )
@@ -157,6 +163,7 @@ def _cell_form(calibration: "Calibration", cell: CellResult) -> CellForm:
     return CellForm(
         views=tuple(CellView.of(cell.tree, view) for view in calibration.views),
         validation=validation if validation.is_of_unseen else None,
+        conditions=calibration.conditions,
         **_head(calibration),
         **{name: getattr(calibration, name) for name in _OF_CELL},
     )

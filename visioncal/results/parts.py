@@ -144,6 +144,8 @@ class VerdictForm:
         status: good, check or bad.
         reasons: Its reasons, in sentences.
         good_for_mm: Smallest need that it would be good for [mm]; absent where there is none.
+        good_for_mm_uncorrected: The same by the controller's own poses, where the arm was
+            calibrated along; `good_for_mm` then is for corrected targets.
         causes: Probable causes why it is not good, most probable first.
         findings: The findings behind the reasons.
     """
@@ -151,6 +153,7 @@ class VerdictForm:
     status: VerdictStatus
     reasons: tuple[str, ...]
     good_for_mm: float | None = None
+    good_for_mm_uncorrected: float | None = None
     causes: tuple[CauseForm, ...] = ()
     findings: tuple[Finding, ...] = ()
 
@@ -161,13 +164,14 @@ class VerdictForm:
             status=verdict.status,
             reasons=verdict.reasons,
             good_for_mm=verdict.good_for_mm,
+            good_for_mm_uncorrected=verdict.good_for_mm_uncorrected,
             causes=tuple(map(CauseForm.of, verdict.causes)),
             findings=verdict.findings,
         )
 
     def verdict(self, _: str) -> Verdict:
         """The verdict."""
-        return Verdict(self.status, self.findings, self.good_for_mm)
+        return Verdict(self.status, self.findings, self.good_for_mm, self.good_for_mm_uncorrected)
 
 
 StoredVerdict = Annotated[Verdict, WrittenForm(VerdictForm.of, VerdictForm.verdict, VerdictForm)]

@@ -26,6 +26,7 @@ from visioncal.estimation.chain import edge_names
 from visioncal.estimation.intervals import freedom_of
 from visioncal.results.arm import NOMINAL, ArmResult, ArmSections
 from visioncal.results.cell import CellResult
+from visioncal.results.conditions import Condition, conditions_of
 from visioncal.results.document import fields_from_document, to_document
 from visioncal.results.edge import Edge
 from visioncal.results.frame import Frame
@@ -101,6 +102,11 @@ class Calibration(CalibrationSections):
         if self.camera is None or edge not in self.edges:
             return None
         return ray_frame(edge, self.edges[edge], self.camera)
+
+    @cached_property
+    def conditions(self) -> tuple[Condition, ...]:
+        """What the result is valid for."""
+        return tuple(conditions_of(self))
 
     @cached_property
     def by_name(self) -> CellResult:

@@ -370,7 +370,7 @@ class CalibrationSections(ArmSections):
         rig: Estimated shape of the only rig of points, which has no name.
         rigs: Estimated shapes of the rigs by name.
         uncertainty: Uncertainty of a point located where the views look.
-        conditions: Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
+        means: Mean values over the used views, by the columns `ambient_c` and `payload_kg`.
         joint_fit: Parameters of the fit and their covariance, for verification.
         dense: Comparison of corners by dense image fits with template corners.
         touch_test: Result of a touch test.
@@ -385,7 +385,7 @@ class CalibrationSections(ArmSections):
     rig: RigResult | None = None
     rigs: Mapping[str, RigResult] = field(default_factory=dict)
     uncertainty: UncertaintyResult | NoiseIntervals | None = None
-    conditions: Mapping[str, float] = field(default_factory=dict)
+    means: Mapping[str, float] = field(default_factory=dict)
     joint_fit: JointFit | None = None
     dense: DenseResult | None = None
     touch_test: TouchTest | None = None

@@ -238,7 +238,7 @@ def _contradictions(declaration: Declaration, observed: bool) -> Iterator[tuple[
         yield from _plural_contradictions(declaration, kind)
     yield from _prior_contradictions(declaration)
     need = declaration.need
-    if need is not None and need.mm is None and need.deg is None:
+    if need is not None and need.mm is None and need.deg is None and not need.corrected:
         yield "need", "says neither mm nor deg: give how near picks have to come"
     if need is not None and (wrong := need.wrong_place()):
         yield "need.at", wrong

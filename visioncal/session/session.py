@@ -336,18 +336,24 @@ class Session:
         return replace(self, streams=ordered, warnings=(*self.warnings, *gap_warnings(ordered)))
 
     @typed
-    def needing(self, mm: float | None = None, deg: float | None = None) -> "Session":
+    def needing(
+        self, mm: float | None = None, deg: float | None = None, *, corrected: bool = False
+    ) -> "Session":
         """The session with another required accuracy; a value of None keeps the declared one.
 
         Args:
             mm: Required accuracy of picks [mm].
             deg: The same in rotation [deg].
+            corrected: Whether targets are corrected for a calibrated arm; False keeps what is
+                declared.
 
         Raises:
             DataError: One is not a number above 0.
         """
         given = {"mm": mm, "deg": deg}
-        asked = {name: float(value) for name, value in given.items() if value is not None}
+        asked: dict[str, float | bool] = {
+            name: float(value) for name, value in given.items() if value is not None
+        }
         for name, value in asked.items():
             if not 0.0 < value < np.inf:
                 raise DataError(
@@ -355,6 +361,8 @@ class Session:
                     culprits=[f"--need-{name}"],
                     next_step=f"Give how near picks have to come, as --need-{name} 0.5.",
                 )
+        if corrected:
+            asked["corrected"] = True
         if not asked:
             return self
         table = {**self.document.get("need", {}), **asked}
@@ -364,7 +372,13 @@ class Session:
     def need(self) -> Need | None:
         """Required accuracy of the task; None where not declared."""
         table = self.declaration.need
-        return None if table is None else table.need
+        is_stated = table is not None and (table.mm is not None or table.deg is not None)
+        return table.need if table is not None and is_stated else None
+
+    @property
+    def corrects_targets(self) -> bool:
+        """Whether targets are corrected for a calibrated arm before they are sent."""
+        return self.declaration.need is not None and self.declaration.need.corrected
 
     @typed
     def save(self, folder: Path | str) -> None:

@@ -90,6 +90,7 @@ class NeedTable(TableModel):
 
     mm: Positive | None = None
     deg: Positive | None = None
+    corrected: bool = False
     # "views" or three numbers: checked by `wrong_place`.
     at: Any = VIEWS
 
@@ -97,9 +98,9 @@ class NeedTable(TableModel):
     def need(self) -> Need:
         """The typed need."""
         if self.at == VIEWS:
-            return Need(self.mm, self.deg)
+            return Need(self.mm, self.deg, corrected=self.corrected)
         x, y, z = map(float, self.at)
-        return Need(self.mm, self.deg, (x, y, z))
+        return Need(self.mm, self.deg, (x, y, z), self.corrected)
 
     def wrong_place(self) -> str:
         """Message for an invalid `at`; empty where it is valid."""

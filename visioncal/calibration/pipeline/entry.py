@@ -40,6 +40,7 @@ def calibrate(
     convention: Convention | None = None,
     need_mm: float | None = None,
     need_deg: float | None = None,
+    corrected: bool = False,
     progress: Progress | None = None,
     dense: bool = False,
     device: str = "auto",
@@ -62,6 +63,8 @@ def calibrate(
             `modified` or `hayati`; None for the stated one, or Hayati's where axes are parallel.
         need_mm: Required accuracy of picks [mm]; replaces that of `[need]`.
         need_deg: The same in rotation [deg].
+        corrected: Whether targets are corrected for a calibrated arm before they are sent; else the
+            verdict is about picks by the controller's own poses.
         progress: Called with the progress of long work.
         dense: Whether to fit corners to all pixels around them, for blurred, moving and badly lit
             images; needs the extra `dense`. Dense corners are kept only where left-out views are
@@ -87,7 +90,7 @@ def calibrate(
         threads=threads,
     )
     state = initial_state(session, **asked)
-    with_need = state.session.needing(need_mm, need_deg)
+    with_need = state.session.needing(need_mm, need_deg, corrected=corrected)
     state = replace(state, session=with_need, given_corners=corners)
     if dense:
         return run_dense(state.session, device=device, **asked).calibration

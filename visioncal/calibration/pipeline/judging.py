@@ -33,6 +33,7 @@ from visioncal.calibration.stages.findings import (
 )
 from visioncal.calibration.stages.need import PickInputs, predict_picks
 from visioncal.calibration.stages.priors import prior_findings
+from visioncal.core.conventions import controller_form
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import counted, figure, mm_and_deg, some_of
 from visioncal.core.transforms import invert
@@ -105,7 +106,24 @@ def findings_of(run: RunState) -> Findings:
         run.session.need,
         predict_picks(_pick_inputs(run), run.session.need),
         None if run.mount else _sole_static_view(solved.cell, answer.last_edges),
+        run.session.corrects_targets,
+        _use(run),
     )
+
+
+def _use(run: RunState) -> Remedy:
+    """How a good result is used: in the robot's own program, or to locate things by it."""
+    form = None if run.robot is None else controller_form(run.robot.name)
+    if run.mount is None:
+        words, command = "Take the frames to another program", "export OUT --to ros --edge all"
+    elif form is not None:
+        words, command = "Take the transform to the robot", f"export OUT --to {form.name}"
+    elif run.mount == "instrument":
+        words, command = "Take the transform to another program", "export OUT --to text"
+    else:
+        words, command = "Locate things by the camera", "locate SESSION -c OUT"
+    again = "visioncal verify compares later stops with it."
+    return Remedy(f"{words}, and keep the result: {again}", f"visioncal {command}")
 
 
 def _sole_static_view(cell: Cell, edges: Mapping[str, Edge]) -> StandingTie | None:

@@ -99,7 +99,7 @@ def result_of(run: RunState) -> Calibration:
         boards=boards,
         rigs=rigs,
         cell=cell,
-        need=need_met(findings.need, findings.picks, whole=cell is not None),
+        need=need_met(findings.need, findings.judged_picks, whole=cell is not None),
     )
     return calibration if cell is not None else _complete_pair(calibration, run, names)
 
@@ -126,7 +126,7 @@ def _complete_pair(
         rig=next(iter(calibration.rigs.values()), None) if is_unnamed else None,
         rigs={} if is_unnamed else calibration.rigs,
         uncertainty=_uncertainty(run),
-        conditions=_conditions_of(run),
+        means=_means_of(run),
         joint_fit=_joint_fit_of(run),
         **vars(_arm(run)),
     )
@@ -253,8 +253,8 @@ def _joint_fit_of(run: RunState) -> JointFit | None:
     )
 
 
-def _conditions_of(run: RunState) -> dict[str, float]:
-    """The mean conditions of the used views, of those that all used views state."""
+def _means_of(run: RunState) -> dict[str, float]:
+    """The means of `CONDITIONS` over the used views, of those that all used views state."""
     views = [view for view in run.session.views if view.number in run.used]
     return {
         name: float(np.mean([view.numbers[name] for view in views]))

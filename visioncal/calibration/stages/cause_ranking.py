@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from visioncal.calibration.stages.need import Picks
+from visioncal.calibration.stages.need import CONTROLLER, Picks
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.quantiles import chi2_limit
@@ -145,6 +145,14 @@ _STATED_BETTER = (MEASURE_BOARD, REFINE_LENS)
 NO_JOINTS = Remedy(
     "Record joint angles with the poses, and name the arm as [robot] model in session.toml: "
     "calibrate then estimates the arm, too."
+)
+
+
+# Remedy where the arm was calibrated, and the controller moves by its own model of it.
+CORRECT = Remedy(
+    "Correct targets for the calibrated arm before they are sent, and calibrate with --corrected: "
+    "the verdict then is about them.",
+    "visioncal correct targets.csv --against OUT -o corrected.csv",
 )
 
 
@@ -407,6 +415,11 @@ _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
         "robot_noise_of_pick",
         "the robot's own noise where it picks, which no calibration changes",
         Remedy("Take a robot that repeats better, or a gripper that forgives."),
+    ),
+    CONTROLLER: (
+        "uncorrected_targets",
+        "the controller's own model of the arm, which the calibration corrects",
+        CORRECT,
     ),
     "arm": ("arm_errors", "the arm's own errors, which more views do not change", NO_JOINTS),
     "left out": (

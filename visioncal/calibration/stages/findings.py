@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from visioncal.calibration.stages.need import Picks
 from visioncal.core.types import Mount, Need, Rejection
-from visioncal.core.verdict import Finding
+from visioncal.core.verdict import Finding, Remedy
 from visioncal.estimation.observability import Direction
 from visioncal.results import Rms, ViewResult
 from visioncal.results.views import holdout_rms, left_out_rms, rms_of
@@ -136,8 +136,11 @@ class Findings:
         notes: Their remarks that are no reason for doubt.
         mount: Mount of the sensor.
         need: Required accuracy; None where it is not stated.
-        picks: Error budgets of picks by camera and robot; empty where they are not predicted.
+        picks: Error budgets of picks by camera and robot, with targets that are corrected where the
+            arm was calibrated; empty where they are not predicted.
         tie: The only connection of the worst frame; None where there are more.
+        corrects_targets: Whether targets are corrected for a calibrated arm.
+        use: How a good result is used.
     """
 
     pairs: Sequence[JudgedPair]
@@ -151,6 +154,15 @@ class Findings:
     need: Need | None = None
     picks: Sequence[Picks] = ()
     tie: StandingTie | None = None
+    corrects_targets: bool = False
+    use: Remedy | None = None
+
+    @property
+    def judged_picks(self) -> tuple[Picks, ...]:
+        """Picks as the task makes them: by the controller's own poses, unless it corrects them."""
+        if self.corrects_targets:
+            return tuple(self.picks)
+        return tuple(pick.uncorrected or pick for pick in self.picks)
 
     @property
     def plannable(self) -> bool:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import is_negligible, rank_causes
+from visioncal.calibration.stages.cause_ranking import CORRECT, is_negligible, rank_causes
 from visioncal.calibration.stages.doubts import (
     collect_findings,
     is_scattered,
@@ -17,17 +17,18 @@ from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, percent, rounded_up
 from visioncal.core.verdict import (
     AGREEMENT,
+    CALIBRATED_ARM,
     GOOD_FOR,
     NEED,
     NO_DOUBTS,
     NOTE,
     Finding,
-    Remedy,
     Verdict,
     VerdictStatus,
     remarks,
 )
 from visioncal.results import NeedMet
+from visioncal.results.conditions import uncorrected_words
 
 
 def judge(findings: Findings) -> Verdict:
@@ -44,7 +45,10 @@ def judge(findings: Findings) -> Verdict:
     findings = replace(findings, warnings=warnings, notes=notes)
     doubts = collect_findings(findings)
     good_for_mm = _good_for_mm(findings.picks, doubts)
-    met = need_met(findings.need, findings.picks)
+    uncorrected = [pick.uncorrected or pick for pick in findings.picks]
+    is_calibrated = any(pick.uncorrected is not None for pick in findings.picks)
+    uncorrected_mm = _good_for_mm(uncorrected, doubts) if is_calibrated else None
+    met = need_met(findings.need, findings.judged_picks)
     status: VerdictStatus = "good" if not doubts else "check"
     if met is None:
         status = "bad" if any(doubt.is_fatal for doubt in doubts) else status
@@ -58,7 +62,7 @@ def judge(findings: Findings) -> Verdict:
     if status != "good":
         ordered = rank_causes(
             ordered,
-            findings.picks,
+            findings.picks if met is None else findings.judged_picks,
             met,
             more=remedy_for_uncertainty(findings),
             left_out_mm=findings.held_out.mm,
@@ -72,7 +76,14 @@ def judge(findings: Findings) -> Verdict:
         stated.insert(place, Finding(NEED, _need_words(findings, met)))
     stated += [] if doubts else [_agreement(findings, is_enough=status == "good")]
     stated += [warning for warning in findings.warnings if warning.kind in NO_DOUBTS]
-    return Verdict(status, (*stated, *remarks(findings.notes, NOTE)), good_for_mm)
+    verdict = Verdict(
+        status, (*stated, *remarks(findings.notes, NOTE)), good_for_mm, uncorrected_mm
+    )
+    if not is_calibrated:
+        return verdict
+    step = None if findings.corrects_targets else CORRECT
+    found = Finding(CALIBRATED_ARM, uncorrected_words(verdict), step)
+    return replace(verdict, findings=(*verdict.findings, found))
 
 
 def _good_for_mm(picks: Sequence[Picks], doubts: Sequence[Finding]) -> float | None:
@@ -93,28 +104,28 @@ def _good_for(
     sensor = "instrument" if worst.camera.startswith("instrument") else "camera"
     words = (
         f"It {verb} good for tasks of {figure(rounded_up(good_for_mm))} mm and more at "
-        f"{figure(worst.distance_m)} m from the {sensor}."
+        f"{figure(worst.distance_m)} m from the {sensor}"
+        f"{'' if worst.uncorrected is None else ', with corrected targets'}."
     )
     return (Finding(GOOD_FOR, words),)
 
 
 def _need_words(findings: Findings, met: NeedMet) -> str:
     """States the probability that picks are within the need."""
-    need, worst = met.need, min(findings.picks, key=lambda pick: pick.probability(met.need))
+    need, picks = met.need, findings.judged_picks
+    worst = min(picks, key=lambda pick: pick.probability(need))
     within = [f"{value:g} {unit}" for value, unit in ((need.mm, "mm"), (need.deg, "deg")) if value]
     where = "where the views looked" if need.at == "views" else f"at {list(need.at)} m in the base"
-    who = f" by robot {worst.robot} of what {worst.camera} sees" if len(findings.picks) > 1 else ""
+    who = f" by robot {worst.robot} of what {worst.camera} sees" if len(picks) > 1 else ""
+    by = "by the controller's own poses " if worst.offsets is not None else ""
+    by = "with corrected targets " if worst.uncorrected is not None else by
     return (
-        f"A pick{who} {where} lands within {' and '.join(within)} with a probability of "
+        f"A pick{who} {by}{where} lands within {' and '.join(within)} with a probability of "
         f"{percent(met.probability)}; 95 % land within {worst.stays_within(need)}."
     )
 
 
 def _agreement(findings: Findings, *, is_enough: bool) -> Finding:
-    keep = Remedy(
-        "Use the result with its covariance, and keep it: visioncal verify and visioncal diff "
-        "compare later stops with it."
-    )
     used = sum(view.used for view in findings.views)
     worst_known = "".join(
         f", and {worst.words}, its worst direction, is known to {figure(1e3 * worst.sigma)} mm"
@@ -124,5 +135,5 @@ def _agreement(findings: Findings, *, is_enough: bool) -> Finding:
         AGREEMENT,
         f"All {used} used views agree: left out of the fit, they are predicted to "
         f"{findings.held_out.words} (rms){worst_known}.",
-        keep if is_enough else None,
+        findings.use if is_enough else None,
     )

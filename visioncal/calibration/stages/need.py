@@ -19,6 +19,11 @@ arm has posture-dependent errors, calibrated or not, the position is compared wi
 whole chain: the errors of its first and last link are the same in all views, are absorbed by the
 frames of camera and target, and recur when the arm picks. Of errors that are not significant, only
 those of links are treated so.
+
+A calibrated arm reaches its targets where they are corrected (`visioncal correct`). By the
+controller's own poses it misses them by what was calibrated, which is known at each view, and adds
+to the above: one that carries its camera looks in the posture of one view, and picks in that of
+another.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +37,7 @@ from visioncal.calibration.stages.validate import HeldOutResiduals
 from visioncal.core.limits import NeedLimits
 from visioncal.core.number_format import figure, rounded_up
 from visioncal.core.quantiles import chi2_limit
-from visioncal.core.transforms import adjoint, apply_each, invert, skew
+from visioncal.core.transforms import adjoint, apply_each, invert, log, skew
 from visioncal.core.types import FloatArray, IntArray, Need
 from visioncal.estimation.arm import ArmErrors, misfit_jacobian
 from visioncal.estimation.problem import Problem
@@ -41,6 +46,11 @@ from visioncal.estimation.solve import Solution
 from visioncal.estimation.tolerance_probability import chance_within, radius_within
 from visioncal.results import NeedMet, Picker
 from visioncal.session.frames import object_name
+
+# Source of what a calibrated arm misses by the controller's own poses.
+CONTROLLER = "controller"
+# So many pairs of views are picked by at most: twenty for each of fifty views.
+_MOST_PAIRS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +65,9 @@ class Picks:
             at k positions.
         freedom: Degrees of freedom of the noise estimate.
         distance_m: Mean distance of the positions from the camera.
+        offsets: (k, 6) known error, of the controller's own poses; None for targets that are
+            corrected, or need not be.
+        uncorrected: The same picks by the controller's own poses; None where the arm is nominal.
     """
 
     camera: str
@@ -62,6 +75,8 @@ class Picks:
     parts: Mapping[str, FloatArray]
     freedom: float
     distance_m: float
+    offsets: FloatArray | None = None
+    uncorrected: "Picks | None" = None
 
     @property
     def covariances(self) -> FloatArray:
@@ -72,23 +87,29 @@ class Picks:
         """The probability that a pick at one of the positions is within a need."""
         turn_rad = np.inf if need.deg is None else float(np.deg2rad(need.deg))
         shift_m = np.inf if need.mm is None else 1e-3 * need.mm
-        return chance_within(self.covariances, turn_rad, shift_m, self.freedom)
+        return chance_within(self.covariances, turn_rad, shift_m, self.freedom, self.offsets)
 
     def without(self, source: str) -> "Picks":
         """Picks without the error of one source."""
+        if source == CONTROLLER:
+            return replace(self, offsets=None)
         parts = {name: part for name, part in self.parts.items() if name != source}
         return replace(self, parts=parts or {"none": np.zeros_like(self.parts[source])})
 
     @cached_property
     def good_for_mm(self) -> float:
         """The least need of position alone that would be met [mm]."""
-        return 1e3 * radius_within(self.covariances, NeedLimits.probability[0], self.freedom)
+        return 1e3 * radius_within(
+            self.covariances, NeedLimits.probability[0], self.freedom, self.offsets
+        )
 
     @cached_property
     def good_for_deg(self) -> float:
         """The least need of rotation alone that would be met [deg]."""
         turned = np.roll(self.covariances, 3, axis=(1, 2))
-        return float(np.rad2deg(radius_within(turned, NeedLimits.probability[0], self.freedom)))
+        offsets = None if self.offsets is None else np.roll(self.offsets, 3, axis=1)
+        share = NeedLimits.probability[0]
+        return float(np.rad2deg(radius_within(turned, share, self.freedom, offsets)))
 
     @property
     def budget_mm(self) -> dict[str, float]:
@@ -101,8 +122,11 @@ class Picks:
         return {name: float(np.rad2deg(value)) for name, value in self._budget(slice(3)).items()}
 
     def _budget(self, axes: slice) -> dict[str, float]:
-        budget = {}
-        for name, covariances in {**self.parts, "total": self.covariances}.items():
+        budget, known, total = {}, {}, self.covariances
+        if self.offsets is not None:
+            known = {CONTROLLER: self.offsets[:, :, None] * self.offsets[:, None]}
+            total = total + known[CONTROLLER]
+        for name, covariances in {**self.parts, **known, "total": total}.items():
             squares = np.trace(covariances[:, axes, axes], axis1=1, axis2=2)
             # Of two sources that compensate, one may be negative.
             budget[name] = float(max(squares.mean(), 0.0) ** 0.5)
@@ -262,13 +286,54 @@ def _picks(
     if as_noise is not None and not as_noise.of_links:
         by_source["pick"] = by_source["pick"] + carried * _at_points(by_posture, at_m)
     by_source["left out"] = np.broadcast_to(_excess_covariance(fitted), parts["look"].shape)
-    return Picks(
+    picks = Picks(
         camera,
         robot,
         {name: array for name, array in by_source.items() if array.any()},
         fitted.freedom.get(robot, np.inf),
         float(np.linalg.norm(in_camera, axis=1).mean()),
     )
+    return replace(picks, uncorrected=_uncorrected(picks, fitted, in_base, at_m, whole=whole))
+
+
+def _uncorrected(
+    picks: Picks, fitted: PickInputs, in_base: FloatArray, at_m: FloatArray, *, whole: bool
+) -> Picks | None:
+    """The same picks by the controller's own poses; None where these are the arm's.
+
+    Args:
+        picks: Picks at the n observations.
+        fitted: Their fit.
+        in_base: (n, 4, 4) `base_from_target`.
+        at_m: (n, 3) the positions, in the targets' frames where `whole`, else in the base [m].
+        whole: Whether the picks are in the targets' frames.
+    """
+    problem, arm = fitted.problem, fitted.arms.get(picks.robot)
+    if arm is None or (arm.model is None and arm.drift is None):
+        return None
+    stops = problem.observations.stops
+    flange = problem.poses[picks.robot][stops]
+    carry = adjoint((invert(in_base) if whole else np.eye(4)) @ flange)
+    missed = carry @ log(invert(flange) @ arm.reported[stops])[:, :, None]
+    offsets = missed[:, :, 0]
+    offsets[:, 3:] -= np.cross(at_m, offsets[:, :3])
+    base = problem.tree.bases[picks.robot]
+    carried = {
+        _is_between(problem, observer, base, picks.robot)
+        for observer in problem.observations.observers
+    }
+    if carried != {True} or len(offsets) < 2:
+        return replace(picks, offsets=offsets)
+    # It looks in the posture of one view, and picks in that of another.
+    looks, after = np.arange(len(offsets)), np.arange(1, len(offsets))
+    after = after[:: -(-len(looks) * len(after) // _MOST_PAIRS)]
+    goes = ((looks + after[:, None]) % len(looks)).ravel()
+    looks = np.tile(looks, len(after))
+    turn = np.zeros((len(offsets), 6, 6))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = in_base[:, :3, :3] if whole else np.eye(3)
+    offsets = (turn @ offsets[:, :, None])[:, :, 0]
+    parts = {name: (turn @ part @ turn.mT)[looks] for name, part in picks.parts.items()}
+    return replace(picks, parts=parts, offsets=offsets[looks] - offsets[goes])
 
 
 def _noise_covariance(level: FloatArray) -> FloatArray:

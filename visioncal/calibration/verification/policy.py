@@ -126,7 +126,7 @@ def facts_of(
         now: The time; that of the clock where None.
     """
     values, unknown = {}, {}
-    before = calibration.conditions
+    before = calibration.means
     for quantity, column in _COLUMNS.items():
         readings = [view.numbers[column] for view in session.views if column in view.numbers]
         if column not in before:
