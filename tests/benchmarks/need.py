@@ -306,9 +306,9 @@ def main_of_arms(cells: int) -> None:
             )
     head = ("cells", "picks by", "count", "stated [mm]", "95 % within [mm]", "landed [%]")
     known = 1e5 * MEASURED.square_sigma_m / MEASURED.square_m
-    text = f"""{cells} simulated cells of 20 to 60 views with joint angles, both mounts; links are off
-by 0.05 to 0.5 mm and twice as many mrad, and the arm repeats to 0.02 mm and 0.03 mrad; the board is
-known to {known:.0f} in 100,000. Of each, {PICKS_BY_ARM} picks with new noise.
+    text = f"""{cells} simulated cells of 20 to 60 views with joint angles, both mounts; links are
+off by 0.05 to 0.5 mm and twice as many mrad, and the arm repeats to 0.02 mm and 0.03 mrad; the
+board is known to {known:.0f} in 100,000. Of each, {PICKS_BY_ARM} picks with new noise.
 `good_for_mm_uncorrected` and `good_for_mm` state within how much 95 % land; medians over the cells,
 and the mean share that lands within, with its standard error.
 {cells - len(found)} arms were not calibrated, or have unexplained errors.

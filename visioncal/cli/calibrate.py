@@ -57,6 +57,14 @@ def calibrate_command(
             "is calibrated from all of them.",
         ),
     ] = False,
+    corrected: Annotated[
+        bool,
+        typer.Option(
+            "--corrected",
+            help="Targets are corrected for the calibrated arm (visioncal correct) before they are "
+            "sent; else the verdict is about picks by the controller's own poses.",
+        ),
+    ] = False,
     dense: Annotated[
         bool,
         typer.Option(
@@ -97,7 +105,10 @@ def calibrate_command(
     # Of several sessions, the recording is that of the joined session.
     session = sessions[0] if len(sessions) == 1 else out / RECORDING
     with with_run_paths(session, out):
-        loaded = _joined([need.session(session) for session in sessions], shared=robot_shared)
+        loaded = _joined(
+            [need.session(session, corrected=corrected) for session in sessions],
+            shared=robot_shared,
+        )
         if views is not None:
             loaded = loaded.only(views_in(views, "--views"))
     asked = CalibrationOptions(

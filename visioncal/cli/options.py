@@ -85,15 +85,15 @@ class NeedOptions:
     ] = None
     need_deg: Annotated[float | None, typer.Option(help="The same in rotation, in degrees.")] = None
 
-    def session(self, path: Path) -> "Session":
-        """Loads a session with this need.
+    def session(self, path: Path, *, corrected: bool) -> "Session":
+        """Loads a session with this need, for targets that are corrected or not.
 
         Raises:
             DataError: It cannot be read, or the need is no positive number.
         """
         from visioncal.session import Session
 
-        return Session.load(path).needing(self.need_mm, self.need_deg)
+        return Session.load(path).needing(self.need_mm, self.need_deg, corrected=corrected)
 
 
 @dataclass(frozen=True)

@@ -49,11 +49,13 @@ def print_summary(calibration: Calibration, *, verbose: bool) -> None:
     """Prints a result: the verdict first, then the transforms and errors."""
     console, cell = answers(), calibration.cell
     print_verdict(calibration.verdict, calibration.session_name)
+    for words in calibration.unstated_conditions:
+        console.print(f"[bold yellow]only where:[/] {escape(words)}")
     if cell is not None:
         console.print(f"the cell's frame is that of {cell.reference}")
     for name, edge in calibration.edges.items():
-        no_rotation = "" if edge.oriented else ", its rotation not measured"
-        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}{no_rotation}")
+        console.print(f"{name}: {edge.place_words()}, {edge.sigma_words}")
+        console.print(f"  {edge.rotation_words(calibration.controller)}")
     if cell is not None:
         _print_noise(cell)
     else:

@@ -100,7 +100,9 @@ POSE_FORMS: Mapping[str, PoseForm] = {
             "euler-xyz-deg",
             r"yaskawa|motoman|gp\d|hc\d",
         ),
-        PoseForm("abb", "ABB pos and orient", "mm", "quaternion-wxyz", r"abb|irb|gofa|yumi"),
+        PoseForm(
+            "abb", "ABB X, Y, Z, q1, q2, q3, q4", "mm", "quaternion-wxyz", r"abb|irb|gofa|yumi"
+        ),
         PoseForm(
             "staubli", "Staubli X, Y, Z, Rx, Ry, Rz", "mm", "euler-XYZ-deg", r"staubli|tx2?\d|ts2"
         ),

@@ -7,9 +7,11 @@ from typing import Annotated
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from visioncal.core.choices import PoseForm as PoseNotation
 from visioncal.core.codec import Array, WrittenForm
+from visioncal.core.conventions import ROTATION_FORMS
 from visioncal.core.errors import DataError
-from visioncal.core.number_format import figure
+from visioncal.core.number_format import figure, fixed
 from visioncal.core.types import FloatArray
 
 # Largest difference between the forms of one pose, rounded to six places [m, rad].
@@ -17,6 +19,8 @@ _SAME = 5e-6
 # Tolerance of correlations for symmetry and definiteness: rounding of J C J^T is amplified where a
 # rotation is known much better than the translation.
 _ROUNDING = 1e-3
+# A tenth of a millidegree, and less of a quaternion or in radians: under any sigma of a camera.
+_DEGREE_DECIMALS, _RADIAN_DECIMALS = 4, 6
 
 
 class PoseSigmas:
@@ -67,6 +71,24 @@ class Edge(PoseSigmas):
         """Its translation in words, in millimetres with `decimals` decimals."""
         x, y, z = (f"{1e3 * value:.{decimals}f}" for value in self.transform.translation)
         return f"({x}, {y}, {z}) mm"
+
+    def rotation_words(self, controller: PoseNotation | None = None) -> str:
+        """Its rotation in words: as a rotation vector, and as a robot's controller states it."""
+        if not self.oriented:
+            return "rotation not measured"
+        forms = [("rotation vector", "rotation-vector-deg", "deg")]
+        if controller is not None:
+            names = controller.words.partition("Z, ")[2] or "rx, ry, rz"
+            unit = "" if "quaternion" in controller.rotation else controller.rotation[-3:]
+            unit = "rad" if controller.rotation == "rotation-vector" else unit
+            forms.append((f"{controller.name.upper()} {names}", controller.rotation, unit))
+        stated = []
+        for name, rotation, unit in forms:
+            numbers = ROTATION_FORMS[rotation].write(self.matrix[None, :3, :3])[0]
+            decimals = _DEGREE_DECIMALS if unit == "deg" else _RADIAN_DECIMALS
+            listed = ", ".join(fixed(number, decimals) for number in numbers)
+            stated.append(f"{name} ({listed}) {unit}".strip())
+        return ", ".join(stated)
 
 
 def _covariance_fault(matrix: FloatArray) -> str:

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from visioncal.core.arguments import typed
-from visioncal.core.choices import DYNAMICS_FILE
+from visioncal.core.choices import DYNAMICS_FILE, PoseForm
 from visioncal.core.codec import entries, reading
+from visioncal.core.conventions import controller_form
 from visioncal.core.documents import parse_stored
 from visioncal.core.errors import DataError
 from visioncal.core.files import read_bytes, write_atomically
@@ -107,6 +108,23 @@ class Calibration(CalibrationSections):
     def conditions(self) -> tuple[Condition, ...]:
         """What the result is valid for."""
         return tuple(conditions_of(self))
+
+    @property
+    def unstated_conditions(self) -> tuple[str, ...]:
+        """The conditions that no finding of the verdict states, in words."""
+        stated = [finding.words for finding in self.verdict.findings]
+        return tuple(
+            condition.words
+            for condition in self.conditions
+            if not any(words in condition.sentence for words in stated)
+        )
+
+    @property
+    def controller(self) -> PoseForm | None:
+        """The pose notation of the robot's own controller; None where unknown."""
+        robots = [robot.model for robot in self.by_name.robots.values() if robot.model is not None]
+        forms = [controller_form(robot.name) for robot in robots]
+        return forms[0] if forms and len(set(forms)) == 1 else None
 
     @cached_property
     def by_name(self) -> CellResult:
@@ -233,7 +251,7 @@ class Calibration(CalibrationSections):
 
     def _repr_html_(self) -> str:
         steps = (f"Next: {step}" for step in self.verdict.next_steps[:1])
-        says = (*self.verdict.top, *steps)
+        says = (*self.verdict.top, *self.unstated_conditions, *steps)
         title = f"Calibration of {self.session_name}"
         return html_card(title, self._facts, self.verdict.status, says)
 
@@ -246,7 +264,8 @@ class Calibration(CalibrationSections):
             "views used": f"{used} of {len(self.views)}",
             "left out, predicted to": f"{figure(left_out.mm)} mm{turned}",
             **{
-                name: f"{edge.place_words()}, {edge.sigma_words}"
+                name: f"{edge.place_words()}, {edge.rotation_words(self.controller)}, "
+                f"{edge.sigma_words}"
                 for name, edge in [*self.placed.items()][:_SHOWN]
             },
         }

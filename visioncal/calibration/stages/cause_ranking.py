@@ -28,7 +28,9 @@ from visioncal.calibration.stages.need import CONTROLLER, Picks
 from visioncal.core.limits import CalibrationLimits, NeedLimits
 from visioncal.core.number_format import figure, percent
 from visioncal.core.quantiles import chi2_limit
+from visioncal.core.types import Need
 from visioncal.core.verdict import (
+    CALIBRATE,
     EXCHANGED,
     GOOD_FOR,
     PLAN,
@@ -148,12 +150,18 @@ NO_JOINTS = Remedy(
 )
 
 
-# Remedy where the arm was calibrated, and the controller moves by its own model of it.
-CORRECT = Remedy(
-    "Correct targets for the calibrated arm before they are sent, and calibrate with --corrected: "
-    "the verdict then is about them.",
-    "visioncal correct targets.csv --against OUT -o corrected.csv",
-)
+def correcting(need: Need | None) -> Remedy:
+    """Advice to correct targets for a calibrated arm; with a need, to have it judged so."""
+    words = "Correct targets for the calibrated arm before they are sent"
+    correct = "visioncal correct targets.csv --against OUT -o corrected.csv"
+    if need is None:
+        return Remedy(f"{words}.", correct)
+    limits = (("mm", need.mm), ("deg", need.deg))
+    options = "".join(f" --need-{unit} {limit:g}" for unit, limit in limits if limit is not None)
+    return Remedy(
+        f"{words}; with --corrected, the verdict is about them.",
+        f"{CALIBRATE} --corrected{options} && {correct}",
+    )
 
 
 def add_views_remedy(words: str, *, modelled: bool, purpose: str = "") -> Remedy:
@@ -419,7 +427,7 @@ _SOURCES: Mapping[str, tuple[str, str, Remedy | None]] = {
     CONTROLLER: (
         "uncorrected_targets",
         "the controller's own model of the arm, which the calibration corrects",
-        CORRECT,
+        None,
     ),
     "arm": ("arm_errors", "the arm's own errors, which more views do not change", NO_JOINTS),
     "left out": (
@@ -444,6 +452,7 @@ def _sources(picks: Sequence[Picks], met: NeedMet | None, more: Remedy | None) -
         if size**2 < _LEAST_SHARE * total**2:
             continue
         kind, words, do = _SOURCES[name]
+        do = correcting(need) if name == CONTROLLER else do
         rest = worst.without(name)
         without = f"Without this part 95 % of picks land within {rest.stays_within(need)}"
         if met is not None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from visioncal.calibration.stages.cause_ranking import CORRECT, is_negligible, rank_causes
+from visioncal.calibration.stages.cause_ranking import correcting, is_negligible, rank_causes
 from visioncal.calibration.stages.doubts import (
     collect_findings,
     is_scattered,
@@ -81,7 +81,7 @@ def judge(findings: Findings) -> Verdict:
     )
     if not is_calibrated:
         return verdict
-    step = None if findings.corrects_targets else CORRECT
+    step = None if findings.corrects_targets else correcting(findings.need)
     found = Finding(CALIBRATED_ARM, uncorrected_words(verdict), step)
     return replace(verdict, findings=(*verdict.findings, found))
 

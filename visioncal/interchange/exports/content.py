@@ -12,6 +12,7 @@ from visioncal.core.files import one_line
 from visioncal.core.number_format import figure
 from visioncal.core.types import FloatArray, Mount
 from visioncal.results import CameraResult, Edge, Verdict
+from visioncal.results.conditions import Condition
 from visioncal.results.lens import RefittedLens, fit_coefficients
 
 _OF_LENS = "it goes with the lens of that calibration: with other intrinsics, use its ray_frame"
@@ -98,6 +99,7 @@ class Content:
         frames: Our own names of parent and child.
         lens: The camera, where there is one.
         origin: Where the result comes from, in one line.
+        conditions: Under which the transform holds.
         rotation_of: Our name of the frame whose rotation was copied; None where it was measured.
     """
 
@@ -110,6 +112,7 @@ class Content:
     lens: CameraResult | None
     origin: str
     verdict: Verdict
+    conditions: tuple[Condition, ...] = ()
     rotation_of: str | None = None
     number: int | None = None
     load: Load | None = None
@@ -152,9 +155,11 @@ class Content:
 
     @property
     def notes(self) -> list[str]:
-        """Comment lines: origin, quality, and the meaning of the transform."""
+        """Comment lines: origin, quality, meaning of the transform, and its conditions."""
         is_of_lens = self.lens is not None and any(frame.startswith("cam") for frame in self.frames)
-        return [self.origin, self.quality, self.direction, *([_OF_LENS] if is_of_lens else [])]
+        holds = [f"only where: {condition.words}" for condition in self.conditions]
+        of_lens = [_OF_LENS] if is_of_lens else []
+        return [self.origin, self.quality, self.direction, *of_lens, *holds]
 
 
 @dataclass(frozen=True)

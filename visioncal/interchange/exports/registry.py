@@ -113,9 +113,10 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         contents = _select_all(source, selection, form)
         written = "" if form.write_all is None else form.write_all(contents)
         verdicts = {content.verdict.status: content.verdict for content in contents}
-        return Document(written, next(verdicts[one] for one in WORST_FIRST if one in verdicts))
+        worst = next(verdicts[one] for one in WORST_FIRST if one in verdicts)
+        return Document(written, worst, _conditions(contents[0]))
     content = select(source, selection, form)
-    return Document(form.write(content), content.verdict, tuple(form.warn(content)))
+    return Document(form.write(content), content.verdict, (*_conditions(content), *form.warn(content)))
 
 
 def _robot_part(
@@ -138,6 +139,10 @@ def _robot_part(
     choice = Choice(selection.camera, selection.robot, selection.target)
     part = source.chosen(choice, ARM if isinstance(form, ArmFormat) else needs)
     return part, replace(selection, camera=None, robot=None, target=None)
+
+
+def _conditions(content: Content) -> tuple[str, ...]:
+    return tuple(condition.words for condition in content.conditions)
 
 
 def _find(name: str) -> ExportFormat | ArmFormat:
@@ -214,6 +219,7 @@ def _content(form: ExportFormat, selection: Selection, available: Placements, na
         else available.lens,
         placement.origin,
         placement.verdict,
+        () if form.holds == "lens" else placement.conditions,
         rotation_of,
         selection.number,
         selection.load,

@@ -9,6 +9,7 @@ from visioncal.core.errors import DataError
 from visioncal.core.number_format import did_you_mean
 from visioncal.core.types import Mount
 from visioncal.results import Calibration, CameraResult, Edge, Frame, FrameFile, Verdict
+from visioncal.results.conditions import Condition
 
 Source: TypeAlias = Calibration | FrameFile
 Kind: TypeAlias = Literal["tool", "fixture"]
@@ -36,6 +37,7 @@ class Placement:
         edge: `parent_from_child`.
         oriented: Whether its rotation was measured.
         rotation_of: The frame whose rotation was copied otherwise; empty for its parent's.
+        conditions: Under which it holds.
     """
 
     edge: Edge
@@ -43,6 +45,7 @@ class Placement:
     verdict: Verdict
     oriented: bool = True
     rotation_of: str = ""
+    conditions: tuple[Condition, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +164,16 @@ def placements(source: Source, camera: str | None = None) -> Placements:
             culprits=["--camera"],
             next_step="Leave it out.",
         )
-    frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
     if isinstance(source, FrameFile):
+        frames = {name: _of_frame(frame) for name, frame in source.frames.items()}
         return Placements(frames, tuple(frames), "this file of frames", None, None)
+    frames = {
+        name: replace(_of_frame(frame), conditions=source.conditions)
+        for name, frame in source.frames.items()
+    }
     origin = f"calibrated by visioncal from {source.session_name!r}, {source.created}"
     edges = {
-        name: Placement(edge, origin, source.verdict, edge.oriented)
+        name: Placement(edge, origin, source.verdict, edge.oriented, conditions=source.conditions)
         for name, edge in source.edges.items()
     }
     return Placements(
@@ -208,7 +215,7 @@ def _camera(lenses: Mapping[str, CameraResult], camera: str | None) -> str:
 
 def _in_cell(source: Calibration, edge: Edge) -> Placement:
     origin = f"aligned by visioncal from {source.session_name!r}, {source.created}"
-    return Placement(edge, origin, source.verdict)
+    return Placement(edge, origin, source.verdict, conditions=source.conditions)
 
 
 def _between(source: Calibration, first: str, second: str) -> Placement:

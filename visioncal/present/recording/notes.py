@@ -136,6 +136,8 @@ def _verdict_lines(calibration: Calibration) -> Iterator[str]:
     for name, frame in calibration.frames.items():
         if frame.verdict.status != "good":
             yield f"- {plain(name)}: {frame.verdict.headline}, see Tools and fixtures."
+    if calibration.unstated_conditions:
+        yield from ("", "## What it is valid for", "", *_list(calibration.unstated_conditions))
     if verdict.rest:
         yield from ("", "## What else was found", "", *_list(verdict.rest))
     if cell is not None:

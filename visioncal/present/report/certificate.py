@@ -92,11 +92,11 @@ def _cell(
 def _result(calibration: Calibration) -> Iterator[tuple[str, str]]:
     for fact in need_facts(calibration.need, calibration.verdict):
         yield fact.label[0].upper() + fact.label[1:], f"{fact.value} {fact.note}".strip()
+    for condition in calibration.conditions:
+        yield "Only where", condition.words
     for name, edge in [*calibration.placed.items()][:_MOST_EDGES]:
-        rotation = ", ".join(
-            f"{value:.4f}" for value in edge.transform.rotation.as_rotvec(degrees=True)
-        )
-        yield name, f"{edge.place_words(3)}; rotation vector ({rotation}) deg; {edge.sigma_words}"
+        rotation = edge.rotation_words(calibration.controller)
+        yield name, f"{edge.place_words(3)}; {rotation}; {edge.sigma_words}"
     if (test := calibration.touch_test) is not None:
         largest = max(point.gap_mm for point in test.points)
         words = "passed" if test.passed else "not passed"

@@ -145,13 +145,13 @@ def need_facts(need: NeedMet | None, verdict: Verdict) -> tuple[Fact, ...]:
         words = " and ".join(f"{value:g}{unit}" for value, unit in tolerances if value is not None)
         facts.append(Fact(f"picks within {words}", percent(need.probability)))
     if verdict.good_for_mm is not None:
-        facts.append(
-            Fact(
-                "good for tasks of",
-                f"{significant(rounded_up(verdict.good_for_mm))} mm",
-                "and more",
-            )
-        )
+        of = verdict.good_for_mm_uncorrected
+        sent = "and more" if of is None else "and more, with corrected targets"
+        size = f"{significant(rounded_up(verdict.good_for_mm))} mm"
+        facts.append(Fact("good for tasks of", size, sent))
+        if of is not None:
+            size = f"{significant(rounded_up(of))} mm"
+            facts.append(Fact("by the controller's own poses, of", size, "and more"))
     return tuple(facts)
 
 
