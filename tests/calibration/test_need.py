@@ -202,7 +202,8 @@ def test_a_board_of_another_size_misplaces_things_for_a_calibrated_arm(mount: st
     # 1.5 sigma of that size make nearly all of it, and what is held counts by its pull as well.
     assert 0.7 < away_mm / picks.budget_mm["total"] < 2.0
     # More views would not help, and are not the advice.
-    cause = judge(replace(known.findings, need=Need(0.3))).causes[0]
+    needing = replace(known.findings, need=Need(0.3), corrects_targets=True)
+    cause = judge(needing).causes[0]
     assert cause.kind == "unmeasured_board"
     assert "square_sigma_m" in cause.do.words
 
