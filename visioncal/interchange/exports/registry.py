@@ -116,7 +116,9 @@ def document(source: Source | Identified, to: str, selection: Selection = _EVERY
         worst = next(verdicts[one] for one in WORST_FIRST if one in verdicts)
         return Document(written, worst, _conditions(contents[0]))
     content = select(source, selection, form)
-    return Document(form.write(content), content.verdict, (*_conditions(content), *form.warn(content)))
+    return Document(
+        form.write(content), content.verdict, (*_conditions(content), *form.warn(content))
+    )
 
 
 def _robot_part(
