@@ -161,9 +161,16 @@ def test_a_tip_that_is_not_there_is_refused_with_the_frames(tmp_path: Path) -> N
 
 def test_what_is_no_urdf_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.urdf").write_text("<robot name='x'><link name=")
+    with pytest.raises(DataError, match="is no XML"):
+        load_robot("a.urdf", "x", tmp_path)
+    (tmp_path / "a.urdf").write_text("<robot/>")
     with pytest.raises(DataError, match="cannot be parsed"):
         load_robot("a.urdf", "x", tmp_path)
     capfd.readouterr()  # the parser speaks on its own
+    # One that Pinocchio's reader takes, and no other.
+    (tmp_path / "bold.urdf").write_text(URDF.replace("<link name=", "<link note='<i>' name=", 1))
+    with pytest.raises(DataError, match="is no XML: not well-formed"):
+        load_robot("bold.urdf", "tool0", tmp_path)
     (tmp_path / "long.urdf").write_text(f"<robot name='x'>{'<joint/>' * 2001}</robot>")
     with pytest.raises(DataError, match="has 2001 joints; up to 2000"):
         load_robot("long.urdf", "x", tmp_path)

@@ -136,6 +136,7 @@ def _with_starts(
         raise DataError(
             "pnp: no view's pose can be solved: the lens's distortion cannot be inverted where the "
             "corners are.",
+            culprits=["session.toml: camera.distortion"],
             next_step="Check the distortion coefficients: their number, order and model.",
         )
     lost = [view for view, solved in zip(stack.views, guess.solved, strict=True) if not solved]
