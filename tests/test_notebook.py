@@ -81,11 +81,12 @@ def test_figures_of_the_report_are_drawn_on_their_own(tmp_path):
     drawing = calibration.plot()
     drawing.save(tmp_path / "residuals.svg")
     text = (tmp_path / "residuals.svg").read_text("utf-8")
-    assert text.startswith("<svg xmlns=")
+    assert text.startswith("<svg ")
+    assert 'xmlns="http://www.w3.org/2000/svg"' in text
     # Each view's bar, in two panels at least.
     bars = [
         element.get("d", "")
-        for element in ElementTree.fromstring(text)
+        for element in ElementTree.fromstring(text).iter()
         if element.tag.endswith("path")
     ]
     assert sum(bar.count("z") for bar in bars) >= 2 * sum(view.used for view in calibration.views)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from markupsafe import Markup
+from matplotlib.figure import Figure
 
 from visioncal.calibration.verification.change_hypotheses import NOISE
 from visioncal.calibration.verification.check import Check
@@ -12,13 +12,19 @@ from visioncal.calibration.verification.policy import Outcome
 from visioncal.core.number_format import significant
 from visioncal.core.types import FloatArray
 from visioncal.core.verdict import Verdict
-from visioncal.present.report import svg
-from visioncal.present.report.axes import Margins, Panel, Scale, boxes
-from visioncal.present.report.svg import Figure
+from visioncal.present.report.plotting import (
+    ACCENT,
+    BAD,
+    WIDE_IN,
+    drawn,
+    few_ticks,
+    label_x,
+    legend,
+    panels,
+)
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Table, TableRow
 
-_WIDE_IN, _HIGH_IN = 9.2, 3.6
 # Width of a stop's bars, and the largest number of labels below them.
 _BAR, _MOST_LABELS = 0.38, 20
 
@@ -64,30 +70,28 @@ def _residual_table(stops: Sequence[str], before: FloatArray, after: FloatArray 
     )
 
 
-def _residuals(stops: Sequence[str], before: FloatArray, after: FloatArray | None) -> Markup:
+@drawn
+def _residuals(
+    stops: Sequence[str], before: FloatArray, after: FloatArray | None
+) -> tuple[Figure, str]:
     """Residuals by stop: as calibrated, and with the change undone."""
-    count, sides = len(stops), [("as calibrated", svg.ACCENT, before)]
-    if after is not None:
-        sides = [("as calibrated", svg.BAD, before),
-                 ("with the change undone", svg.ACCENT, after)]  # fmt: skip
-    step = -(-count // _MOST_LABELS)
-    ticks = [(float(index), stops[index]) for index in range(0, count, step)]
-    figure = Figure(_WIDE_IN, _HIGH_IN)
-    rows = boxes(figure, 2, 1, Margins(0.75, top=0.3), (0.0, 0.2))
+    sides = [("as calibrated", ACCENT if after is None else BAD, before)]
+    sides += [] if after is None else [("with the change undone", ACCENT, after)]
+    figure, grid = panels(WIDE_IN, 3.6, 2, sharex=True)
     # Side by side where there are two.
     width, shifts = (1.5 * _BAR, (0.0,)) if after is None else (_BAR, (-0.5 * _BAR, 0.5 * _BAR))
+    places = np.arange(len(stops))
     for column, label in enumerate(("position [mm]", "rotation [deg]")):
-        ((box,), is_last) = (rows[column], column == 1)
-        top = 1.05 * max(float(values[:, column].max()) for *_, values in sides) or 1.0
-        panel = Panel(figure, box, Scale(-0.7, count - 0.3), Scale(0.0, top))
-        panel.x_axis("stop, by its views" if is_last else "", ticks, grid=False, words=is_last)
-        panel.y_axis(label)
+        axes = grid[column, 0]
         for shift, (_, colour, values) in zip(shifts, sides, strict=True):
-            panel.bars([index + shift for index in range(count)], values[:, column], width, colour)
+            axes.bar(places + shift, values[:, column], width, color=colour, alpha=0.9)
+        axes.set_ylabel(label)
+        few_ticks(axes, y=4)
+    label_x(grid[1, 0], stops, _MOST_LABELS, "stop, by its views")
+    grid[0, 0].grid(visible=False, axis="x")
     if after is not None:
-        entries = [("\N{BLACK SQUARE}", colour, words) for words, colour, _ in sides]
-        figure.legend(rows[0][0].right, 12.0, entries)
-    return figure.inline("Residuals of each stop, before and after the change")
+        legend(figure, [("s", colour, words) for words, colour, _ in sides])
+    return figure, "Residuals of each stop, before and after the change"
 
 
 def _undone(check: Check) -> str:

@@ -15,7 +15,6 @@ _COLOURS = (
     "--ink:#1c2733;--muted:#5c6b7a;--line:#cfd6dd;--accent:#1f6fb2;--good:#2e7d32;--bad:#c62828;"
     "--check:#b26a00;--card:#ffffff;background:#fff"
 )
-_SPACE = 'xmlns="http://www.w3.org/2000/svg"'
 
 
 @dataclass(frozen=True)
@@ -39,10 +38,8 @@ class Drawing:
     @typed
     def save(self, path: Path | str) -> None:
         """Writes the figure as an .svg file, whole or not at all."""
-        start = self.markup.index("<svg")
-        text = self.markup[start : self.markup.rindex("</svg>") + len("</svg>")]
-        opening = f'<svg {_SPACE} style="{_COLOURS};font-family:sans-serif"'
-        write_atomically(Path(path), text.replace("<svg", opening, 1))
+        opening = f'<svg style="{_COLOURS};font-family:sans-serif"'
+        write_atomically(Path(path), self.markup.replace("<svg", opening, 1))
 
 
 def draw(calibration: Calibration, what: str) -> Drawing:

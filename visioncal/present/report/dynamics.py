@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from visioncal.core.number_format import matched, significant
 from visioncal.core.types import FloatArray
@@ -18,23 +19,28 @@ from visioncal.dynamics import (
 )
 from visioncal.present import facts
 from visioncal.present.facts import PLUS_MINUS
-from visioncal.present.report import svg
-from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
-from visioncal.present.report.svg import Figure
+from visioncal.present.report.plotting import (
+    ACCENT,
+    BAD,
+    MUTED,
+    WIDE_IN,
+    dots,
+    drawn,
+    few_ticks,
+    legend,
+    panels,
+)
 from visioncal.present.report.templates import template
 from visioncal.present.tables import Fact
 
 # Number of fitted motions shown: more look alike.
 _MOST_FITTED = 2
-_WIDE_IN, _PANEL_IN, _SQUARE_IN = 9.2, 1.15, 3.0
 # Relative widths of torque and error panels.
 _SHARES = (2.2, 1.0)
 # Largest number of points per line, and of marks.
 _MOST_POINTS, _MOST_MARKS = 1500, 600
 _COLUMNS = 3
-_CURVE_POINTS, _TICKS = 401, 5
-# Gaps between columns and between rows.
-_FRICTION_GAPS_IN = (0.55, 0.5)
+_CURVE_POINTS = 401
 
 
 def render_dynamics(run: Run) -> str:
@@ -95,78 +101,67 @@ def _hump_facts(identified: Identified) -> Iterator[Fact]:
         )
 
 
-def torques(prediction: Prediction) -> Markup:
+@drawn
+def torques(prediction: Prediction) -> tuple[Figure, str]:
     """Measured and predicted torques of each joint over time, and their difference."""
     subset = slice(None, None, max(len(prediction.times_s) // _MOST_POINTS, 1))
     times = (prediction.times_s - prediction.times_s[0])[subset]
     measured, predicted = prediction.measured_nm[subset], prediction.predicted_nm[subset]
     errors = np.where(prediction.used[subset], measured - predicted, np.nan)
     joints = measured.shape[1]
-    figure = Figure(_WIDE_IN, _PANEL_IN * joints + 0.4)
-    margins, gaps_in = Margins(left=0.85, top=0.3), (0.75, 0.15)
-    span = Scale(float(times[0]), float(times[-1]))
-    for joint, pair in enumerate(boxes(figure, joints, 2, margins, gaps_in, _SHARES)):
-        is_last = joint == joints - 1
-        heights = spanning(np.concatenate([measured[:, joint], predicted[:, joint]]))
-        panel = Panel(figure, pair[0], span, heights)
-        error_panel = Panel(figure, pair[1], span, spanning(errors[:, joint]))
-        for part, title in ((panel, f"joint {joint + 1}\n[N m]"), (error_panel, "")):
-            part.x_axis("time [s]" if is_last else "", _TICKS, words=is_last)
-            part.y_axis(title, 3)
-        panel.line(times, measured[:, joint], svg.MUTED, 2.0)
-        panel.line(times, predicted[:, joint], svg.ACCENT, 0.9)
-        error_panel.line(times, errors[:, joint], svg.BAD, 0.7)
-        if joint == 0:
-            line, above = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}", pair[0].top - 6.0
-            entries = [(line, svg.MUTED, "measured"), (line, svg.ACCENT, "predicted")]
-            figure.legend(pair[0].left, above, entries, anchor="start")
-            figure.legend(pair[1].left, above, [(line, svg.BAD, "error")], anchor="start")
-    return figure.inline(f"Torques over time: {prediction.label}")
+    figure, grid = panels(
+        WIDE_IN, 1.15 * joints + 0.4, joints, 2, sharex=True, width_ratios=_SHARES
+    )
+    for joint, (axes, error_axes) in enumerate(grid):
+        axes.plot(times, measured[:, joint], color=MUTED, linewidth=2.0)
+        axes.plot(times, predicted[:, joint], color=ACCENT, linewidth=0.9)
+        error_axes.plot(times, errors[:, joint], color=BAD, linewidth=0.7)
+        axes.set_ylabel(f"joint {joint + 1}\n[N m]")
+        few_ticks(axes, y=3)
+        few_ticks(error_axes, y=3)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+    entries = [("line", MUTED, "measured"), ("line", ACCENT, "predicted")]
+    legend(figure, [*entries, ("line", BAD, "error")])
+    return figure, f"Torques over time: {prediction.label}"
 
 
-def friction(identified: Identified, predictions: Sequence[Prediction]) -> Markup:
+@drawn
+def friction(
+    identified: Identified, predictions: Sequence[Prediction]
+) -> tuple[Figure, str] | None:
     """Friction of each joint against its speed: by the torques, and by the model."""
     if not identified.base.model.terms.symbols:
-        return Markup("")
+        return None
     joints = identified.robot.joint_count
     rows = -(-joints // _COLUMNS)
-    figure = Figure(_WIDE_IN, 0.75 * _SQUARE_IN * rows)
-    grid = boxes(figure, rows, _COLUMNS, Margins(top=0.25), _FRICTION_GAPS_IN)
-    panels = [box for row in grid for box in row]
-    for joint, box in enumerate(panels[:joints]):
-        speed = "speed [rad/s]" if joint >= joints - _COLUMNS else ""
-        torque = "" if joint % _COLUMNS else "friction [N m]"
-        panel = _friction_panel(figure, box, (speed, torque), identified, predictions, joint)
-        panel.title(identified.robot.joint_names[joint])
-    return figure.inline("Friction of each joint over its speed")
+    figure, grid = panels(WIDE_IN, 2.3 * rows, rows, _COLUMNS)
+    for axes in grid.flat[joints:]:
+        axes.set_visible(False)
+    for joint, axes in enumerate(grid.flat[:joints]):
+        _draw_friction(axes, identified, predictions, joint)
+        axes.set_title(identified.robot.joint_names[joint])
+        axes.set_xlabel("speed [rad/s]" if joint >= joints - _COLUMNS else "")
+        axes.set_ylabel("" if joint % _COLUMNS else "friction [N m]")
+    return figure, "Friction of each joint over its speed"
 
 
-def _friction_panel(
-    figure: Figure,
-    box: Box,
-    titles: tuple[str, str],
-    identified: Identified,
-    predictions: Sequence[Prediction],
-    joint: int,
-) -> Panel:
+def _draw_friction(
+    axes: Axes, identified: Identified, predictions: Sequence[Prediction], joint: int
+) -> None:
     samples = np.concatenate(
         [_samples(identified, prediction, joint) for prediction in predictions]
     )
-    speeds, measured = samples[:: max(len(samples) // _MOST_MARKS, 1)].T
-    max_speed = max(float(np.abs(speeds).max(initial=0.0)), 1e-3)
+    samples = samples[:: max(len(samples) // _MOST_MARKS, 1)]
+    max_speed = max(float(np.abs(samples[:, 0]).max(initial=0.0)), 1e-3)
     # Small steps near standstill, where dry friction changes sign.
     steps = np.linspace(-1.0, 1.0, _CURVE_POINTS)
     curve = np.zeros((_CURVE_POINTS, identified.robot.joint_count))
     curve[:, joint] = max_speed * np.sign(steps) * np.abs(steps) ** 3
     modelled = friction_at(identified, curve)[:, joint]
-    panel = Panel(
-        figure, box, spanning(curve[:, joint]), spanning(np.concatenate([measured, modelled]))
-    )
-    panel.x_axis(titles[0], 5)
-    panel.y_axis(titles[1], 5)
-    panel.marks(speeds, measured, "dot", svg.MUTED, 3.0, 0.5)
-    panel.line(curve[:, joint], modelled, svg.ACCENT)
-    return panel
+    dots(axes, samples, color=MUTED, alpha=0.5)
+    axes.plot(curve[:, joint], modelled, color=ACCENT, linewidth=1.6)
+    few_ticks(axes, 5, 5)
 
 
 def _samples(identified: Identified, prediction: Prediction, joint: int) -> FloatArray:

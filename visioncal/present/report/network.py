@@ -1,9 +1,12 @@
 """The network of a cell's frames: parents, who saw whom, and the sigma of each."""
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
-from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
 
 from visioncal.core.number_format import counted, significant
 from visioncal.core.types import FloatArray
@@ -16,9 +19,17 @@ from visioncal.present.network_layout import (
     spans,
     weakest_frame,
 )
-from visioncal.present.report import svg
-from visioncal.present.report.axes import Box, Panel, Scale
-from visioncal.present.report.svg import Figure
+from visioncal.present.report.plotting import (
+    ACCENT,
+    BAD,
+    CARD,
+    CHECK,
+    INK,
+    LINE,
+    MUTED,
+    drawn,
+    panels,
+)
 from visioncal.present.tables import Table
 from visioncal.results import Calibration
 from visioncal.results.tree import FrameTree
@@ -36,8 +47,8 @@ _BOX_W, _BOX_H = 1.36, 0.44
 # Font size of a frame's name, and the number of letters that fit.
 _NAME_SIZE, _NAME_LENGTH = 7.5, 15
 _INCHES, _NARROWEST_IN = 0.72, 7.0
-# Size of other labels, and of arrow heads [points].
-_SMALL, _HEAD_PT = 7.0, 6.0
+# Size of other labels [points].
+_SMALL = 7.0
 
 
 def kinds(tree: FrameTree) -> str:
@@ -79,95 +90,84 @@ def _is_oriented(tree: FrameTree, frame: str) -> bool:
     return frame in (*tree.flanges, tree.reference) or tree.edge_of(frame).oriented
 
 
-def graph(calibration: Calibration) -> Markup:
+@drawn
+def graph(calibration: Calibration) -> tuple[Figure, str]:
     """Draws the network: bodies as boxes with their frames, and who saw whom between them.
 
-    Returns:
-        The figure. Each frame's box has the sigma of its pose on its parent.
+    Each frame's box has the sigma of its pose on its parent.
     """
     tree = calibration.tree
     bodies, frames = spans(tree), places(tree)
     right = max(span[1] for span in bodies.values())
-    width_in = _INCHES * (right + 0.3)
-    figure = Figure(max(width_in, _NARROWEST_IN), _INCHES * 4.5)
     margin = 0.5 * max(_NARROWEST_IN / _INCHES - (right + 0.3), 0.0)
-    box = Box(0.0, 0.0, figure.width, figure.height)
-    panel = Panel(figure, box, Scale(-0.15 - margin, right + 0.15 + margin), Scale(-0.6, 3.5))
-    for name, span in bodies.items():
-        _draw_body(panel, tree, name, span)
+    figure, ((axes,),) = panels(max(_INCHES * (right + 0.3), _NARROWEST_IN), _INCHES * 4.5)
+    axes.set(xlim=(-0.15 - margin, right + 0.15 + margin), ylim=(-0.6, 3.5))
+    axes.set_axis_off()
+    for name, (left, end) in bodies.items():
+        _box(axes, (left, -0.35), (end, 2.9), 0.08, facecolor="none", edgecolor=LINE, lw=1.2)
+        words = f"cell, the frame of {tree.reference}" if name == CELL else name
+        axes.text(0.5 * (left + end), 3.2, words, ha="center", va="center", weight="bold")
     seen = [
         pair for pair in pairs(calibration.views) if pair.seer in frames and pair.seen in frames
     ]
     for pair in seen:
-        _draw_pair(panel, pair, frames)
+        colour = ACCENT if pair.used else BAD
+        # More observations make it wider.
+        width = 0.8 + 0.5 * min(pair.used, 40) ** 0.5
+        axes.plot(*_ends(pair, frames).T, color=colour, linewidth=width, alpha=0.55)
     for flange, robot in tree.flanges.items():
-        _draw_robot(panel, frames, bodies, tree.parents[flange], (flange, robot))
+        base = tree.parents[flange]
+        if base in frames:
+            _draw_robot(axes, frames[base], bodies[flange], robot)
     for pair in seen:
-        _count_pair(panel, pair, frames)
+        # Close to the board, where the lines of one camera have separated.
+        start, end = _ends(pair, frames)
+        words = f"{pair.used}" + (f" (\N{MINUS SIGN}{pair.left_out})" if pair.left_out else "")
+        axes.text(*(start + 0.72 * (end - start)), words, size=_SMALL, ha="center", va="center",
+                  color=BAD if pair.left_out else INK,
+                  bbox={"facecolor": CARD, "edgecolor": "none", "pad": 1.5})  # fmt: skip
     worst = weakest_frame(tree)
     for name, place in frames.items():
-        _draw_frame(panel, tree, name, place, is_worst=name == worst)
-    return figure.inline("The network of frames: who saw whom, sigma of each")
+        _draw_frame(axes, tree, name, place, is_worst=name == worst)
+    return figure, "The network of frames: who saw whom, sigma of each"
 
 
-def _box(panel: Panel, left: float, low: float, right: float, high: float, pad: float) -> str:
-    """Path commands of a box with round corners, in the panel's units."""
-    x, y = panel.x_at([left - pad, right + pad]), panel.y_at([high + pad, low - pad])
-    radius = float(panel.x_at(pad) - panel.x_at(0.0))
-    size = float(x[1] - x[0]), float(y[1] - y[0])
-    return svg.rounded(float(x[0]), float(y[0]), *size, radius)
-
-
-def _draw_body(panel: Panel, tree: FrameTree, name: str, span: tuple[float, float]) -> None:
-    outline = _box(panel, span[0], -0.35, span[1], 2.9, 0.08)
-    panel.figure.path(outline, stroke=svg.LINE, width=1.2)
-    words = f"cell, the frame of {tree.reference}" if name == CELL else name
-    x, y = float(panel.x_at(0.5 * sum(span))), float(panel.y_at(3.2))
-    panel.figure.text(x, y, words, anchor="middle", rise="middle", bold=True)
+def _box(
+    axes: Axes,
+    low: tuple[float, float],
+    high: tuple[float, float],
+    pad: float,
+    **style: Any,  # noqa: ANN401
+) -> None:
+    """Draws a box with round corners, in a patch's style, around two opposite ones."""
+    size = high[0] - low[0], high[1] - low[1]
+    axes.add_patch(FancyBboxPatch(low, *size, boxstyle=f"round,pad={pad}", **style))
 
 
 def _draw_frame(
-    panel: Panel, tree: FrameTree, name: str, place: tuple[float, float], *, is_worst: bool
+    axes: Axes, tree: FrameTree, name: str, place: tuple[float, float], *, is_worst: bool
 ) -> None:
     x, y = place
-    colour = svg.CHECK if is_worst else svg.INK
-    half_width, half_height = 0.5 * _BOX_W, 0.5 * _BOX_H
-    outline = _box(panel, x - half_width, y - half_height, x + half_width, y + half_height, 0.02)
-    panel.figure.path(outline, fill=svg.CARD, stroke=colour, width=1.8 if is_worst else 0.9)
+    colour = CHECK if is_worst else INK
+    low, high = (x - 0.5 * _BOX_W, y - 0.5 * _BOX_H), (x + 0.5 * _BOX_W, y + 0.5 * _BOX_H)
+    _box(axes, low, high, 0.02, facecolor=CARD, edgecolor=colour, lw=1.8 if is_worst else 0.9,
+         zorder=3)  # fmt: skip
     size = min(_NAME_SIZE, _NAME_SIZE * _NAME_LENGTH / len(name))
-    centre = float(panel.x_at(x))
-    lines = ((0.1, name, size, svg.INK), (-0.1, sigma_words(tree, name), _SMALL, colour))
-    for rise, words, font_size, ink in lines:
-        height = float(panel.y_at(y + rise))
-        panel.figure.text(centre, height, words, size=font_size, colour=ink, anchor="middle",
-                          rise="middle")  # fmt: skip
+    style: Any = {"ha": "center", "va": "center", "zorder": 4}
+    axes.text(x, y + 0.1, name, size=size, **style)
+    axes.text(x, y - 0.1, sigma_words(tree, name), size=_SMALL, color=colour, **style)
 
 
 def _draw_robot(
-    panel: Panel,
-    frames: Mapping[str, tuple[float, float]],
-    bodies: Mapping[str, tuple[float, float]],
-    base: str,
-    flange_and_robot: tuple[str, str],
+    axes: Axes, place: tuple[float, float], span: tuple[float, float], robot: str
 ) -> None:
     """Draws an arrow from a robot's base to the body of its flange."""
-    flange, robot = flange_and_robot
-    if base not in frames:
-        return
-    x, y = frames[base]
-    span = bodies[flange]
+    x, y = place
     end = span[1] + 0.08 if span[1] < x else span[0] - 0.08
     start = x - 0.5 * _BOX_W if end < x else x + 0.5 * _BOX_W
-    (tail, tip), height = panel.x_at([start, end]).tolist(), float(panel.y_at(y))
-    # The head's length is negative if it points to the left.
-    head = _HEAD_PT if tip > tail else -_HEAD_PT
-    panel.figure.path(f"M{tail:.1f} {height:.1f}H{tip - head:.1f}", stroke=svg.MUTED, width=1.6,
-                      dash="6.4 3.2")  # fmt: skip
-    point = f"M{tip:.1f} {height:.1f}l{-head:g} -{0.5 * _HEAD_PT:g}v{_HEAD_PT:g}z"
-    panel.figure.path(point, fill=svg.MUTED)
-    middle, above = 0.5 * (tail + tip), float(panel.y_at(y + 0.1))
-    panel.figure.text(middle, above, f"robot {robot}", size=_SMALL, colour=svg.MUTED,
-                      anchor="middle")  # fmt: skip
+    arrow = {"arrowstyle": "-|>", "color": MUTED, "linewidth": 1.6, "linestyle": "--"}
+    axes.annotate("", (end, y), (start, y), arrowprops=arrow)
+    axes.text(0.5 * (start + end), y + 0.1, f"robot {robot}", size=_SMALL, color=MUTED, ha="center")
 
 
 def _ends(pair: SeenPair, frames: Mapping[str, tuple[float, float]]) -> FloatArray:
@@ -176,26 +176,3 @@ def _ends(pair: SeenPair, frames: Mapping[str, tuple[float, float]]) -> FloatArr
     # Lines start towards their targets, so that those of one frame separate at once.
     lean = max(-0.4, min(0.4, 0.08 * (to_x - x)))
     return np.array([[x + lean, y - 0.5 * _BOX_H], [to_x - lean, to_y + 0.5 * _BOX_H]])
-
-
-def _draw_pair(panel: Panel, pair: SeenPair, frames: Mapping[str, tuple[float, float]]) -> None:
-    """Draws a line between a camera and what it saw; more observations make it wider."""
-    x, y = _ends(pair, frames).T
-    colour = svg.BAD if not pair.used else svg.ACCENT
-    width = 0.8 + 0.5 * min(pair.used, 40) ** 0.5
-    line = svg.polyline(panel.x_at(x), panel.y_at(y))
-    panel.figure.path(line, stroke=colour, width=width, opacity=0.55)
-
-
-def _count_pair(panel: Panel, pair: SeenPair, frames: Mapping[str, tuple[float, float]]) -> None:
-    """Writes the number of observations on the line."""
-    # Close to the board, where the lines of one camera have separated.
-    start, end = _ends(pair, frames)
-    position = start + 0.72 * (end - start)
-    x, y = float(panel.x_at(position[0])), float(panel.y_at(position[1]))
-    words = f"{pair.used}" + (f" (\N{MINUS SIGN}{pair.left_out})" if pair.left_out else "")
-    half = 0.3 * _SMALL * len(words) + 1.5
-    background = svg.rounded(x - half, y - 0.65 * _SMALL, 2.0 * half, 1.3 * _SMALL, 1.5)
-    panel.figure.path(background, fill=svg.CARD)
-    colour = svg.BAD if pair.left_out else svg.INK
-    panel.figure.text(x, y, words, size=_SMALL, colour=colour, anchor="middle", rise="middle")

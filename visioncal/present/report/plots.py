@@ -1,50 +1,52 @@
 """Plots of the report: residuals by view and joint angle, coverage, tools and fixtures."""
 
-import base64
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from visioncal.core.limits import CalibrationLimits
 from visioncal.core.number_format import significant
 from visioncal.core.transforms import log, nearest_rotation
-from visioncal.core.types import FloatArray, IntArray
+from visioncal.core.types import FloatArray
 from visioncal.present.advice import contradicts
 from visioncal.present.coverage import directions_chart
 from visioncal.present.placements import placement, target_frames
-from visioncal.present.report import svg
-from visioncal.present.report.axes import Box, Margins, Panel, Scale, boxes, spanning
-from visioncal.present.report.svg import Figure
+from visioncal.present.report.plotting import (
+    ACCENT,
+    BAD,
+    CHECK,
+    GOOD,
+    INK,
+    MIDDLE_IN,
+    MUTED,
+    NARROW_IN,
+    SMALL,
+    WIDE_IN,
+    beside,
+    colour_bar,
+    dots,
+    drawn,
+    few_ticks,
+    label_x,
+    legend,
+    panels,
+)
 from visioncal.results import Calibration, Frame, Observation, Rms, ViewResult
 from visioncal.results.evidence import ViewEvidence
 from visioncal.results.views import rms_of
 from visioncal.session import Session
 
-# Above this number of marks a bitmap is smaller than vectors.
-_MANY_MARKS = 2500
-# Widths of figures at which their text matches the page's.
-_WIDE_IN, _SMALL_IN = 9.2, 3.7
-# Number of colours for errors; size of dots [points]; pixels per point and dot radius in bitmaps.
-_SHADES, _DOT_PT, _DOTS_A_POINT, _DOT_REACH = 24, 2.2, 2.0, 2
-_AXES = (("x", svg.ACCENT), ("y", svg.CHECK), ("z", svg.GOOD))
-_WIDTH_IN, _ROW_IN = 9.2, 1.25
+_AXES = (("x", ACCENT), ("y", CHECK), ("z", GOOD))
 # Scales ignore the few largest points, which would compress the others.
 _ROOM, _KEPT_PERCENT = 1.3, 95.0
-# Width of a mark.
-_DASH_PT = 2.4
-
-_FRAME_WIDTH_IN, _FRAME_HEIGHT_IN = 5.0, 1.7
-# Labels with more characters in total are vertical; longest label.
-_MOST_CHARACTERS, _LONGEST = 36, 12
-_MOST_LABELS = 24
-# Mean width of a letter.
-_LETTER_IN = 0.068
-
-_HEADROOM, _WIDTH = 1.25, 0.7
+# Labels with more characters in total are vertical; longest label; most labels.
+_MOST_CHARACTERS, _LONGEST, _MOST_LABELS = 36, 12, 24
+# Height of a bar chart over its largest used bar.
+_HEADROOM = 1.25
 
 
 @dataclass(frozen=True)
@@ -64,82 +66,45 @@ class Bar:
     colour: str
 
 
-def draw_bars(
-    figure: Figure,
-    box: Box,
-    bars: Sequence[Bar],
-    rms: float | None,
-    most_labels: int = 25,
-    limit: float | None = None,
-    *,
-    titles: tuple[str, str] = ("", ""),
-    labelled: bool = True,
-    turned: bool = False,
-) -> None:
+def draw_bars(axes: Axes, bars: Sequence[Bar], rms: float | None, limit: float | None) -> None:
     """Draws a bar chart, clipped to the scale of the used bars.
 
     Args:
-        figure: Figure to draw in.
-        box: Box of the chart.
+        axes: Axes to draw in.
         bars: Bars from left to right.
         rms: Root mean square of the used bars, drawn as a line; None for no line.
-        most_labels: Largest number of labels below the bars.
         limit: Value where doubt begins: a line if the scale contains it, else a text. None for
             neither.
-        titles: Titles of the horizontal and the vertical axis.
-        labelled: Whether bars have labels.
-        turned: Whether labels are vertical.
     """
-    valued = [
-        (position, bar, bar.value) for position, bar in enumerate(bars) if bar.value is not None
-    ]
-    used = [value for _, bar, value in valued if bar.used]
-    top = _HEADROOM * max(used or [value for _, _, value in valued], default=1.0) or 1.0
-    panel = Panel(figure, box, Scale(-0.7, len(bars) - 0.3), Scale(0.0, 1.2 * top))
-    step = max(1, -(-len(bars) // most_labels))
-    ticks = [(float(position), bars[position].label) for position in range(0, len(bars), step)]
-    panel.x_axis(titles[0], ticks, grid=False, words=labelled, turned=turned)
-    panel.y_axis(titles[1])
-    for colour in dict.fromkeys(bar.colour for _, bar, _ in valued):
-        shown = [(position, value) for position, bar, value in valued if bar.colour == colour]
-        panel.bars(
-            [index for index, _ in shown], [min(value, top) for _, value in shown], _WIDTH, colour
-        )
-    for position, bar, value in valued:
-        if not bar.used:
-            _mark_unused(panel, position, bar, value, top)
-    for position, bar in enumerate(bars):
-        if bar.value is None and not bar.used:
-            panel.marks([position], [0.05 * top], "x", bar.colour, 5.0)
+    values = np.array([np.nan if bar.value is None else bar.value for bar in bars])
+    used = np.array([bar.used for bar in bars])
+    shown = values[used & np.isfinite(values)] if used.any() else values[np.isfinite(values)]
+    top = _HEADROOM * float(shown.max(initial=0.0)) or 1.0
+    places, colours = np.arange(len(bars)), [bar.colour for bar in bars]
+    axes.bar(places, np.minimum(np.nan_to_num(values), top), 0.7, color=colours, alpha=0.9)
+    axes.set_ylim(0.0, 1.2 * top)
+    few_ticks(axes, y=4)
+    for place in places[~used]:
+        value, colour = values[place], colours[place]
+        clipped = bool(value > top)
+        height = 0.05 * top if np.isnan(value) else min(value, top)
+        axes.plot([place], [height], marker="^" if clipped else "x", color=colour, markersize=5.0)
+        if clipped:
+            axes.annotate(significant(value), (place, top), xytext=(0.0, 5.0), ha="center",
+                          textcoords="offset points", fontsize=SMALL, color=colour)  # fmt: skip
     if rms is not None:
-        panel.level(rms, svg.INK, dash=svg.DASHED)
-        label, height = f"rms {significant(rms)}", float(panel.y_at(rms))
-        figure.text(box.right + 4.0, height, label, size=svg.SMALL, rise="middle")
-    if limit is not None:
-        _draw_limit(panel, limit, top)
-
-
-def _draw_limit(panel: Panel, limit: float, top: float) -> None:
-    words, box = f"doubt from {limit:g}", panel.box
-    if limit < top * 1.1:
-        panel.level(limit, svg.BAD, dash=svg.DOTTED)
-        above = float(panel.y_at(limit)) - 2.0
-        panel.figure.text(box.left + 4.0, above, words, size=svg.SMALL, colour=svg.BAD)
+        axes.axhline(rms, color=INK, linewidth=0.9, linestyle="--")
+        beside(axes, rms, f"rms {significant(rms)}")
+    if limit is None:
         return
-    panel.figure.text(
-        box.right, box.top + 2.0, f"{words} \N{UPWARDS ARROW}", size=svg.SMALL, colour=svg.MUTED,
-        anchor="end", rise="top",
-    )  # fmt: skip
-
-
-def _mark_unused(panel: Panel, position: int, bar: Bar, value: float, top: float) -> None:
-    """Marks an unused bar, with its value if it exceeds the scale."""
-    clipped = value > top
-    panel.marks([position], [min(value, top)], "^" if clipped else "x", bar.colour, 5.0)
-    if clipped:
-        x, y = float(panel.x_at(position)), float(panel.y_at(top)) - 5.0
-        panel.figure.text(x, y, significant(value), size=svg.SMALL, colour=bar.colour,
-                          anchor="middle")  # fmt: skip
+    words = f"doubt from {limit:g}"
+    if limit < top * 1.1:
+        axes.axhline(limit, color=BAD, linewidth=0.9, linestyle=":")
+        axes.annotate(words, (0.0, limit), xycoords=("axes fraction", "data"), xytext=(4.0, 2.0),
+                      textcoords="offset points", fontsize=SMALL, color=BAD)  # fmt: skip
+    else:
+        axes.text(1.0, 0.99, f"{words} \N{UPWARDS ARROW}", fontsize=SMALL, color=MUTED, ha="right",
+                  va="top", transform=axes.transAxes)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -152,118 +117,90 @@ class _Measure:
     limit: float | None
 
 
+_LIMITS = CalibrationLimits()
 _MEASURES = (
     _Measure(
-        "position [mm]",
-        lambda view: view.residual_mm,
-        lambda rms: rms.mm,
-        CalibrationLimits().scatter_mm[0],
+        "position [mm]", lambda view: view.residual_mm, lambda rms: rms.mm, _LIMITS.scatter_mm[0]
     ),
     _Measure(
         "orientation [deg]",
         lambda view: view.residual_deg,
         lambda rms: rms.deg,
-        CalibrationLimits().scatter_deg[0],
+        _LIMITS.scatter_deg[0],
     ),
     _Measure("reprojection [px]", lambda view: view.rms_px, lambda rms: rms.px, None),
 )
 
 
-def residuals(calibration: Calibration, outlying: Collection[int] = ()) -> Markup:
+@drawn
+def residuals(
+    calibration: Calibration, outlying: Collection[int] = ()
+) -> tuple[Figure, str] | None:
     """Residuals of all views: every kind for one camera, positions by camera for a cell.
 
     Args:
         calibration: The result.
         outlying: Numbers of used views to highlight, beside the unused ones.
-
-    Returns:
-        The figure; empty without residuals.
     """
-    measures: tuple[_Measure, ...] = _MEASURES
-    if calibration.cell is not None:
-        measures = (replace(_MEASURES[0], limit=None),)
+    is_cell = calibration.cell is not None
+    measures = (replace(_MEASURES[0], limit=None),) if is_cell else _MEASURES
     by_seer: dict[str, list[ViewResult]] = {}
     for view in calibration.views:
         by_seer.setdefault(view.seer, []).append(view)
     shown = [
-        (seer, seer_views, measure)
-        for seer, seer_views in by_seer.items()
+        (seer, views, measure)
+        for seer, views in by_seer.items()
         for measure in measures
-        if any(measure.value_of(view) is not None for view in seer_views)
+        if any(measure.value_of(view) is not None for view in views)
     ]
     if not shown:
-        return Markup("")
-    header_in = 0.3 if calibration.cell is not None else 0.0
-    figure = Figure(_WIDE_IN, (1.3 + header_in) * len(shown) + 0.25)
-    rows = boxes(
-        figure, len(shown), 1, Margins(0.75, 0.75, top=0.1 + header_in), (0.0, 0.15 + header_in)
-    )
-    for (box,), (seer, seer_views, measure) in zip(rows, shown, strict=True):
-        is_last = box is rows[-1][0]
-        bars = [Bar(str(view.view), measure.value_of(view), view.used, _colour(view, outlying))
-                  for view in seer_views]  # fmt: skip
+        return None
+    figure, grid = panels(WIDE_IN, (1.6 if is_cell else 1.3) * len(shown) + 0.25, len(shown))
+    for axes, (seer, views, measure) in zip(grid[:, 0], shown, strict=True):
+        bars = [
+            Bar(str(view.view), measure.value_of(view), view.used, _colour(view, outlying))
+            for view in views
+        ]
+        draw_bars(axes, bars, measure.rms_of(rms_of(views)), measure.limit)
+        is_last = axes is grid[-1, 0]
+        label_x(axes, [bar.label for bar in bars], 25, "view" if is_last else "")
         # With several cameras, each panel has other views.
-        labelled = is_last or calibration.cell is not None
-        draw_bars(figure, box, bars, measure.rms_of(rms_of(seer_views)), limit=measure.limit,
-                  labelled=labelled, titles=("view" if is_last else "", measure.label))  # fmt: skip
-        figure.text(box.left, box.top - 5.0, seer)
-    return figure.inline("Bars: residuals of each view")
+        axes.tick_params(labelbottom=is_last or is_cell)
+        axes.set_ylabel(measure.label)
+        axes.set_title(seer, loc="left")
+    return figure, "Bars: residuals of each view"
 
 
 def _colour(view: ViewResult, outlying: Collection[int]) -> str:
     if view.used:
-        return svg.CHECK if view.view in outlying else svg.ACCENT
-    return svg.BAD if contradicts(view) else svg.MUTED
+        return CHECK if view.view in outlying else ACCENT
+    return BAD if contradicts(view) else MUTED
 
 
-def image_coverage(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
+@drawn
+def image_coverage(
+    calibration: Calibration, evidence: Sequence[ViewEvidence]
+) -> tuple[Figure, str] | None:
     """Corners of the used views over the image, coloured by reprojection error."""
     used = {view.view for view in calibration.views if view.used}
     seen = [view for view in evidence if view.corners is not None and view.view in used]
     if not seen or calibration.camera is None:
-        return Markup("")
+        return None
     px = np.concatenate([view.corners.px for view in seen if view.corners is not None])
     errors = np.concatenate([_corner_errors(view) for view in seen])
-    with_error = np.isfinite(errors)
+    known = np.isfinite(errors)
     width, height = calibration.camera.camera.resolution
-    errors_known = bool(with_error.any())
-    margins = Margins(right=0.85 if errors_known else 0.15)
-    width_in = _SMALL_IN - margins.left - margins.right
-    figure = Figure(_SMALL_IN, margins.top + width_in * height / width + margins.bottom)
-    ((box,),) = boxes(figure, 1, 1, margins)
-    scale_x, scale_y = Scale(-0.5, width - 0.5), Scale(height - 0.5, -0.5)
-    panel = Panel(figure, box.shaped(height / width), scale_x, scale_y)
-    panel.x_axis("image x [px]", 4)
-    panel.y_axis("image y [px]", 5)
-    panel.frame()
-    top = float(np.percentile(errors[with_error], 98)) if errors_known else 1.0
-    steps, colours = svg.shades(errors[with_error], 0.0, top, svg.PLASMA, _SHADES)
-    layers = [(px[~with_error], svg.ACCENT), *((px[with_error][steps == index], colours[index])
-                                          for index in range(_SHADES))]  # fmt: skip
-    if len(px) > _MANY_MARKS and errors_known:
-        _draw_bitmap(panel, px[with_error], steps, colours)
-    else:
-        for positions, colour in layers:
-            panel.marks(positions[:, 0], positions[:, 1], "dot", colour, _DOT_PT)
-    if errors_known:
-        panel.colour_bar(Scale(0.0, top), svg.PLASMA, "reprojection error [px]")
-    return figure.inline("Corners of all used views over the image")
-
-
-def _draw_bitmap(panel: Panel, px: FloatArray, steps: IntArray, colours: Sequence[str]) -> None:
-    box: Box = panel.box
-    size = np.array([box.right - box.left, box.bottom - box.top]) * _DOTS_A_POINT
-    image = np.zeros((int(size[1]) + 1, int(size[0]) + 1, 4), np.uint8)
-    shades = np.array([[int(colour[k : k + 2], 16) for k in (5, 3, 1)] for colour in colours])
-    shares = np.stack([panel.x.shares(px[:, 0]), 1.0 - panel.y.shares(px[:, 1])], axis=1)
-    centres = np.round(shares * size - 0.5).astype(int)
-    reach = range(-_DOT_REACH, _DOT_REACH + 1)
-    for shift in ((i, j) for i in reach for j in reach if abs(i) + abs(j) < 2 * _DOT_REACH):
-        x, y = np.clip(centres + shift, 0, size.astype(int)).T
-        image[y, x, :3], image[y, x, 3] = shades[steps], 255
-    encoded = cv2.imencode(".png", image)[1].tobytes()
-    uri = "data:image/png;base64," + base64.b64encode(encoded).decode("ascii")
-    panel.figure.image(box.left, box.top, box.right - box.left, box.bottom - box.top, uri)
+    figure, ((axes,),) = panels(NARROW_IN, 0.6 + 0.75 * NARROW_IN * height / width)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set(xlabel="image x [px]", ylabel="image y [px]")
+    axes.spines[:].set_visible(True)
+    few_ticks(axes, 4, 5)
+    dots(axes, px[~known], color=ACCENT, s=4.0)
+    if known.any():
+        top = float(np.percentile(errors[known], 98))
+        shown = dots(axes, px[known], errors[known], vmin=0.0, vmax=top, s=4.0)
+        colour_bar(axes, shown, "reprojection error [px]")
+    return figure, "Corners of all used views over the image"
 
 
 def _corner_errors(evidence: ViewEvidence) -> FloatArray:
@@ -275,66 +212,41 @@ def _corner_errors(evidence: ViewEvidence) -> FloatArray:
     return np.asarray(np.linalg.norm(evidence.corners.px - evidence.predicted_px, axis=1))
 
 
-def viewing_directions(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
+@drawn
+def viewing_directions(
+    calibration: Calibration, evidence: Sequence[ViewEvidence]
+) -> tuple[Figure, str] | None:
     """Viewing directions towards the target: tilt against its normal, and azimuth."""
     chart = directions_chart({view.view: view for view in evidence})
     if chart is None or calibration.mount == "instrument":
-        return Markup("")
+        return None
     used = {view.view for view in calibration.views if view.used}
-    seen = [
-        (mark, colour, label, np.vstack(shown))
-        for is_used, mark, colour, label in (
-            (True, "dot", svg.ACCENT, "used"),
-            (False, "x", svg.BAD, "not used"),
-        )
-        if (
-            shown := [
-                positions for view, positions in chart.points.items() if (view in used) is is_used
-            ]
-        )
-    ]
-    farthest_deg = max(float(np.linalg.norm(positions, axis=1).max()) for *_, positions in seen)
-    top = max(45.0, 5.0 + farthest_deg)
-    figure = Figure(_SMALL_IN, 3.0)
-    centre_x, radius = 0.5 * figure.width, 0.5 * figure.height - 24.0
-    box = Box(centre_x - radius, 24.0, centre_x + radius, 24.0 + 2.0 * radius)
-    panel = Panel(figure, box, Scale(-top, top), Scale(top, -top))
-    _draw_rings(panel, [tick for tick in Scale(0.0, top).ticks(4, whole=True) if tick > 0.0], top)
-    for mark, colour, _, positions in seen:
-        panel.marks(positions[:, 0], positions[:, 1], mark, colour)
-    if len(seen) > 1:
-        signs = {"dot": "\N{BLACK CIRCLE}", "x": "\N{MULTIPLICATION SIGN}"}
-        entries = [(signs[mark], colour, label) for mark, colour, label, *_ in seen]
-        figure.legend(4.0, figure.height - 4.0, entries, anchor="start")
-    return figure.inline("Where the camera looked from")
-
-
-def _draw_rings(panel: Panel, rings_deg: Sequence[float], top_deg: float) -> None:
-    """Draws circles of equal tilt with labels, and the target's axes."""
-    figure, box = panel.figure, panel.box
-    x, y = 0.5 * (box.left + box.right), 0.5 * (box.top + box.bottom)
-    radius = 0.5 * (box.right - box.left)
-    for tilt_deg in (*rings_deg, top_deg):
-        r = radius * tilt_deg / top_deg
-        ring = f"a{r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0a{r:.1f} {r:.1f} 0 1 0 -{2 * r:.1f} 0z"
-        figure.path(f"M{x - r:.1f} {y:.1f}{ring}", stroke=svg.LINE, width=0.6)
-    cross = f"M{box.left:.1f} {y:.1f}H{box.right:.1f}M{x:.1f} {box.top:.1f}V{box.bottom:.1f}"
-    figure.path(cross, stroke=svg.LINE, width=0.6)
-    for tilt_deg in rings_deg:
-        # Labels lie along a line between two axes.
-        r_label = radius * tilt_deg / top_deg
-        label = f"{tilt_deg:.0f}\N{DEGREE SIGN}"
-        figure.text(x + 0.92 * r_label, y - 0.38 * r_label, label, colour=svg.MUTED)
-    for label, dx, dy, anchor in (
-        ("x", radius + 6.0, 0.0, "start"),
-        ("y", 0.0, radius + 9.0, "middle"),
-        ("-x", -radius - 6.0, 0.0, "end"),
-        ("-y", 0.0, -radius - 9.0, "middle"),
+    figure, ((axes,),) = panels(NARROW_IN, 3.0, subplot_kw={"projection": "polar"})
+    # The target's y points down, as on the printed page.
+    axes.set_theta_direction(-1)
+    axes.set_xticks(np.deg2rad([0.0, 90.0, 180.0, 270.0]), ["x", "y", "-x", "-y"])
+    entries = []
+    for is_used, marker, colour, label in (
+        (True, "o", ACCENT, "used"),
+        (False, "x", BAD, "not used"),
     ):
-        figure.text(x + dx, y + dy, label, colour=svg.MUTED, anchor=anchor, rise="middle")
+        points = [xy for view, xy in chart.points.items() if (view in used) is is_used]
+        if points:
+            x, y = np.vstack(points).T
+            axes.plot(np.arctan2(y, x), np.hypot(x, y), marker, color=colour, markersize=4.5)
+            entries.append((marker, colour, label))
+    axes.set_rlim(0.0, max(45.0, 5.0 + max(np.hypot(*xy.T).max() for xy in chart.points.values())))
+    few_ticks(axes, y=4)
+    axes.yaxis.set_major_formatter("{x:.0f}\N{DEGREE SIGN}")
+    if len(entries) > 1:
+        legend(figure, entries, "left")
+    return figure, "Where the camera looked from"
 
 
-def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence]) -> Markup:
+@drawn
+def flange_rotations(
+    calibration: Calibration, evidence: Sequence[ViewEvidence]
+) -> tuple[Figure, str] | None:
     """Rotation of the flange from its mean orientation, about each of its axes."""
     used = {view.view for view in calibration.views if view.used}
     poses = [
@@ -343,27 +255,27 @@ def flange_rotations(calibration: Calibration, evidence: Sequence[ViewEvidence])
         if view.base_from_flange is not None and view.view in used
     ]
     if len(poses) < 2:
-        return Markup("")
+        return None
     rotations = np.stack(poses)[:, :3, :3]
     base_from_mean = nearest_rotation(rotations.mean(axis=0))
     rotvecs_deg = np.rad2deg(Rotation.from_matrix(base_from_mean.T @ rotations).as_rotvec())
     reach = max(10.0, 1.1 * float(np.abs(rotvecs_deg).max()))
-    figure = Figure(_SMALL_IN, 2.0)
-    ((box,),) = boxes(figure, 1, 1, Margins(left=0.5))
-    panel = Panel(figure, box, Scale(-reach, reach), Scale(2.6, -0.6))
-    panel.x_axis("rotation from the mean orientation [deg]")
-    panel.y_axis("flange axis", [(0.0, "x"), (1.0, "y"), (2.0, "z")])
-    for row in range(3):
-        panel.marks(rotvecs_deg[:, row], np.full(len(rotvecs_deg), row), "|", svg.ACCENT, 17.0)
-    return figure.inline("Rotations of the flange in the used views")
+    figure, ((axes,),) = panels(NARROW_IN, 2.0)
+    axes.set(xlim=(-reach, reach), ylim=(2.6, -0.6), ylabel="flange axis")
+    axes.set_xlabel("rotation from the mean orientation [deg]")
+    axes.set_yticks([0, 1, 2], ["x", "y", "z"])
+    rows = np.broadcast_to(np.arange(3), rotvecs_deg.shape)
+    axes.plot(rotvecs_deg.ravel(), rows.ravel(), "|", color=ACCENT, markersize=17.0)
+    return figure, "Rotations of the flange in the used views"
 
 
+@drawn
 def residuals_over_joints(
     calibration: Calibration,
     session: Session | None,
     evidence: Sequence[ViewEvidence],
     outlying: Collection[int] = (),
-) -> Markup:
+) -> tuple[Figure, str] | None:
     """Residuals of the used views along the target's axes, one column per joint.
 
     Args:
@@ -371,12 +283,9 @@ def residuals_over_joints(
         session: Session with the joint angles.
         evidence: Poses of the views.
         outlying: Numbers of used views to leave out, as they would compress the scale.
-
-    Returns:
-        The figure; empty without joint angles.
     """
     if session is None or not evidence:
-        return Markup("")
+        return None
     joints_rad = {view.number: view.joints_rad for view in session.views}
     shown = {view.view for view in calibration.views if view.used and view.view not in outlying}
     frames = target_frames(calibration, session)
@@ -388,63 +297,53 @@ def residuals_over_joints(
         and (placed := placement(calibration, view, frames.get(view.view))) is not None
     ]
     if len(pairs) < 3:
-        return Markup("")
+        return None
     joints_deg = np.rad2deg([joints for joints, _ in pairs])
     twists = np.array([residual for _, residual in pairs])
-    return _joint_figure(joints_deg, 1e3 * twists[:, 3:], np.rad2deg(twists[:, :3]))
-
-
-def _joint_figure(
-    joints_deg: FloatArray, residuals_mm: FloatArray, residuals_deg: FloatArray
-) -> Markup:
-    """Plots (m, 3) position and orientation residuals against (m, n) joint angles."""
-    count = joints_deg.shape[1]
-    figure = Figure(_WIDTH_IN, 2 * _ROW_IN + 0.5)
-    upper, lower = boxes(figure, 2, count, Margins(0.85, top=0.3))
-    for row, values, label in (
-        (upper, residuals_mm, "position [mm]"),
-        (lower, residuals_deg, "rotation [deg]"),
-    ):
+    figure, grid = panels(WIDE_IN, 3.0, 2, joints_deg.shape[1], sharex="col", sharey="row")
+    rows = (
+        (grid[0], 1e3 * twists[:, 3:], "position [mm]"),
+        (grid[1], np.rad2deg(twists[:, :3]), "rotation [deg]"),
+    )
+    for row, values, label in rows:
         reach = _ROOM * float(np.percentile(np.abs(values), _KEPT_PERCENT)) or 1.0
-        shown, is_lower = np.clip(values, -reach, reach), row is lower
-        for joint, box in enumerate(row):
-            angles_deg = joints_deg[:, joint]
-            panel = Panel(figure, box, spanning(angles_deg), Scale(-1.1 * reach, 1.1 * reach))
-            title = f"q{joint + 1} [deg]" if is_lower else ""
-            panel.x_axis(title, 3, words=is_lower, whole=True)
-            panel.y_axis("" if joint else label, words=joint == 0)
-            panel.level(0.0, svg.INK, 0.7)
+        row[0].set(ylim=(-1.1 * reach, 1.1 * reach), ylabel=label)
+        for axes, angles_deg in zip(row, joints_deg.T, strict=True):
+            axes.axhline(0.0, color=INK, linewidth=0.7)
+            few_ticks(axes, 2, 4)
             for column, (_, colour) in enumerate(_AXES):
-                panel.marks(angles_deg, shown[:, column], "-", colour, _DASH_PT)
-    sign = 2 * "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
-    entries = [(sign, colour, f"target {name}") for name, colour in _AXES]
-    figure.legend(upper[-1].right, 12.0, entries)
-    return figure.inline("Residuals of the used views over each joint's angle")
+                shown_values = np.clip(values[:, column], -reach, reach)
+                axes.plot(angles_deg, shown_values, "_", color=colour, markersize=4.0)
+    for joint, axes in enumerate(grid[1]):
+        axes.set_xlabel(f"q{joint + 1} [deg]")
+    legend(figure, [("_", colour, f"target {name}") for name, colour in _AXES])
+    return figure, "Residuals of the used views over each joint's angle"
 
 
-def frame_plot(name: str, frame: Frame) -> Markup:
+@drawn
+def frame_plot(name: str, frame: Frame) -> tuple[Figure, str] | None:
     """Residual of each observation of a tool or a fixture; outliers in red."""
     if all(observation.residual_mm is None for observation in frame.observations):
-        return Markup("")
-    names = [observation.name for observation in frame.observations]
+        return None
     labels = [
-        name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"
-        for name in names
+        seen.name
+        if len(seen.name) <= _LONGEST
+        else f"{seen.name[: _LONGEST - 1]}\N{HORIZONTAL ELLIPSIS}"
+        for seen in frame.observations
     ]
     vertical = sum(map(len, labels)) > _MOST_CHARACTERS
-    shown = [
-        Bar(label, observation.residual_mm, observation.used, _observation_colour(observation))
-        for label, observation in zip(labels, frame.observations, strict=True)
+    bars = [
+        Bar(label, seen.residual_mm, seen.used, _observation_colour(seen))
+        for label, seen in zip(labels, frame.observations, strict=True)
     ]
-    bottom_in = 0.25 + _LETTER_IN * max(map(len, labels)) if vertical else 0.3
-    figure = Figure(_FRAME_WIDTH_IN, _FRAME_HEIGHT_IN + (0.4 if vertical else 0.0))
-    ((box,),) = boxes(figure, 1, 1, Margins(0.65, 0.65, bottom_in))
-    draw_bars(figure, box, shown, frame.rms_mm, _MOST_LABELS, titles=("", "off by [mm]"),
-              turned=vertical)  # fmt: skip
-    return figure.inline(f"Bars: what each observation of {name} is off")
+    figure, ((axes,),) = panels(MIDDLE_IN, 2.1 if vertical else 1.7)
+    draw_bars(axes, bars, frame.rms_mm, None)
+    label_x(axes, labels, _MOST_LABELS, "", vertical=vertical)
+    axes.set_ylabel("off by [mm]")
+    return figure, f"Bars: what each observation of {name} is off"
 
 
 def _observation_colour(observation: Observation) -> str:
     if not observation.used:
-        return svg.BAD
-    return svg.CHECK if observation.reason else svg.ACCENT
+        return BAD
+    return CHECK if observation.reason else ACCENT
