@@ -333,23 +333,6 @@ def test_findings_are_kept_and_name_the_session(tmp_path: Path) -> None:
     assert with_paths(GUESS, recording).endswith(f"cell.rrd {folder}-fixed --guess --yes")
 
 
-def test_verdicts_of_earlier_files_say_the_same() -> None:
-    causes = [
-        {"cause": "lens", "probability": 0.9, "sentence": "It is another.", "do": "Measure it."},
-        {"cause": "calibration", "probability": 0.4, "sentence": "Much comes from it."},
-    ]
-    reasons = ["Views disagree.", "It is another. Hold it."]
-    old = read(VerdictForm, {"status": "bad", "reasons": reasons, "causes": causes}, "verdict")
-    old = old.verdict("verdict")
-    assert [cause.kind for cause in old.causes] == ["lens", "calibration"]
-    assert old.top == (
-        "Most likely (90 %): It is another. Hold it.",
-        "Much comes from it.",
-        "Views disagree.",
-    )
-    assert old.next_steps == (Remedy("Measure it."),)
-
-
 def _scattered() -> Verdict:
     return judge(changed(SOUND, held_out=Rms(30.0, 0.011), rms=Rms(29.0, 0.01)))
 
